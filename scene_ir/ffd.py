@@ -1,0 +1,78 @@
+"""Free-form deformation on a 4x4x4 Bernstein lattice over the unit box (Sederberg and Parry 1986; 3D-SDN)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from scene_ir.types import LATTICE, LATTICE_POINTS
+
+SYMMETRIC_DIM = LATTICE_POINTS * 3 // 2
+"""Independent offsets once left and right mirror each other: 96."""
+
+
+def _bernstein(t: Tensor, degree: int) -> Tensor:
+    """Bernstein polynomials (..., degree + 1) at t (...,)."""
+    k = torch.arange(degree + 1, device=t.device)
+    binomial = torch.tensor([math.comb(degree, int(i)) for i in k], dtype=t.dtype, device=t.device)
+    return binomial * t[..., None] ** k * (1 - t[..., None]) ** (degree - k)
+
+
+def lattice_weights(unit: Tensor) -> Tensor:
+    """Weights (V, 64) with which the lattice offsets move unit-box vertices (V, 3).
+
+    Lattice points are ordered length-major, then height (from the roof, y = -1, to the ground, y = 0), then width.
+    """
+    bx = _bernstein(unit[:, 0] + 0.5, LATTICE[0] - 1)
+    by = _bernstein(unit[:, 1] + 1.0, LATTICE[1] - 1)
+    bz = _bernstein(unit[:, 2] + 0.5, LATTICE[2] - 1)
+    return torch.einsum("vi,vj,vk->vijk", bx, by, bz).reshape(unit.shape[0], LATTICE_POINTS)
+
+
+def deform(unit: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
+    """Deformed vertices. unit (V, 3), weights (V, 64) of `lattice_weights`, offsets (..., 64, 3) -> (..., V, 3)."""
+    return unit + weights @ offsets
+
+
+def symmetrise(offsets: Tensor) -> Tensor:
+    """The nearest offsets (..., 64, 3) that are symmetric left to right (z to -z)."""
+    grid = offsets.reshape(*offsets.shape[:-2], *LATTICE, 3)
+    mirror = grid.flip(-2) * grid.new_tensor([1.0, 1.0, -1.0])
+    return (0.5 * (grid + mirror)).reshape(offsets.shape)
+
+
+def from_symmetric(code: Tensor) -> Tensor:
+    """Offsets (..., 64, 3) from the 96 independent numbers (..., 96): those of the half with z < 0."""
+    half = code.reshape(*code.shape[:-1], LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)
+    mirror = half.flip(-2) * half.new_tensor([1.0, 1.0, -1.0])
+    return torch.cat([half, mirror], dim=-2).reshape(*code.shape[:-1], LATTICE_POINTS, 3)
+
+
+def to_symmetric(offsets: Tensor) -> Tensor:
+    """The inverse of `from_symmetric` for symmetric offsets: (..., 64, 3) -> (..., 96)."""
+    grid = symmetrise(offsets).reshape(*offsets.shape[:-2], *LATTICE, 3)
+    return grid[..., : LATTICE[2] // 2, :].reshape(*offsets.shape[:-2], SYMMETRIC_DIM)
+
+
+def jacobian(unit: Tensor, offsets: Tensor) -> Tensor:
+    """Jacobian (..., V, 3, 3) of the deformation at unit-box points (V, 3), offsets (..., 64, 3).
+
+    Its singular values are the local strain; a positive determinant everywhere means that nothing is inverted.
+    """
+    t = unit + unit.new_tensor([0.5, 1.0, 0.5])
+    values = [_bernstein(t[:, axis], LATTICE[axis] - 1) for axis in range(3)]
+    slopes = [_bernstein_slope(t[:, axis], LATTICE[axis] - 1) for axis in range(3)]
+    columns = []
+    for axis in range(3):
+        factors = [slopes[i] if i == axis else values[i] for i in range(3)]
+        weights = torch.einsum("vi,vj,vk->vijk", *factors).reshape(unit.shape[0], LATTICE_POINTS)
+        columns.append(weights @ offsets)
+    return torch.eye(3, dtype=unit.dtype, device=unit.device) + torch.stack(columns, dim=-1)
+
+
+def _bernstein_slope(t: Tensor, degree: int) -> Tensor:
+    """Derivatives (..., degree + 1) of the Bernstein polynomials: degree * (b[k-1] - b[k]) of one degree less."""
+    lower = _bernstein(t, degree - 1)
+    return degree * (torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1)))
