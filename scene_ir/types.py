@@ -281,6 +281,31 @@ class SceneIR:
         """The same scene with some fields of `environment` replaced."""
         return replace(self, environment=replace(self.environment, **changes))
 
+    def as_photographed(self) -> SceneIR:
+        """The scene at theta0: every object where the photograph saw it, every code at 0.
+
+        A saved counterexample thus carries the scene that it was made from. Needs `objects.source`.
+        """
+        source = self.objects.source
+        if len(source) != len(self.objects):
+            raise RangeError("objects.source", "one entry an object", len(source))
+        if not source:
+            return self
+        objects = replace(
+            self.objects,
+            translation=torch.stack([s.translation for s in source]),
+            yaw=torch.stack([s.yaw for s in source]),
+            size_lhw=torch.stack([s.size_lhw for s in source]),
+            ffd=torch.stack([s.ffd for s in source]),
+            texture_code=torch.zeros_like(self.objects.texture_code),
+        )
+        environment = replace(
+            self.environment,
+            weather=torch.zeros_like(self.environment.weather),
+            foliage=torch.zeros_like(self.environment.foliage),
+        )
+        return replace(self, objects=objects, environment=environment)
+
 
 @dataclass(frozen=True, slots=True)
 class Labels:

@@ -1,0 +1,57 @@
+"""The contract of every detector with gradients: images to raw predictions, to a loss, to detections."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from detectors.types import Detections, Targets
+
+
+@dataclass(frozen=True, slots=True)
+class RawPredictions:
+    """What the network says about each of its A anchors, before any choice is made; differentiable.
+
+    boxes_xyxy (B, A, 4) px of the input image, not clipped; deltas (B, A, 4), the box head's own numbers;
+    class_logits (B, A, C); confidence_logits (B, A); image_hw, size of the input image in pixels.
+    """
+
+    boxes_xyxy: Tensor
+    deltas: Tensor
+    class_logits: Tensor
+    confidence_logits: Tensor
+    image_hw: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        b, a = self.confidence_logits.shape
+        wanted = {"boxes_xyxy": (b, a, 4), "deltas": (b, a, 4), "class_logits": (b, a, self.class_logits.shape[-1])}
+        for name, shape in wanted.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"raw.{name}: expected shape {shape}, found {found}")
+
+    def __len__(self) -> int:
+        return int(self.confidence_logits.shape[0])
+
+
+class Detector(nn.Module, ABC):
+    """A detector: `name`, `classes` (labels are indices into it), `t_star` (score of best F1 on benign frames)."""
+
+    name: str
+    classes: tuple[str, ...]
+    t_star: float
+
+    @abstractmethod
+    def forward(self, images: Tensor) -> RawPredictions:
+        """images (B, 3, H, W), RGB in [0, 1], any size; differentiable to the images."""
+
+    @abstractmethod
+    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """Scalars "confidence", "box", "class" and their sum "total"; one Targets for each image."""
+
+    @abstractmethod
+    def decode(self, raw: RawPredictions) -> list[Detections]:
+        """One Detections for each image, best first, boxes inside the image; carries no gradient."""

@@ -1,0 +1,318 @@
+"""SqueezeDet (Wu et al., 2017, arXiv:1612.01051): SqueezeNet 1.1 layers, two more Fire modules, ConvDet.
+
+One departure from the published code: anchor centres lie in the middle of their 16 px cell instead of being
+spread over the image as (i + 1) * width / (cells + 1). So they do not depend on the size of the image, which may
+be any. At 1248x384 the two differ by less than a cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from detectors import boxes
+from detectors.base import Detector, RawPredictions
+from detectors.types import CLASSES, Detections, Targets
+
+STRIDE = 16
+"""Pixels a grid cell: conv1 and three poolings halve the image."""
+
+ANCHOR_SIZES_WH = (
+    (36.0, 37.0),
+    (366.0, 174.0),
+    (115.0, 59.0),
+    (162.0, 87.0),
+    (38.0, 90.0),
+    (258.0, 173.0),
+    (224.0, 108.0),
+    (78.0, 170.0),
+    (72.0, 43.0),
+)
+"""Anchor shapes in pixels: config/kitti_squeezeDet_config.py of the published code."""
+
+BGR_MEAN = (103.939, 116.779, 123.68)
+"""Subtracted from pixels in 0..255: the mean of ImageNet that the backbone's weights were trained with."""
+
+EXP_THRESHOLD = 1.0
+"""Beyond this log-size the exponential goes on as its tangent (published code, EXP_THRESH)."""
+
+WEIGHT_BOX = 5.0
+WEIGHT_CONFIDENCE_POSITIVE = 75.0
+WEIGHT_CONFIDENCE_NEGATIVE = 100.0
+WEIGHT_CLASS = 1.0
+"""Weights of the loss terms (published code, LOSS_COEF_*)."""
+
+TOP_DETECTIONS = 64
+NMS_IOU = 0.4
+SCORE_MINIMUM = 0.005
+"""Decoding (published code: TOP_N_DETECTION, NMS_THRESH, PROB_THRESH)."""
+
+IGNORE_OVERLAP = 0.5
+"""An anchor that overlaps an ignored box more than this is no negative."""
+
+_FIRE = (
+    # name, input channels, squeeze, expand (1x1 and 3x3 each); None is a 3x3/2 max pooling
+    ("fire2", 64, 16, 64),
+    ("fire3", 128, 16, 64),
+    None,
+    ("fire4", 128, 32, 128),
+    ("fire5", 256, 32, 128),
+    None,
+    ("fire6", 256, 48, 192),
+    ("fire7", 384, 48, 192),
+    ("fire8", 384, 64, 256),
+    ("fire9", 512, 64, 256),
+    ("fire10", 512, 96, 384),
+    ("fire11", 768, 96, 384),
+)
+
+
+class Fire(nn.Module):
+    """Squeeze by 1x1, expand by 1x1 and 3x3 side by side (SqueezeNet, arXiv:1602.07360)."""
+
+    def __init__(self, channels: int, squeeze: int, expand: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeeze, 1)
+        self.expand1x1 = nn.Conv2d(squeeze, expand, 1)
+        self.expand3x3 = nn.Conv2d(squeeze, expand, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        squeezed = F.relu(self.squeeze(x), inplace=True)
+        return F.relu(torch.cat((self.expand1x1(squeezed), self.expand3x3(squeezed)), 1), inplace=True)
+
+
+class SeededDropout(nn.Module):
+    """Dropout that draws from a generator of its own, so that training resumes exactly; identity in eval mode."""
+
+    def __init__(self, probability: float) -> None:
+        super().__init__()
+        self.probability = probability
+        self.generator: torch.Generator | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training or self.probability == 0:
+            return x
+        keep = torch.rand(x.shape, generator=self.generator, device=x.device) >= self.probability
+        return x * keep.to(x.dtype) / (1 - self.probability)
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Which anchors answer for which objects; holds no gradient. K objects of the batch that are not ignored.
+
+    image, anchor (K,) int64; confidence (K,), the IoU of predicted and true box; deltas (K, 4); labels (K,) int64;
+    negative (B, A) bool, the anchors that must stay silent.
+    """
+
+    image: Tensor
+    anchor: Tensor
+    confidence: Tensor
+    deltas: Tensor
+    labels: Tensor
+    negative: Tensor
+
+
+class SqueezeDet(Detector):
+    """SqueezeDet for images of any size: padded right and below to a multiple of 16 px, never resized."""
+
+    name = "squeezedet"
+
+    def __init__(self, classes: tuple[str, ...] = CLASSES, t_star: float = 0.5, dropout: float = 0.5) -> None:
+        super().__init__()
+        self.classes = tuple(classes)
+        self.t_star = t_star
+        self.conv1 = nn.Conv2d(3, 64, 3, stride=2)
+        self.fires = nn.ModuleDict({fire[0]: Fire(*fire[1:]) for fire in _FIRE if fire is not None})
+        self.dropout = SeededDropout(dropout)
+        self.convdet = nn.Conv2d(768, len(ANCHOR_SIZES_WH) * (len(self.classes) + 1 + 4), 3, padding=1)
+
+    @torch.no_grad()
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw all weights anew: He for the backbone, near zero for ConvDet (as published), anchors mostly silent."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                std = (2 / (module.weight[0].numel())) ** 0.5
+                module.weight.normal_(0.0, 1e-3 if module is self.convdet else std, generator=generator)
+                if module.bias is not None:
+                    module.bias.zero_()
+        count = len(ANCHOR_SIZES_WH)
+        first = count * len(self.classes)
+        if self.convdet.bias is not None:
+            self.convdet.bias[first : first + count] = -2.0  # sigmoid 0.12: most anchors see no object
+
+    def forward(self, images: Tensor) -> RawPredictions:
+        """images (B, 3, H, W), RGB in [0, 1]; A = 9 * ceil(H / 16) * ceil(W / 16), cells row by row, 9 each."""
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
+        height, width = int(images.shape[2]), int(images.shape[3])
+        mean = images.new_tensor(BGR_MEAN).view(1, 3, 1, 1)
+        x = images.flip(1) * 255.0 - mean
+        # To a multiple of 16, and one more row and column for conv1: TensorFlow's SAME puts its single row of
+        # padding for stride 2 below and to the right. Zeros here are the mean colour.
+        x = F.pad(x, (0, -width % STRIDE + 1, 0, -height % STRIDE + 1))
+        x = x.contiguous(memory_format=torch.channels_last)
+        x = F.relu(self.conv1(x), inplace=True)
+        x = _pool(x)
+        for fire in _FIRE:
+            x = _pool(x) if fire is None else self.fires[fire[0]](x)
+        return self._interpret(self.convdet(self.dropout(x)), (height, width))
+
+    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """The published loss; what it aims at (`assign`) is taken as constant, as in the published code."""
+        return self.loss_terms(raw, self.assign(raw, targets))
+
+    @torch.no_grad()
+    def assign(self, raw: RawPredictions, targets: Sequence[Targets]) -> Assignment:
+        """Give each object the anchor with the highest IoU that is not taken yet (nearest shape where none overlaps).
+
+        Raises ValueError where targets and images differ in number, or a label is no class of this detector.
+        """
+        if len(targets) != len(raw):
+            raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
+        height, width = raw.image_hw
+        like = raw.deltas
+        anchors_cxcywh = _anchors(-(-height // STRIDE), -(-width // STRIDE), like.dtype, like.device)
+        anchors_xyxy = _corners(anchors_cxcywh)
+        negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
+        image, anchor, true_boxes, labels = [], [], [], []
+        for b, target in enumerate(targets):
+            everything = target.boxes_xyxy.to(like)
+            ignored = everything[target.ignore.to(like.device)]
+            if len(ignored):
+                negative[b] = ~(_covered(anchors_xyxy, ignored) | _covered(raw.boxes_xyxy[b], ignored))
+            wanted = everything[~target.ignore.to(like.device)]
+            kept_labels = target.labels.to(like.device)[~target.ignore.to(like.device)]
+            if len(kept_labels) and not (0 <= int(kept_labels.min()) and int(kept_labels.max()) < len(self.classes)):
+                raise ValueError(
+                    f"targets[{b}].labels: expected 0..{len(self.classes) - 1}, found {kept_labels.tolist()}"
+                )
+            overlaps = boxes.iou_matrix(wanted, anchors_xyxy)
+            for box, overlap in zip(wanted, overlaps, strict=True):
+                if float(overlap.max()) <= 0:
+                    overlap = -(_centred(box) - anchors_cxcywh).square().sum(-1)
+                best = int(overlap.argmax())
+                overlaps[:, best] = -1.0
+                while (b, best) in zip(image, anchor, strict=True):
+                    overlap[best] = -torch.inf
+                    best = int(overlap.argmax())
+                image.append(b)
+                anchor.append(best)
+            true_boxes.append(wanted)
+            labels.append(kept_labels)
+        images = torch.tensor(image, dtype=torch.int64, device=like.device)
+        anchor_index = torch.tensor(anchor, dtype=torch.int64, device=like.device)
+        truth_xyxy = torch.cat(true_boxes) if true_boxes else like.new_zeros(0, 4)
+        negative[images, anchor_index] = False
+        chosen, truth = anchors_cxcywh[anchor_index], _centred(truth_xyxy)
+        deltas = torch.cat(((truth[:, :2] - chosen[:, :2]) / chosen[:, 2:], _safe_log(truth[:, 2:] / chosen[:, 2:])), 1)
+        predicted = boxes.clip(raw.boxes_xyxy[images, anchor_index], height, width)
+        return Assignment(images, anchor_index, _paired_iou(predicted, truth_xyxy), deltas, torch.cat(labels), negative)
+
+    def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
+        """The three terms over the whole batch, each weighted as published, and their sum."""
+        image, anchor = assignment.image, assignment.anchor
+        objects = max(len(image), 1)
+        confidence = torch.sigmoid(raw.confidence_logits)
+        missed = (confidence[image, anchor] - assignment.confidence).square().sum() / objects
+        silent = max(confidence.numel() - len(image), 1)
+        alarms = torch.where(assignment.negative, confidence, 0.0).square().sum() / silent
+        box = (raw.deltas[image, anchor] - assignment.deltas).square().sum() / objects
+        classes = F.cross_entropy(raw.class_logits[image, anchor], assignment.labels, reduction="sum") / objects
+        terms = {
+            "confidence": WEIGHT_CONFIDENCE_POSITIVE * missed + WEIGHT_CONFIDENCE_NEGATIVE * alarms,
+            "box": WEIGHT_BOX * box,
+            "class": WEIGHT_CLASS * classes,
+        }
+        return terms | {"total": terms["confidence"] + terms["box"] + terms["class"]}
+
+    @torch.no_grad()
+    def decode(self, raw: RawPredictions) -> list[Detections]:
+        """Score = confidence x class probability; the 64 best anchors, NMS at 0.4 in each class, score >= 0.005."""
+        probability, labels = torch.softmax(raw.class_logits, -1).max(-1)
+        scores = torch.sigmoid(raw.confidence_logits) * probability
+        found = []
+        for boxes_xyxy, label, score in zip(raw.boxes_xyxy, labels, scores, strict=True):
+            top = torch.sort(score, descending=True, stable=True).indices[:TOP_DETECTIONS]
+            top = top[score[top] >= SCORE_MINIMUM]
+            clipped = boxes.clip(boxes_xyxy[top], *raw.image_hw)
+            keep = boxes.nms_per_class(clipped, label[top], score[top], NMS_IOU)
+            found.append(Detections(clipped[keep], label[top][keep], score[top][keep]))
+        return found
+
+    def _interpret(self, output: Tensor, image_hw: tuple[int, int]) -> RawPredictions:
+        """Split ConvDet's channels (B, 9 * (C + 1 + 4), gh, gw): class scores, confidences, deltas."""
+        batch, _, rows, columns = output.shape
+        count, classes = len(ANCHOR_SIZES_WH), len(self.classes)
+        cells = output.permute(0, 2, 3, 1).float() if output.dtype == torch.bfloat16 else output.permute(0, 2, 3, 1)
+        class_logits, confidence, deltas = cells.split((count * classes, count, count * 4), -1)
+        anchors = _anchors(rows, columns, cells.dtype, cells.device)
+        deltas = deltas.reshape(batch, -1, 4)
+        centre = anchors[:, :2] + deltas[..., :2] * anchors[:, 2:]
+        size = anchors[:, 2:] * _safe_exp(deltas[..., 2:])
+        return RawPredictions(
+            boxes_xyxy=torch.cat((centre - size / 2, centre + size / 2), -1),
+            deltas=deltas,
+            class_logits=class_logits.reshape(batch, -1, classes),
+            confidence_logits=confidence.reshape(batch, -1),
+            image_hw=image_hw,
+        )
+
+
+def _pool(x: Tensor) -> Tensor:
+    # TensorFlow's SAME on an even size: the last window reaches one pixel beyond the edge.
+    return F.max_pool2d(x, 3, stride=2, ceil_mode=True)
+
+
+@lru_cache(maxsize=16)
+def _anchors(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Anchors (9 * rows * columns, 4) as centre x, centre y, width, height in px; cells row by row, 9 each."""
+    y = torch.arange(rows, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
+    x = torch.arange(columns, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
+    centres = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (rows, columns, 2)
+    sizes = torch.tensor(ANCHOR_SIZES_WH, dtype=dtype, device=device)
+    shape = (rows, columns, len(ANCHOR_SIZES_WH), 2)
+    return torch.cat((centres[:, :, None].expand(shape), sizes.expand(shape)), -1).reshape(-1, 4)
+
+
+def _corners(boxes_cxcywh: Tensor) -> Tensor:
+    half = boxes_cxcywh[..., 2:] / 2
+    return torch.cat((boxes_cxcywh[..., :2] - half, boxes_cxcywh[..., :2] + half), -1)
+
+
+def _centred(boxes_xyxy: Tensor) -> Tensor:
+    return torch.cat(((boxes_xyxy[..., :2] + boxes_xyxy[..., 2:]) / 2, boxes_xyxy[..., 2:] - boxes_xyxy[..., :2]), -1)
+
+
+def _covered(candidates_xyxy: Tensor, ignored_xyxy: Tensor) -> Tensor:
+    shared = boxes.iou_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP
+    return (shared | (boxes.ioa_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP)).any(1)
+
+
+def _paired_iou(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
+    """IoU (K,) of the k-th box with the k-th box."""
+    size = (
+        torch.minimum(first_xyxy[:, 2:], second_xyxy[:, 2:]) - torch.maximum(first_xyxy[:, :2], second_xyxy[:, :2])
+    ).clamp_min(0)
+    shared = size[:, 0] * size[:, 1]
+    union = boxes.area(first_xyxy) + boxes.area(second_xyxy) - shared
+    return torch.where(union > 0, shared / union.clamp_min(1e-9), torch.zeros_like(shared))
+
+
+def _safe_exp(x: Tensor) -> Tensor:
+    """exp up to EXP_THRESHOLD, its tangent beyond: an untrained box cannot overflow."""
+    slope = torch.exp(x.new_tensor(EXP_THRESHOLD))
+    return torch.where(x > EXP_THRESHOLD, slope * (x - EXP_THRESHOLD + 1), torch.exp(x.clamp_max(EXP_THRESHOLD)))
+
+
+def _safe_log(ratio: Tensor) -> Tensor:
+    """Inverse of _safe_exp for positive ratios. The published code takes the plain logarithm here, so a box more
+    than e times its anchor had a target that its own decoding did not hit.
+    """
+    slope = torch.exp(ratio.new_tensor(EXP_THRESHOLD))
+    tiny = torch.finfo(ratio.dtype).tiny
+    return torch.where(ratio > slope, ratio / slope + EXP_THRESHOLD - 1, torch.log(ratio.clamp(tiny, float(slope))))

@@ -1,0 +1,160 @@
+"""One dataclass a command. Command-line values win over `--config FILE.yaml`, which wins over the defaults here.
+
+This module is loaded by `drivesem --help`: it imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+import yaml
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+COMBO_NUMBERS = (1, 2, 3, 4)
+DEFAULT_COMBO = 2
+
+
+class UsageError(ValueError):
+    """A setting that cannot be. The message is one line: setting, expected, found."""
+
+    def __init__(self, field: str, expected: str, actual: object) -> None:
+        super().__init__(f"{field}: expected {expected}, found {actual}")
+
+
+@dataclass(frozen=True)
+class Common:
+    """Options that mean the same in every command."""
+
+    out: str | None = None
+    """Folder for the results; a second run with the same folder goes on where it stopped."""
+    limit: int | None = None
+    """Take the first N frames (those with vehicles, where a command needs vehicles)."""
+    seed: int = 0
+    """Seed of everything random."""
+    workers: int = 1
+    """Processes that share the frames."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, ..."""
+    keep_going: Flag = False
+    """List a frame that cannot be used in the results and go on with the rest."""
+    resume: bool = True
+    """Keep the frames that are already there."""
+    json: Flag = False
+    """Print one JSON object on standard output; everything else goes to standard error."""
+
+
+@dataclass(frozen=True)
+class Attack(Common):
+    """Find feasible changes of driving scenes that a detector gets wrong."""
+
+    dataset: str = "demo"
+    """demo (generated scenes, needs no data) or kitti."""
+    root: str | None = None
+    """Folder of the data set: KITTI's folder with training/image_2, label_2 and calib."""
+    combo: int | None = None
+    """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
+    params: str | None = None
+    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
+    detector: str = "squeezedet"
+    """Name of a shipped detector, or a .safetensors file of one."""
+    steps: int = 10
+    """si-FGSM steps; each is one query of the detector's gradient."""
+    early_stop: Flag = False
+    """Stop a frame at its first success instead of using all steps."""
+    objective_labels: Literal["moved", "paper"] = "moved"
+    """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
+    fit: bool = True
+    """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+    backend: Literal["warp", "reference"] = "warp"
+    """Renderer: the fast kernels, or the plain torch reference that defines them."""
+
+
+@dataclass(frozen=True)
+class Synth(Common):
+    """Make driving frames with exact ground truth by code."""
+
+    frames: int = 10
+    """How many frames."""
+    layout: Literal["kitti"] = "kitti"
+    """Layout of the folder that is written."""
+    split: Literal["train", "heldout"] = "train"
+    """Pools of vehicle shapes and surroundings; the two share nothing."""
+
+
+COMMANDS: dict[str, type[Common]] = {"attack": Attack, "synth": Synth}
+
+
+def validate(config: Common) -> None:
+    """Raise UsageError for values that no command accepts."""
+    if config.workers < 1:
+        raise UsageError("--workers", "at least 1", config.workers)
+    if config.limit is not None and config.limit < 1:
+        raise UsageError("--limit", "at least 1", config.limit)
+    if isinstance(config, Attack):
+        if config.steps < 1:
+            raise UsageError("--steps", "at least 1", config.steps)
+        if config.combo is not None and config.combo not in COMBO_NUMBERS:
+            raise UsageError("--combo", "1, 2, 3 or 4", config.combo)
+        if config.combo is not None and config.params is not None:
+            raise UsageError("--params", "no --combo beside it", f"--combo {config.combo}")
+        if config.dataset != "demo" and config.root is None:
+            raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
+        if config.dataset == "demo" and config.root is not None:
+            raise UsageError("--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root)
+    if isinstance(config, Synth) and config.frames < 1:
+        raise UsageError("--frames", "at least 1", config.frames)
+
+
+def yaml_arguments(path: str, command: type[Common]) -> list[str]:
+    """The settings of a YAML preset as command-line words, so that both are checked by one parser.
+
+    Raises UsageError naming the file, and the key where there is one.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(path, "a readable YAML file", error) from error
+    try:
+        loaded: Any = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UsageError(path, "YAML", " ".join(str(error).split())) from error
+    if loaded is None:
+        return []
+    if not isinstance(loaded, dict):
+        raise UsageError(path, "a mapping of settings", type(loaded).__name__)
+    fields = {f.name: f for f in dataclasses.fields(command)}
+    words: list[str] = []
+    for key, value in loaded.items():
+        name = str(key).replace("-", "_")
+        if name not in fields:
+            raise UsageError(f"{path}: {key}", f"one of {', '.join(fields)}", "an unknown key")
+        words += _words(path, fields[name], value)
+    return words
+
+
+def _words(path: str, field: dataclasses.Field[Any], value: Any) -> list[str]:
+    flag = field.name.replace("_", "-")
+    kind = str(field.type)
+    if kind in ("Flag", "bool"):
+        if not isinstance(value, bool):
+            raise UsageError(f"{path}: {field.name}", "true or false", repr(value))
+        if value:
+            return [f"--{flag}"]
+        return [f"--no-{flag}"] if kind == "bool" else []
+    if isinstance(value, list | tuple):
+        value = ",".join(str(item) for item in value)
+    if isinstance(value, dict) or (isinstance(value, float) and not math.isfinite(value)):
+        raise UsageError(f"{path}: {field.name}", "one value", repr(value))
+    # "=": a value that begins with a dash stays a value.
+    return [f"--{flag}={value}"]
+
+
+def to_yaml(config: Common) -> str:
+    """The resolved configuration, as it is written beside the results."""
+    return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)

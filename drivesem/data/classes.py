@@ -1,0 +1,75 @@
+"""Which of a data set's types are which of the detectors' classes, and what nothing is judged on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+from detectors.types import CLASSES, Targets
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.types import Category, Labels
+
+
+@dataclass(frozen=True, slots=True)
+class ClassMap:
+    """How a data set's types are read.
+
+    classes: type -> one of `detectors.types.CLASSES`. ignored: type -> the class it is ignored for, or None for
+    every class: such objects are neither missed nor a hit.
+    """
+
+    classes: Mapping[str, str]
+    ignored: Mapping[str, str | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, name in (*self.classes.items(), *self.ignored.items()):
+            if name is not None and name not in CLASSES:
+                raise RangeError(f"class map: {kind}", f"one of {', '.join(CLASSES)}", name)
+        both = sorted(set(self.classes) & set(self.ignored))
+        if both:
+            raise RangeError(f"class map: {both[0]}", "a class or to be ignored", "both")
+
+    def category(self, kind: str) -> Category | None:
+        """The class that a type counts as; None where it is ignored. FormatError for a type in neither table."""
+        if kind in self.classes:
+            return Category(CLASSES.index(self.classes[kind]))
+        if kind in self.ignored:
+            return None
+        raise FormatError("type", f"one of {', '.join((*self.classes, *self.ignored))}", kind)
+
+    def targets(self, labels: Labels) -> Targets:
+        """What a detector is trained on and judged by.
+
+        Objects in file order, then the DontCare regions. What is ignored for every class carries the label 0: an
+        ignored target's label says nothing.
+        """
+        categories = [self.category(kind) for kind in labels.kind]
+        named = [self.ignored.get(kind) for kind in labels.kind]
+        index = [
+            int(c) if c is not None else CLASSES.index(n) if n is not None else 0
+            for c, n in zip(categories, named, strict=True)
+        ]
+        regions = labels.ignore_xyxy.shape[0]
+        return Targets(
+            boxes_xyxy=torch.cat([labels.boxes_xyxy, labels.ignore_xyxy]),
+            labels=torch.tensor([*index, *[0] * regions], dtype=torch.int64),
+            ignore=torch.tensor([*(c is None for c in categories), *[True] * regions], dtype=torch.bool),
+        )
+
+
+KITTI = ClassMap(
+    classes={"Car": "Car", "Van": "Car", "Truck": "Truck", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"},
+    ignored={"Person_sitting": "Pedestrian", "Tram": None, "Misc": None},
+)
+"""KITTI's types. Vans count as cars and sitting people are ignored; trams and the miscellaneous look like nothing
+the detectors know."""
+
+VEHICLES: Mapping[str, Category] = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
+"""Types that are de-rendered into objects that can be moved."""
+
+
+def vehicle_count(labels: Labels | None) -> int:
+    """How many objects of a frame can be moved."""
+    return 0 if labels is None else sum(kind in VEHICLES for kind in labels.kind)

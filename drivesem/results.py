@@ -1,0 +1,168 @@
+"""What a run leaves behind, as plain dataclasses: written as JSON, read by the report and by a resumed run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scene_ir.errors import FormatError
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class BoxRecord:
+    """One true or detected box. xyxy px; label: class name; score in [0, 1] for detections;
+    ignore: true boxes that are neither missed nor a hit. index: the object of the scene, where it is one.
+    """
+
+    xyxy: tuple[float, float, float, float]
+    label: str
+    score: float | None = None
+    ignore: bool = False
+    index: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinate:
+    """One coordinate of theta. name such as `objects[3].yaw`; value, lower, upper in `unit`;
+    display: the value in the unit that people use (metres, degrees).
+    """
+
+    name: str
+    unit: str
+    value: float
+    lower: float
+    upper: float
+    display: str
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One thing the detector got wrong only after the change. kind: lost or phantom; label: class name;
+    xyxy: the true box that was lost, or the detection that nothing supports; index: the lost object.
+    """
+
+    kind: str
+    label: str
+    xyxy: tuple[float, float, float, float]
+    index: int | None = None
+    score: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """One frame of a run. Lists of boxes are in the frame's pixels; `seconds` is the only field that may differ
+    between two runs with the same configuration.
+    """
+
+    identifier: str
+    objects: int
+    queries: int
+    loss_trace: tuple[float, ...]
+    theta: tuple[Coordinate, ...]
+    active_constraints: tuple[str, ...]
+    violations: tuple[str, ...]
+    targets_benign: tuple[BoxRecord, ...]
+    targets_moved: tuple[BoxRecord, ...]
+    detections_benign: tuple[BoxRecord, ...]
+    detections_rerendered: tuple[BoxRecord, ...]
+    detections_attacked: tuple[BoxRecord, ...]
+    failures: tuple[Failure, ...]
+    became_ignored: tuple[int, ...]
+    success_paper: bool
+    success_moved: bool
+    identity_psnr_db: float | None
+    seconds: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the independent check found nothing violated."""
+        return not self.violations
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Figures over all frames, as fractions of 1; None where nothing defines them (no true object)."""
+
+    ap50: float | None
+    ap70: float | None
+    ap: float | None
+    recall: float | None
+    recall_at_t_star: float | None
+    per_class: dict[str, dict[str, float | None]]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """The figures of a run; `to_json` is what `--json` prints."""
+
+    out: str
+    dataset: str
+    params: tuple[str, ...]
+    detector: str
+    headline: str
+    t_star: float
+    frames: int
+    frames_without_vehicles: int
+    frames_failed: dict[str, str]
+    objects: int
+    benign: Scores
+    rerendered: Scores
+    attacked_paper: Scores
+    attacked_moved: Scores
+    lost_objects: dict[str, int]
+    phantoms: dict[str, int]
+    successes_paper: int
+    successes_moved: int
+    feasible_fraction: float | None
+    queries: int
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object; classes stand apart, totals in front."""
+        data = dataclasses.asdict(self)
+        attacked = {"paper": data.pop("attacked_paper"), "moved": data.pop("attacked_moved")}
+        lost, phantoms = data.pop("lost_objects"), data.pop("phantoms")
+        return {
+            "schema": SCHEMA,
+            **data,
+            "attacked": attacked,
+            "lost_objects": sum(lost.values()),
+            "lost_objects_by_class": lost,
+            "phantoms": sum(phantoms.values()),
+            "phantoms_by_class": phantoms,
+        }
+
+
+def dump_frame(result: FrameResult) -> str:
+    """JSON text of one frame's result, exact and in a fixed order."""
+    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
+
+
+def load_frame(path: Path) -> FrameResult:
+    """Read what `dump_frame` wrote. Raises FormatError naming the file and the field."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FormatError(str(path), "a frame's result as JSON", error) from error
+    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
+        raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
+    nested: dict[str, type[BoxRecord] | type[Coordinate] | type[Failure]] = {
+        "theta": Coordinate,
+        "failures": Failure,
+        **{name: BoxRecord for name in data if name.startswith(("targets_", "detections_"))},
+    }
+    try:
+        for name, kind in nested.items():
+            data[name] = tuple(kind(**_tuples(item)) for item in data[name])
+        return FrameResult(**_tuples(data))
+    except (KeyError, TypeError) as error:
+        raise FormatError(str(path), "the fields of a frame's result", error) from error
+
+
+def _tuples(item: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in item.items()}
