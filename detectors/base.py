@@ -27,8 +27,8 @@ class RawPredictions:
 
     def __post_init__(self) -> None:
         b, a = self.confidence_logits.shape
-        wanted = {"boxes_xyxy": (b, a, 4), "deltas": (b, a, 4), "class_logits": (b, a, self.class_logits.shape[-1])}
-        for name, shape in wanted.items():
+        c = self.class_logits.shape[-1]
+        for name, shape in {"boxes_xyxy": (b, a, 4), "deltas": (b, a, 4), "class_logits": (b, a, c)}.items():
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"raw.{name}: expected shape {shape}, found {found}")
@@ -43,6 +43,8 @@ class Detector(nn.Module, ABC):
     name: str
     classes: tuple[str, ...]
     t_star: float
+    fresh_layers: tuple[str, ...] = ()
+    """Beginnings of the names of those parameters that no pretrained backbone provides."""
 
     @abstractmethod
     def forward(self, images: Tensor) -> RawPredictions:

@@ -5,6 +5,7 @@ Width is right - left, as continuous edges: KITTI's boxes as they stand, without
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,14 +28,23 @@ def iou_matrix(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
     """Intersection over union (N, M) in [0, 1] of boxes (N, 4) with boxes (M, 4); 0 where both are empty."""
     shared = intersection_matrix(first_xyxy, second_xyxy)
     union = area(first_xyxy)[:, None] + area(second_xyxy)[None, :] - shared
-    return torch.where(union > 0, shared / union.clamp_min(torch.finfo(union.dtype).tiny), torch.zeros_like(shared))
+    return _quotient(shared, union)
 
 
 def ioa_matrix(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
     """Intersection over the area of the FIRST box (N, M) in [0, 1]; 0 where the first box is empty."""
     shared = intersection_matrix(first_xyxy, second_xyxy)
     own = area(first_xyxy)[:, None]
-    return torch.where(own > 0, shared / own.clamp_min(torch.finfo(own.dtype).tiny), torch.zeros_like(shared))
+    return _quotient(shared, own)
+
+
+def paired_iou(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
+    """IoU (N,) in [0, 1] of the n-th box with the n-th box, both (N, 4)."""
+    top_left = torch.maximum(first_xyxy[:, :2], second_xyxy[:, :2])
+    bottom_right = torch.minimum(first_xyxy[:, 2:], second_xyxy[:, 2:])
+    size = (bottom_right - top_left).clamp_min(0)
+    shared = size[:, 0] * size[:, 1]
+    return _quotient(shared, area(first_xyxy) + area(second_xyxy) - shared)
 
 
 def clip(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
@@ -43,29 +53,25 @@ def clip(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(boxes_xyxy.clamp_min(0), limit)
 
 
-def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
+def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float, labels: Tensor | None = None) -> Tensor:
     """Greedy non-maximum suppression: indices (K,) int64 of the boxes kept, best first.
 
-    boxes_xyxy (N, 4) px; scores (N,). A box goes when its IoU with a better kept one exceeds the threshold.
-    Equal scores keep their order, so the result depends on nothing but its input.
+    boxes_xyxy (N, 4) px; scores (N,). A box goes when its IoU with a better kept one exceeds the threshold; with
+    labels (N,), only a box of its own label can suppress it. Equal scores keep their order, so the result depends
+    on nothing but its input.
     """
     order = torch.sort(scores, descending=True, stable=True).indices
-    rivals = (iou_matrix(boxes_xyxy[order], boxes_xyxy[order]) > iou_threshold).cpu().numpy()
-    alive = torch.ones(len(order), dtype=torch.bool).numpy()
+    rivals = iou_matrix(boxes_xyxy[order], boxes_xyxy[order]) > iou_threshold
+    if labels is not None:
+        rivals &= labels[order][:, None] == labels[order][None, :]
+    # Greedy choice is sequential: one row of a numpy matrix a step is far cheaper than a tensor operation.
+    suppresses = rivals.cpu().numpy()
+    alive = np.ones(len(order), dtype=bool)
     for i in range(len(order)):
         if alive[i]:
-            alive[i + 1 :] &= ~rivals[i, i + 1 :]
+            alive[i + 1 :] &= ~suppresses[i, i + 1 :]
     return order[torch.from_numpy(alive).to(order.device)]
 
 
-def nms_per_class(boxes_xyxy: Tensor, labels: Tensor, scores: Tensor, iou_threshold: float) -> Tensor:
-    """As `nms`, but a box (N, 4) is only suppressed by a better one of its own label (N,)."""
-    order = torch.sort(scores, descending=True, stable=True).indices
-    boxes, classes = boxes_xyxy[order], labels[order]
-    rivals = (iou_matrix(boxes, boxes) > iou_threshold) & (classes[:, None] == classes[None, :])
-    rivals = rivals.cpu().numpy()
-    alive = torch.ones(len(order), dtype=torch.bool).numpy()
-    for i in range(len(order)):
-        if alive[i]:
-            alive[i + 1 :] &= ~rivals[i, i + 1 :]
-    return order[torch.from_numpy(alive).to(order.device)]
+def _quotient(part: Tensor, whole: Tensor) -> Tensor:
+    return torch.where(whole > 0, part / whole.clamp_min(torch.finfo(whole.dtype).tiny), torch.zeros_like(part))

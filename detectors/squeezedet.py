@@ -97,8 +97,10 @@ class SeededDropout(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if not self.training or self.probability == 0:
             return x
-        keep = torch.rand(x.shape, generator=self.generator, device=x.device) >= self.probability
-        return x * keep.to(x.dtype) / (1 - self.probability)
+        # A byte an element, eight from one draw: uniform floats would take a tenth of a training step.
+        draws = torch.randint(-(2**63), 2**63 - 1, (-(-x.numel() // 8),), generator=self.generator)
+        keep = draws.view(torch.uint8)[: x.numel()].view(x.shape) >= round(self.probability * 256)
+        return x * keep.to(x) / (1 - self.probability)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +123,7 @@ class SqueezeDet(Detector):
     """SqueezeDet for images of any size: padded right and below to a multiple of 16 px, never resized."""
 
     name = "squeezedet"
+    fresh_layers = ("convdet.", "fires.fire10.", "fires.fire11.")
 
     def __init__(self, classes: tuple[str, ...] = CLASSES, t_star: float = 0.5, dropout: float = 0.5) -> None:
         super().__init__()
@@ -133,7 +136,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw all weights anew: He for the backbone, near zero for ConvDet (as published), anchors mostly silent."""
+        """Draw all weights anew: He for the backbone, near zero for ConvDet (as published), anchors silent."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 std = (2 / (module.weight[0].numel())) ** 0.5
@@ -144,6 +147,20 @@ class SqueezeDet(Detector):
         first = count * len(self.classes)
         if self.convdet.bias is not None:
             self.convdet.bias[first : first + count] = -2.0  # sigmoid 0.12: most anchors see no object
+
+    @torch.no_grad()
+    def load_backbone(self, tensors: dict[str, Tensor]) -> None:
+        """Take conv1 and fire2 to fire9 from SqueezeNet 1.1 (names as in `state_dict`); other layers stay.
+
+        Raises ValueError where one of these tensors is missing or of another shape.
+        """
+        for key, own in self.state_dict().items():
+            if key.startswith(self.fresh_layers):
+                continue
+            if key not in tensors or tensors[key].shape != own.shape:
+                found = tuple(tensors[key].shape) if key in tensors else "none"
+                raise ValueError(f"backbone: {key}: expected shape {tuple(own.shape)}, found {found}")
+            own.copy_(tensors[key])
 
     def forward(self, images: Tensor) -> RawPredictions:
         """images (B, 3, H, W), RGB in [0, 1]; A = 9 * ceil(H / 16) * ceil(W / 16), cells row by row, 9 each."""
@@ -156,8 +173,7 @@ class SqueezeDet(Detector):
         # padding for stride 2 below and to the right. Zeros here are the mean colour.
         x = F.pad(x, (0, -width % STRIDE + 1, 0, -height % STRIDE + 1))
         x = x.contiguous(memory_format=torch.channels_last)
-        x = F.relu(self.conv1(x), inplace=True)
-        x = _pool(x)
+        x = F.relu(_pool(self.conv1(x)), inplace=True)  # the order does not matter, a quarter of the pixels does
         for fire in _FIRE:
             x = _pool(x) if fire is None else self.fires[fire[0]](x)
         return self._interpret(self.convdet(self.dropout(x)), (height, width))
@@ -168,7 +184,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def assign(self, raw: RawPredictions, targets: Sequence[Targets]) -> Assignment:
-        """Give each object the anchor with the highest IoU that is not taken yet (nearest shape where none overlaps).
+        """Give each object the anchor of highest IoU that is not taken yet; the nearest one where none overlaps.
 
         Raises ValueError where targets and images differ in number, or a label is no class of this detector.
         """
@@ -181,37 +197,38 @@ class SqueezeDet(Detector):
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
         image, anchor, true_boxes, labels = [], [], [], []
         for b, target in enumerate(targets):
-            everything = target.boxes_xyxy.to(like)
-            ignored = everything[target.ignore.to(like.device)]
-            if len(ignored):
-                negative[b] = ~(_covered(anchors_xyxy, ignored) | _covered(raw.boxes_xyxy[b], ignored))
-            wanted = everything[~target.ignore.to(like.device)]
-            kept_labels = target.labels.to(like.device)[~target.ignore.to(like.device)]
-            if len(kept_labels) and not (0 <= int(kept_labels.min()) and int(kept_labels.max()) < len(self.classes)):
-                raise ValueError(
-                    f"targets[{b}].labels: expected 0..{len(self.classes) - 1}, found {kept_labels.tolist()}"
-                )
-            overlaps = boxes.iou_matrix(wanted, anchors_xyxy)
-            for box, overlap in zip(wanted, overlaps, strict=True):
-                if float(overlap.max()) <= 0:
-                    overlap = -(_centred(box) - anchors_cxcywh).square().sum(-1)
-                best = int(overlap.argmax())
-                overlaps[:, best] = -1.0
-                while (b, best) in zip(image, anchor, strict=True):
-                    overlap[best] = -torch.inf
-                    best = int(overlap.argmax())
+            ignore = target.ignore.to(like.device)
+            ignored_xyxy, wanted_xyxy = target.boxes_xyxy.to(like)[ignore], target.boxes_xyxy.to(like)[~ignore]
+            if len(ignored_xyxy):
+                negative[b] = ~(_covered(anchors_xyxy, ignored_xyxy) | _covered(raw.boxes_xyxy[b], ignored_xyxy))
+            taken = torch.zeros(len(anchors_xyxy), dtype=torch.bool, device=like.device)
+            for box, overlap in zip(wanted_xyxy, boxes.iou_matrix(wanted_xyxy, anchors_xyxy), strict=True):
+                fit = overlap.masked_fill(taken, 0)
+                if float(fit.max()) <= 0:
+                    distance = (_centred(box) - anchors_cxcywh).square().sum(-1)
+                    fit = -distance.masked_fill(taken, torch.inf)
+                best = int(fit.argmax())
+                taken[best] = True
                 image.append(b)
                 anchor.append(best)
-            true_boxes.append(wanted)
-            labels.append(kept_labels)
-        images = torch.tensor(image, dtype=torch.int64, device=like.device)
-        anchor_index = torch.tensor(anchor, dtype=torch.int64, device=like.device)
-        truth_xyxy = torch.cat(true_boxes) if true_boxes else like.new_zeros(0, 4)
-        negative[images, anchor_index] = False
-        chosen, truth = anchors_cxcywh[anchor_index], _centred(truth_xyxy)
-        deltas = torch.cat(((truth[:, :2] - chosen[:, :2]) / chosen[:, 2:], _safe_log(truth[:, 2:] / chosen[:, 2:])), 1)
-        predicted = boxes.clip(raw.boxes_xyxy[images, anchor_index], height, width)
-        return Assignment(images, anchor_index, _paired_iou(predicted, truth_xyxy), deltas, torch.cat(labels), negative)
+            true_boxes.append(wanted_xyxy)
+            labels.append(target.labels.to(like.device)[~ignore])
+        image = torch.tensor(image, dtype=torch.int64, device=like.device)
+        anchor = torch.tensor(anchor, dtype=torch.int64, device=like.device)
+        truth_xyxy, label = torch.cat(true_boxes), torch.cat(labels)
+        if bool(((label < 0) | (label >= len(self.classes))).any()):
+            raise ValueError(f"targets.labels: expected 0..{len(self.classes) - 1}, found {label.tolist()}")
+        negative[image, anchor] = False
+        chosen, truth = anchors_cxcywh[anchor], _centred(truth_xyxy)
+        shift, scale = (truth[:, :2] - chosen[:, :2]) / chosen[:, 2:], truth[:, 2:] / chosen[:, 2:]
+        return Assignment(
+            image=image,
+            anchor=anchor,
+            confidence=boxes.paired_iou(boxes.clip(raw.boxes_xyxy[image, anchor], height, width), truth_xyxy),
+            deltas=torch.cat((shift, _safe_log(scale)), 1),
+            labels=label,
+            negative=negative,
+        )
 
     def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
         """The three terms over the whole batch, each weighted as published, and their sum."""
@@ -232,7 +249,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:
-        """Score = confidence x class probability; the 64 best anchors, NMS at 0.4 in each class, score >= 0.005."""
+        """Score = confidence x class probability; the 64 best, NMS at 0.4 in each class, score >= 0.005."""
         probability, labels = torch.softmax(raw.class_logits, -1).max(-1)
         scores = torch.sigmoid(raw.confidence_logits) * probability
         found = []
@@ -240,7 +257,7 @@ class SqueezeDet(Detector):
             top = torch.sort(score, descending=True, stable=True).indices[:TOP_DETECTIONS]
             top = top[score[top] >= SCORE_MINIMUM]
             clipped = boxes.clip(boxes_xyxy[top], *raw.image_hw)
-            keep = boxes.nms_per_class(clipped, label[top], score[top], NMS_IOU)
+            keep = boxes.nms(clipped, score[top], NMS_IOU, label[top])
             found.append(Detections(clipped[keep], label[top][keep], score[top][keep]))
         return found
 
@@ -248,7 +265,9 @@ class SqueezeDet(Detector):
         """Split ConvDet's channels (B, 9 * (C + 1 + 4), gh, gw): class scores, confidences, deltas."""
         batch, _, rows, columns = output.shape
         count, classes = len(ANCHOR_SIZES_WH), len(self.classes)
-        cells = output.permute(0, 2, 3, 1).float() if output.dtype == torch.bfloat16 else output.permute(0, 2, 3, 1)
+        cells = output.permute(0, 2, 3, 1)
+        if cells.dtype == torch.bfloat16:  # under autocast; boxes need more than its 8 bits
+            cells = cells.float()
         class_logits, confidence, deltas = cells.split((count * classes, count, count * 4), -1)
         anchors = _anchors(rows, columns, cells.dtype, cells.device)
         deltas = deltas.reshape(batch, -1, 4)
@@ -285,22 +304,13 @@ def _corners(boxes_cxcywh: Tensor) -> Tensor:
 
 
 def _centred(boxes_xyxy: Tensor) -> Tensor:
-    return torch.cat(((boxes_xyxy[..., :2] + boxes_xyxy[..., 2:]) / 2, boxes_xyxy[..., 2:] - boxes_xyxy[..., :2]), -1)
+    top_left, bottom_right = boxes_xyxy[..., :2], boxes_xyxy[..., 2:]
+    return torch.cat(((top_left + bottom_right) / 2, bottom_right - top_left), -1)
 
 
 def _covered(candidates_xyxy: Tensor, ignored_xyxy: Tensor) -> Tensor:
     shared = boxes.iou_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP
     return (shared | (boxes.ioa_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP)).any(1)
-
-
-def _paired_iou(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
-    """IoU (K,) of the k-th box with the k-th box."""
-    size = (
-        torch.minimum(first_xyxy[:, 2:], second_xyxy[:, 2:]) - torch.maximum(first_xyxy[:, :2], second_xyxy[:, :2])
-    ).clamp_min(0)
-    shared = size[:, 0] * size[:, 1]
-    union = boxes.area(first_xyxy) + boxes.area(second_xyxy) - shared
-    return torch.where(union > 0, shared / union.clamp_min(1e-9), torch.zeros_like(shared))
 
 
 def _safe_exp(x: Tensor) -> Tensor:
@@ -314,5 +324,5 @@ def _safe_log(ratio: Tensor) -> Tensor:
     than e times its anchor had a target that its own decoding did not hit.
     """
     slope = torch.exp(ratio.new_tensor(EXP_THRESHOLD))
-    tiny = torch.finfo(ratio.dtype).tiny
-    return torch.where(ratio > slope, ratio / slope + EXP_THRESHOLD - 1, torch.log(ratio.clamp(tiny, float(slope))))
+    logarithm = torch.log(ratio.clamp(torch.finfo(ratio.dtype).tiny, float(slope)))
+    return torch.where(ratio > slope, ratio / slope + EXP_THRESHOLD - 1, logarithm)

@@ -31,7 +31,9 @@ def parse(argv: Sequence[str]) -> Common:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        raise UsageError("command line", "known options (see drivesem --help)", _unboxed(captured.getvalue())) from None
+        raise UsageError(
+            "command line", "known options (see drivesem --help)", _unboxed(captured.getvalue())
+        ) from None
     validate(config)
     return config
 

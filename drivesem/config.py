@@ -106,7 +106,9 @@ def validate(config: Common) -> None:
         if config.dataset != "demo" and config.root is None:
             raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
         if config.dataset == "demo" and config.root is not None:
-            raise UsageError("--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root)
+            raise UsageError(
+                "--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root
+            )
     if isinstance(config, Synth) and config.frames < 1:
         raise UsageError("--frames", "at least 1", config.frames)
 

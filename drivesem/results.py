@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivesem.evaluation.coco import Scores
 from scene_ir.errors import FormatError
 
 SCHEMA = 1
@@ -85,18 +86,6 @@ class FrameResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
-    """Figures over all frames, as fractions of 1; None where nothing defines them (no true object)."""
-
-    ap50: float | None
-    ap70: float | None
-    ap: float | None
-    recall: float | None
-    recall_at_t_star: float | None
-    per_class: dict[str, dict[str, float | None]]
-
-
-@dataclass(frozen=True, slots=True)
 class RunSummary:
     """The figures of a run; `to_json` is what `--json` prints."""
 
@@ -124,17 +113,19 @@ class RunSummary:
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; classes stand apart, totals in front."""
-        data = dataclasses.asdict(self)
-        attacked = {"paper": data.pop("attacked_paper"), "moved": data.pop("attacked_moved")}
-        lost, phantoms = data.pop("lost_objects"), data.pop("phantoms")
+        data = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        paper, moved = data.pop("attacked_paper"), data.pop("attacked_moved")
         return {
             "schema": SCHEMA,
             **data,
-            "attacked": attacked,
-            "lost_objects": sum(lost.values()),
-            "lost_objects_by_class": lost,
-            "phantoms": sum(phantoms.values()),
-            "phantoms_by_class": phantoms,
+            "params": list(self.params),
+            "benign": self.benign.to_json(),
+            "rerendered": self.rerendered.to_json(),
+            "attacked": {"paper": paper.to_json(), "moved": moved.to_json()},
+            "lost_objects": sum(self.lost_objects.values()),
+            "lost_objects_by_class": self.lost_objects,
+            "phantoms": sum(self.phantoms.values()),
+            "phantoms_by_class": self.phantoms,
         }
 
 

@@ -8,6 +8,7 @@ import os
 import secrets
 import shutil
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,7 +44,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically. Floats round trip exactly; ValueError where one is not finite."""
+    """Write `value` as indented JSON, atomically. Floats round trip; ValueError where one is not finite."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
@@ -73,7 +74,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its name, and replaces it, when the block ends without error."""
+    """A temporary folder beside `folder` that takes its name and place when the block ends without error."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(folder)
     temporary.mkdir()
@@ -103,7 +104,9 @@ def read_text(path: Path) -> str:
     try:
         return read_bytes(path).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise FormatError(str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x} at {error.start}") from error
+        raise FormatError(
+            str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x} at {error.start}"
+        ) from error
 
 
 def read_json(path: Path) -> Any:
@@ -139,9 +142,7 @@ def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray
         channels = image.shape[2] if image.ndim == 3 else 1
         raise FormatError(str(path), "8 bits and 3 channels", f"{image.dtype.itemsize * 8} bits and {channels}")
     if size_hw is not None and image.shape[:2] != size_hw:
-        raise FormatError(
-            str(path), f"{size_hw[1]}x{size_hw[0]} px", f"{image.shape[1]}x{image.shape[0]} px"
-        )
+        raise FormatError(str(path), f"{size_hw[1]}x{size_hw[0]} px", f"{image.shape[1]}x{image.shape[0]} px")
     return np.ascontiguousarray(image[..., ::-1])
 
 
@@ -153,7 +154,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise FormatError(str(path), "an NPZ archive of arrays", "a single array")
             return {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError) as error:
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError(str(path), "an NPZ archive of arrays", str(error).splitlines()[0]) from error

@@ -33,7 +33,7 @@ DATASETS: dict[str, Callable[[Path], Dataset]] = {"kitti": KittiDataset}
 
 
 def open_dataset(name: str, root: Path) -> Dataset:
-    """The data set `name` under the folder `root`. RangeError for an unknown name, FormatError for a bad folder."""
+    """The data set `name` under `root`. RangeError for an unknown name, FormatError for a bad folder."""
     if name not in DATASETS:
         raise RangeError("dataset", f"one of {', '.join(sorted(DATASETS))}", name)
     return DATASETS[name](Path(root))

@@ -11,11 +11,16 @@ from pathlib import Path
 import cv2
 import jinja2
 
-from drivesem.results import BoxRecord, FrameResult, RunSummary, Scores
+from drivesem.results import BoxRecord, FrameResult, RunSummary
 
 JPEG_QUALITY = 88
-_SCORE_COLUMNS = (("AP50", "ap50"), ("AP70", "ap70"), ("AP50:95", "ap"), ("recall", "recall"),
-                  ("recall at t*", "recall_at_t_star"))
+_SCORE_COLUMNS = (
+    ("AP50", "ap50"),
+    ("AP70", "ap70"),
+    ("AP50:95", "ap"),
+    ("recall", "recall"),
+    ("recall at t*", "recall_at_t_star"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +37,7 @@ class _Picture:
     changes: tuple[tuple[str, str], ...]
 
 
-def render_report(
-    summary: RunSummary, frames: Sequence[FrameResult], folder: Path, command: str
-) -> str:
+def render_report(summary: RunSummary, frames: Sequence[FrameResult], folder: Path, command: str) -> str:
     """The page's text. `folder` holds `frames/<id>/benign.png` and `counterexample.png`; worst frames come first.
 
     command: what reproduces the run.
@@ -53,18 +56,18 @@ def render_report(
     ]
     return template.render(
         summary=summary,
-        rows=[(name, [_percent(getattr(scores, key)) for _, key in _SCORE_COLUMNS]) for name, scores in rows],
+        rows=[
+            (name, [_percent(getattr(scores.headline, key)) for _, key in _SCORE_COLUMNS]) for name, scores in rows
+        ],
         columns=[title for title, _ in _SCORE_COLUMNS],
-        drop=_drop(summary.rerendered, summary.attacked_moved),
+        drop=_drop(summary.rerendered.headline.ap50, summary.attacked_moved.headline.ap50),
         pictures=pictures,
         command=command,
     )
 
 
-def _drop(before: Scores, after: Scores) -> str:
-    if before.ap50 is None or after.ap50 is None:
-        return "-"
-    return f"{100 * (before.ap50 - after.ap50):.1f}"
+def _drop(before: float | None, after: float | None) -> str:
+    return "-" if before is None or after is None else f"{100 * (before - after):.1f}"
 
 
 def _percent(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""Closed solids that vehicle templates are put together from: swept boxes with named grid lines, wheels, plain boxes.
+"""Closed solids that vehicle templates consist of: boxes on a grid with named lines, wheels, plain boxes.
 
 Everything here is in metres, axes x forward, y up, z to the car's left (a left-handed look at the unit box's axes,
 turned over once at the very end by `assemble`). Solids are symmetric to z = 0 or come in mirrored pairs.
@@ -243,7 +243,7 @@ def assemble(solids: Sequence[Solid], name: str) -> Mesh:
     part = np.array([PART.get(Material(m), Part.OTHER) for m in range(len(Material))])
     colour = np.array([COLOUR[Material(m)] for m in range(len(Material))])
     return Mesh(
-        vertices=torch.from_numpy(unit[unique[:, 0]].astype(np.float32)),
+        vertices=torch.from_numpy(unit[unique[:, 0]].astype(np.float32) + np.float32(0)),
         faces=torch.from_numpy(inverse.reshape(-1, 3).astype(np.int64)),
         part=torch.from_numpy(part[material].astype(np.int64)),
         name=name,

@@ -1,0 +1,195 @@
+"""Views of a training frame: windows at (nearly) native scale, mirrored, with other colours, blur, noise, JPEG.
+
+Everything is drawn from the generator that comes in, so a view is a function of (frame, generator) alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors import boxes
+from detectors.squeezedet import BGR_MEAN
+from detectors.types import Targets
+
+CUT_VISIBLE = 0.3
+"""A box of which the window shows less than this fraction becomes an ignored one."""
+
+_LUMA = (0.299, 0.587, 0.114)
+"""ITU-R BT.601."""
+
+_JPEG_LUMA = (
+    (16, 11, 10, 16, 24, 40, 51, 61),
+    (12, 12, 14, 19, 26, 58, 60, 55),
+    (14, 13, 16, 24, 40, 57, 69, 56),
+    (14, 17, 22, 29, 51, 87, 80, 62),
+    (18, 22, 37, 56, 68, 109, 103, 77),
+    (24, 35, 55, 64, 81, 104, 113, 92),
+    (49, 64, 78, 87, 103, 121, 120, 101),
+    (72, 92, 95, 98, 112, 100, 103, 99),
+)
+"""Quantisation of luminance, ITU-T T.81, table K.1; used for all three channels."""
+
+
+@dataclass(frozen=True, slots=True)
+class AugmentSettings:
+    """How far views may depart from their frame."""
+
+    window_hw: tuple[int, int] = (288, 640)
+    """Size of the view in pixels; frames smaller than it are padded by their border."""
+    scale: tuple[float, float] = (0.75, 1.35)
+    """Range of the zoom, drawn uniformly in its logarithm."""
+    scale_probability: float = 0.7
+    object_probability: float = 0.9
+    """How often the window is placed around an object instead of anywhere."""
+    flip_probability: float = 0.5
+    brightness: float = 0.15
+    """Largest shift, in units of the whole range; the following three are relative."""
+    contrast: float = 0.35
+    gamma: float = 0.35
+    channel_gain: float = 0.12
+    saturation: float = 0.6
+    hue_rad: float = 0.35
+    blur_probability: float = 0.15
+    noise_probability: float = 0.2
+    jpeg_probability: float = 0.15
+    minimum_height_px: float = 11.0
+    """Objects lower than this in the view are ignored: the coarsest thing a 16 px grid can be asked for."""
+
+
+def view(
+    image: np.ndarray, targets: Targets, settings: AugmentSettings, generator: np.random.Generator
+) -> tuple[Tensor, Targets]:
+    """One view (3, h, w) float32 in [0, 1] with its targets, of a frame (H, W, 3) uint8 RGB with its targets."""
+    scale = 1.0
+    if generator.random() < settings.scale_probability:
+        scale = float(np.exp(generator.uniform(*np.log(settings.scale))))
+    height, width = (round(side / scale) for side in settings.window_hw)
+    x0, y0 = _place(image.shape[:2], (height, width), targets, settings, generator)
+    pixels = torch.from_numpy(_cut(image, x0, y0, height, width)).permute(2, 0, 1).float() / 255
+    if (height, width) != settings.window_hw:
+        pixels = F.interpolate(pixels[None], settings.window_hw, mode="bilinear", antialias=scale < 1)[0]
+    zoom_xy = (settings.window_hw[1] / width, settings.window_hw[0] / height)
+    moved = cut_targets(targets, (x0, y0), zoom_xy, settings)
+    if generator.random() < settings.flip_probability:
+        pixels, moved = pixels.flip(2), mirror(moved, settings.window_hw[1])
+    return degrade(recolour(pixels, settings, generator), settings, generator), moved
+
+
+def cut_targets(
+    targets: Targets, origin_xy: tuple[int, int], zoom_xy: tuple[float, float], settings: AugmentSettings
+) -> Targets:
+    """Targets in the window that starts at pixel origin_xy of the frame and was zoomed to settings.window_hw.
+
+    Boxes are cut at the window; those outside go, those cut to less than CUT_VISIBLE or too low become ignored.
+    """
+    zoom = torch.tensor([*zoom_xy, *zoom_xy])
+    origin = torch.tensor([*origin_xy, *origin_xy])
+    # Pixel centres are integers, so edges are what scales: x + 0.5.
+    whole = (targets.boxes_xyxy.float() - origin + 0.5) * zoom - 0.5
+    cut = boxes.clip(whole, *settings.window_hw)
+    shown = boxes.area(cut) / boxes.area(whole).clamp_min(1e-6)
+    low = (cut[:, 3] - cut[:, 1]) < settings.minimum_height_px
+    there = boxes.area(cut) > 0
+    ignore = targets.ignore | (shown < CUT_VISIBLE) | low
+    return Targets(cut[there], targets.labels[there], ignore[there])
+
+
+def mirror(targets: Targets, width: int) -> Targets:
+    """Targets in an image (of that width in px) that was flipped left to right."""
+    left, top, right, bottom = targets.boxes_xyxy.unbind(-1)
+    boxes_xyxy = torch.stack((width - 1 - right, top, width - 1 - left, bottom), -1)
+    return Targets(boxes_xyxy, targets.labels, targets.ignore)
+
+
+def recolour(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
+    """The image (3, H, W) in [0, 1] in other light: brightness, contrast, saturation, hue, channel gain, gamma."""
+    gain = np.exp(generator.uniform(-settings.channel_gain, settings.channel_gain, 3))
+    contrast = np.exp(generator.uniform(-settings.contrast, settings.contrast))
+    saturation = 1 + settings.saturation * generator.uniform(-1, 1)
+    hue = generator.uniform(-settings.hue_rad, settings.hue_rad)
+    matrix = contrast * gain[:, None] * _colour_matrix(hue, saturation)
+    shift = 0.5 * (1 - contrast) + generator.uniform(-settings.brightness, settings.brightness)
+    exponent = float(np.exp(generator.uniform(-settings.gamma, settings.gamma)))
+    offset = torch.full((3, 1), float(shift))
+    flat = torch.addmm(offset, torch.from_numpy(matrix.astype(np.float32)), image.reshape(3, -1))
+    return flat.clamp_(0, 1).pow_(exponent).reshape(image.shape)
+
+
+def degrade(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
+    """The image (3, H, W) in [0, 1], now and then blurred, noisy, or through JPEG."""
+    if generator.random() < settings.blur_probability:
+        image = _blur(image, float(generator.uniform(0.4, 1.3)))
+    if generator.random() < settings.noise_probability:
+        grain = generator.standard_normal(tuple(image.shape), dtype=np.float32)
+        image = (image + torch.from_numpy(grain) * float(generator.uniform(0.005, 0.04))).clamp_(0, 1)
+    if generator.random() < settings.jpeg_probability:
+        image = _jpeg(image, float(generator.uniform(0.3, 2.0)))
+    return image
+
+
+def _place(
+    image_hw: tuple[int, ...],
+    size_hw: tuple[int, int],
+    targets: Targets,
+    settings: AugmentSettings,
+    generator: np.random.Generator,
+) -> tuple[int, int]:
+    """First pixel (x0, y0) of a window of that size; inside the frame where it fits."""
+    chosen = torch.nonzero(~targets.ignore)[:, 0]
+    focus = generator.uniform(0, 1, 2) * (image_hw[1], image_hw[0])
+    if len(chosen) and generator.random() < settings.object_probability:
+        left, top, right, bottom = targets.boxes_xyxy[chosen[generator.integers(len(chosen))]].tolist()
+        focus = np.array([(left + right) / 2, (top + bottom) / 2])
+    corner = focus - generator.uniform(0.1, 0.9, 2) * (size_hw[1], size_hw[0])
+    free = np.array([image_hw[1] - size_hw[1], image_hw[0] - size_hw[0]])
+    x0, y0 = np.clip(np.round(corner), np.minimum(free, 0), np.maximum(free, 0)).astype(int).tolist()
+    return x0, y0
+
+
+def _cut(image: np.ndarray, x0: int, y0: int, height: int, width: int) -> np.ndarray:
+    """Pixels (height, width, 3) from (x0, y0) on; the network's mean colour outside the frame."""
+    inside_y = slice(max(y0, 0), min(y0 + height, image.shape[0]))
+    inside_x = slice(max(x0, 0), min(x0 + width, image.shape[1]))
+    part = image[inside_y, inside_x]
+    if part.shape[:2] == (height, width):
+        return np.array(part)
+    window = np.empty((height, width, 3), np.uint8)
+    window[:] = np.round(BGR_MEAN[::-1])
+    window[inside_y.start - y0 : inside_y.stop - y0, inside_x.start - x0 : inside_x.stop - x0] = part
+    return window
+
+
+def _colour_matrix(hue_rad: float, saturation: float) -> np.ndarray:
+    """(3, 3) that turns chroma around the grey axis by an angle and scales it; grey stays grey."""
+    axis = np.full(3, 3**-0.5)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = np.eye(3) + np.sin(hue_rad) * cross + (1 - np.cos(hue_rad)) * cross @ cross  # Rodrigues
+    grey = np.tile(_LUMA, (3, 1))
+    return (grey + saturation * (np.eye(3) - grey)) @ turn
+
+
+def _blur(image: Tensor, sigma_px: float) -> Tensor:
+    reach = torch.arange(-3, 4, dtype=image.dtype)
+    kernel = torch.exp(-0.5 * (reach / sigma_px) ** 2)
+    kernel = kernel / kernel.sum()
+    padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, 7)), kernel.view(1, 1, 7, 1))[:, 0]
+
+
+def _jpeg(image: Tensor, strength: float) -> Tensor:
+    """Quantise 8x8 cosine blocks (3, H, W) as JPEG does, at that multiple of its standard table (quality 50)."""
+    rows = torch.arange(8, dtype=image.dtype)
+    cosine = torch.cos((2 * rows[None] + 1) * rows[:, None] * torch.pi / 16) / 2
+    cosine[0] /= 2**0.5
+    table = torch.tensor(_JPEG_LUMA, dtype=image.dtype) * (strength / 255)
+    height, width = image.shape[1:]
+    padded = F.pad(image, (0, -width % 8, 0, -height % 8), mode="replicate")
+    blocks = padded.unfold(1, 8, 8).unfold(2, 8, 8)  # (3, H/8, W/8, 8, 8)
+    coded = torch.round(cosine @ blocks @ cosine.T / table) * table
+    decoded = (cosine.T @ coded @ cosine).permute(0, 1, 3, 2, 4).reshape(padded.shape)
+    return decoded[:, :height, :width].clamp(0, 1)

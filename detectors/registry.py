@@ -1,0 +1,98 @@
+"""Detectors by name or weights file, ready to be attacked: frozen, in eval mode, channels-last."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from detectors.base import Detector
+from detectors.squeezedet import SqueezeDet
+from detectors.types import CLASSES
+
+ARCHITECTURES: dict[str, type[SqueezeDet]] = {"squeezedet": SqueezeDet}
+"""Name of an architecture, as weights files carry it in their metadata, and its class."""
+
+SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safetensors"}
+"""Detectors that come with the package."""
+
+
+def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") -> Detector:
+    """The shipped detector of that name, or the one in a `.safetensors` file; frozen, eval mode, channels-last.
+
+    Raises ValueError for a name that is not known, a file that is missing or damaged, and weights that belong to
+    another architecture; the message names the file, what was expected and what was found.
+    """
+    path = SHIPPED.get(str(name_or_path), Path(name_or_path))
+    if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
+        known = ", ".join(sorted(SHIPPED))
+        raise ValueError(f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}")
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a weights file, found none")
+    metadata, tensors = read_weights(path)
+    architecture = metadata.get("architecture", "squeezedet")
+    if architecture not in ARCHITECTURES:
+        known = ", ".join(sorted(ARCHITECTURES))
+        raise ValueError(f"{path}: expected architecture {known}, found {architecture!r}")
+    try:
+        classes = tuple(json.loads(metadata.get("classes", json.dumps(CLASSES))))
+        t_star = float(metadata.get("t_star", "0.5"))
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: expected metadata with a list 'classes' and a number 't_star': {error}"
+        ) from None
+    detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
+    _load_into(detector, tensors, path)
+    detector.requires_grad_(False)
+    return detector.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None = None) -> None:
+    """Write weights as float16 with name, classes, t_star and further facts as metadata; atomic."""
+    metadata = {
+        "architecture": detector.name,
+        "classes": json.dumps(list(detector.classes)),
+        "t_star": f"{detector.t_star:.6g}",
+        **(facts or {}),
+    }
+    tensors = {k: v.detach().cpu().contiguous().to(torch.float16) for k, v in detector.state_dict().items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_bytes(save(tensors, metadata))
+    os.replace(temporary, path)
+
+
+def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    """Metadata and tensors of a safetensors file; ValueError where it is none."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: expected a safetensors file, found {error}") from None
+
+
+def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    expected = detector.state_dict()
+    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or unexpected:
+        raise ValueError(
+            f"{path}: expected the {len(expected)} tensors of {detector.name}, found "
+            f"{len(missing)} missing{_first(missing)} and {len(unexpected)} unexpected{_first(unexpected)}"
+        )
+    for key, tensor in tensors.items():
+        if tensor.shape != expected[key].shape:
+            raise ValueError(
+                f"{path}: {key}: expected shape {tuple(expected[key].shape)} of {detector.name} with "
+                f"{len(detector.classes)} classes, found {tuple(tensor.shape)}"
+            )
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{path}: {key}: expected finite numbers, found NaN or infinity")
+    detector.load_state_dict(tensors)
+
+
+def _first(keys: list[str]) -> str:
+    return f" ({keys[0]}{', ...' if len(keys) > 1 else ''})" if keys else ""

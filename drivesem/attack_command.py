@@ -1,0 +1,343 @@
+"""`drivesem attack`: every frame through the pipeline, then the figures and the page."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from detectors.base import Detector
+from detectors.registry import load_detector
+from drivesem.attacks.si_fgsm import SiFGSM
+from drivesem.config import DEFAULT_COMBO, Attack, UsageError, to_yaml
+from drivesem.evaluation import coco
+from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
+from drivesem.report.html import render_report
+from drivesem.results import FrameResult, RunSummary, load_frame
+from drivesem.sources import SceneSource, open_source
+from drivesem.space import Parameter, combo, parse_params
+from scene_ir import files
+from scene_ir.compositor import RenderSettings
+from scene_ir.errors import SceneError
+
+HEADLINE = "Car"
+"""The class that the paper reports."""
+
+_PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
+"""Settings that change no frame's result: a run may be continued with others."""
+_PACKAGES = (
+    "drivesem",
+    "torch",
+    "kornia",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "warp-lang",
+    "pycocotools",
+)
+
+
+def run(config: Attack) -> int:
+    """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
+    start = time.perf_counter()
+    params = parse_params(config.params) if config.params is not None else combo(config.combo or DEFAULT_COMBO)
+    _check_device(config.device)
+    worker = _Worker(config, params)
+    out = Path(config.out) if config.out else Path("runs") / _name(config, params)
+    _claim(out, config)
+    names, without_vehicles, failed = _select(worker.source, config)
+    todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
+    console = Console(stderr=True)
+    _attack_all(worker, todo, out, failed, console)
+    done = [name for name in names if name not in failed]
+    results = [load_frame(out / "frames" / name / RESULT) for name in done]
+    summary = _summary(config, params, worker.detector, results, without_vehicles, failed, out, start)
+    files.write_json(out / "metrics.json", summary.to_json())
+    files.write_json(out / "manifest.json", _manifest(config, out, done))
+    files.write_text(out / "report.html", render_report(summary, results, out, _command(config)))
+    if config.json:
+        sys.stdout.write(json.dumps(summary.to_json()) + "\n")
+    else:
+        _print(summary, Console())
+    return 0
+
+
+@dataclass
+class _Worker:
+    """What one process needs: built once, used for many frames."""
+
+    config: Attack
+    params: tuple[Parameter, ...]
+
+    def __post_init__(self) -> None:
+        self.source: SceneSource = open_source(self.config)
+        try:
+            self.detector: Detector = load_detector(self.config.detector, self.config.device)
+        except ValueError as error:
+            raise UsageError("--detector", "a detector", error) from error
+
+    def attack(self, identifier: str, out: Path) -> FrameResult:
+        """One frame, from the source to its folder."""
+        config = self.config
+        settings = FrameSettings(
+            attack=SiFGSM(steps=config.steps, early_stop=config.early_stop),
+            params=self.params,
+            label_mode=config.objective_labels,
+            render=RenderSettings(backend=config.backend),
+            seed=config.seed,
+        )
+        scene = self.source.scene(identifier)
+        return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+
+
+_process_worker: _Worker | None = None
+
+
+def _start_process(config: Attack, params: tuple[Parameter, ...], threads: int) -> None:
+    global _process_worker
+    torch.set_num_threads(threads)
+    _process_worker = _Worker(config, params)
+
+
+def _attack_in_process(identifier: str, out: Path) -> None:
+    assert _process_worker is not None
+    _process_worker.attack(identifier, out)
+
+
+def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console) -> None:
+    """Attack the frames of `todo`, in this process or in several; a bad frame goes to `failed` or ends the run."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not todo) as progress:
+        task = progress.add_task("attacking frames", total=len(todo))
+        for identifier, outcome in _outcomes(worker, todo, out):
+            try:
+                outcome()
+            except SceneError as error:
+                if not worker.config.keep_going:
+                    raise
+                failed[identifier] = str(error)
+            progress.advance(task)
+
+
+def _outcomes(worker: _Worker, todo: Sequence[str], out: Path) -> Iterator[tuple[str, Callable[[], object]]]:
+    config = worker.config
+    processes = min(config.workers, len(todo))
+    if processes <= 1:
+        for identifier in todo:
+            yield identifier, lambda identifier=identifier: worker.attack(identifier, out)
+        return
+    threads = max(torch.get_num_threads() // processes, 1)
+    pool = ProcessPoolExecutor(
+        processes, get_context("spawn"), initializer=_start_process, initargs=(config, worker.params, threads)
+    )
+    with pool:
+        pending = {pool.submit(_attack_in_process, identifier, out): identifier for identifier in todo}
+        try:
+            for future in as_completed(pending):
+                yield pending[future], future.result
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _select(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
+    """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
+    names: list[str] = []
+    failed: dict[str, str] = {}
+    without = 0
+    for identifier in source.identifiers():
+        if config.limit is not None and len(names) == config.limit:
+            break
+        try:
+            usable = source.has_vehicles(identifier)
+        except SceneError as error:
+            if not config.keep_going:
+                raise
+            failed[identifier] = str(error)
+            continue
+        if usable:
+            names.append(identifier)
+        else:
+            without += 1
+    return names, without, failed
+
+
+def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
+    return f"{config.dataset}-{'-'.join(params)}-seed{config.seed}"
+
+
+def _identity(config: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key not in _PRESENTATION}
+
+
+def _claim(out: Path, config: Attack) -> None:
+    """Make `out` this run's folder: new, or one with the same settings to go on in."""
+    path = out / "config.yaml"
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    if path.exists():
+        if config.resume:
+            before = yaml.safe_load(files.read_text(path))
+            if not isinstance(before, dict) or _identity(before) != _identity(asdict(config)):
+                known = before if isinstance(before, dict) else {}
+                changed = [k for k, v in _identity(asdict(config)).items() if known.get(k) != v]
+                raise UsageError(
+                    str(path),
+                    "the settings of this run (else another --out, or --no-resume)",
+                    "other values of " + ", ".join(changed),
+                )
+        else:
+            _clear(out)
+    elif out.is_dir() and any(out.iterdir()):
+        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
+    files.write_text(path, to_yaml(config))
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run wrote, and nothing else."""
+    for name in ("metrics.json", "manifest.json", "report.html"):
+        (out / name).unlink(missing_ok=True)
+    if (out / "frames").is_dir():
+        shutil.rmtree(out / "frames")
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(
+            "--device", "a torch device of this machine", f"{device!r}: {error}".split("\n")[0]
+        ) from error
+
+
+def _summary(
+    config: Attack,
+    params: tuple[Parameter, ...],
+    detector: Detector,
+    results: Sequence[FrameResult],
+    without_vehicles: int,
+    failed: dict[str, str],
+    out: Path,
+    start: float,
+) -> RunSummary:
+    names = detector.classes
+    benign = [as_targets(r.targets_benign, names) for r in results]
+    moved = [as_targets(r.targets_moved, names) for r in results]
+    attacked = [as_detections(r.detections_attacked, names) for r in results]
+
+    def scores(targets: list[Any], detections: list[Any]) -> coco.Scores:
+        return coco.evaluate(targets, detections, names, detector.t_star, HEADLINE)
+
+    def count(kind: str) -> dict[str, int]:
+        counted = dict.fromkeys(names, 0)
+        for failure in (f for r in results for f in r.failures if f.kind == kind):
+            counted[failure.label] += 1
+        return counted
+
+    return RunSummary(
+        out=str(out),
+        dataset=config.dataset,
+        params=tuple(str(p) for p in params),
+        detector=config.detector,
+        headline=HEADLINE,
+        t_star=detector.t_star,
+        frames=len(results),
+        frames_without_vehicles=without_vehicles,
+        frames_failed=dict(sorted(failed.items())),
+        objects=sum(r.objects for r in results),
+        benign=scores(benign, [as_detections(r.detections_benign, names) for r in results]),
+        rerendered=scores(benign, [as_detections(r.detections_rerendered, names) for r in results]),
+        attacked_paper=scores(benign, attacked),
+        attacked_moved=scores(moved, attacked),
+        lost_objects=count("lost"),
+        phantoms=count("phantom"),
+        successes_paper=sum(r.success_paper for r in results),
+        successes_moved=sum(r.success_moved for r in results),
+        feasible_fraction=sum(r.feasible for r in results) / len(results) if results else None,
+        queries=sum(r.queries for r in results),
+        seconds=round(time.perf_counter() - start, 3),
+    )
+
+
+def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Versions, seed and hashes: what a second run must reproduce to the byte."""
+    pictures = (
+        "benign.png",
+        "rerender.png",
+        "counterexample.png",
+        "theta.json",
+        "labels_paper.txt",
+        "labels_moved.txt",
+    )
+    return {
+        "versions": {package: importlib.metadata.version(package) for package in _PACKAGES},
+        "seed": config.seed,
+        "frames": {
+            name: {picture: _sha256(out / "frames" / name / picture) for picture in pictures} for name in names
+        },
+    }
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(files.read_bytes(path)).hexdigest()
+
+
+def _command(config: Attack) -> str:
+    """The command line that gives this configuration."""
+    words = ["drivesem", "attack"]
+    default = Attack()
+    for key, value in asdict(config).items():
+        if value == getattr(default, key) or key in ("out", "json"):
+            continue
+        flag = key.replace("_", "-")
+        words += (
+            [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+        )
+    return shlex.join(words)
+
+
+def _print(summary: RunSummary, console: Console) -> None:
+    table = Table(
+        title=f"{summary.detector} on {summary.dataset}: {' + '.join(summary.params)}", title_justify="left"
+    )
+    table.add_column(f"{summary.headline}, %")
+    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*"):
+        table.add_column(title, justify="right")
+    rows = {
+        "benign": summary.benign,
+        "benign re-rendered": summary.rerendered,
+        "attacked, moved labels": summary.attacked_moved,
+        "attacked, benign labels (paper)": summary.attacked_paper,
+    }
+    for name, scores in rows.items():
+        one = scores.headline
+        cells = (one.ap50, one.ap70, one.ap, one.recall, one.recall_at_t_star)
+        table.add_row(name, *("-" if cell is None else f"{100 * cell:.1f}" for cell in cells))
+    console.print(table)
+    feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
+    console.print(
+        f"{summary.frames} frames, {summary.objects} vehicles: {sum(summary.lost_objects.values())} lost, "
+        f"{sum(summary.phantoms.values())} phantoms, {summary.successes_moved} frames broken; feasible {feasible}; "
+        f"{summary.queries} queries in {summary.seconds:.0f} s"
+    )
+    if summary.frames_without_vehicles:
+        console.print(f"{summary.frames_without_vehicles} frames without vehicles passed over")
+    for name, reason in summary.frames_failed.items():
+        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
+    console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)

@@ -1,0 +1,119 @@
+"""What every attack is: it proposes, and what came of it is decided elsewhere.
+
+A subclass writes `_propose`; the final `__call__` projects each proposal, re-renders, re-scores and decides on
+success. No attack marks its own homework.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, final
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from drivesem.feasible import Projected
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What the detector makes of one theta. loss: the attack's objective, to be raised. lost: objects found in the
+    benign re-render and missed now; phantoms: new false positives; success: any of the two, all under `moved`
+    labels. success_paper: the same under `paper` labels.
+    """
+
+    loss: float
+    lost: int
+    phantoms: int
+    success: bool
+    success_paper: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What an attack sees of scene and detector: callables of theta (D,).
+
+    loss_and_grad: the objective to be raised, and its gradient (D,). project: onto the feasible set.
+    score: re-render and judge. step (D,): the step alpha of each coordinate.
+    """
+
+    loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
+    project: Callable[[Tensor], Projected]
+    score: Callable[[Tensor], Score]
+    step: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Proposals:
+    """What `_propose` hands over. thetas: the iterates in order; losses: one each, None where it was not computed;
+    queries: gradients taken; active_constraints: what projections on the way held back.
+    """
+
+    thetas: tuple[Tensor, ...]
+    losses: tuple[float | None, ...]
+    queries: int
+    active_constraints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class AttackResult:
+    """theta, theta0 (D,); loss_trace: the objective at each iterate, as far as the attack knew it, and at theta;
+    score: of theta, from the final re-render; success_paper, success_moved: whether theta fails the detector under
+    either label mode; queries: one gradient step counts as one (re-scoring takes no gradient and is not counted);
+    active_constraints: what held the attack back at any of its iterates, each named once.
+    """
+
+    theta: Tensor
+    theta0: Tensor
+    loss_trace: tuple[float, ...]
+    score: Score
+    success_paper: bool
+    success_moved: bool
+    queries: int
+    seed: int
+    active_constraints: tuple[str, ...]
+
+
+class Attack(ABC):
+    """A way of choosing theta."""
+
+    @abstractmethod
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        """Iterates from theta0 (D,), feasible or not; all randomness from `generator`."""
+
+    @final
+    def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
+        """Run from theta0 (D,). Of theta0, the proposal of highest loss and the last one, each projected and scored
+        anew, the one with most lost objects under `moved` labels wins; then a success, then the highest loss.
+        """
+        generator = torch.Generator(device="cpu").manual_seed(seed)
+        proposals = self._propose(problem, theta0, generator)
+        candidates = [theta0.detach()]
+        known = [(loss, -i) for i, loss in enumerate(proposals.losses) if loss is not None]
+        if known:
+            candidates.append(proposals.thetas[-max(known)[1]])
+        if proposals.thetas:
+            candidates.append(proposals.thetas[-1])
+        projected: list[Projected] = []
+        for candidate in candidates:
+            feasible = problem.project(candidate.detach())
+            if not any(torch.equal(feasible.theta, other.theta) for other in projected):
+                projected.append(feasible)
+        scores = [problem.score(p.theta) for p in projected]
+        best = max(range(len(scores)), key=lambda i: (scores[i].lost, scores[i].success, scores[i].loss, -i))
+        score = scores[best]
+        trace = [loss for loss in proposals.losses if loss is not None]
+        return AttackResult(
+            theta=projected[best].theta,
+            theta0=theta0.detach(),
+            loss_trace=(*trace, score.loss),
+            score=score,
+            success_paper=score.success_paper,
+            success_moved=score.success,
+            queries=proposals.queries,
+            seed=seed,
+            active_constraints=tuple(dict.fromkeys((*proposals.active_constraints, *projected[best].active))),
+        )

@@ -1,0 +1,138 @@
+"""theta -> loss: the one place where scene, renderer, labels and detector meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from detectors.base import Detector
+from detectors.types import Detections
+from drivesem.attacks.base import Problem, Score
+from drivesem.evaluation import failures
+from drivesem.feasible import FeasibleSet
+from drivesem.labels import Difficulty, Labeller, LabelMode, MovedLabels
+from drivesem.space import ParameterSpace
+from scene_ir.compositor import Compositor
+from scene_ir.errors import RangeError
+from scene_ir.types import Render, SceneIR
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """One theta, rendered, detected and labelled; carries no gradient. loss: the objective, by its own labels."""
+
+    scene: SceneIR
+    render: Render
+    detections: Detections
+    paper: MovedLabels
+    moved: MovedLabels
+    loss: float
+
+
+class Objective:
+    """A term of the detector's loss as a function of theta (D,), to be raised by an attack.
+
+    label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
+    away from the label. They are constant in the gradient. term: a key of `Detector.loss`.
+    """
+
+    def __init__(
+        self,
+        compositor: Compositor,
+        space: ParameterSpace,
+        detector: Detector,
+        label_mode: LabelMode = "moved",
+        term: str = "confidence",
+        difficulty: Difficulty | None = None,
+    ) -> None:
+        self.compositor = compositor
+        self.space = space
+        self.detector = detector
+        self.label_mode: LabelMode = label_mode
+        self.term = term
+        with torch.no_grad():
+            base_render = compositor.render(space.apply(space.scene, space.theta0))
+        self._labeller = Labeller(space.scene, base_render, difficulty)
+        self._benign = self._judged(space.scene, base_render)
+
+    @property
+    def benign(self) -> Rendered:
+        """The scene at theta = 0, re-rendered."""
+        return self._benign
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
+        scene = self.space.apply(self.space.scene, theta)
+        render = self.compositor.render(scene)
+        labels = self._labeller.labels(self.label_mode, scene, render)
+        terms = self.detector.loss(self.detector(render.image[None]), [labels.targets])
+        return self._term(terms)
+
+    def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
+        """Loss and its gradient (D,). Raises RangeError naming the coordinate where either is not finite."""
+        leaf = theta.detach().clone().requires_grad_(True)
+        loss = self(leaf)
+        (gradient,) = torch.autograd.grad(loss, leaf)
+        bad = (~torch.isfinite(gradient)).nonzero()
+        if len(bad):
+            i = int(bad[0])
+            raise RangeError(f"gradient of {self.space.name(i)}", "a finite value", float(gradient[i]))
+        return float(loss.detach()), gradient
+
+    @torch.no_grad()
+    def evaluate(self, theta: Tensor) -> Rendered:
+        """Render, detect and label at theta (D,), without gradients."""
+        if torch.equal(theta, self.space.theta0):
+            return self._benign
+        scene = self.space.apply(self.space.scene, theta)
+        return self._judged(scene, self.compositor.render(scene))
+
+    def failures(self, rendered: Rendered, mode: LabelMode) -> failures.Failures:
+        """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""
+        labels = rendered.moved if mode == "moved" else rendered.paper
+        return failures.find(
+            self._benign.paper.targets,
+            self._benign.detections,
+            labels.targets,
+            rendered.detections,
+            self.detector.t_star,
+        )
+
+    def score(self, theta: Tensor) -> Score:
+        """What the detector makes of theta (D,): a fresh render, judged under both label modes."""
+        rendered = self.evaluate(theta)
+        moved = self.failures(rendered, "moved")
+        return Score(
+            loss=rendered.loss,
+            lost=len(moved.lost),
+            phantoms=len(moved.phantoms),
+            success=moved.success,
+            success_paper=self.failures(rendered, "paper").success,
+        )
+
+    def problem(self, feasible: FeasibleSet) -> Problem:
+        """This objective as attacks see it."""
+        return Problem(
+            loss_and_grad=self.loss_and_grad,
+            project=feasible.project,
+            score=self.score,
+            step=self.space.step,
+        )
+
+    @torch.no_grad()
+    def _judged(self, scene: SceneIR, render: Render) -> Rendered:
+        raw = self.detector(render.image[None])
+        paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
+        aim = moved if self.label_mode == "moved" else paper
+        loss = self._term(self.detector.loss(raw, [aim.targets]))
+        return Rendered(scene, render, self.detector.decode(raw)[0], paper, moved, float(loss))
+
+    def _term(self, terms: dict[str, Tensor]) -> Tensor:
+        if self.term not in terms:
+            raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
+        loss = terms[self.term]
+        if not bool(torch.isfinite(loss)):
+            raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
+        return loss

@@ -1,0 +1,292 @@
+"""One synthetic frame: a street from a seed, its photograph and its exact ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from drivesem.synth.layout import (
+    Actor,
+    LayoutSettings,
+    Road,
+    place_people,
+    place_vehicles,
+    plan_road,
+    statistics,
+)
+from drivesem.synth.light import draw_light, draw_response
+from drivesem.synth.noise import noise_set
+from drivesem.synth.render import (
+    SUPERSAMPLING,
+    Picture,
+    Setting,
+    Shadow,
+    View,
+    fine_matrix,
+    rasterise,
+    render,
+)
+from drivesem.synth.soup import Material, Soup, join
+from drivesem.synth.world import POOLS, actor_soup, surroundings
+from scene_ir.errors import RangeError
+from scene_ir.geometry import project_boxes, yaw_matrix
+from scene_ir.types import Camera, Crop, Environment, Labels
+
+SPLITS = ("train", "heldout")
+VARIANTS = {"train": (0, 100), "heldout": (100, 60)}
+"""First vehicle shape and their number: held-out scenes share no shape with training scenes."""
+_OCCLUSION_STEPS = (0.8, 0.5, 0.2)
+"""Visible fractions above which an object counts as occlusion 0, 1, 2; below all, 3."""
+_LEAST_VISIBLE = 0.05
+_LEAST_HEIGHT_PX = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class SynthSettings:
+    """What varies between uses of the generator. layout: vehicles and roads. sunny: clear weather only.
+    tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None: any.
+    """
+
+    layout: LayoutSettings | None = None
+    sunny: bool = False
+    tilt_rad: float = 0.008
+    camera: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Exact ground truth of one actor. translation (3,) m, yaw rad: camera axes, KITTI's convention. box_xyxy (4,) px;
+    visible: share of its own silhouette in the image that nothing hides; truncation in [0, 1]; opacity: its own
+    silhouette (1, h, w), in [0, 1].
+    """
+
+    actor: Actor
+    translation: np.ndarray
+    yaw: float
+    box_xyxy: np.ndarray
+    visible: float
+    occlusion: int
+    truncation: float
+    opacity: Crop
+
+
+@dataclass(frozen=True, slots=True)
+class SynthFrame:
+    """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels: KITTI's
+    classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; environment: codes 0 and exact maps;
+    manifest: seed and shapes used.
+    """
+
+    image: np.ndarray
+    background: np.ndarray | None
+    background_depth_m: np.ndarray | None
+    labels: Labels
+    truths: tuple[Truth, ...]
+    depth_m: np.ndarray
+    camera: Camera
+    environment: Environment
+    road: Road
+    manifest: dict[str, object] = field(default_factory=dict)
+
+
+def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
+    fitted = statistics()
+    choice = int(rng.integers(len(fitted.cameras))) if settings.camera is None else settings.camera
+    raw = fitted.cameras[choice]
+    f, (cx, cy) = raw["focal_px"], raw["centre_px"]
+    k = torch.tensor([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+    projection = torch.cat([k, torch.tensor(raw["offset_px_m"])[:, None]], dim=1)
+    width, height = raw["size_wh_px"]
+    pitch, roll = rng.normal(0, settings.tilt_rad), rng.normal(0, settings.tilt_rad * 0.5)
+    tilt = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    lean = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    return View(Camera(k, height, width, projection), lean @ tilt, fitted.camera_height_m + float(rng.normal(0, 0.03)))
+
+
+def _into_camera(soup: Soup, view: View) -> Soup:
+    """The surroundings in camera axes about the centre of projection."""
+    corners = (view.to_camera(soup.corners) - view.centre).astype(np.float32)
+    normals = (soup.normals @ view.rotation.T).astype(np.float32)
+    return Soup(corners, normals, soup.uv, soup.material, soup.albedo, soup.pattern, soup.owner)
+
+
+def _stand(actor: Actor, view: View) -> np.ndarray:
+    """Where the bottom-face centre (3,) of an actor lies in camera axes: on the ground plane."""
+    return view.to_camera(np.array([actor.position_xz[0], 0.0, actor.position_xz[1]]))
+
+
+def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
+    """An actor in camera axes about the centre of projection, upright as labels know it."""
+    spot = _stand(actor, view)
+    soup = actor_soup(actor, owner, float(spot[2]), float(view.camera.intrinsics[0, 0]))
+    turn = yaw_matrix(torch.tensor(actor.yaw, dtype=torch.float64)).numpy().T
+    corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
+    return Soup(corners, (soup.normals @ turn).astype(np.float32), soup.uv, soup.material, soup.albedo, soup.pattern,
+                soup.owner)  # fmt: skip
+
+
+def _full_boxes(actors: list[Actor], view: View) -> np.ndarray:
+    """Boxes (N, 4) px of the actors' 3D boxes, not cut at the image border; NaN behind the camera."""
+    if not actors:
+        return np.zeros((0, 4))
+    size = torch.tensor([a.size_lhw for a in actors], dtype=torch.float64)
+    yaw = torch.tensor([a.yaw for a in actors], dtype=torch.float64)
+    spot = torch.from_numpy(np.stack([_stand(a, view) for a in actors]))
+    return project_boxes(size, yaw, spot, view.camera.matrix.double()).numpy()
+
+
+def _truths(actors: list[Actor], soups: list[Soup], picture: Picture, view: View) -> list[Truth]:
+    n = SUPERSAMPLING
+    height, width = view.camera.height, view.camera.width
+    full = _full_boxes(actors, view)
+    rects = np.zeros((len(actors), 4), np.int64)
+    for i, box in enumerate(full):
+        if np.isfinite(box).all():
+            low = np.floor(np.clip(box[:2] - 2, 0, [width, height]))
+            high = np.ceil(np.clip(box[2:] + 3, 0, [width, height]))
+            rects[i] = n * np.concatenate([low, np.maximum(high, low)])
+    ends = np.cumsum([len(s) for s in soups])
+    ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1) if soups else np.zeros((0, 2))
+    found = []
+    if not soups:
+        return found
+    face, _ = rasterise(np.concatenate([s.corners for s in soups]), fine_matrix(view), rects, ranges)
+    start = 0
+    for i, (actor, (x0, y0, x1, y1)) in enumerate(zip(actors, rects, strict=True)):
+        count = int((x1 - x0) * (y1 - y0))
+        own = face[start : start + count].reshape(y1 - y0, x1 - x0) >= 0
+        start += count
+        if own.sum() < 4:
+            continue
+        shown = (picture.owner[y0:y1, x0:x1] == i + 1) & own
+        rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
+        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1], y0 + rows[-1]]) / n
+        box = np.clip(box, 0, [width - 1, height - 1, width - 1, height - 1])
+        visible = float(shown.sum() / own.sum())
+        cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
+        whole = np.prod(full[i][2:] - full[i][:2])
+        truncation = float(np.clip(1 - np.prod(cut[2:] - cut[:2]) / max(whole, 1e-6), 0, 1))
+        opacity = own.reshape((y1 - y0) // n, n, (x1 - x0) // n, n).mean(axis=(1, 3), dtype=np.float32)
+        found.append(
+            Truth(
+                actor=actor,
+                translation=_stand(actor, view),
+                yaw=actor.yaw,
+                box_xyxy=box,
+                visible=visible,
+                occlusion=int(sum(visible <= t for t in _OCCLUSION_STEPS)),
+                truncation=truncation if truncation > 0.005 else 0.0,
+                opacity=Crop(torch.from_numpy(opacity)[None], int(x0) // n, int(y0) // n),
+            )
+        )
+    return found
+
+
+def _labels(truths: list[Truth]) -> Labels:
+    """KITTI labels; what is hardly visible or tiny becomes a region to ignore."""
+    kept, ignored = [], []
+    for truth in truths:
+        small = truth.box_xyxy[3] - truth.box_xyxy[1] < _LEAST_HEIGHT_PX
+        if truth.visible >= _LEAST_VISIBLE and not small:
+            kept.append(truth)
+        elif truth.visible > 0:
+            ignored.append(truth.box_xyxy)
+
+    def table(rows: list, width: int) -> torch.Tensor:
+        return torch.tensor(np.array(rows), dtype=torch.float32).reshape(-1, width)
+
+    return Labels(
+        kind=tuple(t.actor.label for t in kept),
+        boxes_xyxy=table([t.box_xyxy for t in kept], 4),
+        truncation=torch.tensor([t.truncation for t in kept], dtype=torch.float32),
+        occlusion=torch.tensor([t.occlusion for t in kept], dtype=torch.int64),
+        translation=table([t.translation for t in kept], 3),
+        yaw=torch.tensor([t.yaw for t in kept], dtype=torch.float32),
+        size_lhw=table([t.actor.size_lhw for t in kept], 3),
+        ignore_xyxy=table(ignored, 4),
+    )
+
+
+def _share(material: np.ndarray, chosen: tuple[Material, ...], camera: Camera) -> torch.Tensor:
+    """Share (H, W) of each pixel's samples made of the chosen materials."""
+    n = SUPERSAMPLING
+    hit = np.isin(material, chosen).reshape(camera.height, n, camera.width, n)
+    return torch.from_numpy(hit.mean(axis=(1, 3), dtype=np.float32))
+
+
+def _environment(picture: Picture, setting: Setting) -> Environment:
+    view = setting.view
+    up = view.up
+    return Environment(
+        weather=torch.zeros(4),
+        foliage=torch.zeros(3),
+        sun=torch.tensor(setting.light.sun, dtype=torch.float32),
+        ground=torch.tensor([*up, view.height_m], dtype=torch.float32),
+        sky=_share(picture.material, (Material.SKY,), view.camera),
+        foliage_map=_share(picture.material, (Material.LEAF, Material.GRASS), view.camera),
+        road=_share(picture.material, (Material.ROAD, Material.PARKING), view.camera),
+    )
+
+
+def stream(seed: int, index: int, split: str, name: int) -> np.random.Generator:
+    """The generator for one purpose of one frame: independent of all others, of order and of workers."""
+    if split not in SPLITS:
+        raise RangeError("synth split", " or ".join(SPLITS), split)
+    return np.random.default_rng([0xD51F, SPLITS.index(split), seed, index, name])
+
+
+def generate_frame(
+    seed: int,
+    index: int,
+    split: str = "train",
+    settings: SynthSettings | None = None,
+    with_background: bool = False,
+    attempt: int = 0,
+) -> SynthFrame:
+    """Frame `index` of the stream `seed` of a split ("train" or "heldout"): same arguments, same bytes.
+
+    with_background: also render the street without its actors and their shadows. attempt: another draw of the same
+    frame. Raises RangeError for an unknown split.
+    """
+    settings = settings or SynthSettings()
+    rng = [stream(seed, index, split, 16 * attempt + i) for i in range(5)]
+    layout = settings.layout or LayoutSettings(variants=VARIANTS[split])
+    view = _camera(rng[0], settings)
+    road = plan_road(rng[1], layout.kinds)
+    actors = place_vehicles(rng[1], road, layout)
+    if layout.people:
+        actors += place_people(rng[2], road, actors)
+    static, used = surroundings(road, POOLS[split], rng[3])
+    light = draw_light(rng[4], view.up, settings.sunny)
+    setting = Setting(
+        view=view,
+        road=road,
+        light=light,
+        response=draw_response(rng[4], light.weather),
+        noise=noise_set(SPLITS.index(split)),
+        grain_seed=(seed, index, SPLITS.index(split), attempt),
+    )
+    street = _into_camera(static, view)
+    soups = [_place_actor(a, i + 1, view) for i, a in enumerate(actors)]
+    shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in actors]
+    picture = render(join([street, *soups]), shadows, setting)
+    empty = render(street, [], setting) if with_background else None
+    truths = _truths(actors, soups, picture, view)
+    shapes = sorted({f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")})
+    return SynthFrame(
+        image=picture.image,
+        background=None if empty is None else empty.image,
+        background_depth_m=None if empty is None else empty.depth_m,
+        labels=_labels(truths),
+        truths=tuple(truths),
+        depth_m=picture.depth_m,
+        camera=view.camera,
+        environment=_environment(empty or picture, setting),
+        road=road,
+        manifest={
+            "seed": seed, "index": index, "split": split, "attempt": attempt, "road": road.kind,
+            "weather": light.weather, "vehicles": shapes, **used,
+        },  # fmt: skip
+    )

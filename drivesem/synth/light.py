@@ -1,0 +1,125 @@
+"""Sun, sky and the camera's response: everything about a frame's light that is not geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivesem.synth.noise import NoiseSet, sample
+
+WEATHERS = ("sun", "overcast", "fog", "dusk")
+_WEATHER_SHARE = (0.72, 0.15, 0.05, 0.08)
+"""Mostly sun, as in KITTI's recordings; 28 % of training frames have other weather, for variety."""
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are linear
+    radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
+    """
+
+    weather: str
+    sun: np.ndarray
+    up: np.ndarray
+    sun_colour: np.ndarray
+    zenith: np.ndarray
+    horizon: np.ndarray
+    ambient: np.ndarray
+    haze_per_m: float
+    clouds: float
+    cloud_seed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """The camera. exposure: factor; white_balance (3,); contrast: exponent of the toe; vignette: loss in the corners;
+    blur_px: standard deviation; noise: standard deviation of a mid-grey pixel, of 1.
+    """
+
+    exposure: float
+    white_balance: np.ndarray
+    contrast: float
+    vignette: float
+    blur_px: float
+    noise: float
+
+
+def draw_light(rng: np.random.Generator, up: np.ndarray, sunny: bool) -> Light:
+    """Random light; `sunny` keeps to clear weather."""
+    weather = "sun" if sunny else WEATHERS[int(rng.choice(len(WEATHERS), p=_WEATHER_SHARE))]
+    elevation = np.deg2rad(rng.uniform(7, 14) if weather == "dusk" else rng.uniform(24, 62))
+    azimuth = rng.uniform(0, 2 * np.pi)
+    forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    sun = np.cos(elevation) * (np.sin(azimuth) * right + np.cos(azimuth) * forward) + np.sin(elevation) * up
+    warm = float(np.clip((np.deg2rad(30) - elevation) / np.deg2rad(30), 0, 1))
+    strength = {"sun": 1.0, "overcast": 0.0, "fog": 0.05, "dusk": 0.55}[weather]
+    sun_colour = strength * np.array([1.0, 0.95 - 0.2 * warm, 0.86 - 0.42 * warm])
+    blue = np.array([0.34, 0.52, 0.95]) * rng.uniform(0.75, 1.15)
+    pale = np.array([0.92, 0.97, 1.05]) * rng.uniform(0.85, 1.35)
+    clouds = float(rng.choice([0.0, 0.35, 0.6, 0.9], p=[0.4, 0.25, 0.2, 0.15]))
+    ambient = np.array([0.23, 0.265, 0.32]) * rng.uniform(0.7, 1.25)
+    haze = float(rng.uniform(0.0003, 0.0018))
+    if weather in ("overcast", "fog"):
+        grey = rng.uniform(0.75, 1.05)
+        blue, pale, clouds = np.full(3, 0.75) * grey, np.array([0.95, 0.97, 1.0]) * grey, 1.0
+        ambient = np.array([0.62, 0.64, 0.67]) * rng.uniform(0.6, 0.9)
+        haze = float(rng.uniform(0.012, 0.03)) if weather == "fog" else float(rng.uniform(0.0008, 0.004))
+    elif weather == "dusk":
+        blue, pale = np.array([0.20, 0.27, 0.48]), np.array([0.85, 0.62, 0.48]) * rng.uniform(0.7, 1.1)
+        ambient = np.array([0.22, 0.22, 0.28])
+    return Light(weather, sun, up, sun_colour, blue, pale, ambient, haze, clouds, float(rng.uniform(0, 512)))
+
+
+def draw_response(rng: np.random.Generator, weather: str) -> Response:
+    """A random camera response: KITTI's cameras, exposure bracketed for the weather."""
+    base = {"sun": 2.0, "overcast": 2.3, "fog": 1.7, "dusk": 2.4}[weather]
+    return Response(
+        exposure=base * float(rng.lognormal(0, 0.2)),
+        white_balance=np.array([1.0, 1.0, 1.0]) * rng.normal(1.0, (0.04, 0.01, 0.05)),
+        contrast=float(rng.uniform(1.05, 1.3)),
+        vignette=float(rng.uniform(0.02, 0.15)),
+        blur_px=float(rng.uniform(0.35, 0.6)),
+        noise=float(rng.uniform(0.004, 0.013)),
+    )
+
+
+def sky_radiance(light: Light, direction: np.ndarray, noise: NoiseSet) -> np.ndarray:
+    """Radiance (n, 3) of the sky in directions (n, 3) (unit, camera axes); below the horizon, of the horizon."""
+    height = np.clip(direction @ light.up.astype(np.float32), 0.0, 1.0)
+    blend = np.power(height, 0.5)[:, None]
+    colour = light.horizon.astype(np.float32) * (1 - blend) + light.zenith.astype(np.float32) * blend
+    if light.clouds > 0:
+        reach = np.float32(60.0) / np.maximum(height + 0.09, 0.09)
+        field = sample(noise.soft, direction[:, 0] * reach + light.cloud_seed, direction[:, 2] * reach)
+        cover = np.clip((field - 1.6 + 2.6 * light.clouds) * 0.6, 0, 1) * min(light.clouds * 1.4, 1.0)
+        white = light.horizon.astype(np.float32) * (1.15 + 0.1 * np.clip(field, -1.5, 1.5))[:, None]
+        colour += (white - colour) * cover[:, None]
+    glow = np.clip(direction @ light.sun.astype(np.float32), 0, 1) ** 24
+    colour += glow[:, None] * (light.sun_colour * 0.9).astype(np.float32)
+    return colour
+
+
+def reflected_radiance(light: Light, direction: np.ndarray, noise: NoiseSet, ground: np.ndarray) -> np.ndarray:
+    """What polished surfaces mirror from directions (n, 3): sky, a skyline of dark trees and houses, the road."""
+    height = direction @ light.up.astype(np.float32)
+    blend = np.sqrt(np.clip(height, 0, 1))[:, None]
+    sky = light.horizon.astype(np.float32) * (1 - blend) + light.zenith.astype(np.float32) * blend
+    azimuth = np.arctan2(direction[:, 0], direction[:, 2])
+    ridge = 0.20 + 0.09 * sample(noise.soft, azimuth * 81.4872 + light.cloud_seed, height * 20.0)
+    town = (light.ambient * 0.22 + light.sun_colour * 0.03).astype(np.float32)
+    road = (ground * (light.ambient + 0.6 * light.sun_colour)).astype(np.float32)
+    above = np.clip((height - ridge) * 12.0 + 0.5, 0, 1)[:, None]
+    below = np.clip(-height * 14.0 + 0.5, 0, 1)[:, None]
+    return (sky * above + town * (1 - above)) * (1 - below) + road * below
+
+
+def develop(radiance: np.ndarray, response: Response) -> np.ndarray:
+    """Display values in [0, 1] of linear radiance (n, 3): white balance, shoulder, gamma 2.2 with a darker toe."""
+    x = radiance * (response.exposure * response.white_balance).astype(np.float32)
+    np.maximum(x, 0, out=x)
+    square = x * x
+    x /= np.sqrt(np.sqrt(1.0 + square * square))
+    return np.power(x, np.float32(response.contrast / 2.2))

@@ -1,0 +1,362 @@
+"""From triangles to a photograph: visibility by the project's rasteriser at twice the resolution, then shading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from drivesem.synth.layout import Road
+from drivesem.synth.light import Light, Response, develop, sky_radiance
+from drivesem.synth.noise import NoiseSet
+from drivesem.synth.shading import Samples, shade
+from drivesem.synth.soup import GROUND, Material, Soup
+from scene_ir.raster import verbs
+from scene_ir.raster.layout import Layout
+from scene_ir.types import Camera
+
+SUPERSAMPLING = 2
+"""Samples a pixel along each axis."""
+_SHADOW_TEXELS = 1024
+_SHADOW_VIEWS_M = ((-15.0, 15.0, 1.0, 31.0), (-56.0, 56.0, -2.0, 110.0))
+"""Ground rectangles (x0, x1, z0, z1) that the near and the far shadow map cover."""
+_SHADOW_DISTANCE_M = 3000.0
+"""The sun stands this far away in shadow maps, so that their perspective is below a millimetre."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of projection in
+    camera axes (KITTI's camera 2 sits beside the origin). height_m: of the origin above the ground.
+    """
+
+    camera: Camera
+    rotation: np.ndarray
+    height_m: float
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The centre of projection (3,) in camera axes."""
+        matrix = self.camera.matrix.double().numpy()
+        return -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+
+    def to_camera(self, world: np.ndarray) -> np.ndarray:
+        """Camera axes of world points (..., 3)."""
+        return (world + np.array([0.0, self.height_m, 0.0])) @ self.rotation.T
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """World axes of camera-space points (..., 3)."""
+        return points @ self.rotation.astype(points.dtype) - np.array([0.0, self.height_m, 0.0], points.dtype)
+
+    @property
+    def up(self) -> np.ndarray:
+        """The ground's normal (3,) in camera axes."""
+        return self.rotation @ np.array([0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Shadow:
+    """A footprint under which the sky is hidden: corners' centre (x, z), yaw, size_lhw, in world axes."""
+
+    position_xz: tuple[float, float]
+    yaw: float
+    size_lhw: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What a frame is rendered with, apart from the triangles."""
+
+    view: View
+    road: Road
+    light: Light
+    response: Response
+    noise: NoiseSet
+    grain_seed: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A render. image (H, W, 3) uint8; depth_m (H, W) float32, inf in the sky, of the nearest of a pixel's samples;
+    owner (2H, 2W) int32 of each sample, -1 in the sky; material (2H, 2W) uint8 of each sample.
+    """
+
+    image: np.ndarray
+    depth_m: np.ndarray
+    owner: np.ndarray
+    material: np.ndarray
+
+
+def _in_front(points: np.ndarray, view: View) -> np.ndarray:
+    """Faces (F,) that may be seen: not wholly beyond one border of the image."""
+    k = view.camera.intrinsics.numpy()
+    x, y, z = points[..., 0], points[..., 1], np.maximum(points[..., 2], 1e-3)
+    left, right = -k[0, 2] / k[0, 0], (view.camera.width - k[0, 2]) / k[0, 0]
+    top, bottom = -k[1, 2] / k[1, 1], (view.camera.height - k[1, 2]) / k[1, 1]
+    out = (points[..., 2] < 0.05).all(axis=1)
+    out |= (x < left * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
+    out |= (x > right * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
+    out |= (y < top * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
+    out |= (y > bottom * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
+    return ~out
+
+
+def fine_matrix(view: View) -> np.ndarray:
+    """(3, 3): centre-relative camera-space points to homogeneous pixels of the supersampled image."""
+    n = SUPERSAMPLING
+    to_fine = np.array([[n, 0, (n - 1) / 2], [0, n, (n - 1) / 2], [0, 0, 1.0]])
+    return to_fine @ view.camera.matrix.double().numpy()[:, :3]
+
+
+def rasterise(corners: np.ndarray, matrix: np.ndarray, rects: np.ndarray, ranges: np.ndarray) -> tuple:
+    """Face (T,) int32 (-1: none) and depth (T,) float32 of each draw's pixels, packed.
+
+    corners (F, 3, 3) m; matrix (3, 3); rects (N, 4) px; ranges (N, 2) faces.
+    """
+    clip = torch.from_numpy((corners.reshape(-1, 3) @ matrix.T).astype(np.float32))
+    faces = torch.arange(clip.shape[0], dtype=torch.int32).reshape(-1, 3)
+    fragments = verbs.rasterize(
+        clip, faces, torch.from_numpy(np.asarray(ranges, np.int32)), Layout.of(torch.from_numpy(np.asarray(rects)))
+    )
+    return fragments.face.numpy(), fragments.depth.numpy()
+
+
+@dataclass(frozen=True, slots=True)
+class _SunMaps:
+    """Depth along the sun's rays: (views, 2, texels, texels); the second axis is surroundings, actors."""
+
+    rows: np.ndarray
+    depth: np.ndarray
+
+
+def _sun_maps(soup: Soup, setting: Setting) -> _SunMaps | None:
+    """Shadow maps over the ground, or None without sun. soup: camera axes about the centre of projection."""
+    light, view = setting.light, setting.view
+    if float(light.sun_colour.max()) <= 0.01:
+        return None
+    # A world point slides along the sun's ray to the ground: (gx, gz) = (x, z) - h / l_up (l_x, l_z); h = -y.
+    sun = light.sun @ view.rotation
+    slope = np.array([sun[0], sun[2]]) / -sun[1]
+    to_ground = np.array([[1.0, slope[0], 0.0], [0.0, slope[1], 1.0], [0.0, 1.0 / -sun[1], 0.0]])
+    rows = to_ground @ view.rotation.T
+    shift = to_ground @ (view.centre @ view.rotation - np.array([0.0, view.height_m, 0.0]))
+    ground = np.isin(soup.material, GROUND)
+    corners = soup.corners[~ground]
+    actor = soup.owner[~ground] > 0
+    placed = corners @ rows.T.astype(np.float32) + shift.astype(np.float32)
+    depth = np.full((len(_SHADOW_VIEWS_M), 2, _SHADOW_TEXELS, _SHADOW_TEXELS), np.inf, np.float32)
+    size = _SHADOW_TEXELS
+    for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
+        flat = placed[..., :2]
+        low, high = flat.min(axis=1), flat.max(axis=1)
+        inside = (high[:, 0] > x0) & (low[:, 0] < x1) & (high[:, 1] > z0) & (low[:, 1] < z1)
+        for j, chosen in enumerate((inside & ~actor, inside & actor)):
+            points = placed[chosen]
+            if not len(points):
+                continue
+            w = points[..., 2:] + np.float32(_SHADOW_DISTANCE_M)
+            pixels = (points[..., :2] - np.float32([x0, z0])) * np.float32([size / (x1 - x0), size / (z1 - z0)]) - 0.5
+            clip = np.concatenate([pixels * w, w], axis=-1)
+            _, found = rasterise(clip, np.eye(3), np.array([[0, 0, size, size]]), np.array([[0, len(points)]]))
+            depth[i, j] = found.reshape(size, size) - np.float32(_SHADOW_DISTANCE_M)
+    return _SunMaps(np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32), depth)
+
+
+def _lit(maps: _SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple) -> np.ndarray:
+    """Share (n,) of the sun that arrives. samples: (material, owner, sun direction)."""
+    n = len(point)
+    if maps is None:
+        return np.zeros(n, np.float32)
+    material, owner, sun = samples
+    lit = np.zeros(n, np.float32)
+    facing = normal @ sun.astype(np.float32)
+    leaf = material == Material.LEAF
+    towards = np.flatnonzero((facing > 0) | leaf)
+    offset = np.where(leaf, 0.25, 0.03 + 0.0006 * point[:, 2])[towards, None].astype(np.float32)
+    moved = point[towards] + offset * np.where(leaf[towards, None], sun.astype(np.float32), normal[towards])
+    place = moved @ maps.rows[:, :3].T + maps.rows[:, 3]
+    by_actor = ((np.isin(material, GROUND)) | (owner > 0))[towards]
+    share = np.ones(len(towards), np.float32)
+    pending = np.ones(len(towards), bool)
+    size = _SHADOW_TEXELS
+    for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
+        texel = (x1 - x0) / size
+        u = (place[:, 0] - np.float32(x0)) * np.float32(1 / texel) - 0.5
+        v = (place[:, 1] - np.float32(z0)) * np.float32(size / (z1 - z0)) - 0.5
+        here = pending & (u > 1) & (v > 1) & (u < size - 3) & (v < size - 3)
+        pending &= ~here
+        for j, chosen in ((0, np.flatnonzero(here)), (1, np.flatnonzero(here & by_actor))):
+            table = maps.depth[i, j]
+            if len(chosen):
+                share[chosen] *= _soft_compare(table, u[chosen], v[chosen], place[chosen, 2] - np.float32(0.02))
+    lit[towards] = share
+    return lit
+
+
+def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Share (n,) of a map's texels around (u, v) that lie behind `depth`, weighted bilinearly."""
+    u0, v0 = np.floor(u), np.floor(v)
+    fu, fv = u - u0, v - v0
+    base = v0.astype(np.int32) * np.int32(table.shape[1]) + u0.astype(np.int32)
+    flat = table.reshape(-1)
+    rows = [
+        (flat[base + step] >= depth) * (1 - fu) + (flat[base + step + 1] >= depth) * fu
+        for step in (0, table.shape[1])
+    ]
+    return (rows[0] * (1 - fv) + rows[1] * fv).astype(np.float32)
+
+
+def _open_sky(world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]) -> np.ndarray:
+    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles."""
+    height = -world[:, 1]
+    upright = ~np.isin(material, GROUND)
+    open_sky = np.ones(len(height), np.float32)
+    low = 0.5 + 0.5 * np.clip(height / 1.2, 0, 1)
+    open_sky = np.where(upright, low, open_sky)
+    actor = owner > 0
+    open_sky = np.where(actor, 0.3 + 0.7 * np.clip((height - 0.12) / 0.6, 0, 1), open_sky).astype(np.float32)
+    ground = np.flatnonzero(~upright)
+    spot = world[ground][:, [0, 2]]
+    for shadow in shadows:
+        reach = 0.75 * shadow.size_lhw[1]
+        radius = 0.5 * float(np.hypot(shadow.size_lhw[0], shadow.size_lhw[2])) + reach
+        local = spot - np.asarray(shadow.position_xz, np.float32)
+        near = np.flatnonzero((np.abs(local[:, 0]) < radius) & (np.abs(local[:, 1]) < radius))
+        if not len(near):
+            continue
+        local = local[near]
+        cos, sin = np.float32(np.cos(shadow.yaw)), np.float32(np.sin(shadow.yaw))
+        along = np.abs(local[:, 0] * cos - local[:, 1] * sin) - np.float32(shadow.size_lhw[0] / 2)
+        across = np.abs(local[:, 0] * sin + local[:, 1] * cos) - np.float32(shadow.size_lhw[2] / 2)
+        outside = np.hypot(np.maximum(along, 0), np.maximum(across, 0))
+        inside = np.minimum(np.maximum(along, across), 0)
+        dark = 0.62 * np.exp(-outside / (0.32 * reach)) + 0.36 * np.clip(-inside / 0.25, 0, 1)
+        open_sky[ground[near]] *= (1 - np.minimum(dark, 0.97)).astype(np.float32)
+    return open_sky
+
+
+def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
+    """Photograph a world. soup: camera axes about the centre of projection; shadows: of the actors in it."""
+    view, n = setting.view, SUPERSAMPLING
+    height, width = view.camera.height, view.camera.width
+    seen = soup.take(_in_front(soup.corners, view))
+    matrix = fine_matrix(view)
+    rect = np.array([[0, 0, n * width, n * height]])
+    face, depth = rasterise(seen.corners, matrix, rect, np.array([[0, len(seen)]]))
+    face, depth = face.reshape(n * height, n * width), depth.reshape(n * height, n * width)
+    hit = face >= 0
+    safe = np.maximum(face, 0)
+    material = np.where(hit, seen.material[safe], np.uint8(Material.SKY))
+    owner = np.where(hit, seen.owner[safe], -1)
+    whole, parts = _shading_sites(face, depth, material, owner)
+    maps = _sun_maps(soup, setting)
+    inverse = np.linalg.inv(matrix)
+    image = np.empty((height * width, 3), np.float32)
+    rows, columns = np.divmod(whole, width)
+    fine = (rows * n) * (n * width) + columns * n
+    middle = np.stack([columns * n + (n - 1) / 2, rows * n + (n - 1) / 2], axis=1)
+    quads = [fine + dy * n * width + dx for dy in range(n) for dx in range(n)]
+    mean_depth = sum(depth.reshape(-1)[q] for q in quads) / len(quads)
+    rows, columns = np.divmod(parts, width)
+    corner = (rows * n) * (n * width) + columns * n
+    spread = np.stack([corner + dy * n * width + dx for dy in range(n) for dx in range(n)], axis=1).reshape(-1)
+    spots = np.stack([spread % (n * width), spread // (n * width)], axis=1)
+    where = np.concatenate([middle, spots])
+    index = np.concatenate([fine, spread])
+    w = np.concatenate([mean_depth, depth.reshape(-1)[spread]])
+    shown = _shade_sites(seen, setting, maps, shadows, (where, face.reshape(-1)[index], w, inverse))
+    shown = develop(shown, setting.response)
+    image[whole] = shown[: len(whole)]
+    image[parts] = shown[len(whole) :].reshape(-1, n * n, 3).mean(axis=1)
+    depth_m = depth.reshape(height, n, width, n).min(axis=(1, 3))
+    return Picture(_camera(image.reshape(height, width, 3), setting), depth_m, owner, material)
+
+
+def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, owner: np.ndarray) -> tuple:
+    """Pixels (flat indices) shaded once, and those where every sample is shaded: outlines, leaves, thin things."""
+    n = SUPERSAMPLING
+    shape = (face.shape[0] // n, n, face.shape[1] // n, n)
+    first = face[::n, ::n]
+    same_face = (face.reshape(shape) == first[:, None, :, None]).all(axis=(1, 3))
+    key = material.astype(np.int32) * 4096 + owner
+    alike = (key.reshape(shape) == key[::n, ::n][:, None, :, None]).all(axis=(1, 3))
+    blocks = depth.reshape(shape)
+    near, far = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
+    smooth = alike & (far < near * np.float32(1.03)) & (material[::n, ::n] != Material.LEAF)
+    once = same_face | smooth
+    return np.flatnonzero(once), np.flatnonzero(~once)
+
+
+def _shade_sites(
+    seen: Soup, setting: Setting, maps: _SunMaps | None, shadows: list[Shadow], sites: tuple
+) -> np.ndarray:
+    """Linear radiance (n, 3) at sites: (pixel (n, 2) of the fine image, face (n,), depth (n,), inverse (3, 3))."""
+    where, face, w, inverse = sites
+    view = setting.view
+    ray = (where @ inverse[:, :2].T + inverse[:, 2]).astype(np.float32)
+    out = np.empty((len(face), 3), np.float32)
+    sky = np.flatnonzero(face < 0)
+    if len(sky):
+        direction = ray[sky] / np.linalg.norm(ray[sky], axis=1, keepdims=True)
+        out[sky] = sky_radiance(setting.light, direction, setting.noise)
+        if setting.light.weather == "fog":
+            out[sky] = setting.light.horizon.astype(np.float32) * 0.8
+    land = np.flatnonzero(face >= 0)
+    if not len(land):
+        return out
+    face = face[land]
+    used, local = np.unique(face, return_inverse=True)
+    attributes = _attribute_maps(seen, used)
+    point = ray[land] * w[land, None]
+    values = np.einsum("nij,nj->ni", attributes[local], point)
+    normal = values[:, :3]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    away = (normal * point).sum(axis=1) > 0
+    normal[away] *= -1
+    world = view.to_world(point + view.centre.astype(np.float32))
+    material, owner = seen.material[face], seen.owner[face]
+    samples = Samples(
+        point=point,
+        world=world,
+        normal=normal,
+        uv=values[:, 3:5],
+        material=material,
+        albedo=seen.albedo[face],
+        pattern=seen.pattern[face],
+        owner=owner,
+        lit=_lit(maps, point, normal, (material, owner, setting.light.sun)),
+        open_sky=_open_sky(world, material, owner, shadows),
+        pixel_m=point[:, 2] / np.float32(view.camera.intrinsics[0, 0]),
+    )
+    out[land] = shade(samples, setting.road, setting.light, setting.noise, view.height_m)
+    return out
+
+
+def _attribute_maps(seen: Soup, used: np.ndarray) -> np.ndarray:
+    """(m, 5, 3) linear maps from a point on each used face (centre-relative) to its normal and surface coordinates.
+
+    Barycentric coordinates are linear in the point, as the point is the same combination of the three corners.
+    """
+    corners = seen.corners[used].astype(np.float64)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    volume = (a * rows[:, 0]).sum(axis=1)
+    rows /= np.where(np.abs(volume) < 1e-12, 1e-12, volume)[:, None, None]
+    values = np.concatenate([seen.normals[used], seen.uv[used]], axis=2)
+    return np.einsum("mik,mij->mkj", values, rows).astype(np.float32)
+
+
+def _camera(image: np.ndarray, setting: Setting) -> np.ndarray:
+    """Lens and sensor: (H, W, 3) display values to uint8, with vignetting, blur and noise."""
+    response = setting.response
+    height, width = image.shape[:2]
+    out = cv2.GaussianBlur(image, (5, 5), response.blur_px)
+    x = np.linspace(-1, 1, width, dtype=np.float32)[None]
+    y = np.linspace(-1, 1, height, dtype=np.float32)[:, None] * np.float32(height / width)
+    out *= (1 - np.float32(response.vignette) * (x * x + y * y))[..., None]
+    rng = np.random.default_rng(list(setting.grain_seed))
+    grain = rng.standard_normal((height, width, 3), dtype=np.float32)
+    out += grain * (np.float32(response.noise) * (0.4 + np.sqrt(np.maximum(out, 0))))
+    return np.clip(np.rint(out * 255), 0, 255).astype(np.uint8)

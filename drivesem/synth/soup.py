@@ -1,0 +1,219 @@
+"""Triangle soups: what a synthetic world is made of, and the solids it is built from.
+
+World axes as the camera's (x right, y down, z forward), but with the ground at y = 0 and up = -y; metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from functools import lru_cache
+
+import numpy as np
+
+
+class Material(IntEnum):
+    """What a triangle is made of; selects its shading."""
+
+    SKY = 0
+    ROAD = 1
+    PARKING = 2
+    PAVEMENT = 3
+    KERB = 4
+    GRASS = 5
+    GRAVEL = 6
+    FACADE = 7
+    ROOF = 8
+    WALL = 9
+    FENCE = 10
+    LEAF = 11
+    BARK = 12
+    METAL = 13
+    FLAT = 14
+    PAINT = 15
+    GLASS = 16
+    TYRE = 17
+    LIGHT = 18
+    TRIM = 19
+    CLOTH = 20
+
+
+GROUND = (Material.ROAD, Material.PARKING, Material.PAVEMENT, Material.KERB, Material.GRASS, Material.GRAVEL)
+"""Materials that receive vehicles' shadows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Soup:
+    """F independent triangles. corners (F, 3, 3) m; normals (F, 3, 3) unit, one a corner; uv (F, 3, 2) m, surface
+    coordinates for patterns; material (F,) uint8; albedo (F, 3) linear RGB; pattern (F, 4), meaning by material;
+    owner (F,) int32, 0 is the surroundings, i + 1 actor i. All float32 unless stated.
+    """
+
+    corners: np.ndarray
+    normals: np.ndarray
+    uv: np.ndarray
+    material: np.ndarray
+    albedo: np.ndarray
+    pattern: np.ndarray
+    owner: np.ndarray
+
+    def __len__(self) -> int:
+        return int(self.corners.shape[0])
+
+    def take(self, keep: np.ndarray) -> Soup:
+        """The triangles selected by a mask or by indices."""
+        return Soup(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def make(
+    corners: np.ndarray,
+    material: int,
+    albedo: np.ndarray | tuple[float, float, float],
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    pattern: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+) -> Soup:
+    """A soup of one material; flat normals and zero surface coordinates where none are given."""
+    corners = np.asarray(corners, np.float32).reshape(-1, 3, 3)
+    count = corners.shape[0]
+    if normals is None:
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+        normals = np.repeat(flat[:, None], 3, axis=1)
+    return Soup(
+        corners=corners,
+        normals=np.asarray(normals, np.float32).reshape(-1, 3, 3),
+        uv=np.zeros((count, 3, 2), np.float32) if uv is None else np.asarray(uv, np.float32).reshape(-1, 3, 2),
+        material=np.full(count, int(material), np.uint8),
+        albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
+        pattern=np.broadcast_to(np.asarray(pattern, np.float32), (count, 4)).copy(),
+        owner=np.zeros(count, np.int32),
+    )
+
+
+def join(soups: list[Soup]) -> Soup:
+    """All triangles in one soup, in order."""
+    return Soup(*(np.concatenate([getattr(s, f.name) for s in soups]) for f in fields(Soup)))
+
+
+def placed(soup: Soup, position: tuple[float, float, float], yaw: float, scale: tuple[float, float, float]) -> Soup:
+    """A copy scaled along its own axes, turned about y (KITTI's sense) and moved."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
+    size = np.asarray(scale, np.float32)
+    corners = (soup.corners * size) @ turn.T + np.asarray(position, np.float32)
+    normals = (soup.normals / size) @ turn.T
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return Soup(corners, normals, soup.uv, soup.material, soup.albedo, soup.pattern, soup.owner)
+
+
+def quad(points: np.ndarray) -> np.ndarray:
+    """Two triangles (2, 3, ...) of four corners (4, ...) in order around the outline."""
+    return points[np.array([[0, 1, 2], [0, 2, 3]])]
+
+
+_UNIT_UV = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
+
+
+def box(
+    size: tuple[float, float, float],
+    material: int,
+    albedo: np.ndarray | tuple[float, float, float],
+    pattern: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+) -> Soup:
+    """A box (length x, height, width z) standing on y = 0; u runs along each side, v is the height, in metres."""
+    lx, h, lz = size[0] / 2, size[1], size[2] / 2
+    ring = np.array([[lx, lz], [-lx, lz], [-lx, -lz], [lx, -lz]], np.float32)
+    corners, uv = [], []
+    for i in range(4):
+        a, b = ring[i], ring[(i + 1) % 4]
+        length = float(np.hypot(*(b - a)))
+        face = np.array([[a[0], 0, a[1]], [b[0], 0, b[1]], [b[0], -h, b[1]], [a[0], -h, a[1]]], np.float32)
+        corners.append(quad(face))
+        uv.append(quad((_UNIT_UV - [0.5, 0.0]) * [length, h]))
+    top = np.stack([ring[:, 0], np.full(4, -h, np.float32), ring[:, 1]], axis=1)
+    corners.append(quad(top))
+    uv.append(quad(ring))
+    points = np.concatenate(corners)
+    return _outward(make(points, material, albedo, uv=np.concatenate(uv), pattern=pattern))
+
+
+def _outward(soup: Soup) -> Soup:
+    """Flip triangles of a solid around the origin's vertical axis whose normals point inwards."""
+    centre = soup.corners.reshape(-1, 3).mean(axis=0)
+    inward = ((soup.corners.mean(axis=1) - centre) * soup.normals[:, 0]).sum(axis=1) < 0
+    soup.normals[inward] *= -1
+    return soup
+
+
+def tube(start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and normals (F, 3, 3) of a closed, round stick from start to end (3,)."""
+    axis = np.asarray(end, float) - np.asarray(start, float)
+    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.8 else np.array([0, 1.0, 0])
+    one = np.cross(axis, helper)
+    one /= np.linalg.norm(one)
+    two = np.cross(axis, one)
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    ring = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
+    low, high = np.asarray(start) + ring * radii[0], np.asarray(end) + ring * radii[1]
+    a, b, c, d = low[:-1], low[1:], high[1:], high[:-1]
+    corners = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    n0, n1 = ring[:-1], ring[1:]
+    normals = np.concatenate([np.stack([n0, n1, n1], 1), np.stack([n0, n1, n0], 1)])
+    for point, circle, normal in ((start, low, -axis), (end, high, axis)):
+        middle = np.broadcast_to(np.asarray(point, float), circle[:-1].shape)
+        corners = np.concatenate([corners, np.stack([middle, circle[:-1], circle[1:]], 1)])
+        normals = np.concatenate([normals, np.broadcast_to(normal, (sides, 3, 3))])
+    return corners.astype(np.float32), normals.astype(np.float32)
+
+
+def stick(
+    start: tuple[float, float, float] | np.ndarray,
+    end: tuple[float, float, float] | np.ndarray,
+    radii: tuple[float, float],
+    material: int,
+    albedo: tuple[float, float, float] | np.ndarray,
+    sides: int = 7,
+) -> Soup:
+    """A round stick as a soup."""
+    corners, normals = tube(np.asarray(start), np.asarray(end), radii, sides)
+    return make(corners, material, albedo, normals)
+
+
+@lru_cache(maxsize=4)
+def unit_sphere(subdivisions: int) -> np.ndarray:
+    """Corners (F, 3, 3) of a subdivided icosahedron of radius 1."""
+    golden = (1 + 5**0.5) / 2
+    points = [(a * 1.0, b * golden, 0.0) for a in (-1, 1) for b in (-1, 1)]
+    base = np.array(points + [(0, x, y) for x, y, _ in points] + [(y, 0, x) for x, y, _ in points])
+    base /= np.linalg.norm(base, axis=1, keepdims=True)
+    distance = np.linalg.norm(base[:, None] - base[None], axis=-1)
+    near = (distance > 0) & (distance < 1.2)
+    triangles = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i + 1, 12)
+        for k in range(j + 1, 12)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
+    corners = base[np.array(triangles)]
+    for _ in range(subdivisions):
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
+        corners = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    return corners.astype(np.float32)
+
+
+def ball(
+    centre: tuple[float, float, float] | np.ndarray,
+    radii: tuple[float, float, float] | np.ndarray,
+    material: int,
+    albedo: tuple[float, float, float] | np.ndarray,
+    subdivisions: int = 1,
+) -> Soup:
+    """An ellipsoid."""
+    sphere = unit_sphere(subdivisions)
+    normals = sphere / np.asarray(radii, np.float32)
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return make(sphere * np.asarray(radii, np.float32) + np.asarray(centre, np.float32), material, albedo, normals)

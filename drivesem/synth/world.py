@@ -1,0 +1,468 @@
+"""The static surroundings of a road, and actors as triangles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from drivesem.synth import buildings, flora, people
+from drivesem.synth.layout import Actor, Road
+from drivesem.synth.soup import Material, Soup, ball, box, join, make, placed, quad, stick
+from scene_ir.meshes.lod import simplify
+from scene_ir.meshes.templates import template
+from scene_ir.types import Part
+
+_STATIONS_M = np.array([-14, -8, -4, 0, 4, 8, 12, 18, 24, 32, 40, 50, 62, 76, 92, 110, 135, 165, 200.0])
+"""Where ribbons of ground are cut along s; gentle bends need no more."""
+_GROUND_ALBEDO = {
+    Material.ROAD: (0.115, 0.113, 0.112),
+    Material.PARKING: (0.15, 0.145, 0.14),
+    Material.PAVEMENT: (0.20, 0.19, 0.18),
+    Material.KERB: (0.24, 0.235, 0.225),
+    Material.GRASS: (0.085, 0.115, 0.035),
+    Material.GRAVEL: (0.17, 0.15, 0.125),
+}
+"""Linear albedo; asphalt 0.08 to 0.15, concrete 0.2 to 0.3, grass about 0.1 in the visible range."""
+_PART_MATERIAL = {
+    Part.PAINT: Material.PAINT,
+    Part.GLASS: Material.GLASS,
+    Part.TYRE: Material.TYRE,
+    Part.LIGHT: Material.LIGHT,
+    Part.OTHER: Material.TRIM,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """First ids and counts of the shapes a split may use: held-out scenes share none with training scenes."""
+
+    offset: int
+    buildings: int
+    trees: int
+    surfaces: int
+
+
+POOLS = {"train": Pool(0, 160, 48, 40), "heldout": Pool(10_000, 60, 24, 20)}
+"""Ids below 10,000 belong to training scenes, the others to held-out ones."""
+
+
+class _Builder:
+    """Collects soups at road coordinates and remembers which shapes were used."""
+
+    def __init__(self, road: Road, pool: Pool, rng: np.random.Generator) -> None:
+        self.road, self.pool, self.rng = road, pool, rng
+        self.parts: list[Soup] = []
+        self.used: dict[str, set[int]] = {"building": set(), "tree": set(), "bush": set(), "surface": set()}
+
+    def draw(self, name: str, count: int) -> int:
+        """A random id of the pool, noted in the manifest."""
+        identifier = self.pool.offset + int(self.rng.integers(count))
+        self.used[name].add(identifier)
+        return identifier
+
+    def free(self, s: float, reach: float) -> bool:
+        """Whether nothing within `reach` of s stands on a crossing road."""
+        crossing = self.road.crossing
+        return crossing is None or s + reach < crossing[0] - 1 or s - reach > crossing[1] + 1
+
+    def put(self, soup: Soup, d: float, s: float, turn: float = 0.0, scale: tuple = (1, 1, 1), y: float = 0.0) -> None:
+        """Place a soup whose x runs along the road (turn 0), turned by `turn`."""
+        x, z = self.road.point(d, s)
+        self.parts.append(placed(soup, (float(x), y, float(z)), self.road.yaw(s, 1) + turn, scale))
+
+
+def _ground(b: _Builder) -> None:
+    road, rng = b.road, b.rng
+    look = np.random.default_rng([0x5F, b.draw("surface", b.pool.surfaces)])
+    tone = {m: look.uniform(0.75, 1.3) * look.uniform(0.96, 1.04, 3) for m in _GROUND_ALBEDO}
+    tone[Material.GRASS] = look.uniform(0.8, 1.4) * np.array([look.uniform(0.8, 1.6), 1.0, look.uniform(0.8, 1.2)])
+    seed = float(look.integers(1000))
+    spans = [(_STATIONS_M[0], _STATIONS_M[-1])]
+    if road.crossing:
+        spans = [(_STATIONS_M[0], road.crossing[0]), (road.crossing[1], _STATIONS_M[-1])]
+        c0, c1 = road.crossing
+        outline = np.array([[-90, c0], [90, c0], [90, c1], [-90, c1]])
+        albedo = _GROUND_ALBEDO[Material.ROAD] * tone[Material.ROAD]
+        b.parts.append(_patch(outline, 0.0, Material.ROAD, albedo, seed))
+        # Half the road's width of lines across: the edge is drawn by kerbs only.
+        for strip in road.strips:
+            if strip.height_m > 0:
+                for at, sign in ((c0, 1.0), (c1, -1.0)):
+                    face = np.array([[strip.d0, 0, at], [strip.d1, 0, at], [strip.d1, -strip.height_m, at],
+                                     [strip.d0, -strip.height_m, at]])
+                    normal = np.broadcast_to([0, 0, sign], (2, 3, 3))
+                    colour = _GROUND_ALBEDO[Material.KERB] * tone[Material.KERB]
+                    b.parts.append(make(quad(face), Material.KERB, colour, normal, pattern=(seed, 0, 0, 0)))
+    for strip in road.strips:
+        albedo = _GROUND_ALBEDO[strip.material] * tone[strip.material]
+        for start, end in spans:
+            inner = _STATIONS_M[(start < _STATIONS_M) & (end > _STATIONS_M)]
+            s = np.concatenate([[start], inner, [end]])
+            b.parts.append(_ribbon(road, (strip.d0, strip.d1), s, (strip.height_m, strip.height_m), strip.material,
+                                   albedo, seed))
+            if strip.material == Material.KERB or (strip.height_m and strip.material != Material.KERB):
+                for edge in (strip.d0, strip.d1):
+                    b.parts.append(_ribbon(road, (edge, edge), s, (0.0, strip.height_m), Material.KERB,
+                                           _GROUND_ALBEDO[Material.KERB] * tone[Material.KERB], seed))
+    far = np.array([[-500, -30], [500, -30], [500, 700], [-500, 700]])
+    b.parts.append(_patch(far, -0.12, Material.GRASS, _GROUND_ALBEDO[Material.GRASS] * tone[Material.GRASS], seed))
+    del rng
+
+
+def _patch(outline: np.ndarray, height_m: float, material: Material, albedo: np.ndarray, seed: float) -> Soup:
+    """A flat, cut-up ground rectangle: outline (4, 2) of (x, z)."""
+    xs = np.linspace(outline[0, 0], outline[1, 0], 9)
+    zs = np.linspace(outline[0, 1], outline[2, 1], 9)
+    cells = [
+        np.array([[x0, -height_m, z0], [x1, -height_m, z0], [x1, -height_m, z1], [x0, -height_m, z1]])
+        for x0, x1 in zip(xs[:-1], xs[1:], strict=True)
+        for z0, z1 in zip(zs[:-1], zs[1:], strict=True)
+    ]
+    corners = np.concatenate([quad(c) for c in cells])
+    normals = np.broadcast_to([0.0, -1.0, 0.0], corners.shape)
+    return make(corners, material, albedo, normals, corners[..., [0, 2]] + [300.0, 0.0], (seed, 0, 0, 0))
+
+
+def _ribbon(
+    road: Road,
+    d: tuple[float, float],
+    s: np.ndarray,
+    heights_m: tuple[float, float],
+    material: Material,
+    albedo: np.ndarray,
+    seed: float,
+) -> Soup:
+    """A band along the road between two offsets, cut at stations s; vertical where both offsets are equal."""
+    sides = []
+    for offset, height in zip(d, heights_m, strict=True):
+        x, z = road.point(offset, s)
+        sides.append(np.stack([x, np.full_like(s, -height), z], axis=1))
+    low, high = sides
+    points = np.stack([low[:-1], high[:-1], high[1:], low[1:]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+    uv = np.stack(
+        [np.stack(np.broadcast_arrays(np.float64(d[i]), s[j]), axis=-1) for i, j in ((0, slice(None, -1)), (1, slice(None, -1)), (1, slice(1, None)), (0, slice(1, None)))],
+        axis=1,
+    )[:, np.array([[0, 1, 2], [0, 2, 3]])]  # fmt: skip
+    if d[0] == d[1]:
+        normal = np.array([1.0 if d[0] < 0 else -1.0, -0.05, 0.0])
+    else:
+        normal = np.array([0.0, -1.0, 0.0])
+    normals = np.broadcast_to(normal / np.linalg.norm(normal), (2 * (len(s) - 1), 3, 3))
+    return make(points.reshape(-1, 3, 3), material, albedo, normals, uv.reshape(-1, 3, 2), (seed, 0, 0, 0))
+
+
+def _detail(distance_m: float) -> int:
+    return 2 if distance_m < 17 else 1 if distance_m < 42 else 0
+
+
+def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
+    if not b.free(s, 0.5):
+        return
+    identifier = b.draw("tree", b.pool.trees)
+    x, z = b.road.point(d, s)
+    detail = _detail(float(np.hypot(x, max(z, 0.0))) * 9.0 / height_m)
+    width = height_m * float(b.rng.uniform(0.85, 1.15))
+    b.put(flora.tree(identifier, detail), d, s, float(b.rng.uniform(0, 6.28)), (width, height_m, width))
+
+
+def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
+    if not b.free(s, size_m):
+        return
+    identifier = b.draw("bush", b.pool.trees)
+    wide = size_m * float(b.rng.uniform(0.9, 1.5))
+    b.put(flora.bush(identifier, _detail(float(np.hypot(d, s)) * 1.4 / size_m)), d, s, float(b.rng.uniform(0, 6.28)),
+          (wide, size_m, wide))  # fmt: skip
+
+
+def _city_row(b: _Builder, side: int, edge: float) -> None:
+    """Adjoining blocks of flats or houses along one side."""
+    rng = b.rng
+    s = float(rng.uniform(-14, -6))
+    storeys = int(rng.integers(2, 6))
+    set_back = float(rng.uniform(0.0, 2.0) if rng.random() < 0.7 else rng.uniform(3, 8))
+    while s < 150:
+        length, depth = float(rng.uniform(8, 18)), float(rng.uniform(9, 13))
+        middle = s + length / 2
+        if b.free(middle, length / 2) and rng.random() < 0.92:
+            levels = max(storeys + int(rng.integers(-1, 2)), 1)
+            identifier = b.draw("building", b.pool.buildings)
+            soup = buildings.building(identifier, length, depth, levels, along=bool(rng.random() < 0.8))
+            b.put(soup, edge + side * (set_back + depth / 2 + float(rng.uniform(0, 0.4))), middle)
+        s += length + (float(rng.uniform(3, 8)) if rng.random() < 0.15 else 0.02)
+
+
+def _houses(b: _Builder, side: int, edge: float) -> None:
+    """Detached houses in gardens behind hedges, walls or fences."""
+    rng = b.rng
+    s = float(rng.uniform(-16, -8))
+    while s < 120:
+        length, depth = float(rng.uniform(8, 14)), float(rng.uniform(8, 12))
+        gap = float(rng.uniform(3, 9))
+        middle, back = s + length / 2, float(rng.uniform(2.5, 8.0))
+        if b.free(middle, length / 2 + 1):
+            identifier = b.draw("building", b.pool.buildings)
+            soup = buildings.building(identifier, length, depth, int(rng.integers(1, 4)), bool(rng.random() < 0.6))
+            b.put(soup, edge + side * (back + depth / 2), middle)
+            plot = length + gap - 0.6
+            _boundary(b, side, edge + side * float(rng.uniform(0.2, 0.5)), middle, plot)
+            for _ in range(int(rng.integers(0, 4))):
+                where = s + float(rng.uniform(-gap, length + gap))
+                if rng.random() < 0.45:
+                    _tree(b, edge + side * float(rng.uniform(1.6, 3.2 + back * 0.5)), where, float(rng.uniform(4, 9)))
+                else:
+                    _bush(b, edge + side * float(rng.uniform(1.2, 2.5)), where, float(rng.uniform(0.8, 2.2)))
+            if rng.random() < 0.5:
+                _tree(b, edge + side * (back + depth + float(rng.uniform(2, 8))), middle, float(rng.uniform(8, 14)))
+        s += length + gap
+
+
+def _boundary(b: _Builder, side: int, d: float, middle: float, length: float) -> None:
+    """What separates a garden from the pavement."""
+    rng = b.rng
+    draw = rng.random()
+    height = float(rng.uniform(0.7, 1.7))
+    if draw < 0.4:
+        b.put(flora.hedge(length, height, 0.7, _detail(float(np.hypot(d, middle - length / 4))), rng), d + side * 0.35,
+              middle)  # fmt: skip
+    elif draw < 0.6:
+        colour = np.array([0.35, 0.33, 0.30]) * rng.uniform(0.5, 1.3)
+        b.put(buildings.garden_wall(length, height * 0.8, Material.WALL, colour), d, middle)
+    elif draw < 0.78:
+        colour = np.array([0.17, 0.11, 0.06]) * rng.uniform(0.6, 1.6)
+        b.put(buildings.garden_wall(length, height, Material.FENCE, colour), d, middle)
+
+
+def _tree_row(b: _Builder, d: float, spacing: tuple[float, float], height: tuple[float, float]) -> None:
+    s = float(b.rng.uniform(-6, 6))
+    while s < 130:
+        _tree(b, d + float(b.rng.normal(0, 0.15)), s, float(b.rng.uniform(*height)))
+        s += float(b.rng.uniform(*spacing))
+
+
+def _guard_rail(b: _Builder, d: float) -> None:
+    """A steel rail on posts."""
+    s = _STATIONS_M[3:-2]
+    steel = np.array([0.30, 0.31, 0.32])
+    for low, high, out in ((0.50, 0.58, 0.02), (0.58, 0.66, -0.03), (0.66, 0.74, 0.02)):
+        offset = d + out
+        x, z = b.road.point(offset, s)
+        x1, z1 = b.road.point(d - out, s)
+        a, c = np.stack([x, np.full_like(s, -low), z], 1), np.stack([x1, np.full_like(s, -high), z1], 1)
+        points = np.stack([a[:-1], c[:-1], c[1:], a[1:]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+        b.parts.append(make(points.reshape(-1, 3, 3), Material.METAL, steel))
+    for at in np.arange(1.0, 80.0, 4.0):
+        b.put(box((0.1, 0.6, 0.08), Material.METAL, steel * 0.8), d + np.sign(d) * 0.08, float(at))
+
+
+def _street_furniture(b: _Builder) -> None:
+    """Lamps, signs, bins, boxes, bollards along the pavements or verges."""
+    rng, road = b.rng, b.road
+    grey = np.array([0.20, 0.21, 0.22])
+    lamp_side = int(rng.choice([-1, 1]))
+    edge = road.flank_m[0] if lamp_side < 0 else road.flank_m[1]
+    s, height = float(rng.uniform(3, 25)), float(rng.uniform(5.5, 10))
+    while s < 120:
+        if b.free(s, 0.3):
+            pole = stick((0, 0, 0), (0, -height, 0), (0.09, 0.05), Material.METAL, grey, 8)
+            arm = stick((0, -height, 0), (0, -height - 0.35, -lamp_side * 1.8), (0.04, 0.03), Material.METAL, grey, 5)
+            head = ball((0, -height - 0.38, -lamp_side * 2.0), (0.14, 0.07, 0.35), Material.METAL, grey * 1.3, 1)
+            b.put(join([pole, arm, head]), edge - lamp_side * 0.3, s)
+        s += float(rng.uniform(22, 38))
+    for _ in range(int(rng.integers(1, 6))):
+        side = int(rng.choice([-1, 1]))
+        edge = road.flank_m[0] if side < 0 else road.flank_m[1]
+        where = float(rng.uniform(7, 60))
+        if b.free(where, 1.0):
+            b.put(_sign(rng), edge - side * float(rng.uniform(0.0, 0.5)), where)
+    for _ in range(int(rng.integers(0, 4))):
+        side = int(rng.choice([-1, 1]))
+        edge = road.flank_m[0] if side < 0 else road.flank_m[1]
+        where = float(rng.uniform(6, 50))
+        if b.free(where, 2.0):
+            b.put(_clutter(rng), edge + side * float(rng.uniform(0.6, 1.6)), where, float(rng.normal(0, 0.2)))
+
+
+def _sign(rng: np.random.Generator) -> Soup:
+    """A traffic sign on its pole, facing oncoming traffic (towards -x)."""
+    height = float(rng.uniform(2.1, 3.0))
+    grey = np.array([0.3, 0.31, 0.32])
+    parts = [stick((0, 0, 0), (0, -height, 0), (0.035, 0.035), Material.METAL, grey, 7)]
+    colours = np.array([[0.5, 0.03, 0.03], [0.7, 0.7, 0.68], [0.03, 0.09, 0.4], [0.7, 0.5, 0.03], [0.3, 0.3, 0.3]])
+    pick = rng.permutation(len(colours))
+    size = float(rng.uniform(0.3, 0.42))
+    sides = int(rng.choice([3, 4, 24]))
+    angle = np.arange(sides + 1) * 2 * np.pi / sides + {3: np.pi / 2, 4: np.pi / 4, 24: 0.0}[sides]
+    for scale, colour, out in ((1.0, colours[pick[0]], -0.05), (0.72, colours[pick[1]], -0.055)):
+        rim = np.stack([np.full_like(angle, out), -height + size - np.sin(angle) * size * scale,
+                        np.cos(angle) * size * scale], axis=1)
+        middle = np.broadcast_to([out, -height + size, 0.0], rim[:-1].shape)
+        corners = np.stack([middle, rim[:-1], rim[1:]], axis=1)
+        parts.append(make(corners, Material.FLAT, colour, np.broadcast_to([-1.0, 0, 0], corners.shape)))
+    return join(parts)
+
+
+def _clutter(rng: np.random.Generator) -> Soup:
+    """Bins, cabinets, containers, billboards: what a detector might take for a car."""
+    pool = np.array([[0.05, 0.05, 0.055], [0.12, 0.16, 0.1], [0.3, 0.3, 0.29], [0.35, 0.2, 0.05], [0.03, 0.06, 0.15],
+                     [0.3, 0.04, 0.04], [0.02, 0.02, 0.02]])  # fmt: skip
+    colour = pool[rng.integers(len(pool))] * rng.uniform(0.7, 1.3)
+    shape = int(rng.integers(5))
+    if shape == 0:
+        bins = [placed(box((0.55, 1.05, 0.6), Material.FLAT, colour * rng.uniform(0.7, 1.2)), (0.68 * i, 0, 0),
+                       float(rng.normal(0, 0.1)), (1, 1, 1)) for i in range(int(rng.integers(1, 4)))]
+        return join(bins)
+    if shape == 1:
+        return box((float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.9, 1.5)), 0.45), Material.FLAT, colour)
+    if shape == 2:
+        return box((float(rng.uniform(2.5, 5.0)), float(rng.uniform(1.4, 2.4)), float(rng.uniform(1.4, 2.2))),
+                   Material.FLAT, colour)  # fmt: skip
+    if shape == 3:
+        legs = [stick((x, 0, 0), (x, -1.0, 0), (0.05, 0.05), Material.METAL, np.full(3, 0.2)) for x in (-1.2, 1.2)]
+        board = placed(box((3.0, 1.6, 0.12), Material.FLAT, colour * 2.0), (0, -0.9, 0), 0.0, (1, 1, 1))
+        return placed(join([*legs, board]), (0, 0, 0), float(rng.uniform(0, 1.57)), (1, 1, 1))
+    posts = [placed(box((0.15, 0.9, 0.15), Material.FLAT, np.full(3, 0.35)), (1.5 * i, 0, 0), 0.0, (1, 1, 1))
+             for i in range(4)]  # fmt: skip
+    return join(posts)
+
+
+def surroundings(road: Road, pool: Pool, rng: np.random.Generator) -> tuple[Soup, dict[str, list[int]]]:
+    """Everything that does not move, and the ids of the shapes used, by kind."""
+    b = _Builder(road, pool, rng)
+    _ground(b)
+    left, right = road.flank_m
+    for side, edge in ((-1, left), (1, right)):
+        _flank(b, side, edge)
+    _street_furniture(b)
+    if road.kind in ("motorway", "country") and rng.random() < 0.6:
+        _guard_rail(b, right - 0.2)
+    if road.kind in ("motorway", "arterial") and rng.random() < (0.9 if road.kind == "motorway" else 0.4):
+        inner = [s for s in road.strips if s.material != Material.ROAD and s.d1 < 0 and s.d0 > left]
+        if inner:
+            _guard_rail(b, (inner[0].d0 + inner[0].d1) / 2)
+    for x0, z0, x1, z1, height in ((-160, 60, -20, 190, 13), (-60, 185, 60, 200, 11), (20, 190, 160, 60, 13)):
+        scale = float(rng.uniform(0.7, 1.5))
+        b.parts.append(flora.tree_line(np.array([x0, z0], float), np.array([x1, z1], float), height * scale, rng))
+    if rng.random() < 0.35:
+        _hill(b)
+    return join(b.parts), {k: sorted(v) for k, v in b.used.items()}
+
+
+def _flank(b: _Builder, side: int, edge: float) -> None:
+    """What stands beside the road on one side."""
+    rng, kind = b.rng, b.road.kind
+    if kind in ("residential", "city", "junction"):
+        draw = rng.random()
+        if draw < (0.75 if kind == "residential" else 0.25):
+            _houses(b, side, edge)
+        elif draw < 0.88:
+            _city_row(b, side, edge)
+        else:
+            _wood(b, side, edge)
+        if rng.random() < 0.45:
+            _tree_row(b, edge - side * float(rng.uniform(0.4, 0.9)), (8, 15), (6, 11))
+        return
+    draw = rng.random()
+    if draw < 0.5:
+        _wood(b, side, edge)
+    elif draw < 0.75:
+        _tree_row(b, edge + side * float(rng.uniform(1.5, 5)), (6, 16), (7, 13))
+        if rng.random() < 0.5:
+            _wood(b, side, edge + side * 14)
+    elif kind != "country" and draw < 0.9:
+        _city_row(b, side, edge + side * float(rng.uniform(4, 12)))
+        _tree_row(b, edge + side * float(rng.uniform(1.5, 3)), (10, 20), (6, 10))
+    else:
+        _houses(b, side, edge + side * float(rng.uniform(15, 35)))
+
+
+def _wood(b: _Builder, side: int, edge: float) -> None:
+    """A belt of trees and bushes."""
+    rng = b.rng
+    s = -4.0
+    density = float(rng.uniform(0.55, 1.0))
+    while s < 110:
+        step = 2.2 + 0.05 * max(s, 0.0)
+        if rng.random() < density:
+            _tree(b, edge + side * float(rng.uniform(2.5, 9)), s, float(rng.uniform(5, 12)))
+        if rng.random() < density:
+            _bush(b, edge + side * float(rng.uniform(1.2, 3.0)), s + 1.0, float(rng.uniform(1.0, 3.0)))
+        s += step
+
+
+def _hill(b: _Builder) -> None:
+    """A wooded ridge on the horizon."""
+    rng = b.rng
+    x = np.linspace(-420, 420, 60)
+    crest = np.interp(x, np.linspace(-420, 420, 9), rng.uniform(8, 60, 9)) * float(rng.uniform(0.5, 1.0))
+    z = 520 - 0.0004 * x**2
+    low, high = np.stack([x, np.zeros(60), z], 1), np.stack([x, -crest, z + 120], 1)
+    strip = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+    normal = np.array([0.0, -0.7, -0.7])
+    b.parts.append(make(strip.reshape(-1, 3, 3), Material.LEAF, np.array([0.06, 0.08, 0.035]),
+                        np.broadcast_to(normal, (118, 3, 3))))  # fmt: skip
+
+
+@lru_cache(maxsize=512)
+def _vehicle_soup(kind: str, variant: int, triangles: int) -> Soup:
+    """A template in its unit box with its parts' materials; painted faces keep their own tint (light grey)."""
+    mesh = template(kind, variant)
+    if triangles and mesh.faces.shape[0] > triangles:
+        mesh = simplify(mesh, triangles)
+    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
+    corners = vertices[faces]
+    colours = mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
+    part = mesh.part.numpy()
+    material = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)[part]
+    soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5))
+    soup.material[:] = material
+    soup.albedo[:] = np.power(np.clip(colours, 0, 1), 2.2)
+    soup.normals[:] = creased_normals(corners * np.array([4.0, 1.5, 1.7], np.float32))
+    return soup
+
+
+def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray:
+    """Corner normals (F, 3, 3): averaged over faces that meet at a point at less than the crease angle."""
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(flat, axis=1, keepdims=True)
+    unit = flat / np.maximum(area, 1e-12)
+    keys = np.round(corners.reshape(-1, 3) * 2000).astype(np.int64)
+    _, point = np.unique(keys, axis=0, return_inverse=True)
+    point = point.reshape(-1)
+    face = np.repeat(np.arange(len(corners)), 3)
+    order = np.argsort(point, kind="stable")
+    starts = np.searchsorted(point[order], np.arange(point.max() + 2))
+    counts = np.diff(starts)
+    summed = np.zeros((len(point), 3))
+    limit = np.cos(crease_rad)
+    for step in range(int(counts.max(initial=0))):
+        has = counts[point] > step
+        other = face[order[np.minimum(starts[point] + step, len(order) - 1)]]
+        close = has & ((unit[face] * unit[other]).sum(axis=1) > limit)
+        summed[close] += flat[other[close]]
+    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
+    return summed.reshape(-1, 3, 3).astype(np.float32)
+
+
+def actor_soup(actor: Actor, owner: int, distance_m: float, focal_px: float) -> Soup:
+    """An actor's triangles in its own axes (front +x, bottom at y = 0), in metres, painted.
+
+    distance_m, focal_px: choose the level of detail.
+    """
+    if actor.label in ("Pedestrian", "Cyclist"):
+        rng = np.random.default_rng([0x9E0, actor.seed])
+        figure = people.pedestrian(rng) if actor.kind == "pedestrian" else people.cyclist(rng)
+        scale = actor.size_lhw[1] / 1.75
+        soup = placed(figure, (0, 0, 0), 0.0, (scale, scale, scale))
+    else:
+        height_px = focal_px * actor.size_lhw[1] / max(distance_m, 1.0)
+        triangles = 0 if height_px > 60 else 1200 if height_px > 28 else 500
+        soup = placed(_vehicle_soup(actor.kind, actor.variant, triangles), (0, 0, 0), 0.0, actor.size_lhw)
+        albedo = soup.albedo.copy()
+        paint = soup.material == Material.PAINT
+        tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
+        albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
+        soup = Soup(soup.corners, soup.normals, soup.uv, soup.material, albedo, soup.pattern, soup.owner)
+    return Soup(soup.corners, soup.normals, soup.uv, soup.material, soup.albedo, soup.pattern,
+                np.full(len(soup), owner, np.int32))  # fmt: skip

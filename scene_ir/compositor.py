@@ -1,0 +1,568 @@
+"""Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all six kinds of parameter.
+
+A vehicle is drawn on two surfaces. Its *mesh* shows the photograph where the photograph saw that point, and completes
+what it did not see. Its *proxy*, the mesh inflated, carries what of the matte lies beyond the mesh. A pixel's lookup
+is `pixel + displacement`, the displacement interpolated from the difference of the clip coordinates then and now: with
+nothing perturbed it is exactly zero, every lookup falls on a pixel centre, and the picture is the photograph.
+
+Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its proxy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from scene_ir import blend, surfaces, texture
+from scene_ir.environment import apply_foliage, apply_weather, shadow_softening, sky_colour
+from scene_ir.errors import ShapeError
+from scene_ir.raster import verbs
+from scene_ir.surfaces import Fleet, Surface
+from scene_ir.texture import Texels, smoothstep
+from scene_ir.types import Crop, Objects, Render, SceneIR, Source
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class RenderSettings:
+    """backend: `warp` (float32, fast) or `reference` (plain torch, the scene's dtype, for gradient checks).
+    shadows: whether vehicles darken the ground.
+    """
+
+    backend: verbs.Backend = "warp"
+    shadows: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The objects of one scene, drawn but not yet blended.
+
+    layout: crops of the objects; colour (T, 4): premultiplied RGB and opacity / depth; opacity (T,); depth (T,) m.
+    shadow_layout, shadow (Ts, 3): the shadows' crops and factors.
+    """
+
+    layout: verbs.Layout
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    shadow_layout: verbs.Layout
+    shadow: Tensor
+
+
+def scene_to(value: T, dtype: torch.dtype, device: torch.device | str | None = None) -> T:
+    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`."""
+    return _convert(value, dtype, device)
+
+
+def _convert(value: Any, dtype: torch.dtype, device: torch.device | str | None) -> Any:
+    if isinstance(value, Tensor):
+        return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+    if isinstance(value, tuple):
+        return tuple(_convert(v, dtype, device) for v in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        changes = {
+            f.name: _convert(getattr(value, f.name), dtype, device)
+            for f in fields(value)
+            if not isinstance(getattr(value, f.name), (int, float, str, Mapping, type(None)))
+        }
+        return replace(value, **changes)
+    return value
+
+
+def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
+    """Render scenes as they stand. To render many perturbations of one scene, keep its `Compositor`."""
+    return [Compositor(scene, settings).render(scene) for scene in scenes]
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """Placed vertices. points (V, 3) m; normals (V, 3); clip (V, 3); cos (V,) towards the camera; the same of the proxy
+    (`shell_clip`, `shell_cos`); ground_clip (4N, 3), the shadows' patches."""
+
+    points: Tensor
+    clip: Tensor
+    cos: Tensor
+    shell_clip: Tensor
+    shell_cos: Tensor
+    ground_clip: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """What the z-buffers found for one perturbation. coverage (T,); shell, ground: fragments of proxies and patches."""
+
+    geometry: _Geometry
+    mesh: verbs.Fragments
+    coverage: Tensor
+    shell: verbs.Fragments
+    ground: verbs.Fragments
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Pixels to be coloured, mesh rows first, each part grouped by object.
+
+    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this row
+    fills; counts (2N,) int64 rows of each mesh, then of each proxy; fringe: see `_Fringe`.
+    """
+
+    pixel: Tensor
+    owner: Tensor
+    xy: Tensor
+    share: Tensor
+    counts: Tensor
+    mesh_rows: int
+    fringe: _Fringe
+
+
+@dataclass(frozen=True, slots=True)
+class _Fringe:
+    """Pixels that a mesh covers partly, but whose centres it misses: they continue what their neighbours show.
+
+    hit (Rm,) 1 or 0; row (K,) int64: rows to fill; neighbour (K, 4) int64 rows; weight (K, 4), 0 where there is none.
+    """
+
+    hit: Tensor
+    row: Tensor
+    neighbour: Tensor
+    weight: Tensor
+
+    def fill(self, values: Tensor) -> Tensor:
+        """Values (Rm, Q) with those of fringe rows replaced by the mean of the hit neighbours'."""
+        known = values * self.hit[:, None]
+        if self.row.numel() == 0:
+            return known
+        return known.index_add(0, self.row, (known[self.neighbour] * self.weight[..., None]).sum(dim=1))
+
+
+class Compositor:
+    """Draws perturbations of one scene; keeps what no parameter touches.
+
+    A perturbed scene may differ from `scene` in objects.translation, yaw, ffd, texture_code and in
+    environment.weather, foliage. With backend `warp` the scene is worked on in float32.
+    """
+
+    def __init__(
+        self, scene: SceneIR, settings: RenderSettings | None = None, hidden: Sequence[Tensor] | None = None
+    ) -> None:
+        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given."""
+        self.settings = settings or RenderSettings()
+        if self.settings.backend == "warp" and scene.photograph.dtype != torch.float32:
+            scene = scene_to(scene, torch.float32)
+        self.scene = scene
+        self._like = scene.photograph
+        self._frame_hw = (scene.camera.height, scene.camera.width)
+        self._centre = surfaces.camera_centre(scene.camera.matrix).to(self._like)
+        self._unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self._like)
+        self._air = sky_colour(scene.photograph, scene.environment.sky)
+        inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
+        self._canvas = torch.cat([scene.background, inverse.to(self._like)[None]])
+        with torch.no_grad():
+            self._prepare(scene.objects, hidden)
+
+    def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
+        """Everything that hangs on the unperturbed objects: normals, proxies, and what the photograph knows."""
+        picked = [Surface.of(self.scene.meshes[int(i)], self._like.dtype) for i in objects.mesh_index]
+        self._fleet = Fleet.of(picked, self._like)
+        base = _photographed(objects)
+        local = self._fleet.local(base.ffd, base.size_lhw)
+        self._sharp, self._smooth = self._fleet.normals(local)
+        inflation = self._like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
+        self._offset = inflation[self._fleet.owner][:, None] * self._smooth
+        self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
+        self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
+        self._size = base.size_lhw
+        self._base = self._place(base)
+        self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
+        self._texels, self._shadows = None, None
+        if objects.source:
+            self._prepare_sources(objects, base, hidden)
+
+    def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
+        drawn = self._draw(base)
+        mirrored = self._fleet.place(
+            self._fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
+        )
+        self._mirror_clip = surfaces.project_vertices(mirrored, self.scene.camera)
+        flipped = surfaces.rotate(
+            self._smooth * self._like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self._fleet.owner]
+        )
+        self._mirror_cos = surfaces.facing(mirrored, flipped, self._centre)
+        order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self._centre)
+        mattes = [replace(s.foreground, values=s.foreground.values[3:]) for s in objects.source]
+        crops = []
+        rects = drawn.mesh.layout.rects.tolist()
+        for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
+            before = [mattes[j] for j in order[order.index(i) + 1 :]]
+            unseen = hidden[i] if hidden else texture.hidden_behind(before, self._frame_hw, self._like)
+            x0, y0, x1, y1 = rects[i]
+            if x1 <= x0:
+                crops.append(Crop(self._like.new_zeros(texture.CHANNELS, 0, 0), 0, 0))
+                continue
+            depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
+            crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self._frame_hw))
+        self._texels = Texels.pack(crops + crops, self._like)
+        self._paint = torch.stack([s.paint for s in objects.source]).to(self._like)
+        self._paint_lightness = texture.lab(self._paint.clamp(0.0, 1.0))[:, 0]
+        self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
+
+    def _place(self, objects: Objects) -> _Geometry:
+        fleet, camera = self._fleet, self.scene.camera
+        local = fleet.local(objects.ffd, objects.size_lhw)
+        points = fleet.place(local, objects.yaw, objects.translation)
+        shell = fleet.place(local + self._offset, objects.yaw, objects.translation)
+        normals = surfaces.rotate(self._smooth, objects.yaw[fleet.owner])
+        ground = surfaces.place_on_ground(
+            self._corners, objects.yaw, objects.translation, self.scene.environment.ground
+        )
+        return _Geometry(
+            points,
+            surfaces.project_vertices(points, camera),
+            surfaces.facing(points, normals, self._centre),
+            surfaces.project_vertices(shell, camera),
+            surfaces.facing(shell, normals, self._centre),
+            surfaces.project_vertices(ground, camera),
+        )
+
+    def _draw(self, objects: Objects) -> _Drawn:
+        fleet, camera, backend = self._fleet, self.scene.camera, self.settings.backend
+        geometry = self._place(objects)
+        rects = surfaces.crop_rects(
+            geometry.shell_clip, fleet.faces, fleet.vertex_ranges, fleet.face_ranges, camera
+        )
+        layout = verbs.Layout.of(rects)
+        mesh = verbs.rasterize(geometry.clip, fleet.faces, fleet.face_ranges, layout, backend)
+        coverage = verbs.antialias(mesh, geometry.clip, fleet.faces, fleet.face_ranges, backend)
+        if objects.source:
+            shell = verbs.rasterize(geometry.shell_clip, fleet.faces, fleet.face_ranges, layout, backend)
+        else:
+            shell = mesh
+        faces, vertex_ranges, face_ranges = _patches(len(objects), self._like.device)
+        patch_rects = surfaces.crop_rects(
+            geometry.ground_clip, faces, vertex_ranges, face_ranges, camera, margin=0
+        )
+        shadowless = [not self.settings.shadows or bool(objects.source) and objects.source[i].shadow is None
+                      for i in range(len(objects))]  # fmt: skip
+        patch_rects[torch.tensor(shadowless, dtype=torch.bool)] = 0
+        ground_layout = verbs.Layout.of(patch_rects)
+        ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
+        return _Drawn(geometry, mesh, coverage, shell, ground)
+
+    def layers(self, objects: Objects) -> Layers:
+        """The objects drawn one by one, not yet blended."""
+        drawn = self._draw(objects)
+        rows = self._rows(drawn, bool(objects.source))
+        size = drawn.mesh.layout.size
+        if objects.source:
+            colour, opacity, depth, paint, height = self._photographed_rows(objects, drawn, rows)
+            lightness = self._paint_lightness
+        else:
+            own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
+            colour, depth, paint = self._own_colour(rows, own, None), own[:, 8], own[:, 6]
+            opacity, height = torch.ones_like(depth), own[:, 9]
+            lightness = torch.full_like(objects.yaw, 60.0)
+        if _active(objects.texture_code):
+            code = objects.texture_code.to(self._like)[rows.owner]
+            colour = texture.apply_texture_code(colour, opacity, code, paint, height, lightness[rows.owner])
+        opacity = opacity * rows.share
+        packed = torch.cat(
+            [colour * rows.share[:, None], (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]], dim=1
+        )
+        z = torch.full_like(drawn.mesh.depth, torch.inf).scatter_reduce(
+            0, rows.pixel, depth.detach(), "amin", include_self=True
+        )
+        return Layers(
+            drawn.mesh.layout,
+            packed.new_zeros(size, 4).index_add(0, rows.pixel, packed),
+            opacity.new_zeros(size).index_add(0, rows.pixel, opacity),
+            z,
+            drawn.ground.layout,
+            self._shadow_factors(objects, drawn),
+        )
+
+    def _rows(self, drawn: _Drawn, with_shell: bool) -> _Rows:
+        layout = drawn.mesh.layout
+        count = layout.rects.shape[0]
+        covered = drawn.coverage.detach()
+        hit = drawn.mesh.face >= 0
+        mesh_pixel = (hit | (covered > 0)).nonzero()[:, 0]
+        owner = layout.draw()
+        pixel, share = mesh_pixel, drawn.coverage[mesh_pixel]
+        counts = torch.bincount(owner[mesh_pixel], minlength=count)
+        if with_shell:
+            shell_pixel = ((drawn.shell.face >= 0) & (covered < 1)).nonzero()[:, 0]
+            pixel = torch.cat([mesh_pixel, shell_pixel])
+            share = torch.cat([share, 1.0 - drawn.coverage[shell_pixel]])
+            counts = torch.cat([counts, torch.bincount(owner[shell_pixel], minlength=count)])
+        rows_owner = owner[pixel]
+        x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
+        within, width = pixel - layout.offsets[rows_owner], x1 - x0
+        xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
+        fringe = _fringe(layout, hit, mesh_pixel, owner, self._like.dtype)
+        return _Rows(pixel, rows_owner, xy.to(self._like), share, counts, mesh_pixel.shape[0], fringe)
+
+    def _mesh_attributes(self, drawn: _Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+        """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
+        dense = verbs.interpolate(
+            drawn.mesh, drawn.geometry.clip, self._fleet.faces, attributes, self.settings.backend
+        )
+        return rows.fringe.fill(dense[rows.pixel[: rows.mesh_rows]])
+
+    def _photographed_rows(
+        self, objects: Objects, drawn: _Drawn, rows: _Rows
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Premultiplied colour (R, 3), opacity, depth m, paint and height (R,) of all rows."""
+        geometry, base, fleet = drawn.geometry, self._base, self._fleet
+        height, width = self._frame_hw
+        fixed = torch.stack([fleet.paint, self._height], dim=1)
+
+        def attributes(clip: Tensor, base_clip: Tensor, cos: Tensor, base_cos: Tensor) -> Tensor:
+            return torch.cat(
+                [base_clip - clip, base_clip[:, 2:], (cos - base_cos)[:, None], base_cos[:, None], fixed], dim=1
+            )
+
+        m = rows.mesh_rows
+        dense = verbs.interpolate(
+            drawn.mesh, geometry.clip, fleet.faces,
+            attributes(geometry.clip, base.clip, geometry.cos, base.cos), self.settings.backend,
+        )  # fmt: skip
+        mesh = rows.fringe.fill(_lookup(dense[rows.pixel[:m]], rows.xy[:m]))
+        dense = verbs.interpolate(
+            drawn.shell, geometry.shell_clip, fleet.faces,
+            attributes(geometry.shell_clip, base.shell_clip, geometry.shell_cos, base.shell_cos),
+            self.settings.backend,
+        )  # fmt: skip
+        shell = _lookup(dense[rows.pixel[m:]], rows.xy[m:])
+        move, z_then, z_now, turned, cos_then, paint, up = torch.cat([mesh, shell]).split(
+            [2, 1, 1, 1, 1, 1, 1], dim=1
+        )
+        z_then, z_now, turned, cos_then, paint, up = (
+            t[:, 0] for t in (z_then, z_now, turned, cos_then, paint, up)
+        )
+
+        assert self._texels is not None
+        uv = rows.xy + move
+        seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
+        alpha = seen[:, 3]
+        weight = (
+            texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * (1.0 - seen[:, 4])
+        )
+        behind = 1.0 - smoothstep(z_then[:m] - seen[:m, 6], *texture.DEPTH_TOLERANCE_M)
+        weight = weight * torch.cat([behind, seen[m:, 5]])
+        rim = 1.0 - smoothstep(cos_then[:m], 0.3, 0.5)
+        opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
+        fill = 1.0 - weight[:m] + weight[:m] * opened
+        colour = weight[:, None] * seen[:, :3]
+        opacity = weight * alpha
+        need = (fill != 0.0).nonzero()[:, 0]
+        if need.numel():
+            completed = self._completion(objects, drawn, rows, need, cos_then[:m] + turned[:m])
+            colour = colour.index_add(0, need, fill[need][:, None] * completed)
+            opacity = opacity.index_add(0, need, fill[need])
+        return colour, opacity, z_now, paint, up
+
+    def _own_attributes(self, objects: Objects, geometry: _Geometry) -> Tensor:
+        """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
+        fleet = self._fleet
+        normals = surfaces.rotate(self._sharp, objects.yaw[fleet.owner])
+        parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self._height)
+        return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
+
+    def _own_colour(self, rows: _Rows, own: Tensor, need: Tensor | None, paint: Tensor | None = None) -> Tensor:
+        """The templates' colours (K, 3) in daylight, for the rows `need` or all; paint: (N, 3) that tints the paint."""
+        xy, owner = (rows.xy, rows.owner) if need is None else (rows.xy[need], rows.owner[need])
+        albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
+        if paint is not None:
+            albedo = albedo * (1.0 + sheen[:, :1] * (paint[owner] - 1.0))
+        ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self._unproject.T
+        normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
+        to_eye = -torch.nn.functional.normalize(ray, dim=-1)
+        sun = self.scene.environment.sun.to(self._like)
+        return texture.shade(normal, to_eye, albedo, sheen, height, sun)
+
+    def _completion(self, objects: Objects, drawn: _Drawn, rows: _Rows, need: Tensor, cos_now: Tensor) -> Tensor:
+        """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the template.
+
+        cos_now: (Rm,) towards the camera.
+        """
+        own = self._own_attributes(objects, drawn.geometry)
+        mirror = torch.cat([self._mirror_clip, self._mirror_cos[:, None]], dim=1)
+        both = self._mesh_attributes(drawn, rows, torch.cat([own, mirror], dim=1))[need]
+        colour = self._own_colour(rows, both[:, :10], need, self._paint)
+        clip, cos_then = both[:, 10:13], both[:, 13]
+        z = clip[:, 2]
+        safe = z.clamp(min=0.1)
+        uv = clip[:, :2] / safe[:, None]
+        counts = torch.bincount(rows.owner[need], minlength=rows.counts.shape[0])
+        assert self._texels is not None
+        seen = self._texels.sample(uv, counts, self.settings.backend, "clamp")
+        height, width = self._frame_hw
+        weight = (
+            texture.inside_weight(uv, height, width)
+            * (1.0 - seen[:, 4]).clamp(min=0.0)
+            * smoothstep(seen[:, 3], 0.5, 0.95)
+            * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
+            * texture.facing_weight(cos_now[need] - cos_then, cos_then)
+            * smoothstep(cos_then, 0.05, 0.2)
+        )
+        straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
+        return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
+
+    def _shadow_factors(self, objects: Objects, drawn: _Drawn) -> Tensor:
+        """Factors (Ts, 3) on the ground, of all patches."""
+        clip, layout = drawn.geometry.ground_clip, drawn.ground.layout
+        if layout.size == 0:
+            return clip.new_zeros(0, 3)
+        faces, _, _ = _patches(len(objects), clip.device)
+        if not objects.source:
+            local, hit, owner = self.ground_local(drawn)
+            density = surfaces.shadow_density(local, self._size[owner], self._sun_offset[owner])
+            return (1.0 - density * hit)[:, None].expand(-1, 3)
+        base = self._base.ground_clip
+        fixed = torch.cat([base - clip, base[:, 2:]], dim=1)
+        dense = verbs.interpolate(drawn.ground, clip, faces, fixed, self.settings.backend)
+        hit = (drawn.ground.face >= 0).nonzero()[:, 0]
+        xy = layout.pixels()[hit].to(self._like)
+        uv = xy + _lookup(dense[hit], xy)[:, :2]
+        counts = torch.bincount(layout.draw()[hit], minlength=len(objects))
+        assert self._shadows is not None
+        dark = self._shadows.sample(uv, counts, self.settings.backend, "zero")
+        height, width = self._frame_hw
+        dark = dark * texture.inside_weight(uv, height, width)[:, None]
+        return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
+
+    def ground_local(self, drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the patches' pixels: (x, z) (Ts, 2) m in the object's frame, hit (Ts,) 1 or 0, owner (Ts,)."""
+        clip = drawn.geometry.ground_clip
+        faces, _, _ = _patches(self._corners.shape[0], clip.device)
+        local = verbs.interpolate(
+            drawn.ground, clip, faces, self._corners.reshape(-1, 2).contiguous(), self.settings.backend
+        )
+        return local, (drawn.ground.face >= 0).to(clip), drawn.ground.layout.draw()
+
+    def render(self, perturbed: SceneIR) -> Render:
+        """The picture of a perturbed scene; with nothing perturbed, the photograph."""
+        objects = perturbed.objects
+        if len(objects) != len(self.scene.objects):
+            raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
+        objects = scene_to(objects, self._like.dtype, self._like.device)
+        environment = perturbed.environment
+        weather, foliage = _active(environment.weather), _active(environment.foliage)
+        canvas = self._canvas
+        if foliage:
+            changed = replace(self.scene.environment, foliage=environment.foliage.to(self._like))
+            canvas = torch.cat([apply_foliage(canvas[:3], changed, self._air), canvas[3:]])
+        opacity: tuple[Crop, ...] = ()
+        with torch.no_grad():
+            depth = self.scene.depth.clone()
+            object_id = torch.zeros(self._frame_hw, dtype=torch.int64, device=depth.device)
+        if len(objects):
+            layers = self.layers(objects)
+            factors = layers.shadow
+            if weather:
+                factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self._like))
+            order = blend.paint_order(objects.size_lhw, objects.yaw, objects.translation, self._centre)
+            spans = blend.spans(layers.layout.rects, layers.layout.offsets)
+            shadow_spans = blend.spans(layers.shadow_layout.rects, layers.shadow_layout.offsets)
+            plan = blend.Plan(
+                tuple(s for s in shadow_spans if min(s[2]) > 0),
+                tuple(spans[i] for i in order if min(spans[i][2]) > 0),
+            )
+            canvas = blend.blend(canvas, factors, layers.colour, layers.opacity, plan)
+            _mark(layers, spans, order, depth, object_id)
+            opacity = tuple(
+                Crop(layers.opacity[packed].reshape(1, *size).clamp(0.0, 1.0), window[1].start, window[0].start)
+                for packed, window, size in spans
+            )
+        image = canvas[:3]
+        if weather:
+            changed = replace(self.scene.environment, weather=environment.weather.to(self._like))
+            image = apply_weather(image, canvas[3], changed, self._air)
+        return Render(image.clamp(0.0, 1.0), depth, object_id, opacity)
+
+
+def _photographed(objects: Objects) -> Objects:
+    """The objects at the geometry of their sources."""
+    if not objects.source:
+        return objects
+    names = ("translation", "yaw", "size_lhw", "ffd")
+    return replace(
+        objects, **{n: torch.stack([getattr(s, n) for s in objects.source]).to(objects.yaw) for n in names}
+    )
+
+
+def _darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
+    """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches there."""
+    if shadow is None or shadow.values.numel() == 0:
+        return Crop(torch.zeros(3, 0, 0), 0, 0)
+    h, w = shadow.values.shape[1:]
+    dark = replace(shadow, values=1.0 - shadow.values)
+    rect = (shadow.x0 - 2, shadow.y0 - 2, shadow.x0 + w + 2, shadow.y0 + h + 2)
+    return Crop(texture.crop_of(dark, rect, frame_hw), rect[0], rect[1])
+
+
+def _patches(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Faces (2N, 3), vertex and face ranges (N, 2) of the shadows' patches, four corners each."""
+    start = torch.arange(count, device=device)[:, None]
+    faces = (4 * start + torch.tensor([0, 1, 2, 0, 2, 3], device=device)).reshape(-1, 3)
+    return faces, torch.cat([4 * start, 4 * start + 4], dim=1), torch.cat([2 * start, 2 * start + 2], dim=1)
+
+
+def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
+    """From interpolated clip differences to where the photograph shows this point.
+
+    attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px
+    -> (R, 4 + K): displacement in px (2), w then, w now, and the K more. A point that was behind the camera is looked up
+    far outside the photograph.
+    """
+    delta, then = attributes[:, :3], attributes[:, 3:4]
+    before = then > verbs.NEAR_M
+    safe = torch.where(before, then, torch.ones_like(then))
+    moved = (delta[:, :2] - xy * delta[:, 2:]) / safe
+    moved = torch.where(before, moved, torch.full_like(moved, 1e5))
+    return torch.cat([moved, then, then - delta[:, 2:], attributes[:, 4:]], dim=1)
+
+
+def _fringe(layout: verbs.Layout, hit: Tensor, mesh_pixel: Tensor, owner: Tensor, dtype: torch.dtype) -> _Fringe:
+    """Of the mesh rows, those whose pixel centres are missed, and the rows of their hit 4-neighbours."""
+    row_hit = hit[mesh_pixel]
+    row = (~row_hit).nonzero()[:, 0]
+    pixel = mesh_pixel[row]
+    draw = owner[pixel]
+    x0, y0, x1, y1 = layout.rects[draw].unbind(-1)
+    width, within = x1 - x0, pixel - layout.offsets[draw]
+    column, line = within % width, within // width
+    steps = torch.stack([torch.full_like(width, -1), torch.ones_like(width), -width, width], dim=1)
+    exists = torch.stack([column > 0, column < width - 1, line > 0, line < y1 - y0 - 1], dim=1)
+    neighbour = torch.where(exists, pixel[:, None] + steps, pixel[:, None])
+    known = exists & hit[neighbour]
+    rank = torch.zeros_like(hit, dtype=torch.int64)
+    rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=hit.device)
+    weight = known.to(dtype) / known.sum(dim=1, keepdim=True).clamp(min=1).to(dtype)
+    return _Fringe(row_hit.to(dtype), row, rank[neighbour], weight)
+
+
+def _active(code: Tensor) -> bool:
+    """Whether a code has to be applied: it is not 0, or somebody wants its gradient."""
+    return code.requires_grad or bool((code.detach() != 0).any())
+
+
+def _mark(
+    layers: Layers, spans: Sequence[blend.Span], order: Sequence[int], depth: Tensor, object_id: Tensor
+) -> None:
+    """Write the depth and number of the front-most objects whose opacity is at least one half."""
+    with torch.no_grad():
+        for i in order:
+            packed, (rows, columns), size = spans[i]
+            if min(size) == 0:
+                continue
+            solid = (layers.opacity[packed] >= 0.5).reshape(size)
+            object_id[rows, columns] = torch.where(solid, i + 1, object_id[rows, columns])
+            depth[rows, columns] = torch.where(
+                solid, layers.depth[packed].reshape(size).to(depth), depth[rows, columns]
+            )

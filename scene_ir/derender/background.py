@@ -1,0 +1,258 @@
+"""What stood behind the cars: holes filled by copying patches of the same photograph, coarse to fine.
+
+The fill is Wexler's space-time completion (CVPR 2004) with the randomised nearest-neighbour search of PatchMatch
+(Barnes 2009). Copies prefer sources at the same height above or below the horizon, where a road's texture has the
+same scale. Everything is numpy: the same input and seed give the same bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_STEPS = (-3, -1, 0, 1, 3)
+_PATTERN = np.array([(dy, dx) for dy in _STEPS for dx in _STEPS if abs(dy) + abs(dx) < 6], np.int64)
+"""Sample points of a 7x7 patch: 21 of 49 tell as much of it at less than half the price."""
+_RADIUS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class FillSettings:
+    """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds at
+    the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far away
+    costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's border.
+    """
+
+    coarsest_radius: float = 4.0
+    max_levels: int = 6
+    iterations: tuple[int, int] = (10, 2)
+    row_weight: float = 0.1
+    column_weight: float = 0.004
+    confidence_px: float = 12.0
+
+
+def push_pull(image: Image, known: NDArray[np.float32]) -> Image:
+    """Smooth interpolation into unknown pixels. image (H, W, C), known (H, W) in [0, 1] -> (H, W, C).
+
+    The pyramid of Gortler's lumigraph (SIGGRAPH 1996): weighted averages go up, fill what is missing on the way down.
+    """
+    height, width = known.shape
+    if min(height, width) <= 2 or bool((known > 0.999).all()):
+        mean = (image * known[..., None]).sum((0, 1)) / max(float(known.sum()), 1e-6)
+        return (image * known[..., None] + mean * (1 - known[..., None])).astype(np.float32)
+    half = ((width + 1) // 2, (height + 1) // 2)
+    weight = cv2.resize(cv2.GaussianBlur(known, (5, 5), 0), half, interpolation=cv2.INTER_AREA)
+    colour = cv2.resize(cv2.GaussianBlur(image * known[..., None], (5, 5), 0), half, interpolation=cv2.INTER_AREA)
+    colour = colour.reshape(half[1], half[0], -1) / np.maximum(weight, 1e-6)[..., None]
+    coarse = push_pull(colour.astype(np.float32), np.minimum(weight * 4, 1).astype(np.float32))
+    up = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR).reshape(height, width, -1)
+    return (image * known[..., None] + up * (1 - known[..., None])).astype(np.float32)
+
+
+def fill(
+    image: Image,
+    hole: Mask,
+    forbidden: Mask,
+    horizon: float,
+    seed: int = 0,
+    settings: FillSettings | None = None,
+) -> Image:
+    """The image with `hole` filled from pixels that are not `forbidden`.
+
+    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row, px
+    -> (H, W, 3) in [0, 1], equal to the image outside the hole.
+    """
+    settings = settings or FillSettings()
+    if not hole.any():
+        return image.copy()
+    forbidden = forbidden | hole
+    pyramid = [(image.astype(np.float32), hole, forbidden)]
+    while len(pyramid) < settings.max_levels and min(pyramid[-1][1].shape) >= 48:
+        level_image, level_hole, level_forbidden = pyramid[-1]
+        if float(_distance(level_hole).max()) <= settings.coarsest_radius:
+            break
+        pyramid.append(_halve(level_image, level_hole, level_forbidden))
+    rng = np.random.default_rng(seed)
+    source: NDArray[np.int64] | None = None
+    current = pyramid[-1][0]
+    for index in reversed(range(len(pyramid))):
+        level_image, level_hole, level_forbidden = pyramid[index]
+        if source is None:
+            start = row_mirror(level_image, level_forbidden)
+        else:
+            size = (level_image.shape[1], level_image.shape[0])
+            start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
+        start = np.where(level_hole[..., None], start, level_image)
+        share = index / max(len(pyramid) - 1, 1)
+        rounds = round(settings.iterations[1] + (settings.iterations[0] - settings.iterations[1]) * share)
+        level = _Level(start, level_hole, level_forbidden, horizon / 2**index, 2**index, settings)
+        current, source = level.run(source, rounds, rng)
+    return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
+
+
+def row_mirror(image: Image, unknown: Mask) -> Image:
+    """A first guess: each unknown pixel copies the known one mirrored at the nearer end of the hole in its row.
+
+    image (H, W, 3), unknown (H, W) -> (H, W, 3). Streets run on sideways behind a car: hedge, wall, kerb, road.
+    """
+    height, width = unknown.shape
+    columns = np.broadcast_to(np.arange(width), unknown.shape)
+    left = np.maximum.accumulate(np.where(unknown, -1, columns), axis=1)
+    right = np.minimum.accumulate(np.where(unknown, width, columns)[:, ::-1], axis=1)[:, ::-1]
+    from_left = np.where(left >= 0, columns - left, 4 * width)
+    from_right = np.where(right < width, right - columns, 4 * width)
+    mirrored = np.where(from_left <= from_right, left - from_left, right + from_right)
+    nearest = np.where(from_left <= from_right, left, right).clip(0, width - 1)
+    mirrored = np.where((mirrored >= 0) & (mirrored < width), mirrored, nearest)
+    rows = np.broadcast_to(np.arange(height)[:, None], unknown.shape)
+    mirrored = np.where(unknown[rows, mirrored], nearest, mirrored)
+    smooth = push_pull(image, (~unknown).astype(np.float32))
+    found = (unknown & ~unknown[rows, mirrored])[..., None]
+    return np.where(found, image[rows, mirrored], np.where(unknown[..., None], smooth, image))
+
+
+def _distance(mask: Mask) -> NDArray[np.float32]:
+    """Distance (H, W) px of each pixel in the mask to the nearest one outside."""
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+
+
+def _halve(image: Image, hole: Mask, forbidden: Mask) -> tuple[Image, Mask, Mask]:
+    """The next coarser level: colours averaged over allowed pixels only, masks by maximum."""
+    size = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
+    allowed = (~forbidden).astype(np.float32)
+    weight = cv2.resize(allowed, size, interpolation=cv2.INTER_AREA)
+    colour = cv2.resize(image * allowed[..., None], size, interpolation=cv2.INTER_AREA)
+    plain = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    colour = np.where(weight[..., None] > 0.2, colour / np.maximum(weight, 1e-6)[..., None], plain)
+    half_hole = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    return colour.astype(np.float32), half_hole, (weight < 0.5) | half_hole
+
+
+class _Level:
+    """One pyramid level of the completion: the current image, its target pixels, and their search for sources."""
+
+    def __init__(
+        self, image: Image, hole: Mask, forbidden: Mask, horizon: float, scale: int, settings: FillSettings
+    ) -> None:
+        self.settings = settings
+        pad = _RADIUS
+        self.pad = pad
+        self.padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REFLECT)
+        self.height, self.width = hole.shape
+        self.stride = self.width + 2 * pad
+        kernel = np.ones((2 * _RADIUS + 1, 2 * _RADIUS + 1), np.uint8)
+        blocked = cv2.dilate(forbidden.astype(np.uint8), kernel).astype(bool)
+        if blocked.all():
+            blocked = forbidden
+        self.allowed = ~blocked
+        self.hole = hole
+        target = cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        self.rows, self.columns = np.nonzero(target)
+        self.index = np.full(hole.shape, -1, np.int64)
+        self.index[target] = np.arange(self.rows.size)
+        self.offsets = _PATTERN[:, 0] * self.stride + _PATTERN[:, 1]
+        self.horizon = horizon
+        self.reach = np.maximum(np.abs(self.rows - horizon), 24 / scale).astype(np.float32)
+        self.column_unit = 200.0 / scale
+        self.confidence = np.exp(-_distance(hole)[target] * scale / settings.confidence_px).astype(np.float32)
+        self.confidence = np.maximum(self.confidence, 1e-4)
+
+    def _flat(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (rows + self.pad) * self.stride + columns + self.pad
+
+    def _patches(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        return self.padded.reshape(-1, 3)[self._flat(rows, columns)[:, None] + self.offsets].reshape(rows.size, -1)
+
+    def _cost(
+        self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Cost of source positions for the targets `which`; infinite where copying is not allowed."""
+        difference = self._patches(rows, columns) - self.target_patches[which]
+        colour = np.einsum("pk,pk->p", difference, difference) / len(_PATTERN)
+        dy = (rows - self.rows[which]) / self.reach[which]
+        dx = (columns - self.columns[which]) / self.column_unit
+        cost = colour + self.settings.row_weight * dy * dy + self.settings.column_weight * dx * dx
+        return np.where(self.allowed[rows, columns], cost, np.inf).astype(np.float32)
+
+    def _try(self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
+        """Take the proposed sources where they are better."""
+        rows = np.clip(rows, 0, self.height - 1)
+        columns = np.clip(columns, 0, self.width - 1)
+        cost = self._cost(which, rows, columns)
+        better = cost < self.best[which]
+        chosen = which[better]
+        self.source[chosen, 0], self.source[chosen, 1] = rows[better], columns[better]
+        self.best[chosen] = cost[better]
+
+    def _start(self, coarse: NDArray[np.int64] | None, rng: np.random.Generator) -> None:
+        """First sources: the coarser level's, else anywhere in the rows around."""
+        everything = np.arange(self.rows.size)
+        allowed_rows, allowed_columns = np.nonzero(self.allowed)
+        pick = rng.integers(0, allowed_rows.size, self.rows.size)
+        self.source = np.stack([allowed_rows[pick], allowed_columns[pick]], 1)
+        self.best = self._cost(everything, self.source[:, 0], self.source[:, 1])
+        if coarse is not None:
+            up = coarse[np.minimum(self.rows // 2, coarse.shape[0] - 1), np.minimum(self.columns // 2, coarse.shape[1] - 1)]
+            parity = np.stack([self.rows % 2, self.columns % 2], 1)
+            proposed = np.where(up >= 0, 2 * up + parity, self.source)
+            self._try(everything, proposed[:, 0], proposed[:, 1])
+
+    def _search(self, rng: np.random.Generator, step: int) -> None:
+        """One round: neighbours' offsets, then random positions in shrinking windows."""
+        everything = np.arange(self.rows.size)
+        for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            dy, dx = dy * step, dx * step
+            rows, columns = self.rows + dy, self.columns + dx
+            inside = (rows >= 0) & (rows < self.height) & (columns >= 0) & (columns < self.width)
+            neighbour = np.where(inside, self.index[rows.clip(0, self.height - 1), columns.clip(0, self.width - 1)], -1)
+            which = everything[neighbour >= 0]
+            near = neighbour[which]
+            self._try(which, self.source[near, 0] - dy, self.source[near, 1] - dx)
+        radius = float(max(self.width, self.height))
+        while radius >= 1:
+            spread_y = np.minimum(radius, 0.5 * self.reach + 2)
+            rows = self.source[:, 0] + rng.uniform(-1, 1, self.rows.size) * spread_y
+            columns = self.source[:, 1] + rng.uniform(-1, 1, self.rows.size) * radius
+            self._try(everything, np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
+            radius /= 3
+
+    def _vote(self) -> None:
+        """Each hole pixel becomes the trust-weighted mean of what the patches around it say."""
+        flat = self.padded.reshape(-1, 3)
+        weight = self.confidence / (self.best + 0.002)
+        total = np.zeros((self.padded.shape[0] * self.stride, 3), np.float64)
+        mass = np.zeros(self.padded.shape[0] * self.stride, np.float64)
+        target = self._flat(self.rows, self.columns)
+        source = self._flat(self.source[:, 0], self.source[:, 1])
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                offset = dy * self.stride + dx
+                share = weight * (1.0 if dy == dx == 0 else 0.5)
+                np.add.at(mass, target + offset, share)
+                for channel in range(3):
+                    np.add.at(total[:, channel], target + offset, share * flat[source + offset, channel])
+        inner = self._flat(*np.nonzero(self.hole))
+        flat[inner] = (total[inner] / np.maximum(mass[inner], 1e-12)[:, None]).astype(np.float32)
+
+    def run(
+        self, coarse: NDArray[np.int64] | None, rounds: int, rng: np.random.Generator
+    ) -> tuple[Image, NDArray[np.int64]]:
+        """Alternate search and vote. -> the image (H, W, 3) and the sources (H, W, 2), -1 where nothing is filled."""
+        everything = (self.rows, self.columns)
+        self.target_patches = self._patches(*everything)
+        self._start(coarse, rng)
+        for round_index in range(rounds):
+            self._search(rng, 1 if round_index % 2 == 0 else 2)
+            self._vote()
+            self.target_patches = self._patches(*everything)
+            self.best = self._cost(np.arange(self.rows.size), self.source[:, 0], self.source[:, 1])
+        dense = np.full((self.height, self.width, 2), -1, np.int64)
+        dense[everything] = self.source
+        pad = self.pad
+        return self.padded[pad:-pad, pad:-pad], dense

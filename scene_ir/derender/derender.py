@@ -1,0 +1,268 @@
+"""From one labelled photograph to a scene whose vehicles can be moved: `derender(frame) -> SceneIR`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scene_ir.derender import background as fills
+from scene_ir.derender import maps, shadow, silhouette
+from scene_ir.derender.matte import matte
+from scene_ir.derender.silhouette import Placement
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.geometry import project_boxes
+from scene_ir.raster import verbs
+from scene_ir.types import (
+    FOLIAGE_DIM,
+    LATTICE_POINTS,
+    TEXTURE_DIM,
+    WEATHER_DIM,
+    Camera,
+    Category,
+    Environment,
+    Frame,
+    Labels,
+    Mesh,
+    Objects,
+    SceneIR,
+)
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
+"""Labels that become objects; all others stay in the background. Vans count as cars, as in the paper."""
+
+
+@dataclass(frozen=True, slots=True)
+class DerenderSettings:
+    """fit: move templates until their outlines meet the masks. min_height_px: smaller vehicles stay background.
+    min_iou: below this agreement of mask and template the template's outline is the mask. max_inflation: of the
+    proxy that carries the matte, as a fraction of the car's height. min_reach_px: how far it reaches at least.
+    seed: of the fill's random search. backend: of the renderer.
+    """
+
+    fit: bool = True
+    min_height_px: float = 12.0
+    min_iou: float = 0.6
+    max_inflation: float = 0.12
+    min_reach_px: float = 4.0
+    seed: int = 0
+    backend: verbs.Backend = "warp"
+    fitting: silhouette.FitSettings = field(default_factory=silhouette.FitSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """One car cut out: its label's row, the fitted placement, the mask, and how well they agree."""
+
+    row: int
+    placement: Placement
+    mask: Mask
+    unknown: Mask
+    agreement: float
+
+
+def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
+    """Take a photograph apart into vehicles, their shadows, and what stood behind them.
+
+    frame: with labels; Car, Van and Truck with a 3D pose become objects, in the labels' order. Masks and depth of
+    the frame, where given, are used instead of estimates. Raises ShapeError without labels, RangeError for a labelled
+    box behind the camera. The unperturbed render of the result is the photograph.
+    """
+    settings = settings or DerenderSettings()
+    if frame.labels is None:
+        raise ShapeError(f"frame {frame.identifier}: labels", "labels with 3D boxes", "none")
+    labels, camera = frame.labels, frame.camera
+    rows = _vehicle_rows(frame.identifier, labels, camera, settings)
+    image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
+    ground = maps.fit_ground(labels, _posed_rows(labels))
+    cuts = _cut_out(image, frame, rows, settings)
+    vehicles = np.zeros(image.shape[:2], bool)
+    for cut in cuts:
+        vehicles |= silhouette.grow(cut.mask, 2)
+    horizon = maps.horizon_row(ground, camera)
+    road = maps.road_map(image, horizon, vehicles)
+    layers = _layers(image, cuts, vehicles, road, ground, horizon, camera, settings.seed)
+    background, mattes, shadows = layers
+    environment, depth = _environment(background, ground, horizon, camera, vehicles)
+    if frame.depth is not None:
+        depth = frame.depth.float()
+    return _assemble(frame, cuts, (background, mattes, shadows), environment, depth, settings)
+
+
+def _posed_rows(labels: Labels) -> list[int]:
+    """Rows whose 3D box is known: KITTI writes -1 for sizes and -1000 for places it does not know."""
+    known = (labels.size_lhw > 0).all(1) & (labels.translation[:, 2] > -900)
+    return [int(i) for i in known.nonzero()[:, 0]]
+
+
+def _vehicle_rows(identifier: str, labels: Labels, camera: Camera, settings: DerenderSettings) -> list[int]:
+    """Rows of the labels that become objects."""
+    rows = [i for i in _posed_rows(labels) if labels.kind[i] in VEHICLES]
+    boxes = project_boxes(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows], camera.matrix)
+    kept = []
+    for row, box in zip(rows, boxes, strict=True):
+        if not bool(torch.isfinite(box).all()):
+            place = f"frame {identifier}: label {row} ({labels.kind[row]})"
+            raise RangeError(place, "a 3D box in front of the camera", labels.translation[row].tolist())
+        shown_width = min(float(box[2]), camera.width - 1) - max(float(box[0]), 0)
+        shown_height = min(float(box[3]), camera.height - 1) - max(float(box[1]), 0)
+        if shown_height >= settings.min_height_px and shown_width >= settings.min_height_px / 2:
+            kept.append(row)
+    return kept
+
+
+def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSettings) -> list[_Cut]:
+    """Masks and fitted placements, near to far, so that what a nearer car hides is known to be hidden."""
+    labels, camera = frame.labels, frame.camera
+    assert labels is not None
+    bytes_image = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+    order = sorted(rows, key=lambda row: (float(labels.translation[row, [0, 2]].norm()), row))
+    unknown = _hidden_by_others(labels, order, camera)
+    chosen: list[Placement] = []
+    masks: list[Mask] = []
+    hidden: list[Mask] = []
+    kept: list[int] = []
+    for row in order:
+        size = labels.size_lhw[row]
+        kinds = silhouette.candidates(labels.kind[row], size.tolist())
+        options = [silhouette.placed(k, labels.translation[row], labels.yaw[row], size) for k in kinds]
+        outlines = silhouette.silhouettes(options, camera, settings.backend)
+        if not outlines[0].any():
+            continue
+        mine = unknown[row] | _union(masks, image.shape[:2])
+        height = _height(outlines[0])
+        if frame.masks is not None:
+            mask = (frame.masks[row] > 0.5).numpy() & ~mine
+        else:
+            band = (0.10 * height + 1.0, 0.07 * height + 1.5)
+            mask = silhouette.instance_mask(bytes_image, outlines[0], mine, band)
+            mask &= _label_box(labels, row, mask.shape)
+        scores = [silhouette.iou(outline, mask, mine) for outline in outlines]
+        best = int(np.argmax(scores))
+        if scores[best] < settings.min_iou:
+            mask = outlines[best] & ~mine
+        if not mask.any():
+            continue
+        kept.append(row)
+        chosen.append(options[best])
+        masks.append(mask)
+        hidden.append(mine)
+    if settings.fit:
+        chosen = silhouette.fit(chosen, masks, hidden, camera, settings.fitting, settings.backend)
+    outlines = silhouette.silhouettes(chosen, camera, settings.backend)
+    cuts: list[_Cut] = []
+    for index, row in enumerate(kept):
+        mine = unknown[row] | _union([c.mask for c in cuts], image.shape[:2])
+        mask, outline = masks[index] & ~mine, outlines[index]
+        if frame.masks is None and settings.fit:
+            width = 0.025 * _height(outline) + 1.5
+            closer = silhouette.instance_mask(bytes_image, outline, mine, (width, width))
+            closer &= _label_box(labels, row, mask.shape)
+            if silhouette.iou(closer, outline, mine) >= settings.min_iou:
+                mask = closer
+        if mask.any():
+            agreement = silhouette.iou(mask, outline, mine)
+            cuts.append(_Cut(row, chosen[index], mask, mine, agreement))
+    return sorted(cuts, key=lambda cut: cut.row)
+
+
+def _hidden_by_others(labels: Labels, rows: list[int], camera: Camera) -> dict[int, Mask]:
+    """For each vehicle the pixels of nearer people: the middle of their boxes, which the car cannot own."""
+    shape = (camera.height, camera.width)
+    people = [i for i in _posed_rows(labels) if labels.kind[i] not in VEHICLES]
+    hidden = {}
+    for row in rows:
+        mask = np.zeros(shape, bool)
+        for other in people:
+            if float(labels.translation[other, 2]) < float(labels.translation[row, 2]):
+                x0, y0, x1, y1 = (round(v) for v in labels.boxes_xyxy[other].tolist())
+                mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = True
+        hidden[row] = mask
+    return hidden
+
+
+def _label_box(labels: Labels, row: int, shape: tuple[int, int]) -> Mask:
+    """Pixels inside the label's 2D box and a little around: hand-drawn, it is tight to a few px."""
+    x0, y0, x1, y1 = labels.boxes_xyxy[row].tolist()
+    slack = 2.0 + 0.02 * (y1 - y0)
+    inside = np.zeros(shape, bool)
+    inside[max(int(y0 - slack), 0) : int(y1 + slack) + 2, max(int(x0 - slack), 0) : int(x1 + slack) + 2] = True
+    return inside
+
+
+def _union(masks: Sequence[Mask], shape: tuple[int, ...]) -> Mask:
+    """Pixels of any of the masks."""
+    return np.logical_or.reduce(masks) if masks else np.zeros(shape, bool)
+
+
+def _height(mask: Mask) -> int:
+    """Height, px, of what is not empty."""
+    _, top, _, bottom = silhouette.extent(mask)
+    return bottom - top
+
+
+def _layers(
+    image: Array,
+    cuts: list[_Cut],
+    vehicles: Mask,
+    road: Array,
+    ground: torch.Tensor,
+    horizon: float,
+    camera: Camera,
+    seed: int,
+) -> tuple[Array, list[Array], list[Array]]:
+    """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W) and shadow factors (H, W, 3) of the cars."""
+    if not cuts:
+        return image, [], []
+    distances = [shadow.footprint_distance(cut.placement, ground, camera) for cut in cuts]
+    shaded = shadow.find(image, road, vehicles, distances)
+    hole = vehicles.copy()
+    for cut, region in zip(cuts, shaded, strict=True):
+        hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4)
+    filled = fills.fill(image, hole, silhouette.grow(hole, 2), horizon, seed)
+    mattes = [matte(image, cut.mask, cut.unknown) for cut in cuts]
+    opaque = np.max(mattes, axis=0)
+    shadow_share = np.zeros(image.shape[:2], np.float32)
+    for region in shaded:
+        inner = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+        shadow_share = np.maximum(shadow_share, np.clip(1.25 - inner / 2.5, 0, 1))
+    replaced = np.clip(np.maximum(shadow_share, opaque * 50), 0, 1)[..., None]
+    mixed = image + (filled - image) * replaced
+    # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
+    only_shadow = (opaque == 0)[..., None]
+    mixed = np.where(only_shadow, np.maximum(mixed, image), mixed)
+    background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
+    near = np.stack(distances).argmin(0)
+    factors = [
+        shadow.factors(image, background, (shadow_share > 0) & (near == i) & (opaque < 1), cut.mask, distances[i])
+        for i, cut in enumerate(cuts)
+    ]
+    return background, mattes, factors
+
+
+def _environment(
+    background: Array, ground: torch.Tensor, horizon: float, camera: Camera, vehicles: Mask
+) -> tuple[Environment, torch.Tensor]:
+    """Maps and depth of the background."""
+    nothing = np.zeros(vehicles.shape, bool)
+    sky = maps.sky_map(background, horizon, nothing)
+    road = maps.road_map(background, horizon, nothing)
+    foliage = maps.foliage_map(background, sky, road, nothing)
+    depth = maps.depth_map(maps.plane_depth(ground, camera), road, sky, horizon)
+    # Vehicles cover both: their pixels must not change with season or weather of what is behind them.
+    sky, foliage = np.where(vehicles, 0, sky), np.where(vehicles, 0, foliage)
+    environment = Environment(
+        torch.zeros(WEATHER_DIM),
+        torch.zeros(FOLIAGE_DIM),
+        maps.sun_direction(),
+        ground,
+        *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, foliage, road)),
+    )
+    return environment, torch.from_numpy(depth)

@@ -1,0 +1,334 @@
+"""Where a car is in the photograph: its template placed by the label, GrabCut around it, and the fit of one to the other.
+
+The fit moves pose, size and a few symmetric modes of the free-form deformation through the project's own renderer
+until the outline of the mesh runs along the border of the mask; it never leaves the label's neighbourhood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_ir import ffd as lattice
+from scene_ir.geometry import place, to_clip
+from scene_ir.meshes.templates import template
+from scene_ir.raster import verbs
+from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
+
+Mask = NDArray[np.bool_]
+
+_WORK_PX = 160
+"""Larger side of the windows in which outlines are fitted: more changes nothing that shows, less loses the wheels."""
+_BAND = 0.12
+"""Width of the band in which mask and outline pull at each other, as a fraction of the window."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A mesh at its place. translation (3,) m, bottom-face centre; yaw () rad; size_lhw (3,) m; ffd (64, 3)."""
+
+    mesh: Mesh
+    translation: Tensor
+    yaw: Tensor
+    size_lhw: Tensor
+    ffd: Tensor
+
+    def vertices(self) -> Tensor:
+        """Vertices (V, 3) m in camera space."""
+        unit = self.mesh.vertices
+        deformed = lattice.deform(unit, lattice.lattice_weights(unit), self.ffd)
+        return place(deformed, self.size_lhw, self.yaw, self.translation)
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """steps of Adam at `rate` (in units of the standard deviations below); the rest are bounds around the label."""
+
+    steps: int = 40
+    rate: float = 0.25
+    max_shift_m: float = 0.3
+    max_turn_rad: float = 0.087
+    max_stretch: float = 0.08
+    max_offset: float = 0.08
+    prior: float = 0.004
+
+
+def candidates(kind: str, size_lhw: Sequence[float]) -> tuple[str, ...]:
+    """Template kinds that may stand for a label of type `kind`, the likeliest by its proportions first."""
+    length, height, _width = size_lhw
+    if kind == "Truck":
+        return ("truck", "bus") if length < 10 else ("bus", "truck")
+    if kind == "Van":
+        return ("van", "suv") if height < 2.4 else ("van",)
+    if height > 1.75:
+        return ("suv", "van", "hatchback")
+    if height > 1.6:
+        return ("suv", "hatchback", "estate")
+    if length < 4.05:
+        return ("hatchback", "sedan", "suv")
+    return ("sedan", "estate", "hatchback")
+
+
+def silhouettes(placements: Sequence[Placement], camera: Camera, backend: verbs.Backend = "warp") -> list[Mask]:
+    """Pixels (H, W) whose centre each placed mesh covers, one mask a placement."""
+    if not placements:
+        return []
+    clip, faces, vertex_ranges, face_ranges = _pack(placements, camera.matrix)
+    rects = verbs.bounding_rects(clip, vertex_ranges, camera.height, camera.width)
+    layout = verbs.Layout.of(rects)
+    hit = (verbs.rasterize(clip, faces, face_ranges, layout, backend).face >= 0).cpu().numpy()
+    masks = []
+    for (span, shape), (x0, y0, x1, y1) in zip(layout.spans(), rects.tolist(), strict=True):
+        mask = np.zeros((camera.height, camera.width), bool)
+        mask[y0:y1, x0:x1] = hit[span].reshape(shape)
+        masks.append(mask)
+    return masks
+
+
+def iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
+    """Intersection over union of two masks, counted outside `unknown`; 0 where both are empty."""
+    if unknown is not None:
+        first, second = first & ~unknown, second & ~unknown
+    union = np.count_nonzero(first | second)
+    return np.count_nonzero(first & second) / union if union else 0.0
+
+
+def extent(mask: Mask) -> tuple[int, int, int, int]:
+    """Bounding rectangle of a mask that is not empty: x0, y0, x1, y1, half-open."""
+    rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def grow(mask: Mask, radius: float) -> Mask:
+    """The mask with everything within `radius` px (negative: without what is that near to its border)."""
+    if radius >= 0:
+        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+        return mask | (outside <= radius) if mask.any() else mask.copy()
+    padded = np.pad(mask, 1, mode="edge").astype(np.uint8)
+    return cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1] > -radius
+
+
+def instance_mask(
+    image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float], rounds: int = 4
+) -> Mask:
+    """The car's pixels by GrabCut (Rother 2004) in a band around the template's outline.
+
+    image (H, W, 3) RGB; outline: the placed template; unknown: pixels of nearer things, which are nobody's;
+    band_px: how far inside and outside of the outline the border is searched -> mask (H, W), without `unknown`.
+    """
+    visible = outline & ~unknown
+    if not visible.any():
+        return visible
+    inside, outside = band_px
+    x0, y0, x1, y1 = extent(outline)
+    margin = int(2 * outside + 12)
+    height, width = outline.shape
+    x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
+    window = (slice(y0, y1), slice(x0, x1))
+    scale = float(np.clip(120 / max(extent(outline)[3] - extent(outline)[1], 1), 1, 4))
+    size = (max(round((x1 - x0) * scale), 8), max(round((y1 - y0) * scale), 8))
+
+    def enlarge(mask: Mask) -> Mask:
+        return cv2.resize(mask[window].astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= 0.5
+
+    crop = cv2.resize(image[window], size, interpolation=cv2.INTER_CUBIC)
+    labels = np.full(size[::-1], cv2.GC_BGD, np.uint8)
+    labels[enlarge(grow(outline, outside))] = cv2.GC_PR_BGD
+    labels[enlarge(outline)] = cv2.GC_PR_FGD
+    core = enlarge(grow(outline, -inside))
+    labels[core] = cv2.GC_FGD
+    hidden = enlarge(unknown)
+    labels[hidden] = cv2.GC_BGD
+    if not ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).any():
+        return visible
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    # OpenCV seeds its clusters from one process-wide generator.
+    cv2.setRNGSeed(0)
+    cv2.grabCut(crop, labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)) & ~hidden
+    found = _tidy(found, enlarge(outline), scale)
+    result = np.zeros_like(outline)
+    back = cv2.resize(found.astype(np.float32), (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    result[window] = back >= 0.5
+    return result & ~unknown
+
+
+def _tidy(found: Mask, outline: Mask, scale: float) -> Mask:
+    """Without specks and hairs, holes closed, only parts that reach well into the template."""
+    radius = max(1, round(1.2 * scale))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    opened = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, disc)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    keep = np.zeros(count, bool)
+    largest = stats[1:, cv2.CC_STAT_AREA].max(initial=0)
+    for part in range(1, count):
+        area = stats[part, cv2.CC_STAT_AREA]
+        keep[part] = area >= 0.05 * largest and np.count_nonzero(outline & (parts == part)) >= 0.6 * area
+    kept = keep[parts]
+    # Holes are windows or reflections, never background: fill what the outside cannot reach.
+    padded = np.pad(~kept, 1, constant_values=True).astype(np.uint8)
+    _, regions = cv2.connectedComponents(padded, connectivity=4)
+    enclosed = regions[1:-1, 1:-1] != regions[0, 0]
+    return kept | (enclosed & outline)
+
+
+def fit(
+    placements: Sequence[Placement],
+    masks: Sequence[Mask],
+    unknown: Sequence[Mask],
+    camera: Camera,
+    settings: FitSettings,
+    backend: verbs.Backend = "warp",
+) -> list[Placement]:
+    """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at nothing.
+
+    Minimises the signed distance to the mask, cut at +-band, summed over what the mesh covers: its gradient moves
+    each piece of outline towards the mask's border from as far as the band reaches (Chan and Vese 2001).
+    """
+    if not placements or settings.steps == 0:
+        return list(placements)
+    windows = [_window(mask, hidden, outline) for mask, hidden, outline in
+               zip(masks, unknown, silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
+    rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
+    layout = verbs.Layout.of(rects)
+    pull = torch.from_numpy(np.concatenate([w.pull.reshape(-1) / w.length for w in windows]))
+    faces, vertex_ranges, face_ranges = _pack(placements, camera.matrix)[1:]
+    matrices = [w.zoom @ camera.matrix for w in windows]
+    weights = [lattice.lattice_weights(p.mesh.vertices) for p in placements]
+    modes = _modes()
+    spread, bound = _units(settings, len(modes))
+    code = torch.zeros(len(placements), spread.numel(), requires_grad=True)
+    optimiser = torch.optim.Adam([code], lr=settings.rate)
+    best = torch.full((len(placements),), torch.inf)
+    best_code = code.detach().clone()
+    for step in range(settings.steps + 1):
+        clips = []
+        for i, (placement, weight, matrix) in enumerate(zip(placements, weights, matrices, strict=True)):
+            moved = _apply(placement, code[i] * spread, modes)
+            unit = lattice.deform(placement.mesh.vertices, weight, moved.ffd)
+            clips.append(to_clip(place(unit, moved.size_lhw, moved.yaw, moved.translation), matrix))
+        clip = torch.cat(clips)
+        fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
+        covered = verbs.antialias(fragments, clip, faces, backend) * pull
+        energy = torch.stack([covered[span].sum() for span, _ in layout.spans()])
+        loss = energy + settings.prior * code.square().sum(1)
+        better = loss.detach() < best
+        best = torch.where(better, loss.detach(), best)
+        best_code = torch.where(better[:, None], code.detach(), best_code)
+        if step == settings.steps:
+            break
+        optimiser.zero_grad()
+        loss.sum().backward()
+        # Vertices at the near plane can give infinite slopes; one car's must not spoil the others.
+        torch.nan_to_num_(code.grad, nan=0.0, posinf=0.0, neginf=0.0)
+        optimiser.step()
+        with torch.no_grad():
+            code.clamp_(-bound / spread, bound / spread)
+    return [_apply(p, c * spread, modes) for p, c in zip(placements, best_code, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """pull (h, w): signed distance to the mask over the band, in [-1, 1], 0 where unknown; length: px of outline;
+    zoom (3, 3): image pixels to window pixels.
+    """
+
+    pull: NDArray[np.float32]
+    length: float
+    zoom: Tensor
+
+
+def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
+    height, width = mask.shape
+    both = mask | outline
+    x0, y0, x1, y1 = extent(both) if both.any() else (0, 0, 1, 1)
+    margin = int(0.15 * max(x1 - x0, y1 - y0)) + 3
+    x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
+    scale = min(_WORK_PX / max(x1 - x0, y1 - y0), 4.0)
+    size = (max(round((x1 - x0) * scale), 1), max(round((y1 - y0) * scale), 1))
+    inner = mask[y0:y1, x0:x1]
+    # Hidden pixels next to the mask belong to neither side: distances are taken to what is surely not the car.
+    shown = ~unknown[y0:y1, x0:x1]
+    to_car = cv2.distanceTransform((~inner).astype(np.uint8), cv2.DIST_L2, 5)
+    to_rest = cv2.distanceTransform((inner | ~shown).astype(np.uint8), cv2.DIST_L2, 5)
+    to_car = np.where(inner.any(), to_car, max(size))
+    to_rest = np.where((~inner & shown).any(), to_rest, max(size))
+    signed = np.where(inner, 0.5 - to_rest, to_car - 0.5) * scale
+    band = _BAND * max(size)
+    pull = np.clip(signed / band, -1, 1) * shown
+    zoom = torch.tensor(
+        [
+            [size[0] / (x1 - x0), 0.0, (0.5 - x0) * size[0] / (x1 - x0) - 0.5],
+            [0.0, size[1] / (y1 - y0), (0.5 - y0) * size[1] / (y1 - y0) - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    resized = cv2.resize(pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    return _Window(resized.reshape(size[::-1]), 2.0 * (size[0] + size[1]), zoom)
+
+
+def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Clip coordinates, faces, vertex ranges (N, 2) and face ranges (N, 2) of all placements in one draw."""
+    clips, faces, vertex_ranges, face_ranges = [], [], [], []
+    vertex = face = 0
+    for placement in placements:
+        mesh = placement.mesh
+        clips.append(to_clip(placement.vertices(), matrix))
+        faces.append(mesh.faces + vertex)
+        vertex_ranges.append([vertex, vertex + len(mesh.vertices)])
+        face_ranges.append([face, face + len(mesh.faces)])
+        vertex, face = vertex_ranges[-1][1], face_ranges[-1][1]
+    return torch.cat(clips), torch.cat(faces), torch.tensor(vertex_ranges), torch.tensor(face_ranges)
+
+
+def _modes() -> Tensor:
+    """Symmetric deformations (K, 64, 3) that turn one car's outline into another's; the lowest layer stays down."""
+    modes = []
+
+    def grid() -> Tensor:
+        modes.append(torch.zeros(*LATTICE, 3))
+        return modes[-1]
+
+    across = torch.linspace(-1.0, 1.0, LATTICE[2])
+    for station in range(LATTICE[0]):
+        grid()[station, 0, :, 1] = 1.0  # roof up and down along the length
+    for station in (1, 2):
+        grid()[station, :2, :, 0] = 1.0  # cabin forth and back, longer and shorter
+    grid()[:, 0, :, 2] = across  # roof broader
+    grid()[:, 1:3, :, 2] = across  # waist broader
+    for station in (0, 3):
+        grid()[station, :, :, 2] = across  # rear and front broader
+        grid()[station, 2, :, 0] = 1.0  # bumpers out
+    return torch.stack(modes).reshape(-1, LATTICE_POINTS, 3)
+
+
+def _units(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:
+    """Standard deviations and bounds of x, z, y (m), yaw (rad), log length, height, width, and the modes."""
+    shift, turn, stretch = settings.max_shift_m, settings.max_turn_rad, settings.max_stretch
+    bound = [shift, shift, shift / 3, turn, stretch, stretch, stretch, *[settings.max_offset] * modes]
+    spread = torch.tensor(bound) / 2
+    spread[7:] = settings.max_offset / 3
+    return spread, torch.tensor(bound)
+
+
+def _apply(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
+    """The placement after a change of pose, size and shape, in the order of `_units`."""
+    return replace(
+        placement,
+        translation=placement.translation + torch.stack([change[0], change[2], change[1]]),
+        yaw=placement.yaw + change[3],
+        size_lhw=placement.size_lhw * torch.exp(change[4:7]),
+        ffd=placement.ffd + torch.einsum("k,kpc->pc", change[7:], modes),
+    )
+
+
+def placed(kind: str, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
+    """The canonical template of `kind` at a label's place and size."""
+    return Placement(template(kind), translation, yaw, size_lhw, torch.zeros(LATTICE_POINTS, 3))

@@ -1,0 +1,161 @@
+"""Weather, time of day and foliage: smooth functions of picture, depth and maps; code 0 leaves every bit as it is.
+
+Each effect is `x + s(code) * change(x)` with s(0) = 0, so that it passes through the photograph and is differentiable
+there from both sides, though the weather code is bounded to [0, 1].
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import kornia
+import torch
+from torch import Tensor
+
+from scene_ir.texture import lab, rgb_of, smoothstep
+from scene_ir.types import Environment
+
+FOG_EXTINCTION_PER_M = 0.03
+"""Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""
+RAIN_EXTINCTION_PER_M = 0.006
+"""Haze of strong rain at rain code 1."""
+HAZE_CAP_M = 300.0
+"""Haze is a layer on the ground: the sky is seen through this much of it."""
+_SKY_RGB = (0.78, 0.82, 0.87)
+"""Colour of the air where the photograph shows no sky."""
+_LUMA = (0.299, 0.587, 0.114)
+"""ITU-R BT.601."""
+_DARKENING = (3.0, 2.5, 1.7)
+"""Optical depth of red, green and blue at time code 1: night is blue and dark, not black."""
+_WARMTH = (0.62, 0.16, -0.34)
+"""What dusk, at half the time code, adds to red, green and blue."""
+
+
+def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
+    """Mean colour (3,) of the photographed sky, where there is some; a bright overcast otherwise."""
+    weight = sky * (sky > 0.5)
+    total = weight.sum()
+    default = photograph.new_tensor(_SKY_RGB)
+    mean = (photograph * weight).flatten(1).sum(dim=1) / total.clamp(min=1.0)
+    share = (total / 500.0).clamp(max=1.0)
+    return share * mean + (1.0 - share) * default
+
+
+def shadow_softening(weather: Tensor) -> Tensor:
+    """The factor () by which overcast, fog, rain and night weaken cast shadows; 1 at code 0. weather (4,)."""
+    fog, rain, time, overcast = weather.unbind(-1)
+    return torch.exp(-(0.5 * fog + 0.4 * rain + 0.5 * time + 0.6 * overcast))
+
+
+def apply_foliage(image: Tensor, environment: Environment, air: Tensor) -> Tensor:
+    """The picture (3, H, W) with its foliage changed by `environment.foliage`, (3,) in [-1, 1].
+
+    Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is a
+    curve in CIE L*; density darkens the crowns (1) or lets the air (3,) RGB show through them (-1).
+    """
+    amount = environment.foliage_map.to(image)
+    index = (amount.flatten() > 0.004).nonzero()[:, 0]
+    if index.numel() == 0:
+        return image
+    rows = image.flatten(1)[:, index].T
+    gaps = _leaf_gaps(*amount.shape).to(image).flatten()[index]
+    code = environment.foliage.to(image)
+    change = _leaves(rows, code, gaps, air) - _leaves(rows, torch.zeros_like(code), gaps, air)
+    change = change * amount.flatten()[index][:, None]
+    return image.flatten(1).index_add(1, index, change.T).reshape(image.shape)
+
+
+def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
+    """The leaf model on rows (R, 3); gaps (R,) in [0, 1] says where a thin crown lets light through."""
+    hue, shift, density = code.unbind(-1)
+    lightness, a, b = lab(rgb.clamp(0.0, 1.0)).unbind(-1)
+    level = (lightness / 100.0).clamp(0.01, 0.99)
+    level = torch.sigmoid(torch.logit(level) + 1.5 * shift)
+    angle = -1.05 * hue
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    chroma = 1.0 + 0.3 * hue
+    room = 4.0 * level * (1.0 - level)
+    red = chroma * (cos * a - sin * b) + 10.0 * hue * room
+    yellow = chroma * (sin * a + cos * b) + 8.0 * hue * room
+    out = rgb_of(torch.stack([100.0 * level, red, yellow], dim=-1))
+    thick = density * torch.sigmoid(6.0 * density)
+    thin = -density * torch.sigmoid(-6.0 * density)
+    out = out + (thick * 0.5 * (1.0 - gaps))[:, None] * (0.25 * out - out)
+    return out + (thin * 0.8 * gaps)[:, None] * (air - out)
+
+
+def apply_weather(image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor) -> Tensor:
+    """The picture (3, H, W) under `environment.weather`, (4,): fog, rain, time of day, overcast, each in [0, 1].
+
+    inverse_depth: (H, W) 1/m of what is seen, 0 in the sky; air: (3,) RGB, the airlight. Differentiable to all.
+    """
+    fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
+    sky, road = environment.sky.to(image), environment.road.to(image)
+    depth = 1.0 / inverse_depth.clamp(min=1.0 / HAZE_CAP_M)
+    luma = image.new_tensor(_LUMA)
+    grey_air = (air * luma).sum().expand(3)
+
+    # Overcast: less colour, less contrast, a plain sky.
+    grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
+    flat = 0.45 * image + 0.55 * grey
+    flat = 0.40 + 0.72 * (flat - 0.42)
+    cover = (0.55 * grey_air + 0.30)[:, None, None] + 0.15 * (grey - grey_air.mean())
+    target = flat + sky * (cover - flat)
+    image = image + 0.85 * overcast * (target - image)
+    air = air + 0.85 * overcast * (0.9 * grey_air - air)
+
+    # Time of day: warm light at one half, then blue darkness.
+    gain = torch.expm1(-image.new_tensor(_DARKENING) * time * time) + (
+        image.new_tensor(_WARMTH) * time * torch.exp(-3.5 * time * time)
+    ) * 0.8 - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip
+    image = image + gain[:, None, None] * image
+    air = air + gain * air
+
+    # Rain: wet and dark, haze, a sheen on the road that mirrors what stands above, streaks.
+    grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
+    damp = 0.72 * (0.65 * image + 0.35 * grey)
+    image = image + 0.9 * rain * (damp - image)
+    mirrored = _mirror(image)
+    grazing = 0.15 + 0.45 * smoothstep(depth, 4.0, 45.0)
+    sheen = 0.55 * mirrored + 0.40 * air[:, None, None]
+    image = image + rain * (road * grazing) * (sheen - image)
+    image = image - torch.expm1(-RAIN_EXTINCTION_PER_M * rain * depth) * (0.85 * air[:, None, None] - image)
+    streaks = _streaks(*sky.shape).to(image)
+    image = image + 0.22 * rain * streaks * (air[:, None, None] - image)
+
+    # Fog (Koschmieder 1924).
+    return image - torch.expm1(-FOG_EXTINCTION_PER_M * fog * depth) * (air[:, None, None] - image)
+
+
+def _mirror(image: Tensor) -> Tensor:
+    """What a wet road reflects, coarsely: the picture smeared downwards."""
+    height = image.shape[1]
+    reach = max(3, (height // 12) | 1)
+    smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate")[0]
+    shift = reach // 2
+    return torch.cat([smeared[:, :1].expand(-1, shift, -1), smeared[:, : height - shift]], dim=1)
+
+
+@lru_cache(maxsize=8)
+def _streaks(height: int, width: int) -> Tensor:
+    """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; the same for each frame size."""
+    generator = torch.Generator().manual_seed(20190416)
+    drops = (torch.rand(height, width, generator=generator) > 0.9965).float()
+    length = max(5, height // 24)
+    kernel = torch.zeros(length, length)
+    rows = torch.arange(length)
+    kernel[rows, (length // 2 + (rows - length // 2) * 0.18).round().long()] = torch.hann_window(length + 2)[1:-1]
+    padded = torch.nn.functional.pad(drops[None, None], (length // 2, (length - 1) // 2) * 2)
+    streaks = torch.nn.functional.conv2d(padded, kernel[None, None])
+    return kornia.filters.gaussian_blur2d(streaks, (3, 3), (0.6, 0.6))[0, 0].clamp(0.0, 1.0)
+
+
+@lru_cache(maxsize=8)
+def _leaf_gaps(height: int, width: int) -> Tensor:
+    """Where thin foliage opens (H, W) in [0, 1]: band-limited noise of a few pixels; the same for each frame size."""
+    generator = torch.Generator().manual_seed(19240901)
+    noise = torch.rand(1, 1, height, width, generator=generator)
+    fine = kornia.filters.gaussian_blur2d(noise, (5, 5), (1.0, 1.0), border_type="replicate")
+    coarse = kornia.filters.gaussian_blur2d(noise, (21, 21), (4.0, 4.0), border_type="replicate")
+    mixed = (fine - 0.5) / fine.std().clamp(min=1e-6) + (coarse - 0.5) / coarse.std().clamp(min=1e-6)
+    return torch.sigmoid(1.5 * mixed)[0, 0]

@@ -1,0 +1,371 @@
+"""A scene as a folder on disk: `scene.json`, images, arrays, meshes. No pickle; load(save(x)) == x, to the bit.
+
+    scene.json        schema version, camera, objects, sources, environment, provenance
+    photograph.png    8-bit RGB, where the tensor holds exactly k / 255; else in arrays.npz
+    background.png    likewise
+    arrays.npz        depth, maps, and the crops of what the photograph saw of each object
+    meshes/0.npz      vertices, faces, parts, colours, uv
+
+A folder that was written by another version of the schema is refused, not guessed at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir import files
+from scene_ir.errors import FormatError, SceneError
+from scene_ir.types import (
+    FOLIAGE_DIM,
+    LATTICE_POINTS,
+    TEXTURE_DIM,
+    WEATHER_DIM,
+    Camera,
+    Crop,
+    Environment,
+    Mesh,
+    Objects,
+    SceneIR,
+    Source,
+    check_shape,
+)
+
+SCHEMA = "drivesem.scene"
+VERSION = 1
+"""Raise it with every change that an older reader would misread."""
+
+_T = TypeVar("_T")
+_DTYPES = {str(d).removeprefix("torch."): d for d in (torch.float32, torch.float64, torch.int64, torch.int32)}
+_MAPS = ("sky", "foliage_map", "road")
+_IMAGES = ("photograph", "background")
+_OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
+    "mesh_index": (),
+    "translation": (3,),
+    "yaw": (),
+    "size_lhw": (3,),
+    "ffd": (LATTICE_POINTS, 3),
+    "texture_code": (TEXTURE_DIM,),
+    "category": (),
+    "box2d": (4,),
+    "truncation": (),
+    "occlusion": (),
+}
+_ENVIRONMENT_FIELDS = {"weather": WEATHER_DIM, "foliage": FOLIAGE_DIM, "sun": 3, "ground": 4}
+_SOURCE_FIELDS: dict[str, tuple[int, ...]] = {
+    "translation": (3,),
+    "yaw": (),
+    "size_lhw": (3,),
+    "ffd": (LATTICE_POINTS, 3),
+    "paint": (3,),
+}
+_INTEGERS = ("mesh_index", "category", "occlusion")
+
+
+def save_scene(scene: SceneIR, folder: Path) -> None:
+    """Write `scene` as `folder`, whole or not at all, in place of what was there. Gradients are not kept."""
+    with files.whole_folder(Path(folder)) as temporary:
+        arrays = {"depth": _array(scene.depth)}
+        arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
+        in_png = {}
+        for name in _IMAGES:
+            image = getattr(scene, name).detach().cpu()
+            in_png[name] = _as_bytes(image)
+            if in_png[name] is None:
+                arrays[name] = _array(image)
+            else:
+                files.write_png(temporary / f"{name}.png", in_png[name])
+        record = {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "provenance": _provenance(scene.provenance),
+            "camera": {
+                "height": scene.camera.height,
+                "width": scene.camera.width,
+                "intrinsics": _numbers(scene.camera.intrinsics),
+                "projection": None if scene.camera.projection is None else _numbers(scene.camera.projection),
+            },
+            "images": {name: "npz" if in_png[name] is None else "png" for name in _IMAGES},
+            "meshes": [{"name": mesh.name} for mesh in scene.meshes],
+            "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
+            "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
+            "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
+            "ignore": _numbers(scene.ignore),
+        }
+        files.write_json(temporary / "scene.json", record)
+        files.write_npz(temporary / "arrays.npz", arrays)
+        for i, mesh in enumerate(scene.meshes):
+            fields = {name: getattr(mesh, name) for name in ("vertices", "faces", "part", "colours", "uv")}
+            given = {name: _array(tensor) for name, tensor in fields.items() if tensor is not None}
+            files.write_npz(temporary / "meshes" / f"{i}.npz", given)
+
+
+def load_scene(folder: Path) -> SceneIR:
+    """The scene that was saved as `folder`, on the CPU.
+
+    Raises FormatError naming file and key: a missing file or key, another version, a wrong shape or type.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FormatError(str(folder), "a folder with a scene", "no such folder")
+    path = folder / "scene.json"
+    root = _Node(str(path), files.read_json(path))
+    root.expect("schema", SCHEMA)
+    root.expect("version", VERSION)
+    camera_node = root["camera"]
+    camera = camera_node.build(
+        lambda: Camera(
+            camera_node["intrinsics"].tensor(3, 3),
+            camera_node["height"].integer(),
+            camera_node["width"].integer(),
+            None if camera_node["projection"].value is None else camera_node["projection"].tensor(3, 4),
+        )
+    )
+    size = (camera.height, camera.width)
+    arrays = _Arrays(folder / "arrays.npz")
+    images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
+    sources = tuple(_load_source(i, node, arrays) for i, node in enumerate(root["sources"].items()))
+    objects_node, environment_node = root["objects"], root["environment"]
+    count = objects_node["translation"].rows()
+    objects = objects_node.build(
+        lambda: Objects(
+            **{
+                name: objects_node[name].tensor(count, *shape, integer=name in _INTEGERS)
+                for name, shape in _OBJECT_FIELDS.items()
+            },
+            source=sources,
+        )
+    )
+    environment = environment_node.build(
+        lambda: Environment(
+            **{name: environment_node[name].tensor(size) for name, size in _ENVIRONMENT_FIELDS.items()},
+            **{name: arrays.tensor(name, *size) for name in _MAPS},
+        )
+    )
+    meshes = tuple(
+        _load_mesh(folder / "meshes" / f"{i}.npz", node["name"].text())
+        for i, node in enumerate(root["meshes"].items())
+    )
+    ignore = root["ignore"]
+    provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
+    return root.build(
+        lambda: SceneIR(
+            camera=camera,
+            meshes=meshes,
+            objects=objects,
+            environment=environment,
+            photograph=images["photograph"],
+            background=images["background"],
+            depth=arrays.tensor("depth", *size),
+            ignore=ignore.tensor(ignore.rows(), 4),
+            provenance=provenance,
+        )
+    )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    if tensor.dtype not in _DTYPES.values():
+        raise FormatError("a tensor to save", f"one of {', '.join(_DTYPES)}", tensor.dtype)
+    return tensor.detach().cpu().numpy()
+
+
+def _as_bytes(image: Tensor) -> np.ndarray | None:
+    """The image (3, H, W) as (H, W, 3) uint8 where that is the very same; else None."""
+    if image.dtype != torch.float32:
+        return None
+    rounded = (image * 255).round().nan_to_num(0).clamp(0, 255).to(torch.uint8)
+    if not torch.equal(rounded.to(torch.float32) / 255, image):
+        return None
+    return np.ascontiguousarray(rounded.permute(1, 2, 0).numpy())
+
+
+def _numbers(tensor: Tensor) -> Any:
+    """A tensor as JSON: nested lists, which hold float32 and int64 exactly; another dtype is named beside them."""
+    values = _finite(_array(tensor).tolist())
+    if tensor.dtype in (torch.float32, torch.int64):
+        return values
+    return {"dtype": str(tensor.dtype).removeprefix("torch."), "values": values}
+
+
+def _finite(value: Any) -> Any:
+    """What JSON cannot say as a number (nan, inf, -inf) as a string."""
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return value if math.isfinite(value) else str(value)
+
+
+def _provenance(provenance: Mapping[str, str]) -> dict[str, str]:
+    for key, value in provenance.items():
+        if not isinstance(key, str) or not isinstance(value, str):
+            raise FormatError(f"scene.provenance[{key!r}]", "text", repr(value))
+    return dict(provenance)
+
+
+def _source_record(index: int, source: Source, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON part of one source; its crops go into `arrays`."""
+    arrays[f"source.{index}.foreground"] = _array(source.foreground.values)
+    record: dict[str, Any] = {name: _numbers(getattr(source, name)) for name in _SOURCE_FIELDS}
+    record["inflation"] = source.inflation
+    record["foreground"] = {"x0": source.foreground.x0, "y0": source.foreground.y0}
+    record["shadow"] = None
+    if source.shadow is not None:
+        arrays[f"source.{index}.shadow"] = _array(source.shadow.values)
+        record["shadow"] = {"x0": source.shadow.x0, "y0": source.shadow.y0}
+    return record
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """A value inside a JSON file that knows where it stands."""
+
+    where: str
+    value: Any
+
+    def __getitem__(self, key: str) -> _Node:
+        if key not in self.mapping():
+            raise FormatError(f"{self.where}: {key}", "a value", "no such key")
+        return _Node(f"{self.where}: {key}", self.value[key])
+
+    def _require(self, kind: type, name: str) -> Any:
+        if not isinstance(self.value, kind) or isinstance(self.value, bool):
+            raise FormatError(self.where, name, type(self.value).__name__)
+        return self.value
+
+    def expect(self, key: str, value: str | int) -> None:
+        if self[key].value != value:
+            raise FormatError(f"{self.where}: {key}", repr(value), repr(self[key].value))
+
+    def mapping(self) -> dict[str, Any]:
+        return self._require(dict, "an object")
+
+    def text(self) -> str:
+        return self._require(str, "text")
+
+    def integer(self) -> int:
+        return self._require(int, "an integer")
+
+    def number(self) -> float:
+        return float(self._require((int, float), "a number"))
+
+    def items(self) -> list[_Node]:
+        return [_Node(f"{self.where}[{i}]", v) for i, v in enumerate(self._require(list, "a list"))]
+
+    def _values(self) -> tuple[Any, torch.dtype | None]:
+        if not isinstance(self.value, dict):
+            return self.value, None
+        name = self["dtype"].text()
+        if name not in _DTYPES:
+            raise FormatError(f"{self.where}: dtype", f"one of {', '.join(_DTYPES)}", repr(name))
+        return self["values"].value, _DTYPES[name]
+
+    def rows(self) -> int:
+        """How many entries a tensor has along its first axis."""
+        return len(_Node(self.where, self._values()[0]).items())
+
+    def tensor(self, *shape: int, integer: bool = False) -> Tensor:
+        """The nested lists as a tensor of `shape`."""
+        nested, dtype = self._values()
+        dtype = dtype or (torch.int64 if integer else torch.float32)
+        flat: list[float] = []
+        found = _flatten(nested, flat, self.where)
+        # an empty list says nothing of the axes behind it
+        if found != shape and not (math.prod(shape) == 0 and found == (0,) and shape[0] == 0):
+            raise FormatError(self.where, f"shape {shape}", found)
+        if not dtype.is_floating_point and not all(isinstance(v, int) for v in flat):
+            raise FormatError(self.where, "integers", "other numbers")
+        return torch.tensor(flat, dtype=dtype).reshape(shape)
+
+    def build(self, make: Callable[[], _T]) -> _T:
+        """What `make` gives; what the types refuse is said of this place in the file."""
+        try:
+            return make()
+        except FormatError:
+            raise
+        except SceneError as error:
+            raise FormatError(f"{self.where}: {error.field}", error.expected, error.actual) from error
+
+
+def _flatten(value: Any, flat: list[float], where: str) -> tuple[int, ...]:
+    """Append the leaves of nested lists to `flat`; their shape. FormatError for ragged lists and no numbers."""
+    if isinstance(value, list):
+        shapes = {_flatten(v, flat, where) for v in value}
+        if len(shapes) > 1:
+            raise FormatError(where, "lists of equal length", f"shapes {sorted(shapes)}")
+        return (len(value), *(shapes.pop() if shapes else ()))
+    if value in ("nan", "inf", "-inf"):
+        value = float(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise FormatError(where, "numbers", repr(value))
+    flat.append(value)
+    return ()
+
+
+class _Arrays:
+    """The arrays of one NPZ."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._arrays = files.read_npz(path)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._arrays
+
+    def tensor(self, name: str, *shape: int | None, integer: bool = False) -> Tensor:
+        """The array `name` as a tensor of `shape` (None: any size). FormatError naming file and key."""
+        where = f"{self.path}: {name}"
+        if name not in self:
+            raise FormatError(where, "an array", f"no such key (has {', '.join(self._arrays)})")
+        array = self._arrays[name]
+        if array.dtype.name not in _DTYPES:
+            raise FormatError(where, f"one of {', '.join(_DTYPES)}", array.dtype.name)
+        tensor = torch.from_numpy(array)
+        try:
+            check_shape(where, tensor, *shape, floating=not integer)
+        except SceneError as error:
+            raise FormatError(error.field, error.expected, error.actual) from error
+        return tensor
+
+
+def _load_image(folder: Path, node: _Node, arrays: _Arrays, size_hw: tuple[int, int], name: str) -> Tensor:
+    if node.text() == "npz":
+        return arrays.tensor(name, 3, *size_hw)
+    if node.text() != "png":
+        raise FormatError(node.where, "'png' or 'npz'", repr(node.value))
+    image = files.read_image(folder / f"{name}.png", size_hw)
+    return torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255
+
+
+def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
+    def crop(name: str, channels: int) -> Crop:
+        values = arrays.tensor(f"source.{index}.{name}", channels, None, None)
+        return Crop(values, node[name]["x0"].integer(), node[name]["y0"].integer())
+
+    return node.build(
+        lambda: Source(
+            **{name: node[name].tensor(*shape) for name, shape in _SOURCE_FIELDS.items()},
+            foreground=crop("foreground", 4),
+            shadow=None if node["shadow"].value is None else crop("shadow", 3),
+            inflation=node["inflation"].number(),
+        )
+    )
+
+
+def _load_mesh(path: Path, name: str) -> Mesh:
+    arrays = _Arrays(path)
+    return _Node(str(path), None).build(
+        lambda: Mesh(
+            vertices=arrays.tensor("vertices", None, 3),
+            faces=arrays.tensor("faces", None, 3, integer=True),
+            part=arrays.tensor("part", None, integer=True),
+            name=name,
+            colours=arrays.tensor("colours", None, 3) if "colours" in arrays else None,
+            uv=arrays.tensor("uv", None, 2) if "uv" in arrays else None,
+        )
+    )

@@ -1,0 +1,292 @@
+"""Meshes from files: import of OBJ, GLB, PLY (whatever trimesh reads), and our own GLB, which keeps every bit."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.types import Mesh, Part
+
+_VERSION = 1
+_KEY = "drivesem_mesh"
+"""Key of the GLB mesh's `extras` that marks files of `save_mesh`."""
+_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+_AXES = {
+    "+x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+_UP = {"y": "+y", "z": "+z", "-y": "-y"}
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Node transform of our GLBs: glTF's y points up, ours down, so that viewers show the mesh upright."""
+_NAMES = (
+    (Part.LIGHT, r"light|lamp|blinker|indicator|luz"),
+    (Part.OTHER, r"rim\b|rims|alloy|hubcap|brake|seat|interior|dash|steer|grill|plate|underbody|engine|chassis"),
+    (Part.TYRE, r"tyre|tire|wheel|rubber|pneu"),
+    (Part.GLASS, r"glass|window|windshield|windscreen|vitre|vidrio"),
+    (Part.PAINT, r"paint|body|carros|door|hood|bonnet|roof|fender|shell"),
+)
+"""What material and mesh names say of a part; the first that is found counts."""
+_DEFAULT_COLOUR = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A mesh in the unit box, and the proportions it had: size_lhw, length, height, width in m."""
+
+    mesh: Mesh
+    size_lhw: tuple[float, float, float]
+
+
+def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_per_unit: float = 1.0) -> Imported:
+    """Read a mesh file and turn it into the unit box: front along +x, y down, sides at z = -0.5 and 0.5.
+
+    up: the file's axis that points up, "y", "z" or "-y". front: the file's axis that the vehicle looks along,
+    "+x" ... "-z", or "auto": the longest horizontal axis, towards parts named front, else away from the roof's
+    centre (bonnets are longer than boots). The scene graph is flattened; materials and textures become vertex
+    colours (a texture is read at the vertices: palettes come out exactly, photographs coarsely); parts are guessed
+    from material and mesh names. Files of `save_mesh` come back as they were saved, whatever the options.
+    Raises FormatError naming the file where it cannot be read or has no faces, RangeError for an unknown axis.
+    """
+    file = Path(path)
+    if up not in _UP:
+        raise RangeError("up", " or ".join(_UP), up)
+    if front != "auto" and (front not in _AXES or front[1] == _UP[up][1]):
+        raise RangeError("front", f"auto or a horizontal axis such as {'+x' if up != 'x' else '+z'}", front)
+    if not metres_per_unit > 0:
+        raise RangeError("metres_per_unit", "a positive number", metres_per_unit)
+    scene = _read(file)
+    own = _own(scene, file)
+    if own is not None:
+        extent = own.vertices.amax(dim=0) - own.vertices.amin(dim=0)
+        return Imported(own, (float(extent[0]), float(extent[1]), float(extent[2])))
+    vertices, faces, part, colours, uv, towards_front = _flatten(scene, file)
+    rotation = _axes(vertices, faces, _AXES[_UP[up]], front, towards_front)
+    turned = vertices @ rotation.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    extent = high - low
+    if not np.all(extent > 0):
+        raise FormatError(str(file), "a solid with length, height and width", f"extents {extent.tolist()}")
+    unit = (turned - low) / extent - np.array([0.5, 1.0, 0.5])
+    corners = unit[faces]
+    if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        faces = faces[:, ::-1].copy()
+    mesh = Mesh(
+        vertices=torch.from_numpy(unit.astype(np.float32)),
+        faces=torch.from_numpy(faces),
+        part=torch.from_numpy(part),
+        name=file.stem,
+        colours=torch.from_numpy(colours.astype(np.float32)),
+        uv=None if uv is None else torch.from_numpy(uv.astype(np.float32)),
+    )
+    length, height, width = (float(e) * metres_per_unit for e in extent)
+    return Imported(mesh, (length, height, width))
+
+
+def load_mesh(path: str | Path, *, up: str = "y", front: str = "auto") -> Mesh:
+    """The mesh of `import_mesh`; of a file written by `save_mesh`, the very mesh that was saved."""
+    return import_mesh(path, up=up, front=front).mesh
+
+
+def save_mesh(mesh: Mesh, path: str | Path) -> None:
+    """Write a GLB that `load_mesh` reads back equal to the bit (float32) and that viewers show in its colours.
+
+    Raises FormatError for another suffix than .glb, or where the mesh has no faces (glTF knows no empty mesh).
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".glb":
+        raise FormatError(str(file), "a file name that ends in .glb", file.suffix or "no suffix")
+    if mesh.faces.shape[0] == 0:
+        raise FormatError(str(file), "a mesh with faces", "none")
+    shape = trimesh.Trimesh(
+        vertices=mesh.vertices.detach().cpu().numpy().astype(np.float32),
+        faces=mesh.faces.cpu().numpy(),
+        process=False,
+        metadata={_KEY: _VERSION, "name_for_people": mesh.name, "part": mesh.part.cpu().tolist()},
+    )
+    if mesh.colours is not None:
+        colours = mesh.colours.detach().cpu().numpy().astype(np.float32)
+        shape.visual.vertex_colors = np.round(colours.clip(0, 1) * 255).astype(np.uint8)
+        shape.vertex_attributes["_rgb"] = colours
+    if mesh.uv is not None:
+        shape.vertex_attributes["_uv"] = mesh.uv.detach().cpu().numpy().astype(np.float32)
+    scene = trimesh.Scene()
+    scene.add_geometry(shape, geom_name="mesh", node_name="vehicle", transform=_FLIP)
+    content = scene.export(file_type="glb", include_normals=False)
+    handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+        os.replace(temporary, file)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _read(file: Path) -> trimesh.Scene:
+    if file.suffix.lower() not in _SUFFIXES:
+        raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
+    if not file.is_file():
+        raise FormatError(str(file), "a mesh file", "no such file")
+    try:
+        return trimesh.load_scene(
+            file, process=False, **({"group_material": True} if file.suffix == ".obj" else {})
+        )
+    except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
+        raise FormatError(
+            str(file), "a readable mesh", f"{type(error).__name__}: {error}".splitlines()[0]
+        ) from None
+
+
+def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
+    """The mesh as `save_mesh` wrote it, or None for a file from elsewhere."""
+    shapes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh) and _KEY in g.metadata]
+    if not shapes:
+        return None
+    shape = shapes[0]
+    if shape.metadata[_KEY] != _VERSION:
+        raise FormatError(f"{file}: {_KEY}", f"version {_VERSION}", shape.metadata[_KEY])
+    part = shape.metadata.get("part")
+    if not isinstance(part, list) or len(part) != len(shape.faces):
+        raise FormatError(f"{file}: part", f"{len(shape.faces)} entries", "none" if part is None else len(part))
+    rgb, uv = shape.vertex_attributes.get("_rgb"), shape.vertex_attributes.get("_uv")
+    return Mesh(
+        vertices=torch.from_numpy(np.array(shape.vertices, dtype=np.float32)),
+        faces=torch.from_numpy(np.array(shape.faces, dtype=np.int64)),
+        part=torch.tensor(part, dtype=torch.int64),
+        name=str(shape.metadata.get("name_for_people", "")),
+        colours=None if rgb is None else torch.from_numpy(np.array(rgb, dtype=np.float32)),
+        uv=None if uv is None else torch.from_numpy(np.array(uv, dtype=np.float32)),
+    )
+
+
+def _flatten(
+    scene: trimesh.Scene, file: Path
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None, NDArray]:
+    """All geometry in the scene's frame: vertices, faces, part, colours, uv, and where parts named front lie."""
+    vertices, faces, names, colours, uvs, sides = [], [], [], [], [], []
+    start = 0
+    for node in sorted(scene.graph.nodes_geometry):
+        transform, geometry_name = scene.graph[node]
+        shape = scene.geometry[geometry_name]
+        if not isinstance(shape, trimesh.Trimesh) or len(shape.faces) == 0:
+            continue
+        placed = trimesh.transform_points(shape.vertices, transform)
+        index = np.asarray(shape.faces, dtype=np.int64)
+        if np.linalg.det(transform[:3, :3]) < 0:
+            index = index[:, ::-1]
+        material = getattr(shape.visual, "material", None)
+        names.append((f"{getattr(material, 'name', '') or ''}", f"{node} {geometry_name}", len(index)))
+        vertices.append(placed)
+        faces.append(index + start)
+        colours.append(_vertex_colours(shape))
+        uv = getattr(shape.visual, "uv", None)
+        uvs.append(None if uv is None or len(uv) != len(placed) else np.asarray(uv)[:, :2])
+        label = node.lower()
+        if "front" in label:
+            sides.append((1.0, placed.mean(axis=0)))
+        elif re.search(r"back|rear", label):
+            sides.append((-1.0, placed.mean(axis=0)))
+        start += len(placed)
+    if not faces:
+        raise FormatError(str(file), "a mesh with faces", "none")
+    everything = np.concatenate(vertices)
+    if not np.isfinite(everything).all():
+        raise FormatError(f"{file}: vertices", "finite coordinates", "NaN or infinity")
+    forward = np.zeros(3)
+    if {sign for sign, _ in sides} == {1.0, -1.0}:
+        for sign in (1.0, -1.0):
+            forward += sign * np.mean([centre for s, centre in sides if s == sign], axis=0)
+    uv = np.concatenate([u for u in uvs if u is not None]) if all(u is not None for u in uvs) else None
+    return everything, np.concatenate(faces), _parts(names), np.concatenate(colours), uv, forward
+
+
+def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
+    """A part a face from (material name, mesh name, number of faces); unnamed ones are paint if no other is."""
+    found = []
+    for material, mesh, _ in names:
+        texts = (material.lower(), mesh.lower())
+        found.append(next((p for text in texts for p, pattern in _NAMES if re.search(pattern, text)), None))
+    unnamed = Part.OTHER if Part.PAINT in found else Part.PAINT
+    counts = [count for _, _, count in names]
+    return np.repeat([int(unnamed if p is None else p) for p in found], counts).astype(np.int64)
+
+
+def _vertex_colours(shape: trimesh.Trimesh) -> NDArray[np.float64]:
+    """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order."""
+    count = len(shape.vertices)
+    visual = shape.visual
+    if not isinstance(visual, trimesh.visual.TextureVisuals):
+        return np.asarray(visual.vertex_colors)[:, :3] / 255.0 if visual.defined else _plain(count)
+    material, uv = visual.material, visual.uv
+    if isinstance(material, trimesh.visual.material.PBRMaterial):
+        factor = material.baseColorFactor
+        image = material.baseColorTexture
+        # glTF's factor is linear light, its textures and our colours are sRGB
+        tint = np.ones(3) if factor is None else _srgb(np.asarray(factor, dtype=float)[:3] / 255.0)
+    else:
+        image = getattr(material, "image", None)
+        tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0 if image is None else np.ones(3)
+    if image is None or uv is None or len(uv) != count:
+        defined = image is not None or not isinstance(material, trimesh.visual.material.PBRMaterial)
+        return np.tile(tint, (count, 1)) if defined or material.baseColorFactor is not None else _plain(count)
+    pixels = np.asarray(image.convert("RGB"), dtype=float) / 255.0
+    height, width = pixels.shape[:2]
+    columns = np.floor(np.mod(uv[:, 0], 1.0) * width).astype(int).clip(0, width - 1)
+    rows = np.floor(np.mod(1.0 - uv[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
+    return pixels[rows, columns] * tint
+
+
+def _plain(count: int) -> NDArray[np.float64]:
+    return np.full((count, 3), _DEFAULT_COLOUR)
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear light to sRGB, in [0, 1] (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _axes(
+    vertices: NDArray, faces: NDArray, up: tuple[float, float, float], front: str, towards_front: NDArray
+) -> NDArray[np.float64]:
+    """Rotation (3, 3) from the file's axes to ours: rows are our x (front), y (down), z."""
+    down = -np.asarray(up)
+    if front != "auto":
+        forward = np.asarray(_AXES[front])
+    else:
+        extent = np.ptp(vertices, axis=0)
+        horizontal = np.where(np.abs(down) > 0.5, -np.inf, extent)
+        forward = np.eye(3)[int(np.argmax(horizontal))]
+        lead = float(forward @ towards_front)
+        if lead == 0.0:
+            lead = _bonnet_side(vertices, faces, forward, -down)
+        if lead < 0:
+            forward = -forward
+    return np.stack([forward, down, np.cross(forward, down)])
+
+
+def _bonnet_side(vertices: NDArray, faces: NDArray, forward: NDArray, up: NDArray) -> float:
+    """Positive where the upper third's surface lies behind the middle, seen along `forward`."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    centre = corners.mean(axis=1)
+    height, along = centre @ up, centre @ forward
+    bounds = vertices @ up
+    upper = height > bounds.min() + 0.67 * np.ptp(bounds)
+    weight = np.where(upper, area, 0.0)
+    if weight.sum() == 0:
+        return 1.0
+    middle = (vertices @ forward).min() + np.ptp(vertices @ forward) / 2
+    return float(middle - (along * weight).sum() / weight.sum())

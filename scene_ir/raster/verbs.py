@@ -1,0 +1,191 @@
+"""Four verbs that turn triangles into differentiable pixels: rasterize, interpolate, texture, antialias.
+
+Each verb has two implementations behind one signature: `reference` (plain torch, any floating dtype, defines what
+is correct) and `warp` (float32, one kernel source for CPU and CUDA, imported on first use). Visibility is decided
+by a hard z-buffer and is not differentiated; values at a hit are, and `antialias` differentiates outlines.
+
+Clip coordinates are (u w, v w, w), as `geometry.to_clip` gives them: u, v in pixels (centres at integers), w in
+metres in front of the camera. Shapes: N draws, T packed pixels (`Layout`), F triangles, V vertices, K attributes.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.types import check_shape
+
+__all__ = [
+    "NEAR_M", "Backend", "Border", "Fragments", "Layout", "antialias", "bounding_rects", "interpolate", "rasterize",
+    "texture", "texture_packed",
+]  # fmt: skip
+
+NEAR_M = 0.05
+"""Surfaces closer than this w, m, are cut away: nearer than anything in front of a car's camera."""
+
+Backend = Literal["warp", "reference"]
+Border = Literal["clamp", "zero"]
+
+
+def rasterize(
+    clip: Tensor,
+    faces: Tensor,
+    face_ranges: Tensor,
+    layout: Layout,
+    backend: Backend = "warp",
+    near: float = NEAR_M,
+) -> Fragments:
+    """Find the nearest triangle at each pixel centre of each draw.
+
+    clip: (V, 3) = (u w, v w, w). faces: (F, 3) int, both windings are seen. face_ranges: (N, 2) int, draw i is faces
+    [start, end) inside layout.rects[i]; ranges may overlap. near: m, surfaces with w < near are cut away.
+    Triangles that share an edge never both hit, nor both miss, a pixel centre on it; of equal depths the lower face
+    index wins; triangles seen edge-on are skipped. Raises ShapeError or RangeError. Source: Olano and Greer 1997,
+    "Triangle scan conversion using 2D homogeneous coordinates".
+    """
+    _check_mesh(clip, faces, backend)
+    count = layout.rects.shape[0]
+    check_shape("raster.face_ranges", face_ranges, count, 2, floating=False)
+    if near <= 0:
+        raise RangeError("raster.near", "a positive distance", near)
+    if count and not 0 <= int(face_ranges.min()) <= int(face_ranges.max()) <= faces.shape[0]:
+        raise RangeError("raster.face_ranges", f"indices in [0, {faces.shape[0]}]", face_ranges.tolist())
+    face_ranges = face_ranges.to(torch.int64)
+    face, depth = _module(backend).rasterize(clip.detach(), faces, face_ranges, layout, near)
+    return Fragments(layout, face, depth, face_ranges, near)
+
+
+def interpolate(
+    fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor, backend: Backend = "warp"
+) -> Tensor:
+    """Perspective-correct attributes at the hits. attributes: (V, K) -> (T, K), 0 where nothing is hit.
+
+    clip, faces: as given to `rasterize`. Differentiable to clip and to attributes.
+    """
+    _check_mesh(clip, faces, backend)
+    check_shape("raster.attributes", attributes, clip.shape[0], None)
+    _check_dtype("raster.attributes", attributes, clip.dtype)
+    return _module(backend).interpolate(fragments, clip, faces, attributes)
+
+
+def texture(image: Tensor, uv: Tensor, backend: Backend = "warp", border: Border = "clamp") -> Tensor:
+    """Sample an image with the Catmull-Rom kernel (a = -1/2), which is smooth also at pixel centres.
+
+    image: (C, H, W). uv: (T, 2) px, pixel centres at integers -> (T, C), the pixel itself at integer uv.
+    border: beyond the image its edge pixels repeat ("clamp") or everything is 0 ("zero"). Differentiable to uv and
+    image. Source: Keys 1981, "Cubic convolution interpolation".
+    """
+    check_shape("raster.image", image, None, None, None)
+    check_shape("raster.uv", uv, None, 2)
+    if border not in ("clamp", "zero"):
+        raise RangeError("raster.border", "clamp or zero", border)
+    if 0 in image.shape[1:]:
+        raise ShapeError("raster.image", "at least one pixel", tuple(image.shape))
+    _check_backend(backend, uv)
+    _check_dtype("raster.image", image, uv.dtype)
+    return _module(backend).texture(image, uv, border == "clamp")
+
+
+def texture_packed(
+    values: Tensor,
+    crop_rects: Tensor,
+    crop_offsets: Tensor,
+    layout: Layout,
+    uv: Tensor,
+    backend: Backend = "warp",
+    border: Border = "zero",
+) -> Tensor:
+    """`texture` for all draws at once: the pixels of draw i sample crop i of N crops of different sizes.
+
+    values: (S, C), the texels of all crops one after the other, row-major. crop_rects: (N, 4) int64 px, half-open
+    (x0, y0, x1, y1), where each crop lies in the frame; crop_offsets: (N + 1,) int64 (both as in `Layout`).
+    uv: (T, 2) px of the *frame* -> (T, C). Samples of an empty crop are 0. Differentiable to uv and values.
+    """
+    crops = Layout(crop_rects, crop_offsets)
+    if crops.rects.shape[0] != layout.rects.shape[0]:
+        raise ShapeError("raster.crop_rects", f"{layout.rects.shape[0]} crops, one a draw", crops.rects.shape[0])
+    check_shape("raster.values", values, crops.size, None)
+    check_shape("raster.uv", uv, layout.size, 2)
+    if border not in ("clamp", "zero"):
+        raise RangeError("raster.border", "clamp or zero", border)
+    _check_backend(backend, uv)
+    _check_dtype("raster.values", values, uv.dtype)
+    return _module(backend).texture_packed(values, crops, layout, uv, border == "clamp")
+
+
+def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backend = "warp") -> Tensor:
+    """Coverage (T,) in [0, 1] of each pixel by its draw, with outlines blended against empty neighbours.
+
+    clip, faces: as given to `rasterize`. Between a hit pixel and an empty 4-neighbour of the same
+    draw the outline crosses the segment of their centres at t in [0, 1], measured from the hit: the hit pixel keeps
+    1/2 + t, the empty one gets t - 1/2, each at most 1 and at least 0; of the horizontal and the vertical estimate
+    the one that changes the pixel more counts. So a straight outline that sweeps over the pixels changes coverage
+    continuously. Differentiable to clip, through the vertices of the edge that makes the outline.
+    The idea of differentiating analytic edge coverage is from Laine et al. 2020, "Modular primitives for
+    high-performance differentiable rendering".
+    """
+    _check_mesh(clip, faces, backend)
+    return _module(backend).antialias(fragments, clip, faces)
+
+
+def bounding_rects(
+    clip: Tensor, vertex_ranges: Tensor, height: int, width: int, margin: int = 2, near: float = NEAR_M
+) -> Tensor:
+    """Pixel rectangles (N, 4) int64, half-open and inside the image, that hold vertices [start, end) of each draw.
+
+    clip: (V, 3). vertex_ranges: (N, 2) int. margin: px on each side. A draw with vertices on both sides of the near
+    plane gets the whole image; one wholly behind it, or without vertices, an empty rectangle.
+    """
+    check_shape("raster.clip", clip, None, 3)
+    check_shape("raster.vertex_ranges", vertex_ranges, None, 2, floating=False)
+    points = clip.detach().to("cpu", torch.float64)
+    in_front = points[:, 2] >= near
+    px = points[:, :2] / torch.where(in_front, points[:, 2], 1.0)[:, None]
+    limit = torch.tensor([width, height], dtype=torch.float64)
+    rects = torch.zeros(vertex_ranges.shape[0], 4, dtype=torch.int64)
+    for i, (start, end) in enumerate(vertex_ranges.tolist()):
+        front = in_front[start:end]
+        if bool(front.all()) and end > start:
+            low, high = px[start:end].aminmax(dim=0)
+            low = (low - margin).ceil().clamp(min=0).minimum(limit)
+            high = ((high + margin).floor() + 1).minimum(limit)
+            rects[i, :2], rects[i, 2:] = low, high.maximum(low)
+        elif bool(front.any()):
+            rects[i, 2], rects[i, 3] = width, height
+    return rects.to(clip.device)
+
+
+def _module(backend: Backend) -> ModuleType:
+    """The implementation; Warp is imported here, so that only who uses it pays for it."""
+    if backend == "warp":
+        from scene_ir.raster import kernels
+
+        return kernels
+    from scene_ir.raster import reference
+
+    return reference
+
+
+def _check_mesh(clip: Tensor, faces: Tensor, backend: Backend) -> None:
+    check_shape("raster.clip", clip, None, 3)
+    check_shape("raster.faces", faces, None, 3, floating=False)
+    _check_backend(backend, clip)
+    if faces.shape[0] and not 0 <= int(faces.min()) <= int(faces.max()) < clip.shape[0]:
+        raise RangeError("raster.faces", f"indices in [0, {clip.shape[0]})", [int(faces.min()), int(faces.max())])
+
+
+def _check_backend(backend: Backend, tensor: Tensor) -> None:
+    if backend not in ("warp", "reference"):
+        raise RangeError("raster.backend", "warp or reference", backend)
+    if backend == "warp" and tensor.dtype != torch.float32:
+        raise ShapeError("raster", "float32 with backend warp (backend reference takes any dtype)", tensor.dtype)
+
+
+def _check_dtype(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
+    if tensor.dtype != dtype:
+        raise ShapeError(name, str(dtype), tensor.dtype)

@@ -1,0 +1,284 @@
+"""What the compositor draws: a vehicle's mesh, its inflated proxy and the patch of ground that carries its shadow.
+
+Shapes: N objects; V vertices and F triangles of all objects together, object after object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir.ffd import lattice_weights
+from scene_ir.geometry import to_clip, vertex_normals
+from scene_ir.raster import verbs
+from scene_ir.types import Camera, Mesh, Part
+
+CREASE_RAD = 0.7
+"""Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling tools."""
+SHADOW_MARGIN_M = 1.0
+"""How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
+SUN_OFFSET_MAX_M = 2.2
+"""Longest cast shadow that is kept: beyond it the penumbra of a low sun is too faint to be worth its pixels."""
+_WELD = 1e-5
+"""Vertices of the unit box nearer than this are one point."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A mesh made ready to draw, sharp edges split.
+
+    unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its mirror
+    image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0, 1].
+    """
+
+    unit: Tensor
+    faces: Tensor
+    weights: Tensor
+    mirror_weights: Tensor
+    weld: Tensor
+    colours: Tensor
+    paint: Tensor
+    glass: Tensor
+
+    @classmethod
+    def of(cls, mesh: Mesh, dtype: torch.dtype) -> Surface:
+        """The surface of `mesh`; prepared once a mesh and kept while few others are used."""
+        return _surface(mesh.vertices, mesh.faces, mesh.part, mesh.colours, dtype)
+
+
+@lru_cache(maxsize=128)
+def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | None, dtype: torch.dtype) -> Surface:
+    points = vertices.detach().cpu().numpy().astype(np.float64)
+    triangles = faces.cpu().numpy()
+    weld = np.unique(np.round(points / _WELD).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    normals = _crease_normals(points, triangles, weld)
+    corner = triangles.reshape(-1)
+    key = np.concatenate([corner[:, None], np.round(normals * 500).astype(np.int64)], axis=1)
+    _, first, split = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    origin = torch.as_tensor(corner[first])
+    new_faces = torch.as_tensor(split.reshape(-1, 3))
+    unit = vertices.detach().cpu()[origin].to(dtype)
+    mirror = unit * unit.new_tensor([1.0, 1.0, -1.0])
+    grey = torch.full((len(points), 3), 0.7) if colours is None else colours.detach().cpu()
+    kinds = part.cpu()
+    tensors = (
+        unit, new_faces, lattice_weights(unit), lattice_weights(mirror), torch.as_tensor(weld)[origin],
+        grey[origin].to(dtype), _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
+    )  # fmt: skip
+    return Surface(*(t.to(vertices.device) for t in tensors))
+
+
+def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
+    """Unit normals (3F, 3) of the corners: area-weighted over the faces around the point that bend less than a crease."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-20)
+    point = weld[faces.reshape(-1)]
+    face = np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(point, kind="stable")
+    count = np.bincount(point)
+    start = np.cumsum(count) - count
+    repeats = count[point]
+    left = np.repeat(np.arange(len(point)), repeats)
+    step = np.arange(len(left)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    right = face[order[start[point[left]] + step]]
+    smooth = (unit[face[left]] * unit[right]).sum(axis=1) > np.cos(CREASE_RAD)
+    summed = np.zeros((len(point), 3))
+    np.add.at(summed, left[smooth], area[right[smooth]])
+    return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
+
+
+def _share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
+    """The share (V,) of the faces around each vertex that are of one part."""
+    index = faces.reshape(-1)
+    flags = is_part.to(like.dtype).repeat_interleave(3)
+    total = like.new_zeros(like.shape[0]).index_add(0, index, torch.ones_like(flags))
+    return like.new_zeros(like.shape[0]).index_add(0, index, flags) / total.clamp(min=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """The surfaces of N objects, one after the other.
+
+    owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into the
+    V vertices; colours (V, 3); paint, glass (V,).
+    """
+
+    surfaces: tuple[Surface, ...]
+    owner: Tensor
+    vertex_ranges: Tensor
+    face_ranges: Tensor
+    faces: Tensor
+    colours: Tensor
+    paint: Tensor
+    glass: Tensor
+
+    @classmethod
+    def of(cls, surfaces: Sequence[Surface], like: Tensor) -> Fleet:
+        """`like`: a tensor of the dtype and device to work in."""
+        device = like.device
+        ends = np.cumsum([0] + [s.unit.shape[0] for s in surfaces])
+        face_ends = np.cumsum([0] + [s.faces.shape[0] for s in surfaces])
+        counts = torch.tensor([s.unit.shape[0] for s in surfaces], dtype=torch.int64)
+
+        def ranges(edges: np.ndarray) -> Tensor:
+            return torch.as_tensor(np.stack([edges[:-1], edges[1:]], axis=1), dtype=torch.int64)
+
+        def packed(parts: list[Tensor], *shape: int) -> Tensor:
+            return torch.cat(parts) if parts else like.new_zeros(shape)
+
+        faces = [s.faces + int(start) for s, start in zip(surfaces, ends[:-1], strict=True)]
+        return cls(
+            tuple(surfaces),
+            torch.repeat_interleave(torch.arange(len(surfaces)), counts).to(device),
+            ranges(ends),
+            ranges(face_ends),
+            packed(faces, 0, 3).to(torch.int64),
+            packed([s.colours for s in surfaces], 0, 3),
+            packed([s.paint for s in surfaces], 0),
+            packed([s.glass for s in surfaces], 0),
+        )
+
+    def local(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
+        """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right swapped."""
+        parts = []
+        for i, surface in enumerate(self.surfaces):
+            if mirrored:
+                unit = surface.unit * surface.unit.new_tensor([1.0, 1.0, -1.0]) + surface.mirror_weights @ ffd[i]
+            else:
+                unit = surface.unit + surface.weights @ ffd[i]
+            parts.append(unit * size_lhw[i])
+        return torch.cat(parts) if parts else ffd.new_zeros(0, 3)
+
+    def normals(self, local: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones, along which a proxy cannot crack."""
+        sharp, smooth = [], []
+        for surface, (start, end) in zip(self.surfaces, self.vertex_ranges.tolist(), strict=True):
+            points = local[start:end]
+            sharp.append(vertex_normals(points, surface.faces))
+            count = int(surface.weld.max()) + 1
+            position = points.new_zeros(count, 3).index_copy(0, surface.weld, points)
+            smooth.append(vertex_normals(position, surface.weld[surface.faces])[surface.weld])
+        if not sharp:
+            return local, local
+        return torch.cat(sharp), torch.cat(smooth)
+
+    def place(self, local: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
+        """Camera-space points (V, 3) m of local ones. yaw (N,) rad; translation (N, 3) m."""
+        return rotate(local, yaw[self.owner]) + translation[self.owner]
+
+
+def rotate(local: Tensor, yaw: Tensor) -> Tensor:
+    """Vectors (V, 3) turned about the camera's y axis, each by its own yaw (V,) rad."""
+    cos, sin = torch.cos(yaw), torch.sin(yaw)
+    x, y, z = local.unbind(-1)
+    return torch.stack([cos * x + sin * z, y, cos * z - sin * x], dim=-1)
+
+
+def facing(points: Tensor, normals: Tensor, centre: Tensor) -> Tensor:
+    """Cosine (V,) between normals (V, 3) and the way to the camera at `centre` (3,), points (V, 3) m."""
+    towards = centre - points
+    return (towards * normals).sum(-1) / towards.norm(dim=-1).clamp(min=1e-6)
+
+
+def camera_centre(matrix: Tensor) -> Tensor:
+    """Where the camera stands (3,) m; its fourth column moves KITTI's camera 2 off the origin."""
+    return -torch.linalg.solve(matrix[:, :3], matrix[:, 3])
+
+
+def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
+    """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun (3,)."""
+    away = -sun / (-sun[1]).clamp(min=0.3)
+    world = torch.stack([away[0].expand_as(yaw), torch.zeros_like(yaw), away[2].expand_as(yaw)], dim=-1)
+    offset = rotate(world, -yaw)[:, [0, 2]] * height_m[:, None]
+    length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    return offset * (length.clamp(max=SUN_OFFSET_MAX_M) / length)
+
+
+def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
+    """Corners (N, 4, 2) m, (x, z) in the objects' frames, of the ground patches that hold the shadows."""
+    half = size_lhw[:, [0, 2]] / 2 + SHADOW_MARGIN_M
+    low, high = -half + offset.clamp(max=0.0), half + offset.clamp(min=0.0)
+    x = torch.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], dim=1)
+    z = torch.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]], dim=1)
+    return torch.stack([x, z], dim=-1)
+
+
+def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: Tensor) -> Tensor:
+    """Points (4N, 3) m, on planes parallel to the ground through the objects' feet, of (N, 4, 2) m local (x, z)."""
+    flat = torch.stack([corners[..., 0], torch.zeros_like(corners[..., 0]), corners[..., 1]], dim=-1).reshape(
+        -1, 3
+    )
+    turned = rotate(flat, yaw.repeat_interleave(4))
+    x, _, z = turned.unbind(-1)
+    y = -(ground[0] * x + ground[2] * z) / ground[1]
+    return torch.stack([x, y, z], dim=-1) + translation.repeat_interleave(4, dim=0)
+
+
+def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
+    """How dark (T,) in [0, 1] a box-like vehicle makes the ground at (x, z) (T, 2) m of its frame; smooth.
+
+    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point. The contact shadow under the body fades over
+    some tens of centimetres; the cast one is that of a box tapering to the roof, moved along the sun's offset.
+    """
+    half = size_lhw[:, [0, 2]] / 2
+
+    def outside(centre: Tensor, extent: Tensor) -> Tensor:
+        q = (local_xz - centre).abs() - extent
+        apart = (q.clamp(min=0.0).square().sum(-1) + 1e-6).sqrt()
+        return apart + q.amax(dim=-1).clamp(max=0.0)
+
+    contact = torch.sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
+    shares = ((0.25, 0.97), (0.55, 0.92), (0.9, 0.72))
+    cast = torch.stack(
+        [torch.sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares]
+    )
+    lit = 1.0 - (1.0 - cast).prod(dim=0)
+    return 1.0 - (1.0 - 0.72 * contact) * (1.0 - 0.55 * lit)
+
+
+def crop_rects(
+    clip: Tensor, faces: Tensor, vertex_ranges: Tensor, face_ranges: Tensor, camera: Camera, margin: int = 2
+) -> Tensor:
+    """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near plane.
+
+    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2). A draw wholly behind the camera or beside the image
+    has an empty rectangle.
+    """
+    points = clip.detach().to("cpu", torch.float64)
+    triangles = faces.cpu()
+    limit = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    rects = torch.zeros(vertex_ranges.shape[0], 4, dtype=torch.int64)
+    pairs = zip(vertex_ranges.tolist(), face_ranges.tolist(), strict=True)
+    for i, ((start, end), (face_start, face_end)) in enumerate(pairs):
+        inside = points[start:end]
+        front = inside[:, 2] >= verbs.NEAR_M
+        if not bool(front.any()):
+            continue
+        if not bool(front.all()):
+            inside = torch.cat([inside[front], _near_crossings(points, triangles[face_start:face_end])])
+        px = inside[:, :2] / inside[:, 2:]
+        low = (px.amin(dim=0) - margin).ceil().clamp(min=0).minimum(limit)
+        high = ((px.amax(dim=0) + margin).floor() + 1).clamp(min=0).minimum(limit)
+        if bool((high > low).all()):
+            rects[i] = torch.cat([low, high]).to(torch.int64)
+    return rects.to(clip.device)
+
+
+def _near_crossings(points: Tensor, faces: Tensor) -> Tensor:
+    """Clip coordinates (K, 3) where the edges of the faces pass through the near plane."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    a, b = points[edges[:, 0]], points[edges[:, 1]]
+    crosses = (a[:, 2] >= verbs.NEAR_M) != (b[:, 2] >= verbs.NEAR_M)
+    a, b = a[crosses], b[crosses]
+    return a + ((verbs.NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
+
+
+def project_vertices(points: Tensor, camera: Camera) -> Tensor:
+    """Clip coordinates (V, 3) of camera-space points (V, 3)."""
+    return to_clip(points, camera.matrix.to(points))

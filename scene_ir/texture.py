@@ -1,0 +1,222 @@
+"""Projective texture: a vehicle's surface takes its colours from the photograph; paint changes on top of them.
+
+Shapes: R rows, one a pixel of some object's layer; S texels of all sources together. RGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir.raster import verbs
+from scene_ir.types import Crop, Source
+
+DEPTH_TOLERANCE_M = (0.25, 0.6)
+"""A point this much behind the photographed surface begins to be, and is, unseen: thicker than a mirror or a seat."""
+TURN_TOLERANCE = (0.08, 0.25)
+"""Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
+OPEN_TURN = (0.02, 0.1)
+"""Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
+OUTLINE_PX = (2.0, 5.0)
+"""Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the inside."""
+HIDDEN_PX = (1.0, 3.0)
+"""Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
+CHANNELS = 7
+"""Of a texel: premultiplied RGB, opacity, hidden, outline, depth m."""
+_PAD = 2
+"""Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
+_LIGHTNESS_GAIN, _CHROMA_GAIN, _GLOSS_GAIN, _DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
+_DUST_RGB = (0.47, 0.42, 0.35)
+"""Dry road dust."""
+
+
+def smoothstep(x: Tensor, low: float, high: float) -> Tensor:
+    """Exactly 0 up to `low`, exactly 1 from `high` on, continuously differentiable between (Hermite cubic)."""
+    t = ((x - low) / (high - low)).clamp(0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@dataclass(frozen=True, slots=True)
+class Texels:
+    """What the photograph knows of each object. values: (S, C); rects (N, 4) int64 px; offsets (N + 1,) int64."""
+
+    values: Tensor
+    rects: Tensor
+    offsets: Tensor
+
+    @classmethod
+    def pack(cls, crops: Sequence[Crop], like: Tensor) -> Texels:
+        """Crops of one channel count, packed. `like`: a tensor of the dtype and device wanted."""
+        rows = [crop.values.flatten(1).T.to(like) for crop in crops]
+        rects = [
+            [c.x0, c.y0, c.x0 + c.values.shape[2], c.y0 + c.values.shape[1]] if c.values.numel() else [0, 0, 0, 0]
+            for c in crops
+        ]
+        offsets = np.cumsum([0] + [r.shape[0] for r in rows])
+        return cls(
+            torch.cat(rows).contiguous(),
+            torch.tensor(rects, dtype=torch.int64, device=like.device),
+            torch.as_tensor(offsets, dtype=torch.int64, device=like.device),
+        )
+
+    def sample(self, uv: Tensor, counts: Tensor, backend: verbs.Backend, border: verbs.Border) -> Tensor:
+        """Catmull-Rom lookups (R, C) at uv (R, 2) px of the frame, the rows grouped by object, counts (N,) of each."""
+        zero = torch.zeros_like(counts)
+        layout = verbs.Layout.of(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
+        return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
+
+
+def crop_of(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tensor:
+    """The values (C, h, w) of `crop` seen through `rect` (x0, y0, x1, y1), which may reach beyond the frame.
+
+    Zero where the crop says nothing; beyond the frame its edge pixels repeat, since a vehicle goes on there.
+    """
+    height, width = frame_hw
+    x0, y0, x1, y1 = rect
+    rows = (torch.arange(y0, y1).clamp(0, height - 1) - crop.y0).to(crop.values.device)
+    columns = (torch.arange(x0, x1).clamp(0, width - 1) - crop.x0).to(crop.values.device)
+    h, w = crop.values.shape[1:]
+    if h == 0 or w == 0:
+        return crop.values.new_zeros(crop.values.shape[0], y1 - y0, x1 - x0)
+    known = ((rows >= 0) & (rows < h))[:, None] & ((columns >= 0) & (columns < w))[None, :]
+    picked = crop.values[:, rows.clamp(0, h - 1)][:, :, columns.clamp(0, w - 1)]
+    return picked * known
+
+
+def source_texels(
+    source: Source, mesh_depth: Crop, hidden: Tensor, rect: Sequence[int], frame_hw: tuple[int, int]
+) -> Crop:
+    """The `CHANNELS` texels of one object inside `rect`, padded.
+
+    mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
+    object stands before this one. Beyond the mesh, texels belong to the outline; its depth lies behind everything.
+    """
+    x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
+    window = (x0, y0, x1, y1)
+    rgba = crop_of(source.foreground, window, frame_hw)
+    frame = Crop(hidden[None], 0, 0)
+    covered = torch.isfinite(mesh_depth.values)
+    padded = crop_of(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
+    finite = torch.where(covered, mesh_depth.values, torch.zeros_like(mesh_depth.values)).to(rgba)
+    depth = crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw)
+    beyond = float(finite.max()) + 2.0 * DEPTH_TOLERANCE_M[1]
+    depth = torch.where(padded, depth, torch.full_like(depth, beyond))
+    depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
+    inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    outline = 1.0 - smoothstep(torch.from_numpy(np.ascontiguousarray(distance)).to(rgba), *OUTLINE_PX)
+    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth])
+    return Crop(values, x0, y0)
+
+
+def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
+    """(H, W) in [0, 1]: 1 well inside the mattes Crop (1, h, w) of nearer objects, 0 wherever they are transparent.
+
+    It depends on where the mattes are above 0 only, not on their values, which the solution raises as it goes.
+    """
+    support = np.zeros(frame_hw, dtype=np.uint8)
+    for matte in mattes:
+        h, w = matte.values.shape[1:]
+        region = support[matte.y0 : matte.y0 + h, matte.x0 : matte.x0 + w]
+        region[matte.values[0].detach().cpu().numpy() > 0.0] = 1
+    if not support.any():
+        return like.new_zeros(frame_hw)
+    padded = np.pad(support, 1, mode="edge")
+    distance = np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
+    return smoothstep(torch.from_numpy(distance).to(like), *HIDDEN_PX)
+
+
+def facing_weight(turned: Tensor, cos_source: Tensor) -> Tensor:
+    """1 where a texel was seen squarely enough for how squarely it is shown now, 0 where it would smear.
+
+    turned: cosine towards the camera now minus then; cos_source: then. Exactly 1, with zero slope, where nothing turned.
+    """
+    positive = 0.5 * (cos_source + (cos_source.square() + 1e-4).sqrt())
+    return 1.0 - smoothstep(turned - positive, *TURN_TOLERANCE)
+
+
+def inside_weight(uv: Tensor, height: int, width: int) -> Tensor:
+    """1 for pixels uv (R, 2) in the photograph, fading to 0 within one pixel beyond it."""
+    limit = uv.new_tensor([width - 1.0, height - 1.0])
+    beyond = torch.maximum(-uv, uv - limit)
+    return (1.0 - smoothstep(beyond, 0.5, 1.5)).prod(dim=-1)
+
+
+def apply_texture_code(
+    colour: Tensor, opacity: Tensor, code: Tensor, paint: Tensor, height: Tensor, base_lightness: Tensor
+) -> Tensor:
+    """Premultiplied colours (R, 3) with the paint changed; untouched bits where the code is 0.
+
+    opacity (R,); code (R, 5): lightness, a*, b*, gloss, dirt in (-1, 1); paint (R,): how much of the pixel is paint;
+    height (R,): 0 at the foot of the vehicle, 1 at its roof (dirt gathers low); base_lightness (R,): CIE L* of the
+    paint, about which gloss turns contrast. The change is f(colour, code) - f(colour, 0): zero at 0, its slope is not.
+    """
+    index = ((paint > 0.0) & (opacity > 0.0)).nonzero()[:, 0]
+    if index.numel() == 0:
+        return colour
+    alpha = opacity[index]
+    straight = (colour[index] / alpha.clamp(min=0.02)[:, None]).clamp(0.0, 1.0)
+    arguments = (height[index], base_lightness[index])
+    change = _paint(straight, code[index], *arguments) - _paint(
+        straight, torch.zeros_like(code[index]), *arguments
+    )
+    return colour.index_add(0, index, change * (alpha * paint[index])[:, None])
+
+
+def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) -> Tensor:
+    """The paint model: a curve in CIE L*, shifts of a* and b*, and a veil of dust. rgb (R, 3), code (R, 5)."""
+    lightness, a, b = lab(rgb).unbind(-1)
+    shift, red, yellow, gloss, dirt = code.unbind(-1)
+    level = (lightness / 100.0).clamp(0.01, 0.99)
+    glossy = gloss * _GLOSS_GAIN * (lightness - base_lightness) / 30.0
+    level = torch.sigmoid(torch.logit(level) + _LIGHTNESS_GAIN * shift + glossy)
+    room = 4.0 * level * (1.0 - level)
+    changed = torch.stack([100.0 * level, a + _CHROMA_GAIN * red * room, b + _CHROMA_GAIN * yellow * room], dim=-1)
+    out = rgb_of(changed)
+    veil = (dirt * _DIRT_GAIN * (1.0 - 0.75 * height.clamp(0.0, 1.0)))[:, None]
+    return out + veil * (out.new_tensor(_DUST_RGB) - out)
+
+
+def lab(rgb: Tensor) -> Tensor:
+    """CIE L*a*b* (R, 3) of sRGB rows (R, 3)."""
+    return kornia.color.rgb_to_lab(rgb.T[None, :, :, None])[0, :, :, 0].T
+
+
+def rgb_of(lab_rows: Tensor) -> Tensor:
+    """sRGB rows (R, 3), not clipped, of CIE L*a*b* rows (R, 3)."""
+    return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
+
+
+_GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90), (0.52, 0.66, 0.86)
+
+
+def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height: Tensor, sun: Tensor) -> Tensor:
+    """Daylight on a vehicle's own colours: RGB (R, 3), the template's look where no photograph helps.
+
+    normal, to_eye (R, 3) unit; albedo (R, 3); sheen (R, 2): paint, glass in [0, 1]; height (R,) 0 at the foot, 1 at the
+    roof; sun (3,) unit. Sky dome and ground bounce, a sun with a highlight, and a Fresnel reflection of a plain sky.
+    """
+    up = -normal[:, 1]
+    dome = 0.5 + 0.5 * up
+    soft = (normal * sun).sum(-1)
+    direct = 0.5 * (soft + (soft.square() + 0.01).sqrt())
+    occluded = 0.45 + 0.55 * smoothstep(height, -0.05, 0.4)
+    diffuse = ((0.30 + 0.38 * dome) + 0.62 * direct) * occluded
+    cos = (normal * to_eye).sum(-1).clamp(0.0, 1.0)
+    mirror = 2.0 * cos[:, None] * normal - to_eye
+    sky_up = -mirror[:, 1]
+    ground, horizon, zenith = (albedo.new_tensor(c) for c in (_GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB))
+    above = horizon + (zenith - horizon) * smoothstep(sky_up, 0.0, 0.9)[:, None]
+    surround = ground + (above - ground) * smoothstep(sky_up, -0.08, 0.12)[:, None]
+    fresnel = 0.04 + 0.96 * (1.0 - cos).pow(5)
+    paint, glass = sheen[:, 0], sheen[:, 1]
+    strength = (0.55 * paint * fresnel + glass * (0.10 + 0.75 * fresnel)) * (0.5 + 0.5 * occluded)
+    glint = ((mirror * sun).sum(-1).clamp(0.0, 1.0)).pow(40) * (0.35 * paint + 0.5 * glass)
+    lit = albedo * diffuse[:, None]
+    return (lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)).clamp(0.0, 1.0)

@@ -1,0 +1,214 @@
+"""Who may import whom, read from the sources; and what stays unloaded until it is used."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("scene_ir", "detectors", "drivesem")
+TOP_LEVEL_NAMES = {
+    *PACKAGES,
+    *("configs", "docs", "tests", "tools"),
+    *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
+}
+HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
+LOADED_WHERE_USED = ("open3d", "pyrender", "onnxruntime", "torchvision", "ultralytics")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What the modules under `package` may import besides the standard library and themselves.
+
+    project: prefixes of this project's modules. libraries: top-level names, None for any. never: prefixes that are
+    out even where `project` covers them. adapters: prefixes of modules whose job is one more library.
+    """
+
+    package: str
+    project: tuple[str, ...]
+    libraries: tuple[str, ...] | None
+    never: tuple[str, ...] = ()
+    adapters: tuple[str, ...] = ()
+
+
+_LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
+_LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
+_JOINED = ("drivesem.space", "drivesem.feasible", "drivesem.attacks")
+RULES = (
+    Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "trimesh", "warp")),
+    Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
+    *(Rule(package, (*_LOGIC, *_JOINED), _LOGIC_LIBRARIES) for package in _JOINED),
+    Rule(
+        "drivesem.evaluation",
+        ("detectors.types", "detectors.boxes"),
+        ("torch", "numpy", "pycocotools"),
+        never=("scene_ir", "drivesem.attacks"),
+    ),
+    Rule(
+        "drivesem.report",
+        ("drivesem.results", "scene_ir.errors", "scene_ir.files"),
+        None,
+        never=("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster"),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import statement: where it stands, and the module or member it names."""
+
+    file: Path
+    line: int
+    name: str
+    at_top: bool
+
+    @property
+    def importer(self) -> str:
+        parts = self.file.relative_to(ROOT).with_suffix("").parts
+        return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+    def __str__(self) -> str:
+        return f"{self.file.relative_to(ROOT)}:{self.line} imports {self.name}"
+
+
+def modules() -> list[Path]:
+    """Every source file of the three packages."""
+    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def imports(path: Path, source: str | None = None) -> Iterator[Import]:
+    """Every import of a file, those inside functions too; not those for the type checker's eyes only."""
+    tree = ast.parse(path.read_text(encoding="utf-8") if source is None else source, filename=str(path))
+    unseen = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    top = set(tree.body)
+    for node in ast.walk(tree):
+        if node in unseen:
+            continue
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield Import(path, node.lineno, alias.name, node in top)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute"
+            for alias in node.names:
+                yield Import(path, node.lineno, f"{node.module}.{alias.name}", node in top)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
+            name = node.args[0]
+            assert isinstance(name, ast.Constant), f"{path}:{node.lineno}: an import that cannot be read"
+            yield Import(path, node.lineno, str(name.value), False)
+
+
+def under(name: str, prefixes: tuple[str, ...]) -> bool:
+    """Whether a dotted name is one of `prefixes` or below one."""
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
+
+
+def breaks(rule: Rule, found: Import) -> bool:
+    """Whether an import of a module under `rule.package` is against it."""
+    if under(found.name, rule.never):
+        return True
+    top = found.name.partition(".")[0]
+    if top in sys.stdlib_module_names or under(found.name, (rule.package,)):
+        return False
+    if top in PACKAGES:
+        return not under(found.name, rule.project)
+    if under(found.importer, rule.adapters):
+        return False
+    return rule.libraries is not None and top not in rule.libraries
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.package)
+def test_packages_import_only_what_they_may(rule: Rule) -> None:
+    every = [found for path in modules() for found in imports(path)]
+    broken = [str(found) for found in every if under(found.importer, (rule.package,)) and breaks(rule, found)]
+    assert not broken, "\n".join(broken)
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("scene_ir/io.py", "from drivesem.data import kitti"),
+        ("scene_ir/types.py", "def f():\n    import detectors.types"),
+        ("scene_ir/types.py", "import open3d"),
+        ("detectors/boxes.py", "from scene_ir.types import Labels"),
+        ("detectors/boxes.py", "import onnxruntime"),
+        ("drivesem/attacks/base.py", "from drivesem import objective"),
+        ("drivesem/attacks/base.py", "from detectors import types"),
+        ("drivesem/feasible.py", "from scene_ir import compositor"),
+        ("drivesem/evaluation/coco.py", "from scene_ir.types import Labels"),
+        ("drivesem/evaluation/coco.py", "import importlib\nimportlib.import_module('drivesem.attacks.base')"),
+        ("drivesem/report/page.py", "import torch"),
+        ("drivesem/report/page.py", "from scene_ir import compositor"),
+    ],
+)
+def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
+    found = list(imports(ROOT / file, source))
+    assert any(breaks(rule, f) for rule in RULES for f in found if under(f.importer, (rule.package,)))
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("scene_ir/io.py", "import json\nimport torch\nfrom scene_ir.types import Mesh"),
+        ("detectors/adapters/onnx.py", "import onnxruntime"),
+        ("drivesem/attacks/si_fgsm.py", "from drivesem.attacks.base import Attack\nfrom scene_ir import ffd"),
+        ("drivesem/pipeline.py", "from scene_ir import compositor\nfrom detectors import registry"),
+        ("drivesem/report/page.py", "import jinja2\nfrom drivesem.results import RunSummary"),
+    ],
+)
+def test_the_rules_let_through_what_they_allow(file: str, source: str) -> None:
+    found = list(imports(ROOT / file, source))
+    assert found
+    assert not [f for rule in RULES for f in found if under(f.importer, (rule.package,)) and breaks(rule, f)]
+
+
+def test_libraries_that_may_be_missing_are_imported_where_used() -> None:
+    early = [str(f) for path in modules() for f in imports(path) if f.at_top and under(f.name, LOADED_WHERE_USED)]
+    early = [line for line in early if not line.startswith("detectors/adapters")]
+    assert not early, "\n".join(early)
+
+
+def test_files_are_named_for_what_they_hold() -> None:
+    assert not [str(path) for path in modules() if path.stem in ("utils", "util", "helpers", "misc", "common")]
+
+
+def test_top_level_names() -> None:
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("needs git and a checkout: top-level names are read from the tracked files")
+    names = {name.partition("/")[0] for name in listed if not name.startswith(".")}
+    assert names <= TOP_LEVEL_NAMES
+    assert {path.name for path in ROOT.iterdir()} >= set(PACKAGES)
+
+
+@pytest.mark.parametrize(
+    "module", ["drivesem", "drivesem.cli", "drivesem.config", "drivesem.results", "scene_ir.files"]
+)
+def test_importing_loads_nothing_heavy(module: str) -> None:
+    code = f"import sys, {module}; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == []
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, atexit\n"
+        f"atexit.register(lambda: print('loaded:', *sorted(set({HEAVY!r}) & set(sys.modules))))\n"
+        "sys.argv = ['drivesem', '--help']\n"
+        "from drivesem.cli import main\n"
+        "main()\n"
+    )
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.rstrip().endswith("loaded:")

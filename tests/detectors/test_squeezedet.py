@@ -1,0 +1,367 @@
+"""SqueezeDet: its layers, its anchors, each term of its loss on planted targets, its decoding."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from detectors import boxes
+from detectors.base import RawPredictions
+from detectors.squeezedet import ANCHOR_SIZES_WH, Assignment, SqueezeDet
+from detectors.types import Targets
+
+
+def fresh(seed: int = 0, classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")) -> SqueezeDet:
+    detector = SqueezeDet(classes=classes)
+    detector.initialise(torch.Generator().manual_seed(seed))
+    return detector.eval()
+
+
+def targets(boxes_xyxy: list, labels: list[int], ignore: list[bool] | None = None) -> Targets:
+    flags = [False] * len(labels) if ignore is None else ignore
+    return Targets(
+        torch.tensor(boxes_xyxy, dtype=torch.float32).reshape(-1, 4),
+        torch.tensor(labels, dtype=torch.int64),
+        torch.tensor(flags, dtype=torch.bool),
+    )
+
+
+def silent(batch: int, height: int, width: int, classes: int = 3) -> dict[str, Tensor]:
+    """Predictions of a network that sees nothing: boxes are the anchors, confidence 1e-9 (logit)."""
+    rows, columns = -(-height // 16), -(-width // 16)
+    count = rows * columns * 9
+    index = torch.arange(count)
+    size = torch.tensor(ANCHOR_SIZES_WH)[index % 9]
+    centre = torch.stack((index // 9 % columns, index // 9 // columns), 1) * 16.0 + 7.5
+    return {
+        "boxes_xyxy": torch.cat((centre - size / 2, centre + size / 2), 1).repeat(batch, 1, 1),
+        "deltas": torch.zeros(batch, count, 4),
+        "class_logits": torch.zeros(batch, count, classes),
+        "confidence_logits": torch.full((batch, count), -40.0),
+    }
+
+
+def anchor_at(row: int, column: int, shape: int, columns: int) -> int:
+    return (row * columns + column) * 9 + shape
+
+
+def raw_of(parts: dict[str, Tensor], height: int, width: int) -> RawPredictions:
+    return RawPredictions(**parts, image_hw=(height, width))
+
+
+def test_parameter_count_is_the_published_one() -> None:
+    # Each line (in * k * k + 1) * out. Fire: squeeze, expand 1x1, expand 3x3.
+    conv1 = (3 * 9 + 1) * 64
+    fires = 0
+    for inputs, squeeze, expand in [
+        (64, 16, 64),
+        (128, 16, 64),
+        (128, 32, 128),
+        (256, 32, 128),
+        (256, 48, 192),
+        (384, 48, 192),
+        (384, 64, 256),
+        (512, 64, 256),
+        (512, 96, 384),
+        (768, 96, 384),
+    ]:
+        fires += (inputs + 1) * squeeze + (squeeze + 1) * expand + (squeeze * 9 + 1) * expand
+    convdet = (768 * 9 + 1) * 9 * (3 + 1 + 4)
+    assert conv1 + fires + convdet == 2_082_120  # 7.9 MiB of float32, as the paper says
+    assert sum(p.numel() for p in fresh().parameters()) == 2_082_120
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "rows", "columns"), [(384, 1248, 24, 78), (375, 1242, 24, 78), (64, 65, 4, 5), (16, 16, 1, 1)]
+)
+def test_grid(height: int, width: int, rows: int, columns: int) -> None:
+    with torch.no_grad():
+        raw = fresh()(torch.zeros(1, 3, height, width))
+    assert raw.boxes_xyxy.shape == (1, 9 * rows * columns, 4)
+    assert raw.class_logits.shape == (1, 9 * rows * columns, 3)
+    assert raw.image_hw == (height, width)
+
+
+def test_zero_deltas_are_the_anchors() -> None:
+    detector = fresh()
+    torch.nn.init.zeros_(detector.convdet.weight)
+    torch.nn.init.zeros_(detector.convdet.bias)
+    with torch.no_grad():
+        raw = detector(torch.rand(2, 3, 50, 70))
+    torch.testing.assert_close(raw.boxes_xyxy, silent(2, 50, 70)["boxes_xyxy"])
+    # second cell of the second row, fourth shape: 162 x 87 around (23.5, 23.5)
+    box = raw.boxes_xyxy[0, anchor_at(1, 1, 3, 5)]
+    assert box.tolist() == [23.5 - 81, 23.5 - 43.5, 23.5 + 81, 23.5 + 43.5]
+
+
+def test_box_regression_and_safe_exponential() -> None:
+    detector = fresh()
+    torch.nn.init.zeros_(detector.convdet.weight)
+    bias = torch.zeros(72)
+    bias[36:40] = torch.tensor([0.25, -0.5, math.log(2.0), 2.0])  # first shape, 36 x 37
+    with torch.no_grad():
+        detector.convdet.bias.copy_(bias)
+        box = detector(torch.zeros(1, 3, 16, 16)).boxes_xyxy[0, 0]
+    width, height = 72.0, 37 * math.e * 2.0  # the tangent of exp at 1 is e * x
+    expected = [7.5 + 9 - width / 2, 7.5 - 18.5 - height / 2, 7.5 + 9 + width / 2, 7.5 - 18.5 + height / 2]
+    torch.testing.assert_close(box, torch.tensor(expected))
+
+
+def test_channel_order_is_classes_confidence_boxes() -> None:
+    detector = fresh()
+    torch.nn.init.zeros_(detector.convdet.weight)
+    with torch.no_grad():
+        detector.convdet.bias.copy_(torch.arange(72.0) / 100)
+        raw = detector(torch.zeros(1, 3, 16, 16))
+    torch.testing.assert_close(raw.class_logits[0], (torch.arange(27.0) / 100).reshape(9, 3))
+    torch.testing.assert_close(raw.confidence_logits[0], torch.arange(27.0, 36.0) / 100)
+    torch.testing.assert_close(raw.deltas[0], (torch.arange(36.0, 72.0) / 100).reshape(9, 4))
+
+
+def test_padding_adds_mean_colour_only() -> None:
+    detector = fresh()
+    image = torch.rand(1, 3, 41, 55, generator=torch.Generator().manual_seed(2))
+    mean_rgb = torch.tensor([123.68, 116.779, 103.939]).view(1, 3, 1, 1) / 255
+    padded = mean_rgb.expand(1, 3, 48, 64).clone()
+    padded[..., :41, :55] = image
+    with torch.no_grad():
+        small, large = detector(image), detector(padded)
+    torch.testing.assert_close(small.confidence_logits, large.confidence_logits, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(small.boxes_xyxy, large.boxes_xyxy, rtol=1e-4, atol=1e-3)
+
+
+def test_channels_are_read_as_rgb() -> None:
+    detector = fresh()
+    with torch.no_grad():
+        detector.conv1.weight.zero_()
+        detector.conv1.weight[0, 2] = 1.0  # third channel of the network is red
+        first = detector.conv1(torch.zeros(1, 3, 3, 3))
+    seen: list[Tensor] = []
+    handle = detector.conv1.register_forward_hook(lambda _m, inputs, _o: seen.append(inputs[0]))
+    red = torch.zeros(1, 3, 16, 16)
+    red[:, 0] = 1.0
+    with torch.no_grad():
+        detector(red)
+    handle.remove()
+    assert first.shape[1] == 64
+    expected = torch.tensor([-103.939, -116.779, 255 - 123.68])
+    torch.testing.assert_close(seen[0][0, :, 0, 0], expected)
+
+
+def test_confidence_term_by_hand() -> None:
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 8, 10)  # 72 x 43 around (87.5, 39.5)
+    anchor = parts["boxes_xyxy"][0, at]
+    # Predicted box: the anchor. True box: 18 px further right, IoU = 54 / 90 = 0.6.
+    truth = anchor + torch.tensor([18.0, 0, 18.0, 0])
+    truth[2] = truth[2].clamp_max(159)
+    parts["confidence_logits"][0, at] = 0.0  # 0.5
+    other = anchor_at(0, 0, 0, 10)
+    parts["confidence_logits"][0, other] = math.log(0.2 / 0.8)
+    raw = raw_of(parts, 64, 160)
+    terms = fresh().loss(raw, [targets([truth.tolist()], [0])])
+    silent_anchors = 9 * 4 * 10 - 1
+    expected = 75 * (0.5 - 0.6) ** 2 / 1 + 100 * 0.2**2 / silent_anchors
+    assert terms["confidence"].item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_box_and_class_terms_by_hand() -> None:
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 8, 10)
+    # 144 wide (log-size ln 2), 43 high, centre moved by (7.2, -4.3) = (0.1, -0.1) anchor sizes
+    truth = [87.5 + 7.2 - 72, 39.5 - 4.3 - 21.5, 87.5 + 7.2 + 72, 39.5 - 4.3 + 21.5]
+    iou = boxes.iou_matrix(torch.tensor([truth]), parts["boxes_xyxy"][0])
+    at = int(iou.argmax())
+    anchor = parts["boxes_xyxy"][0, at]
+    size = anchor[2:] - anchor[:2]
+    shift = (torch.tensor(truth[:2]) + torch.tensor(truth[2:]) - anchor[:2] - anchor[2:]) / 2 / size
+    scale = torch.log(torch.tensor([144.0, 43.0]) / size)
+    parts["deltas"][0, at] = torch.tensor([0.3, 0.0, -0.2, 0.1])
+    parts["class_logits"][0, at] = torch.tensor([1.0, 2.0, 3.0])
+    terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [2])])
+    wanted = torch.cat((shift, scale))
+    box = 5 * float((torch.tensor([0.3, 0.0, -0.2, 0.1]) - wanted).square().sum())
+    cross_entropy = math.log(math.exp(1) + math.exp(2) + math.exp(3)) - 3
+    assert terms["box"].item() == pytest.approx(box, rel=1e-4)
+    assert terms["class"].item() == pytest.approx(cross_entropy, rel=1e-5)
+    assert terms["total"].item() == pytest.approx(sum(terms[k].item() for k in ("confidence", "box", "class")))
+
+
+def test_terms_are_means_over_all_objects_of_the_batch() -> None:
+    parts = silent(2, 64, 160)
+    first, second = anchor_at(2, 5, 8, 10), anchor_at(2, 2, 8, 10)
+    boxes_xyxy = parts["boxes_xyxy"][0]
+    parts["deltas"][0, first, 0] = 0.5
+    terms = fresh().loss(
+        raw_of(parts, 64, 160),
+        [targets([boxes_xyxy[first].tolist(), boxes_xyxy[second].tolist()], [0, 0]), targets([], [])],
+    )
+    assert terms["box"].item() == pytest.approx(5 * 0.5**2 / 2)
+    assert terms["class"].item() == pytest.approx(math.log(3))
+
+
+def test_target_of_the_box_is_what_decoding_hits() -> None:
+    parts = silent(1, 64, 160)
+    truth = torch.tensor([10.0, 5.0, 150.0, 60.0])
+    raw = raw_of(parts, 64, 160)
+    detector = fresh()
+    wanted = detector.assign(raw, [targets([truth.tolist()], [1])])
+    torch.nn.init.zeros_(detector.convdet.weight)
+    bias = torch.zeros(9 * 8)
+    shape = int(wanted.anchor[0]) % 9
+    bias[36 + 4 * shape : 40 + 4 * shape] = wanted.deltas[0]
+    with torch.no_grad():
+        detector.convdet.bias.copy_(bias)
+        box = detector(torch.zeros(1, 3, 64, 160)).boxes_xyxy[0, wanted.anchor[0]]
+    torch.testing.assert_close(box, truth, rtol=1e-5, atol=1e-3)
+
+
+def test_each_object_has_an_anchor_of_its_own() -> None:
+    parts = silent(1, 64, 160)
+    box = parts["boxes_xyxy"][0, anchor_at(2, 5, 8, 10)].tolist()
+    outside = [4000.0, 4000.0, 4010.0, 4010.0]  # overlaps nothing: the nearest anchor
+    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([box, box, outside, outside], [0, 0, 0, 0])])
+    assert len(set(assigned.anchor.tolist())) == 4
+    overlap = boxes.iou_matrix(torch.tensor([box]), parts["boxes_xyxy"][0])[0]
+    assert overlap[assigned.anchor[:2]].tolist() == pytest.approx(overlap.topk(2).values.tolist())
+    assert int(assigned.anchor[2]) // 9 == 39  # last cell
+    assert not assigned.negative[0, assigned.anchor].any()
+
+
+def test_ignored_objects_have_no_positive_and_silence_no_anchor() -> None:
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 8, 10)
+    box = parts["boxes_xyxy"][0, at].tolist()
+    parts["confidence_logits"][0, at] = 3.0
+    raw = raw_of(parts, 64, 160)
+    detector = fresh()
+    punished = detector.loss(raw, [targets([], [])])["confidence"].item()
+    excused = detector.loss(raw, [targets([box], [0], [True])])
+    assert punished == pytest.approx(100 / 360 * torch.sigmoid(torch.tensor(3.0)).item() ** 2, rel=1e-4)
+    assert excused["confidence"].item() == pytest.approx(0, abs=1e-12)
+    assert excused["box"].item() == 0
+    assert excused["class"].item() == 0
+    # A wide region excuses small anchors inside it, by the share of the anchor that it covers.
+    region = detector.assign(raw, [targets([[0.0, 0.0, 80.0, 64.0]], [0], [True])])
+    inside, beyond = anchor_at(2, 2, 0, 10), anchor_at(2, 8, 0, 10)
+    assert not bool(region.negative[0, inside])
+    assert bool(region.negative[0, beyond])
+
+
+def test_ignored_object_excuses_the_box_predicted_over_it() -> None:
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 0, 10)  # 36 x 37: too large for the small box below
+    small = torch.tensor([80.0, 34.0, 92.0, 44.0])
+    parts["boxes_xyxy"][0, at] = small
+    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([small.tolist()], [0], [True])])
+    assert not bool(assigned.negative[0, at])
+
+
+def test_targets_that_do_not_fit_are_refused() -> None:
+    detector, raw = fresh(), raw_of(silent(2, 32, 32), 32, 32)
+    with pytest.raises(ValueError, match=r"targets: expected 2, one for each image, found 1"):
+        detector.loss(raw, [targets([], [])])
+    with pytest.raises(ValueError, match=r"targets\.labels: expected 0\.\.2, found \[3\]"):
+        detector.loss(raw, [targets([[0, 0, 9, 9]], [3]), targets([], [])])
+    with pytest.raises(ValueError, match=r"images: expected shape \(B, 3, H, W\)"):
+        detector(torch.zeros(3, 32, 32))
+
+
+def test_decode_planted_predictions() -> None:
+    parts = silent(2, 64, 160)
+    left, right, near = anchor_at(2, 1, 8, 10), anchor_at(2, 8, 8, 10), anchor_at(2, 7, 8, 10)
+    for at, confidence, logits in [
+        (left, 0.9, [4.0, 0.0, 0.0]),
+        (right, 0.8, [0.0, 4.0, 0.0]),
+        (near, 0.7, [0.0, 4.0, 0.0]),  # IoU 56/88 with `right`, same class: suppressed
+    ]:
+        parts["confidence_logits"][1, at] = math.log(confidence / (1 - confidence))
+        parts["class_logits"][1, at] = torch.tensor(logits)
+    # Another class at the place of `left`, and one below the lowest score.
+    weak, other = anchor_at(0, 4, 1, 10), anchor_at(2, 1, 2, 10)
+    parts["boxes_xyxy"][1, other] = parts["boxes_xyxy"][1, left]
+    parts["confidence_logits"][1, other], parts["class_logits"][1, other] = 0.0, torch.tensor([0.0, 0.0, 9.0])
+    parts["confidence_logits"][1, weak] = math.log(0.014 / 0.986)  # times 1/3
+    nothing, found = fresh().decode(raw_of(parts, 64, 160))
+    assert len(nothing) == 0
+    share = math.exp(4) / (math.exp(4) + 2)
+    assert found.labels.tolist() == [0, 1, 2]
+    assert found.scores.tolist() == pytest.approx([0.9 * share, 0.8 * share, 0.5 * math.exp(9) / (math.exp(9) + 2)])
+    assert found.boxes_xyxy[0].tolist() == [0.0, 39.5 - 21.5, 23.5 + 36, 39.5 + 21.5]
+    assert found.boxes_xyxy[1, 2] == 159
+
+
+def test_decode_returns_at_most_64() -> None:
+    parts = silent(1, 256, 256)
+    parts["confidence_logits"][:] = 2.0
+    parts["boxes_xyxy"][0] = torch.rand(len(parts["boxes_xyxy"][0]), 4) * 1e-3
+    parts["boxes_xyxy"][0, :, :2] += torch.arange(len(parts["boxes_xyxy"][0]))[:, None] % 250
+    parts["boxes_xyxy"][0, :, 2:] += torch.arange(len(parts["boxes_xyxy"][0]))[:, None] % 250 + 1
+    assert len(fresh().decode(raw_of(parts, 256, 256))[0]) == 64
+
+
+def test_gradient_to_the_image_agrees_with_differences() -> None:
+    detector = fresh(3).double().requires_grad_(False)
+    generator = torch.Generator().manual_seed(4)
+    image = torch.rand(1, 3, 40, 52, dtype=torch.float64, generator=generator)
+    wanted = [targets([[5.0, 5.0, 35.0, 30.0], [20.0, 10.0, 50.0, 38.0]], [0, 2], [False, False])]
+    assignment: Assignment = detector.assign(detector(image), wanted)
+
+    def total(x: Tensor) -> Tensor:
+        return detector.loss_terms(detector(x), assignment)["total"]
+
+    x = image.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(total(x), x)
+    directions = torch.randn(12, *image.shape, dtype=torch.float64, generator=generator)
+    step = 1e-7
+    numeric = torch.stack([(total(image + step * d) - total(image - step * d)) / (2 * step) for d in directions])
+    analytic = (directions * gradient).sum((1, 2, 3, 4))
+    torch.testing.assert_close(analytic, numeric, rtol=1e-4, atol=1e-4 * float(numeric.abs().max()))
+
+
+def test_frozen_detector_gives_a_gradient_to_the_image_only() -> None:
+    detector = fresh().requires_grad_(False)
+    image = torch.rand(1, 3, 48, 64).requires_grad_()
+    detector.loss(detector(image), [targets([[5.0, 5.0, 40.0, 30.0]], [0])])["confidence"].backward()
+    assert image.grad is not None
+    assert float(image.grad.abs().sum()) > 0
+    assert all(p.grad is None for p in detector.parameters())
+
+
+def test_only_dropout_depends_on_the_mode() -> None:
+    detector, image = fresh(), torch.rand(1, 3, 48, 64)
+    detector.dropout.probability = 0.0
+    with torch.no_grad():
+        evaluated = detector.eval()(image).confidence_logits
+        assert torch.equal(detector.train()(image).confidence_logits, evaluated)
+        detector.dropout.probability = 0.5
+        detector.dropout.generator = torch.Generator().manual_seed(0)
+        first = detector(image).confidence_logits
+        detector.dropout.generator.manual_seed(0)
+        assert torch.equal(detector(image).confidence_logits, first)
+        assert not torch.equal(first, evaluated)
+
+
+def test_dropout_keeps_the_mean() -> None:
+    dropout = SqueezeDet().dropout.train()
+    dropout.probability, dropout.generator = 0.25, torch.Generator().manual_seed(0)
+    dropped = dropout(torch.ones(3, 5, 7, 101))
+    assert sorted(dropped.unique().tolist()) == pytest.approx([0.0, 1 / 0.75])
+    assert dropped.mean().item() == pytest.approx(1.0, abs=0.03)
+
+
+def test_bfloat16_autocast_still_gives_float32_boxes() -> None:
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        raw = fresh()(torch.rand(1, 3, 32, 48))
+    assert raw.boxes_xyxy.dtype == torch.float32
+
+
+def test_backbone_of_another_shape_is_refused() -> None:
+    detector = SqueezeDet()
+    tensors = dict(detector.state_dict())
+    detector.load_backbone({k: v for k, v in tensors.items() if "fire10" not in k})
+    with pytest.raises(ValueError, match=r"backbone: conv1\.weight: expected shape .* found none"):
+        detector.load_backbone({k: v for k, v in tensors.items() if k != "conv1.weight"})

@@ -1,0 +1,247 @@
+"""Mesh files: our GLB keeps every bit; foreign OBJ, GLB, PLY come into the unit box with colours and parts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.meshes.load import import_mesh, load_mesh, save_mesh
+from scene_ir.meshes.templates import template
+from scene_ir.types import Mesh, Part
+
+KENNEY = Path(__file__).parents[3] / "shared" / "data" / "meshes_kenney"
+
+
+def assert_same(left: Mesh, right: Mesh) -> None:
+    for name in ("vertices", "faces", "part", "colours", "uv"):
+        a, b = getattr(left, name), getattr(right, name)
+        assert (a is None) == (b is None), name
+        if a is not None:
+            assert a.dtype == b.dtype
+            assert torch.equal(a, b), name
+    assert left.name == right.name
+
+
+def wedge_car(towards: tuple[float, float, float] = (0, 0, 1), up: tuple[float, float, float] = (0, 1, 0)):
+    """A body 4 long, 1 high, 1.6 wide with a cabin behind its middle, looking along `towards`."""
+    body = trimesh.creation.box((4.0, 0.6, 1.6))
+    cabin = trimesh.creation.box((1.6, 0.4, 1.4))
+    cabin.apply_translation((-0.8, 0.5, 0.0))
+    axes = np.eye(4)
+    axes[:3, 0], axes[:3, 1], axes[:3, 2] = towards, up, np.cross(towards, up)
+    for piece in (body, cabin):
+        piece.apply_transform(axes)
+        piece.apply_translation((5.0, -2.0, 3.0))
+    return body, cabin
+
+
+@pytest.mark.parametrize("uv", [False, True])
+@pytest.mark.parametrize("colours", [False, True])
+def test_saved_mesh_comes_back_to_the_bit(tmp_path: Path, colours: bool, uv: bool) -> None:
+    generator = torch.Generator().manual_seed(5)
+    mesh = template("hatchback", 2)
+    count = mesh.vertices.shape[0]
+    mesh = replace(
+        mesh,
+        colours=torch.rand(count, 3, generator=generator) if colours else None,
+        uv=torch.rand(count, 2, generator=generator) * 4 - 1 if uv else None,
+        name='größer "x"',
+    )
+    save_mesh(mesh, tmp_path / "a.glb")
+    assert_same(load_mesh(tmp_path / "a.glb"), mesh)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_odd_meshes_come_back_too(tmp_path: Path) -> None:
+    """Unused and duplicate vertices, several parts, vertices outside the unit box stay as they are."""
+    mesh = Mesh(
+        vertices=torch.tensor([[0.1, -3.0, 0], [1 / 3, 0, 0], [0, 1e-30, 0], [0.1, -3.0, 0], [9, 9, 9.0]]),
+        faces=torch.tensor([[0, 1, 2], [2, 1, 3], [2, 2, 1]]),
+        part=torch.tensor([4, 0, 2]),
+    )
+    save_mesh(mesh, tmp_path / "odd.glb")
+    assert_same(load_mesh(tmp_path / "odd.glb"), mesh)
+
+
+def test_saving_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.glb", "b.glb"):
+        save_mesh(template("sedan", 1), tmp_path / name)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+
+
+def test_viewers_get_colours_and_an_upright_mesh(tmp_path: Path) -> None:
+    mesh = template("sedan", 0)
+    save_mesh(mesh, tmp_path / "a.glb")
+    scene = trimesh.load_scene(tmp_path / "a.glb", process=False)
+    shown = scene.to_mesh()
+    assert shown.bounds[:, 1] == pytest.approx([0.0, 1.0], abs=1e-6)
+    assert shown.volume > 0
+    expected = (mesh.colours * 255).round().to(torch.uint8).numpy()
+    np.testing.assert_array_equal(
+        np.asarray(next(iter(scene.geometry.values())).visual.vertex_colors)[:, :3], expected
+    )
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb"])
+@pytest.mark.parametrize("front", ["auto", "given"])
+@pytest.mark.parametrize(
+    ("towards", "axis", "up_vector", "up"),
+    [
+        ((0, 0, 1), "+z", (0, 1, 0), "y"),
+        ((0, 0, -1), "-z", (0, 1, 0), "y"),
+        ((1, 0, 0), "+x", (0, 1, 0), "y"),
+        ((0, -1, 0), "-y", (0, 0, 1), "z"),
+        ((-1, 0, 0), "-x", (0, -1, 0), "-y"),
+    ],
+)
+def test_any_axes_come_into_the_unit_box(tmp_path, suffix, front, towards, axis, up_vector, up) -> None:
+    whole = trimesh.util.concatenate(wedge_car(towards, up_vector))
+    whole.export(tmp_path / f"car.{suffix}")
+    imported = import_mesh(tmp_path / f"car.{suffix}", up=up, front=axis if front == "given" else "auto")
+    points, faces = imported.mesh.vertices, imported.mesh.faces
+    assert imported.size_lhw == pytest.approx((4.0, 1.0, 1.6), abs=1e-5)
+    torch.testing.assert_close(points.amin(0), torch.tensor([-0.5, -1.0, -0.5]))
+    torch.testing.assert_close(points.amax(0), torch.tensor([0.5, 0.0, 0.5]))
+    roof = points[points[:, 1] < -0.99]
+    assert float(roof[:, 0].mean()) == pytest.approx(-0.2, abs=1e-5)
+    corners = points[faces]
+    volume = (corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert float(volume) > 0
+
+
+def test_units_scale_the_size_alone(tmp_path: Path) -> None:
+    trimesh.util.concatenate(wedge_car()).export(tmp_path / "car.obj")
+    metres, centimetres = (import_mesh(tmp_path / "car.obj", metres_per_unit=u) for u in (1.0, 0.01))
+    assert torch.equal(metres.mesh.vertices, centimetres.mesh.vertices)
+    assert centimetres.size_lhw == pytest.approx(tuple(0.01 * s for s in metres.size_lhw))
+
+
+def test_materials_of_an_obj_give_colours_and_parts(tmp_path: Path) -> None:
+    (tmp_path / "car.mtl").write_text(
+        "newmtl carpaint\nKd 0.8 0.1 0.1\nnewmtl Windows_Glass\nKd 0.1 0.1 0.2\nnewmtl rubber\nKd 0 0 0\n"
+        "newmtl Headlight\nKd 1 1 0.8\nnewmtl thing\nKd 0.2 0.4 0.6\n"
+    )
+    box = trimesh.creation.box((1, 1, 4))
+    lines, expected = ["mtllib car.mtl"], {}
+    for i, name in enumerate(("carpaint", "Windows_Glass", "rubber", "Headlight", "thing")):
+        lines += [f"v {x + 2 * i} {y} {z}" for x, y, z in box.vertices]
+        lines += [f"usemtl {name}"] + [f"f {' '.join(str(v + 1 + 8 * i) for v in face)}" for face in box.faces]
+    (tmp_path / "car.obj").write_text("\n".join(lines))
+    mesh = load_mesh(tmp_path / "car.obj", front="+z")
+    colours = mesh.colours[mesh.faces[:, 0]]
+    expected = {
+        Part.PAINT: (0.8, 0.1, 0.1),
+        Part.GLASS: (0.1, 0.1, 0.2),
+        Part.TYRE: (0.0, 0.0, 0.0),
+        Part.LIGHT: (1.0, 1.0, 0.8),
+        Part.OTHER: (0.2, 0.4, 0.6),
+    }
+    for part, colour in expected.items():
+        rows = colours[mesh.part == part]
+        assert rows.shape[0] == 12
+        torch.testing.assert_close(rows, torch.tensor(colour).expand(12, 3), atol=1 / 255, rtol=0)
+
+
+def test_a_palette_texture_becomes_vertex_colours(tmp_path: Path) -> None:
+    palette = np.zeros((2, 2, 3), dtype=np.uint8)
+    palette[0, 0], palette[0, 1], palette[1, 0], palette[1, 1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (9, 9, 9)
+    material = trimesh.visual.material.PBRMaterial(name="colormap", baseColorTexture=Image.fromarray(palette))
+    scene = trimesh.Scene()
+    for i, (uv, name) in enumerate(
+        [((0.25, 0.75), "wheel-front"), ((0.75, 0.75), "wheel-back"), ((0.25, 0.25), "b")]
+    ):
+        box = trimesh.creation.box((1, 1, 1))
+        box.visual = trimesh.visual.TextureVisuals(uv=np.tile(uv, (8, 1)), material=material)
+        move = np.eye(4)
+        move[:3, 3] = (0, 0, (3, -3, 0)[i])
+        scene.add_geometry(box, node_name=name, geom_name=name, transform=move)
+    scene.export(tmp_path / "car.glb")
+    mesh = load_mesh(tmp_path / "car.glb")
+    x, colours = mesh.vertices[:, 0], mesh.colours
+    assert mesh.part.tolist().count(int(Part.TYRE)) == 24
+    assert colours[x > 0.3].unique(dim=0).tolist() == [[1.0, 0.0, 0.0]]
+    assert colours[x < -0.3].unique(dim=0).tolist() == [[0.0, 1.0, 0.0]]
+    assert colours[x.abs() < 0.2].unique(dim=0).tolist() == [[0.0, 0.0, 1.0]]
+
+
+def test_glb_colour_factors_are_linear_light(tmp_path: Path) -> None:
+    box = trimesh.creation.box((2, 1, 1))
+    material = trimesh.visual.material.PBRMaterial(name="m", baseColorFactor=[55, 255, 0, 255])
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    box.export(tmp_path / "a.glb")
+    torch.testing.assert_close(
+        load_mesh(tmp_path / "a.glb").colours[0], torch.tensor([0.5017, 1.0, 0.0]), atol=5e-3, rtol=0
+    )
+
+
+def test_parts_named_front_decide_over_the_outline(tmp_path: Path) -> None:
+    body, cabin = wedge_car()
+    scene = trimesh.Scene({"body-rear": body, "cabin-front": cabin})
+    scene.export(tmp_path / "car.glb")
+    mesh = load_mesh(tmp_path / "car.glb")
+    assert float(mesh.vertices[mesh.vertices[:, 1] < -0.99][:, 0].mean()) > 0.1
+
+
+@pytest.mark.parametrize("name", ["sedan", "garbage-truck", "ambulance"])
+def test_kenney_vehicles_look_forward_with_palette_colours(name: str) -> None:
+    file = KENNEY / f"{name}.glb"
+    if not file.is_file():
+        pytest.skip(f"../shared/data/meshes_kenney/{name}.glb is missing")
+    imported = import_mesh(file)
+    length, height, width = imported.size_lhw
+    assert length > width > 0.8 * height > 0
+    assert imported.mesh.colours.unique(dim=0).shape[0] > 20
+    assert (
+        float(imported.mesh.vertices[imported.mesh.faces[imported.mesh.part == Part.TYRE]][..., 1].mean()) > -0.3
+    )
+
+
+BROKEN = {
+    "garbage.glb": b"not a mesh at all",
+    "garbage.ply": b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n",
+    "empty.obj": b"",
+    "points.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+    "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n",
+    "nan.obj": b"v 0 nan 0\nv 1 0 0\nv 0 1 1\nf 1 2 3\n",
+    "cut.glb": b"glTF\x02\x00\x00\x00\xff\x00\x00\x00",
+    "notes.txt": b"hello",
+}
+
+
+@pytest.mark.parametrize("name", [*BROKEN, "missing.glb"])
+def test_bad_files_are_named_in_one_line(tmp_path: Path, name: str) -> None:
+    if name in BROKEN:
+        (tmp_path / name).write_bytes(BROKEN[name])
+    with pytest.raises(FormatError) as caught:
+        load_mesh(tmp_path / name)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("options", [{"up": "x"}, {"front": "+q"}, {"front": "+y"}, {"metres_per_unit": 0.0}])
+def test_unknown_options_are_refused(tmp_path: Path, options: dict) -> None:
+    with pytest.raises(RangeError):
+        import_mesh(tmp_path / "any.obj", **options)
+
+
+def test_own_files_of_another_version_or_with_lost_parts_are_refused(tmp_path: Path) -> None:
+    for change, field in (({"drivesem_mesh": 99}, "drivesem_mesh"), ({"part": [0]}, "part")):
+        box = trimesh.creation.box()
+        box.metadata = {"drivesem_mesh": 1, "part": [0] * 12} | change
+        box.export(tmp_path / "a.glb")
+        with pytest.raises(FormatError, match=field):
+            load_mesh(tmp_path / "a.glb")
+
+
+def test_only_full_meshes_are_saved_and_only_as_glb(tmp_path: Path) -> None:
+    mesh = template("sedan", 0)
+    with pytest.raises(FormatError, match=r"\.glb"):
+        save_mesh(mesh, tmp_path / "a.stl")
+    with pytest.raises(FormatError, match="faces"):
+        save_mesh(replace(mesh, faces=mesh.faces[:0], part=mesh.part[:0]), tmp_path / "a.glb")
+    assert list(tmp_path.iterdir()) == []

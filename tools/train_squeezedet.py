@@ -1,0 +1,261 @@
+"""Train the shipped SqueezeDet on a folder in KITTI's layout; goes on where it stopped.
+
+    python tools/fetch_backbone.py
+    python tools/train_squeezedet.py --data FOLDER --held-out FOLDER --minutes 75
+
+Writes checkpoints and the log under --run, and the weights with their model card under --out whenever the held-out
+frames say that they are better.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from detectors import boxes
+from detectors.base import Detector
+from detectors.registry import read_weights, save_detector
+from detectors.squeezedet import SqueezeDet
+from detectors.training import Sample, TrainingSettings, train
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.data.classes import KITTI
+from drivesem.data.kitti import KittiDataset
+from scene_ir import files
+from scene_ir.types import Labels
+
+OCCLUSION_UNKNOWN = 3
+MINIMUM_HEIGHT_PX = 12.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Which objects count when a detector is judged; the others are ignored."""
+
+    minimum_height_px: float = 25.0
+    maximum_occlusion: int = 1
+    maximum_truncation: float = 0.3
+
+
+def training_targets(labels: Labels) -> Targets:
+    """What is trained on: all that is at least 12 px high and whose occlusion is known."""
+    targets = KITTI.targets(labels)
+    return _ignore(targets, labels, Judged(MINIMUM_HEIGHT_PX, OCCLUSION_UNKNOWN - 1, 1.0))
+
+
+def judged_targets(labels: Labels) -> Targets:
+    """What is judged by: KITTI's "moderate"."""
+    return _ignore(KITTI.targets(labels), labels, Judged())
+
+
+def _ignore(targets: Targets, labels: Labels, judged: Judged) -> Targets:
+    regions = len(targets) - len(labels.kind)
+    height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    out = (height < judged.minimum_height_px) | (labels.occlusion > judged.maximum_occlusion)
+    out |= labels.truncation > judged.maximum_truncation
+    ignore = targets.ignore | torch.cat([out, torch.ones(regions, dtype=torch.bool)])
+    return Targets(targets.boxes_xyxy, targets.labels, ignore)
+
+
+class FrameStore(Sequence[Sample]):
+    """Frames of a KITTI folder, decoded once into one file of raw pixels that is mapped into memory.
+
+    A folder that grows is read on where the file ends.
+    """
+
+    def __init__(self, root: Path, cache: Path) -> None:
+        dataset = KittiDataset(root)
+        cache.mkdir(parents=True, exist_ok=True)
+        pixels_path, index_path = cache / "pixels.u8", cache / "index.json"
+        self._index: list[tuple[str, int, int, int]] = []
+        if index_path.is_file():
+            self._index = [tuple(row) for row in json.loads(index_path.read_text())]
+        known = {row[0] for row in self._index}
+        end = sum(height * width * 3 for _, _, height, width in self._index)
+        with pixels_path.open("r+b" if pixels_path.is_file() else "w+b") as file:
+            file.truncate(end)
+            file.seek(end)
+            for identifier in dataset.identifiers:
+                path = dataset.folder / "image_2" / f"{identifier}.png"
+                if identifier in known or not path.is_file():
+                    continue
+                image = files.read_image(path)
+                file.write(np.ascontiguousarray(image).tobytes())
+                self._index.append((identifier, end, image.shape[0], image.shape[1]))
+                end += image.size
+        temporary = index_path.with_name("index.json.partial")
+        temporary.write_text(json.dumps(self._index))
+        os.replace(temporary, index_path)
+        self._pixels = np.memmap(pixels_path, np.uint8, "r", shape=(end,))
+        self.labels = []
+        for identifier, *_ in self._index:
+            labels = dataset.labels(identifier)
+            if labels is None:
+                raise SystemExit(f"{root}: expected a folder label_2, found none")
+            self.labels.append(labels)
+        self._targets = [training_targets(labels) for labels in self.labels]
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def image(self, index: int) -> np.ndarray:
+        """Pixels (H, W, 3) uint8 RGB."""
+        _, start, height, width = self._index[index]
+        return self._pixels[start : start + height * width * 3].reshape(height, width, 3)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.image(index), self._targets[index]
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Average precision at IoU 0.5 and number of objects by class; best F1 over all classes and its score."""
+
+    ap50: dict[str, float]
+    recall: dict[str, float]
+    objects: dict[str, int]
+    f1: float
+    t_star: float
+
+    def summary(self) -> str:
+        rows = [f"{n} AP50 {self.ap50[n]:.4f} recall {self.recall[n]:.4f} ({self.objects[n]})" for n in self.ap50]
+        return ", ".join(rows) + f", F1 {self.f1:.4f} at {self.t_star:.3f}"
+
+
+def judge(found: Sequence[Detections], wanted: Sequence[Targets]) -> Marks:
+    """COCO's matching at IoU 0.5 (101 points), with ignored boxes as KITTI has them."""
+    ap50, recall, objects, pooled = {}, {}, {}, []
+    for label, name in enumerate(CLASSES):
+        outcomes = [_outcomes(d, t, label) for d, t in zip(found, wanted, strict=True)]
+        rows = np.concatenate(outcomes)
+        count = sum(int(((t.labels == label) & ~t.ignore).sum()) for t in wanted)
+        order = np.argsort(-rows[:, 0], kind="stable")
+        hits = np.cumsum(rows[order, 1])
+        reached = hits / max(count, 1)
+        precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
+        samples = np.searchsorted(reached, np.linspace(0, 1, 101))
+        ap50[name] = float(np.mean([precision[i] if i < len(precision) else 0.0 for i in samples]))
+        recall[name] = float(reached[-1]) if len(reached) else 0.0
+        objects[name] = count
+        pooled.append(rows)
+    rows = np.concatenate(pooled)
+    rows = rows[np.argsort(-rows[:, 0], kind="stable")]
+    hits = np.cumsum(rows[:, 1])
+    f1 = 2 * hits / (np.arange(1, len(rows) + 1) + sum(objects.values()))
+    best = int(np.argmax(f1)) if len(f1) else 0
+    return Marks(
+        ap50, recall, objects, float(f1[best]) if len(f1) else 0.0, float(rows[best, 0]) if len(f1) else 0.5
+    )
+
+
+def _outcomes(found: Detections, wanted: Targets, label: int) -> np.ndarray:
+    """(K, 2) score and hit of each detection of a class that counts."""
+    mine = found.labels == label
+    boxes_xyxy, scores = found.boxes_xyxy[mine], found.scores[mine]
+    counted = (wanted.labels == label) & ~wanted.ignore
+    overlap = boxes.iou_matrix(boxes_xyxy, wanted.boxes_xyxy[counted]).numpy()
+    ignored = wanted.boxes_xyxy[wanted.ignore]
+    excused = (boxes.iou_matrix(boxes_xyxy, ignored) > 0.5) | (boxes.ioa_matrix(boxes_xyxy, ignored) > 0.5)
+    excused = excused.any(1).numpy() if len(ignored) else np.zeros(len(scores), bool)
+    free = np.ones(overlap.shape[1], bool)
+    rows = []
+    for i, score in enumerate(scores.tolist()):
+        candidates = np.where(free, overlap[i], 0.0)
+        if candidates.size and candidates.max() >= 0.5:
+            free[candidates.argmax()] = False
+            rows.append((score, 1.0))
+        elif not excused[i]:
+            rows.append((score, 0.0))
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+@torch.no_grad()
+def detect(detector: Detector, store: FrameStore, indices: Sequence[int]) -> list[Detections]:
+    """Detections in whole frames."""
+    found = []
+    for index in indices:
+        image = torch.from_numpy(np.array(store.image(index))).permute(2, 0, 1)[None].float() / 255
+        found += detector.decode(detector(image))
+    return found
+
+
+class Keeper:
+    """Judges the averaged weights now and then, and exports them when they are the best so far."""
+
+    def __init__(self, arguments: argparse.Namespace, frames: int, store: FrameStore) -> None:
+        self.arguments, self.frames, self.store = arguments, frames, store
+        self.wanted = [judged_targets(labels) for labels in store.labels]
+        self.best_path = arguments.run / "best.json"
+        self.best = json.loads(self.best_path.read_text())["mark"] if self.best_path.is_file() else 0.0
+        self.started = time.monotonic()
+
+    def __call__(self, detector: Detector, step: int) -> None:
+        indices = range(0, len(self.store), 1 if step >= self.arguments.steps else self.arguments.thin)
+        marks = judge(detect(detector, self.store, indices), [self.wanted[i] for i in indices])
+        print(f"step {step}: {marks.summary()}", flush=True)
+        mark = marks.ap50["Car"] + 0.25 * float(np.mean(list(marks.ap50.values())))
+        if mark >= self.best:
+            self.best = mark
+            self.best_path.write_text(json.dumps({"mark": mark, "step": step}))
+            self.export(detector, step, marks, len(indices))
+
+    def export(self, detector: Detector, step: int, marks: Marks, judged_frames: int) -> None:
+        """Weights as float16 with t* and figures in the metadata, and the model card beside."""
+        out: Path = self.arguments.out
+        detector.t_star = marks.t_star
+        figures = {name: round(value, 4) for name, value in marks.ap50.items()}
+        save_detector(detector, out, {"step": str(step), "ap50": json.dumps(figures), "f1": f"{marks.f1:.4f}"})
+        facts = json.dumps({"step": step, "t_star": marks.t_star, "ap50": figures, "f1": marks.f1}, indent=1)
+        (self.arguments.run / "exported.json").write_text(facts)
+        print(f"step {step}: exported {out}, judged on {judged_frames} frames", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="frames to train on, KITTI layout")
+    parser.add_argument("--held-out", type=Path, help="frames to judge by, KITTI layout")
+    parser.add_argument("--run", type=Path, default=Path("build/squeezedet"), help="checkpoints, log, pixel cache")
+    parser.add_argument("--out", type=Path, default=Path("build/squeezedet/squeezedet.safetensors"))
+    parser.add_argument("--backbone", type=Path, default=Path("build/squeezenet1_1.safetensors"))
+    parser.add_argument("--minutes", type=float, default=75.0, help="wall-clock length of the schedule; 0 is none")
+    parser.add_argument("--steps", type=int, default=100_000, help="length of the schedule in steps")
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--rate", type=float, default=1e-3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--evaluate-every", type=int, default=500)
+    parser.add_argument("--thin", type=int, default=2, help="judge by every n-th held-out frame until the end")
+    parser.add_argument("--no-bfloat16", action="store_true")
+    parser.add_argument("--dropout", type=float, default=0.5)
+    arguments = parser.parse_args()
+    settings = TrainingSettings(
+        steps=arguments.steps,
+        minutes=arguments.minutes,
+        batch=arguments.batch,
+        rate=arguments.rate,
+        seed=arguments.seed,
+        bfloat16=not arguments.no_bfloat16,
+        evaluate_every=arguments.evaluate_every if arguments.held_out else 0,
+    )
+    detector = SqueezeDet(dropout=arguments.dropout)
+    detector.initialise(torch.Generator().manual_seed(arguments.seed))
+    detector.load_backbone(read_weights(arguments.backbone)[1])
+    detector = detector.to(memory_format=torch.channels_last)
+    frames = FrameStore(arguments.data, arguments.run / "cache")
+    print(f"{len(frames)} frames to train on", flush=True)
+    keeper = None
+    if arguments.held_out:
+        held_out = FrameStore(arguments.held_out, arguments.run / "cache_held_out")
+        print(f"{len(held_out)} frames held out", flush=True)
+        keeper = Keeper(arguments, len(frames), held_out)
+    train(detector, frames, settings, arguments.run, keeper)
+
+
+if __name__ == "__main__":
+    main()
