@@ -42,9 +42,7 @@ def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") 
         classes = tuple(json.loads(metadata.get("classes", json.dumps(CLASSES))))
         t_star = float(metadata.get("t_star", "0.5"))
     except ValueError as error:
-        raise ValueError(
-            f"{path}: expected metadata with a list 'classes' and a number 't_star': {error}"
-        ) from None
+        raise ValueError(f"{path}: expected metadata classes (list) and t_star (number): {error}") from None
     detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
     _load_into(detector, tensors, path)
     detector.requires_grad_(False)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.torch import save
 from torch import Tensor
@@ -31,7 +32,7 @@ from detectors.types import Targets
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.csv"
-_COLUMNS = ("step", "seconds", "rate", "confidence", "box", "class", "total", "norm")
+_COLUMNS: tuple[str, ...] = ("step", "seconds", "rate", "confidence", "box", "class", "total", "norm")
 
 Sample = tuple[np.ndarray, Targets]
 """A frame (H, W, 3) uint8 RGB and what is in it."""
@@ -97,7 +98,10 @@ def train(
     step = run.load(folder / CHECKPOINT) if (folder / CHECKPOINT).is_file() else 0
     started, before = time.monotonic(), run.seconds
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as progress, _Log(folder / LOG, step) as log:
+    with (
+        Progress(*columns, transient=True, console=Console(stderr=True)) as progress,
+        _Log(folder / LOG, step) as log,
+    ):
         bar = progress.add_task("training", total=settings.steps, completed=step)
         while step < settings.steps and (stop_after is None or step < stop_after):
             run.seconds = before + time.monotonic() - started
@@ -188,8 +192,8 @@ class _Run:
         # The average of the first steps must not be the random start: its memory grows with the steps.
         decay = min(self.settings.average_decay, (1 + step) / (10 + step))
         with torch.no_grad():
-            names, parameters = zip(*self.detector.named_parameters(), strict=True)
-            torch._foreach_lerp_([self.average[n] for n in names], list(parameters), 1 - decay)
+            for name, parameter in self.detector.named_parameters():
+                self.average[name].lerp_(parameter, 1 - decay)
         return values | {"norm": float(norm), "rate": rate}
 
     @contextmanager

@@ -277,20 +277,12 @@ def _summary(
 
 def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]:
     """Versions, seed and hashes: what a second run must reproduce to the byte."""
-    pictures = (
-        "benign.png",
-        "rerender.png",
-        "counterexample.png",
-        "theta.json",
-        "labels_paper.txt",
-        "labels_moved.txt",
-    )
+    hashed = [f"{name}.png" for name in ("benign", "rerender", "counterexample")]
+    hashed += ["theta.json", "labels_paper.txt", "labels_moved.txt"]
     return {
         "versions": {package: importlib.metadata.version(package) for package in _PACKAGES},
         "seed": config.seed,
-        "frames": {
-            name: {picture: _sha256(out / "frames" / name / picture) for picture in pictures} for name in names
-        },
+        "frames": {name: {part: _sha256(out / "frames" / name / part) for part in hashed} for name in names},
     }
 
 
@@ -333,8 +325,8 @@ def _print(summary: RunSummary, console: Console) -> None:
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(
         f"{summary.frames} frames, {summary.objects} vehicles: {sum(summary.lost_objects.values())} lost, "
-        f"{sum(summary.phantoms.values())} phantoms, {summary.successes_moved} frames broken; feasible {feasible}; "
-        f"{summary.queries} queries in {summary.seconds:.0f} s"
+        f"{sum(summary.phantoms.values())} phantoms, {summary.successes_moved} frames broken; "
+        f"feasible {feasible}; {summary.queries} queries in {summary.seconds:.0f} s"
     )
     if summary.frames_without_vehicles:
         console.print(f"{summary.frames_without_vehicles} frames without vehicles passed over")

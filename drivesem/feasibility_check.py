@@ -1,8 +1,8 @@
 """The second opinion: are two scenes, as they lie on disk, a feasible change of one another?
 
 Shares no code with `drivesem.feasible`: it sees no theta, only the scenes, and measures them in other ways
-(polygon clipping, finite differences, all vertices of the meshes). Its tolerances are wider by what the two ways may
-differ.
+(polygon clipping, finite differences, all vertices of the meshes). Its tolerances are wider by what the two ways
+may differ.
 """
 
 from __future__ import annotations

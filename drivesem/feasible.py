@@ -61,7 +61,7 @@ _TOLERANCE = 1e-6
 """Slack of every comparison (m, m2, shares, strain), far above rounding and far below what matters."""
 _FOOTPRINT_GRID = (9, 5)
 """Points along and across a footprint at which the road map is read."""
-_VISIBLE_GRID = 12
+_RAY_ROWS, _RAY_COLUMNS = 10, 6
 """Rows and columns of an image box through which rays are sent to see what hides a car."""
 _STRAIN_GRID = (5, 5, 5)
 """Points of the unit box at which the strain is bounded; the independent check uses a finer grid."""
@@ -101,6 +101,8 @@ class FeasibleSet:
         self._size = _array(objects.size_lhw)
         self._ffd = _array(objects.ffd)
         self._matrix = _array(scene.camera.matrix)
+        self._inverse = np.linalg.inv(self._matrix[:, :3])
+        self._centre = -self._inverse @ self._matrix[:, 3]
         self._ground = _array(scene.environment.ground)
         self._road = _array(scene.environment.road)
         self._image = (scene.camera.width, scene.camera.height)
@@ -253,11 +255,13 @@ class FeasibleSet:
     def _measure(self, low: Array, high: Array, yaw: Array, translation: Array) -> _State:
         cos, sin = np.cos(yaw), np.sin(yaw)
 
+        zero, one = np.zeros_like(cos), np.ones_like(cos)
+        # Rows: where the car's length, height and width point in camera space.
+        axes = np.stack([cos, zero, -sin, zero, one, zero, sin, zero, cos], axis=-1).reshape(-1, 3, 3)
+
         def to_camera(local: Array) -> Array:
             """Points (N, P, 3) m of the cars' frames to camera space."""
-            x, y, z = local[..., 0], local[..., 1], local[..., 2]
-            turned = [x * cos[:, None] + z * sin[:, None], y, z * cos[:, None] - x * sin[:, None]]
-            return np.stack(turned, axis=-1) + translation[:, None]
+            return local @ axes + translation[:, None]
 
         corners = to_camera(low[:, None] + _CORNERS * (high - low)[:, None])
         footprint = corners[:, :4][:, :, [0, 2]]
@@ -266,9 +270,8 @@ class FeasibleSet:
         grid[..., 1] = 0
         box, clipped, near = self._image_boxes(corners)
         in_frame = _box_area(clipped) / np.maximum(_box_area(box), 1e-9)
-        axes = np.stack([to_camera(axis) - translation[:, None] for axis in np.eye(3)[:, None, None]], axis=1)
-        enter = self._first_hits(clipped, axes[:, :, 0], low, high, translation)
-        covers, height, area = _visible(enter, _VISIBLE_GRID)
+        enter = self._first_hits(clipped, axes, low, high, translation)
+        covers, height, area = _visible(enter, _RAY_ROWS)
         return _State(
             road=self._road_share(to_camera(grid)),
             gap=gap,
@@ -293,26 +296,29 @@ class FeasibleSet:
         return box, np.clip(box, 0, limit), near
 
     def _first_hits(self, box: Array, axes: Array, low: Array, high: Array, translation: Array) -> Array:
-        """Distance (N, N, R) at which rays through a grid on image box i enter the oriented box of car j, else inf.
+        """Distance (N, N, R) at which rays through a grid on image box i enter the box of car j; inf for a miss.
 
-        box (N, 4) px; axes (N, 3, 3): rows are the cars' axes in camera space; low, high (N, 3) m in the cars' frames.
+        box (N, 4) px; axes (N, 3, 3): rows are the cars' axes in camera space; low, high (N, 3) m along them.
         """
-        steps = (np.arange(_VISIBLE_GRID) + 0.5) / _VISIBLE_GRID
         size = _box_size(box)
-        u = box[:, None, :1] + steps[None, None] * size[:, None, :1]
-        v = box[:, None, 1:2] + steps[None, :, None] * size[:, None, 1:]
-        u, v = np.broadcast_arrays(u, v)
-        pixels = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(len(box), -1, 3)
-        inverse = np.linalg.inv(self._matrix[:, :3])
-        rays = pixels @ inverse.T
-        centre = -inverse @ self._matrix[:, 3]
-        along = np.einsum("irk,jak->ijra", rays, axes)
+        rays = box[:, None, :2] + _RAYS * size[:, None]
+        count = len(box)
+        directions = np.concatenate([rays, np.ones((count, len(_RAYS), 1))], axis=-1) @ self._inverse.T
+        enter = np.full((count, count, len(_RAYS)), np.inf)
+        # Only a car whose image box meets box i can be in the way.
+        meets = (box[:, None, :2] <= box[None, :, 2:]).all(axis=2) & (box[None, :, :2] <= box[:, None, 2:]).all(
+            axis=2
+        )
+        i, j = np.nonzero(meets)
+        along = directions[i] @ axes[j].swapaxes(-1, -2)
         along = np.where(np.abs(along) < 1e-12, 1e-12, along)
-        origin = np.einsum("jk,jak->ja", centre - translation, axes)
-        first = (low - origin)[None, :, None] / along
-        second = (high - origin)[None, :, None] / along
-        enter, leave = np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
-        return np.where((enter <= leave) & (leave > 0), enter, np.inf)
+        origin = ((self._centre - translation)[:, None] @ axes.swapaxes(-1, -2))[:, 0]
+        first = (low - origin)[j, None] / along
+        second = (high - origin)[j, None] / along
+        nearest = np.minimum(first, second).max(axis=-1)
+        furthest = np.maximum(first, second).min(axis=-1)
+        enter[i, j] = np.where((nearest <= furthest) & (furthest > 0), nearest, np.inf)
+        return enter
 
     def _road_share(self, points: Array) -> Array:
         """Mean of the road map under points (N, P, 3) in the image; 1 where fewer than a quarter of them are."""
@@ -492,6 +498,14 @@ _FOOTPRINT = np.stack(
     axis=-1,
 ).reshape(-1, 3)
 
+_RAYS = np.stack(
+    np.meshgrid(
+        (np.arange(_RAY_ROWS) + 0.5) / _RAY_ROWS, (np.arange(_RAY_COLUMNS) + 0.5) / _RAY_COLUMNS, indexing="ij"
+    )[::-1],
+    axis=-1,
+).reshape(-1, 2)
+"""Where in an image box its rays pass, (R, 2), as shares of width and height, row by row."""
+
 
 def _separation(footprint: Array, cos: Array, sin: Array) -> tuple[Array, Array]:
     """Signed gap (N, N) m by separating axes (negative: depth of overlap) and shared area (N, N) m2.
@@ -544,8 +558,8 @@ def _visible(enter: Array, rows: int) -> tuple[NDArray[np.bool_], Array, Array]:
     """Who hides whom. enter (N, N, R): distance at which ray r towards car i enters the box of car j, inf where it
     misses; rays of car i in `rows` rows.
 
-    covers (N, N): car j hides a part of car i; height (N,): share of the rows in which car i shows; area (N,): share
-    of the rays that meet car i's box first, among those that meet it.
+    covers (N, N): car j hides a part of car i; height (N,): share of the rows in which car i shows; area (N,):
+    share of the rays that meet car i's box first, among those that meet it.
     """
     count = len(enter)
     index = np.arange(count)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +45,7 @@ class _Blend(torch.autograd.Function):
     """Works in place on one copy of the picture in both directions, where autograd would copy it for each layer."""
 
     @staticmethod
-    def forward(ctx, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:  # type: ignore[override]  # noqa: E501
+    def forward(ctx, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:  # type: ignore[override]
         out = canvas.clone(memory_format=torch.contiguous_format)
         under: list[Tensor] = []
         for packed, (rows, columns), size in plan.shadows:

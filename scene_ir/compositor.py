@@ -23,7 +23,7 @@ from scene_ir.errors import ShapeError
 from scene_ir.raster import verbs
 from scene_ir.surfaces import Fleet, Surface
 from scene_ir.texture import Texels, smoothstep
-from scene_ir.types import Crop, Objects, Render, SceneIR, Source
+from scene_ir.types import Crop, Objects, Render, SceneIR
 
 T = TypeVar("T")
 
@@ -93,7 +93,7 @@ class _Geometry:
 
 
 @dataclass(frozen=True, slots=True)
-class _Drawn:
+class Drawn:
     """What the z-buffers found for one perturbation. coverage (T,); shell, ground: fragments of proxies and patches."""
 
     geometry: _Geometry
@@ -184,7 +184,7 @@ class Compositor:
             self._prepare_sources(objects, base, hidden)
 
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
-        drawn = self._draw(base)
+        drawn = self.draw(base)
         mirrored = self._fleet.place(
             self._fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
         )
@@ -229,7 +229,8 @@ class Compositor:
             surfaces.project_vertices(ground, camera),
         )
 
-    def _draw(self, objects: Objects) -> _Drawn:
+    def draw(self, objects: Objects) -> Drawn:
+        """Find which surfaces the pixels see."""
         fleet, camera, backend = self._fleet, self.scene.camera, self.settings.backend
         geometry = self._place(objects)
         rects = surfaces.crop_rects(
@@ -237,7 +238,7 @@ class Compositor:
         )
         layout = verbs.Layout.of(rects)
         mesh = verbs.rasterize(geometry.clip, fleet.faces, fleet.face_ranges, layout, backend)
-        coverage = verbs.antialias(mesh, geometry.clip, fleet.faces, fleet.face_ranges, backend)
+        coverage = verbs.antialias(mesh, geometry.clip, fleet.faces, backend=backend)
         if objects.source:
             shell = verbs.rasterize(geometry.shell_clip, fleet.faces, fleet.face_ranges, layout, backend)
         else:
@@ -246,16 +247,16 @@ class Compositor:
         patch_rects = surfaces.crop_rects(
             geometry.ground_clip, faces, vertex_ranges, face_ranges, camera, margin=0
         )
-        shadowless = [not self.settings.shadows or bool(objects.source) and objects.source[i].shadow is None
+        shadowless = [not self.settings.shadows or (bool(objects.source) and objects.source[i].shadow is None)
                       for i in range(len(objects))]  # fmt: skip
         patch_rects[torch.tensor(shadowless, dtype=torch.bool)] = 0
         ground_layout = verbs.Layout.of(patch_rects)
         ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return _Drawn(geometry, mesh, coverage, shell, ground)
+        return Drawn(geometry, mesh, coverage, shell, ground)
 
     def layers(self, objects: Objects) -> Layers:
         """The objects drawn one by one, not yet blended."""
-        drawn = self._draw(objects)
+        drawn = self.draw(objects)
         rows = self._rows(drawn, bool(objects.source))
         size = drawn.mesh.layout.size
         if objects.source:
@@ -285,7 +286,7 @@ class Compositor:
             self._shadow_factors(objects, drawn),
         )
 
-    def _rows(self, drawn: _Drawn, with_shell: bool) -> _Rows:
+    def _rows(self, drawn: Drawn, with_shell: bool) -> _Rows:
         layout = drawn.mesh.layout
         count = layout.rects.shape[0]
         covered = drawn.coverage.detach()
@@ -306,7 +307,7 @@ class Compositor:
         fringe = _fringe(layout, hit, mesh_pixel, owner, self._like.dtype)
         return _Rows(pixel, rows_owner, xy.to(self._like), share, counts, mesh_pixel.shape[0], fringe)
 
-    def _mesh_attributes(self, drawn: _Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+    def _mesh_attributes(self, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
         """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
         dense = verbs.interpolate(
             drawn.mesh, drawn.geometry.clip, self._fleet.faces, attributes, self.settings.backend
@@ -314,7 +315,7 @@ class Compositor:
         return rows.fringe.fill(dense[rows.pixel[: rows.mesh_rows]])
 
     def _photographed_rows(
-        self, objects: Objects, drawn: _Drawn, rows: _Rows
+        self, objects: Objects, drawn: Drawn, rows: _Rows
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Premultiplied colour (R, 3), opacity, depth m, paint and height (R,) of all rows."""
         geometry, base, fleet = drawn.geometry, self._base, self._fleet
@@ -385,7 +386,7 @@ class Compositor:
         sun = self.scene.environment.sun.to(self._like)
         return texture.shade(normal, to_eye, albedo, sheen, height, sun)
 
-    def _completion(self, objects: Objects, drawn: _Drawn, rows: _Rows, need: Tensor, cos_now: Tensor) -> Tensor:
+    def _completion(self, objects: Objects, drawn: Drawn, rows: _Rows, need: Tensor, cos_now: Tensor) -> Tensor:
         """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the template.
 
         cos_now: (Rm,) towards the camera.
@@ -413,16 +414,28 @@ class Compositor:
         straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
         return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
 
-    def _shadow_factors(self, objects: Objects, drawn: _Drawn) -> Tensor:
+    def paint_samples(self, objects: Objects) -> tuple[Tensor, Tensor, Tensor]:
+        """How the templates would look in white paint, beside the photograph: to find the paint of each object.
+
+        -> template RGB (K, 3), photographed RGB (K, 3), owner (K,) int64, at pixels that show nothing but paint.
+        """
+        drawn = self.draw(objects)
+        rows = self._rows(drawn, False)
+        own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
+        assert self._texels is not None
+        counts = torch.cat([rows.counts, torch.zeros_like(rows.counts)])
+        seen = self._texels.sample(rows.xy, counts, self.settings.backend, "clamp")
+        clear = (own[:, 6] > 0.9) & (seen[:, 3] > 0.95) & (seen[:, 4] < 0.01)
+        return self._own_colour(rows, own, None)[clear], seen[clear, :3], rows.owner[clear]
+
+    def _shadow_factors(self, objects: Objects, drawn: Drawn) -> Tensor:
         """Factors (Ts, 3) on the ground, of all patches."""
         clip, layout = drawn.geometry.ground_clip, drawn.ground.layout
         if layout.size == 0:
             return clip.new_zeros(0, 3)
         faces, _, _ = _patches(len(objects), clip.device)
         if not objects.source:
-            local, hit, owner = self.ground_local(drawn)
-            density = surfaces.shadow_density(local, self._size[owner], self._sun_offset[owner])
-            return (1.0 - density * hit)[:, None].expand(-1, 3)
+            return (1.0 - self.ground_density(drawn))[:, None].expand(-1, 3)
         base = self._base.ground_clip
         fixed = torch.cat([base - clip, base[:, 2:]], dim=1)
         dense = verbs.interpolate(drawn.ground, clip, faces, fixed, self.settings.backend)
@@ -436,14 +449,15 @@ class Compositor:
         dark = dark * texture.inside_weight(uv, height, width)[:, None]
         return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 
-    def ground_local(self, drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the patches' pixels: (x, z) (Ts, 2) m in the object's frame, hit (Ts,) 1 or 0, owner (Ts,)."""
+    def ground_density(self, drawn: Drawn) -> Tensor:
+        """How much the objects' boxes darken the pixels (Ts,) of their patches, in [0, 1]."""
         clip = drawn.geometry.ground_clip
         faces, _, _ = _patches(self._corners.shape[0], clip.device)
-        local = verbs.interpolate(
-            drawn.ground, clip, faces, self._corners.reshape(-1, 2).contiguous(), self.settings.backend
-        )
-        return local, (drawn.ground.face >= 0).to(clip), drawn.ground.layout.draw()
+        corners = self._corners.reshape(-1, 2).contiguous()
+        local = verbs.interpolate(drawn.ground, clip, faces, corners, self.settings.backend)
+        owner = drawn.ground.layout.draw()
+        density = surfaces.shadow_density(local, self._size[owner], self._sun_offset[owner])
+        return density * (drawn.ground.face >= 0)
 
     def render(self, perturbed: SceneIR) -> Render:
         """The picture of a perturbed scene; with nothing perturbed, the photograph."""

@@ -4,7 +4,7 @@
     photograph.png    8-bit RGB, where the tensor holds exactly k / 255; else in arrays.npz
     background.png    likewise
     arrays.npz        depth, maps, and the crops of what the photograph saw of each object
-    meshes/0.npz      vertices, faces, parts, colours, uv
+    meshes/0.glb      see `scene_ir.meshes.load`: opens in any viewer, keeps every bit of float32
 
 A folder that was written by another version of the schema is refused, not guessed at.
 """
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
+from scene_ir.meshes.load import load_mesh, save_mesh
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -66,6 +67,13 @@ _SOURCE_FIELDS: dict[str, tuple[int, ...]] = {
     "ffd": (LATTICE_POINTS, 3),
     "paint": (3,),
 }
+_MESH_DTYPES = {
+    "vertices": torch.float32,
+    "faces": torch.int64,
+    "part": torch.int64,
+    "colours": torch.float32,
+    "uv": torch.float32,
+}
 _INTEGERS = ("mesh_index", "category", "occlusion")
 
 
@@ -93,7 +101,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
                 "projection": None if scene.camera.projection is None else _numbers(scene.camera.projection),
             },
             "images": {name: "npz" if in_png[name] is None else "png" for name in _IMAGES},
-            "meshes": [{"name": mesh.name} for mesh in scene.meshes],
+            "meshes": len(scene.meshes),
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
@@ -101,10 +109,10 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
         }
         files.write_json(temporary / "scene.json", record)
         files.write_npz(temporary / "arrays.npz", arrays)
+        (temporary / "meshes").mkdir()
         for i, mesh in enumerate(scene.meshes):
-            fields = {name: getattr(mesh, name) for name in ("vertices", "faces", "part", "colours", "uv")}
-            given = {name: _array(tensor) for name, tensor in fields.items() if tensor is not None}
-            files.write_npz(temporary / "meshes" / f"{i}.npz", given)
+            _check_mesh(i, mesh)
+            save_mesh(mesh, temporary / "meshes" / f"{i}.glb")
 
 
 def load_scene(folder: Path) -> SceneIR:
@@ -149,10 +157,7 @@ def load_scene(folder: Path) -> SceneIR:
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )
-    meshes = tuple(
-        _load_mesh(folder / "meshes" / f"{i}.npz", node["name"].text())
-        for i, node in enumerate(root["meshes"].items())
-    )
+    meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))
     ignore = root["ignore"]
     provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
     return root.build(
@@ -176,12 +181,20 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
 
 
+def _check_mesh(index: int, mesh: Mesh) -> None:
+    """Refuse what a GLB does not hold exactly."""
+    for name, dtype in _MESH_DTYPES.items():
+        tensor = getattr(mesh, name)
+        if tensor is not None and tensor.dtype != dtype:
+            raise FormatError(f"scene.meshes[{index}].{name}", str(dtype), tensor.dtype)
+
+
 def _as_bytes(image: Tensor) -> np.ndarray | None:
     """The image (3, H, W) as (H, W, 3) uint8 where that is the very same; else None."""
     if image.dtype != torch.float32:
         return None
     rounded = (image * 255).round().nan_to_num(0).clamp(0, 255).to(torch.uint8)
-    if not torch.equal(rounded.to(torch.float32) / 255, image):
+    if not torch.equal(rounded.to(torch.float32) / 255, image) or bool(torch.signbit(image).any()):
         return None
     return np.ascontiguousarray(rounded.permute(1, 2, 0).numpy())
 
@@ -233,7 +246,7 @@ class _Node:
             raise FormatError(f"{self.where}: {key}", "a value", "no such key")
         return _Node(f"{self.where}: {key}", self.value[key])
 
-    def _require(self, kind: type, name: str) -> Any:
+    def _require(self, kind: type | tuple[type, ...], name: str) -> Any:
         if not isinstance(self.value, kind) or isinstance(self.value, bool):
             raise FormatError(self.where, name, type(self.value).__name__)
         return self.value
@@ -357,15 +370,5 @@ def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
     )
 
 
-def _load_mesh(path: Path, name: str) -> Mesh:
-    arrays = _Arrays(path)
-    return _Node(str(path), None).build(
-        lambda: Mesh(
-            vertices=arrays.tensor("vertices", None, 3),
-            faces=arrays.tensor("faces", None, 3, integer=True),
-            part=arrays.tensor("part", None, integer=True),
-            name=name,
-            colours=arrays.tensor("colours", None, 3) if "colours" in arrays else None,
-            uv=arrays.tensor("uv", None, 2) if "uv" in arrays else None,
-        )
-    )
+def _load_mesh(path: Path) -> Mesh:
+    return _Node(str(path), None).build(lambda: load_mesh(path))

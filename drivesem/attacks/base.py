@@ -86,7 +86,7 @@ class Attack(ABC):
 
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
-        """Run from theta0 (D,). Of theta0, the proposal of highest loss and the last one, each projected and scored
+        """Run from theta0 (D,). Of theta0, the proposal of highest loss and the last one, projected and scored
         anew, the one with most lost objects under `moved` labels wins; then a success, then the highest loss.
         """
         generator = torch.Generator(device="cpu").manual_seed(seed)

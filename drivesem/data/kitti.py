@@ -99,7 +99,9 @@ def _parse_line(where: str, text: str, with_score: bool) -> _Line:
                 _require(size > 0, where, name, "positive metres", f"{size:g}")
             _require(abs(yaw) <= 2 * math.pi + 0.01, where, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
             farthest = z + 0.5 * (l * abs(math.sin(yaw)) + w * abs(math.cos(yaw)))
-            _require(farthest > NEAR_M, where, "z", "a 3D box in front of the camera", f"{z:g} m, wholly behind it")
+            _require(
+                farthest > NEAR_M, where, "z", "a 3D box in front of the camera", f"{z:g} m, wholly behind it"
+            )
     return _Line(where, kind, tuple(values) if len(values) == 15 else (*values, 1.0))
 
 

@@ -32,7 +32,7 @@ DATASETS: dict[str, Callable[[Path], Dataset]] = {"kitti": KittiDataset}
 """Readers by the name that the command line takes."""
 
 
-def open_dataset(name: str, root: Path) -> Dataset:
+def open_dataset(name: str, root: Path | str) -> Dataset:
     """The data set `name` under `root`. RangeError for an unknown name, FormatError for a bad folder."""
     if name not in DATASETS:
         raise RangeError("dataset", f"one of {', '.join(sorted(DATASETS))}", name)

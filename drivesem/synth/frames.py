@@ -120,7 +120,7 @@ def _stand(actor: Actor, view: View) -> np.ndarray:
 def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
     """An actor in camera axes about the centre of projection, upright as labels know it."""
     spot = _stand(actor, view)
-    soup = actor_soup(actor, owner, float(spot[2]), float(view.camera.intrinsics[0, 0]))
+    soup = actor_soup(actor, owner)
     turn = yaw_matrix(torch.tensor(actor.yaw, dtype=torch.float64)).numpy().T
     corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
     return Soup(corners, (soup.normals @ turn).astype(np.float32), soup.uv, soup.material, soup.albedo, soup.pattern,

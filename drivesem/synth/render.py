@@ -185,7 +185,7 @@ def _lit(maps: _SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: 
         texel = (x1 - x0) / size
         u = (place[:, 0] - np.float32(x0)) * np.float32(1 / texel) - 0.5
         v = (place[:, 1] - np.float32(z0)) * np.float32(size / (z1 - z0)) - 0.5
-        here = pending & (u > 1) & (v > 1) & (u < size - 3) & (v < size - 3)
+        here = pending & (u > 2) & (v > 2) & (u < size - 4) & (v < size - 4)
         pending &= ~here
         for j, chosen in ((0, np.flatnonzero(here)), (1, np.flatnonzero(here & by_actor))):
             table = maps.depth[i, j]
@@ -196,16 +196,21 @@ def _lit(maps: _SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: 
 
 
 def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Share (n,) of a map's texels around (u, v) that lie behind `depth`, weighted bilinearly."""
+    """Share (n,) of a map's texels around (u, v) that lie behind `depth`: a tent three texels wide."""
     u0, v0 = np.floor(u), np.floor(v)
     fu, fv = u - u0, v - v0
-    base = v0.astype(np.int32) * np.int32(table.shape[1]) + u0.astype(np.int32)
+    base = (v0.astype(np.int32) - 1) * np.int32(table.shape[1]) + u0.astype(np.int32) - 1
     flat = table.reshape(-1)
-    rows = [
-        (flat[base + step] >= depth) * (1 - fu) + (flat[base + step + 1] >= depth) * fu
-        for step in (0, table.shape[1])
-    ]
-    return (rows[0] * (1 - fv) + rows[1] * fv).astype(np.float32)
+    total = np.zeros(len(u), np.float32)
+    for i, across in enumerate((1 - fv, None, None, fv)):
+        row = base + np.int32(i * table.shape[1])
+        part = (flat[row] >= depth) * (1 - fu)
+        part += flat[row + 1] >= depth
+        part += flat[row + 2] >= depth
+        part += (flat[row + 3] >= depth) * fu
+        total += part if across is None else part * across
+    total *= np.float32(1 / 9)
+    return total
 
 
 def _open_sky(world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]) -> np.ndarray:

@@ -10,7 +10,6 @@ import numpy as np
 from drivesem.synth import buildings, flora, people
 from drivesem.synth.layout import Actor, Road
 from drivesem.synth.soup import Material, Soup, ball, box, join, make, placed, quad, stick
-from scene_ir.meshes.lod import simplify
 from scene_ir.meshes.templates import template
 from scene_ir.types import Part
 
@@ -404,12 +403,10 @@ def _hill(b: _Builder) -> None:
                         np.broadcast_to(normal, (118, 3, 3))))  # fmt: skip
 
 
-@lru_cache(maxsize=512)
-def _vehicle_soup(kind: str, variant: int, triangles: int) -> Soup:
+@lru_cache(maxsize=1024)
+def _vehicle_soup(kind: str, variant: int) -> Soup:
     """A template in its unit box with its parts' materials; painted faces keep their own tint (light grey)."""
     mesh = template(kind, variant)
-    if triangles and mesh.faces.shape[0] > triangles:
-        mesh = simplify(mesh, triangles)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     corners = vertices[faces]
     colours = mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
@@ -445,20 +442,15 @@ def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray
     return summed.reshape(-1, 3, 3).astype(np.float32)
 
 
-def actor_soup(actor: Actor, owner: int, distance_m: float, focal_px: float) -> Soup:
-    """An actor's triangles in its own axes (front +x, bottom at y = 0), in metres, painted.
-
-    distance_m, focal_px: choose the level of detail.
-    """
+def actor_soup(actor: Actor, owner: int) -> Soup:
+    """An actor's triangles in its own axes (front +x, bottom at y = 0), in metres, painted."""
     if actor.label in ("Pedestrian", "Cyclist"):
         rng = np.random.default_rng([0x9E0, actor.seed])
         figure = people.pedestrian(rng) if actor.kind == "pedestrian" else people.cyclist(rng)
         scale = actor.size_lhw[1] / 1.75
         soup = placed(figure, (0, 0, 0), 0.0, (scale, scale, scale))
     else:
-        height_px = focal_px * actor.size_lhw[1] / max(distance_m, 1.0)
-        triangles = 0 if height_px > 60 else 1200 if height_px > 28 else 500
-        soup = placed(_vehicle_soup(actor.kind, actor.variant, triangles), (0, 0, 0), 0.0, actor.size_lhw)
+        soup = placed(_vehicle_soup(actor.kind, actor.variant), (0, 0, 0), 0.0, actor.size_lhw)
         albedo = soup.albedo.copy()
         paint = soup.material == Material.PAINT
         tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)

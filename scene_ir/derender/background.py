@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -20,6 +21,8 @@ _STEPS = (-3, -1, 0, 1, 3)
 _PATTERN = np.array([(dy, dx) for dy in _STEPS for dx in _STEPS if abs(dy) + abs(dx) < 6], np.int64)
 """Sample points of a 7x7 patch: 21 of 49 tell as much of it at less than half the price."""
 _RADIUS = 3
+_SIDEWAYS = 0.4
+"""How much nearer than up and down a pixel to the side counts for the first guess."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +35,7 @@ class FillSettings:
     coarsest_radius: float = 4.0
     max_levels: int = 6
     iterations: tuple[int, int] = (10, 2)
-    row_weight: float = 0.1
+    row_weight: float = 0.05
     column_weight: float = 0.004
     confidence_px: float = 12.0
 
@@ -84,7 +87,7 @@ def fill(
     for index in reversed(range(len(pyramid))):
         level_image, level_hole, level_forbidden = pyramid[index]
         if source is None:
-            start = row_mirror(level_image, level_forbidden)
+            start = mirror(level_image, level_forbidden)
         else:
             size = (level_image.shape[1], level_image.shape[0])
             start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
@@ -96,25 +99,22 @@ def fill(
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
 
 
-def row_mirror(image: Image, unknown: Mask) -> Image:
-    """A first guess: each unknown pixel copies the known one mirrored at the nearer end of the hole in its row.
+def mirror(image: Image, unknown: Mask) -> Image:
+    """A first guess: each unknown pixel copies what lies mirrored at the nearest end of the hole.
 
-    image (H, W, 3), unknown (H, W) -> (H, W, 3). Streets run on sideways behind a car: hedge, wall, kerb, road.
+    image (H, W, 3), unknown (H, W) -> (H, W, 3). Sideways counts as nearer than up and down, since streets run on
+    sideways behind a car: hedge, wall, kerb, road.
     """
     height, width = unknown.shape
-    columns = np.broadcast_to(np.arange(width), unknown.shape)
-    left = np.maximum.accumulate(np.where(unknown, -1, columns), axis=1)
-    right = np.minimum.accumulate(np.where(unknown, width, columns)[:, ::-1], axis=1)[:, ::-1]
-    from_left = np.where(left >= 0, columns - left, 4 * width)
-    from_right = np.where(right < width, right - columns, 4 * width)
-    mirrored = np.where(from_left <= from_right, left - from_left, right + from_right)
-    nearest = np.where(from_left <= from_right, left, right).clip(0, width - 1)
-    mirrored = np.where((mirrored >= 0) & (mirrored < width), mirrored, nearest)
-    rows = np.broadcast_to(np.arange(height)[:, None], unknown.shape)
-    mirrored = np.where(unknown[rows, mirrored], nearest, mirrored)
-    smooth = push_pull(image, (~unknown).astype(np.float32))
-    found = (unknown & ~unknown[rows, mirrored])[..., None]
-    return np.where(found, image[rows, mirrored], np.where(unknown[..., None], smooth, image))
+    if unknown.all():
+        return image
+    nearest = distance_transform_edt(unknown, sampling=(1.0, _SIDEWAYS), return_distances=False, return_indices=True)
+    rows, columns = 2 * nearest - np.mgrid[0:height, 0:width]
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    rows, columns = np.where(inside, rows, nearest[0]), np.where(inside, columns, nearest[1])
+    known = ~unknown[rows, columns]
+    rows, columns = np.where(known, rows, nearest[0]), np.where(known, columns, nearest[1])
+    return image[rows, columns]
 
 
 def _distance(mask: Mask) -> NDArray[np.float32]:

@@ -141,7 +141,7 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
         if frame.masks is not None:
             mask = (frame.masks[row] > 0.5).numpy() & ~mine
         else:
-            band = (0.10 * height + 1.0, 0.07 * height + 1.5)
+            band = (0.10 * height + 1.0, 0.11 * height + 1.5)
             mask = silhouette.instance_mask(bytes_image, outlines[0], mine, band)
             mask &= _label_box(labels, row, mask.shape)
         scores = [silhouette.iou(outline, mask, mine) for outline in outlines]
@@ -162,8 +162,9 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
         mine = unknown[row] | _union([c.mask for c in cuts], image.shape[:2])
         mask, outline = masks[index] & ~mine, outlines[index]
         if frame.masks is None and settings.fit:
-            width = 0.025 * _height(outline) + 1.5
-            closer = silhouette.instance_mask(bytes_image, outline, mine, (width, width))
+            height = _height(outline)
+            band = (0.03 * height + 1.5, 0.05 * height + 1.5)
+            closer = silhouette.instance_mask(bytes_image, outline | masks[index], mine, band)
             closer &= _label_box(labels, row, mask.shape)
             if silhouette.iou(closer, outline, mine) >= settings.min_iou:
                 mask = closer

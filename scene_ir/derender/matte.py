@@ -63,7 +63,7 @@ def matte(image: Array, mask: Mask, unknown: Mask, settings: MatteSettings | Non
         trust = length / (length + settings.contrast**2)
         mixed = trust * np.clip(share, 0, 1) + (1 - trust) * prior
         mixed = cv2.GaussianBlur(mixed.astype(np.float32), (3, 3), 0.6)
-    low = np.clip((depth - 0.8) / 1.5, 0, 1)
+    low = np.clip(depth + 0.5, 0, 1)
     high = np.clip((depth + settings.band_px + 1) / 1.5, 0, 1)
     result = np.clip(mixed, low, high)
     result = np.where(hidden, np.maximum(result, prior), result)

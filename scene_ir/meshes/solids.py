@@ -7,7 +7,7 @@ turned over once at the very end by `assemble`). Solids are symmetric to z = 0 o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -41,7 +41,6 @@ PART = {
     Material.HEADLIGHT: Part.LIGHT,
     Material.TAIL_LIGHT: Part.LIGHT,
     Material.INDICATOR: Part.LIGHT,
-    Material.CARGO: Part.PAINT,
 }
 """Part of each material; those not named are OTHER."""
 
@@ -57,7 +56,7 @@ COLOUR = {
     Material.PLATE: (0.90, 0.90, 0.86),
     Material.TRIM: (0.10, 0.10, 0.11),
     Material.UNDERBODY: (0.05, 0.05, 0.05),
-    Material.CHROME: (0.70, 0.71, 0.73),
+    Material.CHROME: (0.46, 0.47, 0.49),
     Material.CARGO: (0.86, 0.86, 0.86),
 }
 """RGB of each material. PAINT is a neutral light grey, for a paint colour to multiply."""
@@ -101,6 +100,11 @@ def _clean(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Sol
 def mirrored(solid: Solid) -> Solid:
     """The solid on the other side of z = 0."""
     return Solid(solid.vertices * np.array([1.0, 1.0, -1.0]), solid.faces[:, ::-1], solid.material)
+
+
+def shifted(solid: Solid, x: float) -> Solid:
+    """The solid moved forward by `x` m."""
+    return replace(solid, vertices=solid.vertices + np.array([x, 0.0, 0.0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,10 @@
-# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
+# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and
+# evaluates both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
 """The four verbs as NVIDIA Warp kernels: one source for CPU and CUDA, float32 tensors, used without copies.
 
-The mathematics, its order of operations and its constants are those of `reference`, so that both decide alike which
-triangle a pixel shows; fusing of multiply and add is off for the same reason. Gradients are written out by hand.
+The mathematics, its order of operations and its constants are those of `reference`, so that both decide alike
+which triangle a pixel shows; fusing of multiply and add is off for the same reason. Gradients are written by hand.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ NOTHING = (1 << 63) - 1
 
 @wp.struct
 class Job:
-    """One triangle of one draw: clip-space corners, signed edge normals, |det|, the draw's rectangle and offset."""
+    """One triangle of one draw: its pixel bounds, signed edge normals and |det|; the draw's rectangle and offset."""
 
     face: int
     x0: int
@@ -74,7 +76,7 @@ class Job:
 @wp.func
 def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are passed over."""
-    low = 0
+    low = int(0)
     high = int(count)
     while high - low > 1:
         middle = (low + high) // 2
@@ -87,8 +89,9 @@ def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
 
 @wp.func
 def grow(box: wp.vec4d, x: wp.float64, y: wp.float64, w: wp.float64):
-    u = x / w
-    v = y / w
+    scale = ONE / w
+    u = x * scale
+    v = y * scale
     return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
 
 
@@ -113,6 +116,11 @@ def whole(value: wp.float64, low: int, high: int):
 @wp.func
 def edge(n: wp.vec3d, x: int, y: int):
     return (n[0] * wp.float64(x) + n[1] * wp.float64(y)) + n[2]
+
+
+@wp.func
+def extent(c: wp.vec3d):
+    return (wp.abs(c[0]) + wp.abs(c[1])) + wp.abs(c[2])
 
 
 @wp.func
@@ -164,7 +172,7 @@ def make_job(
             n1 = wp.cross(c2, c0)
             n2 = wp.cross(c0, c1)
             det = (c0[0] * n0[0] + c0[1] * n0[1]) + c0[2] * n0[2]
-            if wp.abs(det) > DEGENERATE * (wp.length(c0) * wp.length(c1) * wp.length(c2)):
+            if wp.abs(det) > DEGENERATE * (extent(c0) * extent(c1) * extent(c2)):
                 sign = ONE
                 if det < ZERO:
                     sign = -ONE
@@ -475,8 +483,8 @@ def texture_backward_kernel(
     height = wp.int32(crops[draw, 3]) - y0
     if width > 0 and height > 0:
         t = find_taps(uv[i], x0, y0, width, height, wp.int32(crop_offsets[draw]), texel_stride, clamp)
-        gu = 0.0
-        gv = 0.0
+        gu = float(0.0)
+        gv = float(0.0)
         for c in range(channels):
             g = grad_out[i, c]
             base = c * channel_stride
@@ -506,8 +514,8 @@ def offer(
     is_end: bool,
     key: int,
 ):
-    """Enters a triangle's end at `value` on a line of pixels [low, high) for the pair (s, s + 1), if it is a pair of
-    a hit pixel on the triangle's side and an empty one. pixel: packed index of s; step: to that of s + 1."""
+    """Enters a triangle's end at `value` on a line of pixels [low, high) for the pair (s, s + 1), if that is a hit
+    pixel on the triangle's side and an empty one. pixel: packed index of s; step: to that of s + 1."""
     beyond = value - wp.float64(s)
     if s >= low and s + 1 < high and beyond > -SNAP_PX and beyond < ONE + SNAP_PX:
         here = face[pixel] >= 0
@@ -611,6 +619,24 @@ def scan(
             offer_end(keys, face, axis, span[1], low, high, origin, step, True, job.face * 3 + high_edge)
 
 
+SMALL = wp.constant(64)
+"""Bounds of up to this many pixels are searched for an empty one before the triangle is cut with its lines."""
+
+
+@wp.func
+def meets_empty(job: Job, face: wp.array(dtype=wp.int32)):
+    """Whether there is an empty pixel in the triangle's bounds or beside them; without one it makes no outline."""
+    found = (job.bounds[2] - job.bounds[0]) * (job.bounds[3] - job.bounds[1]) > SMALL
+    if not found:
+        width = job.x1 - job.x0
+        for y in range(wp.max(job.bounds[1] - 1, job.y0), wp.min(job.bounds[3] + 1, job.y1)):
+            row = job.offset + (y - job.y0) * width - job.x0
+            for x in range(wp.max(job.bounds[0] - 1, job.x0), wp.min(job.bounds[2] + 1, job.x1)):
+                if face[row + x] < 0:
+                    found = bool(True)
+    return found
+
+
 @wp.kernel
 def outline_kernel(
     clip: wp.array(dtype=wp.vec3f),
@@ -624,16 +650,17 @@ def outline_kernel(
     keys: wp.array2d(dtype=wp.int64),
 ):
     job = make_job(wp.tid(), clip, faces, job_offsets, face_ranges, rects, offsets, near)
-    for line in range(job.bounds[1], job.bounds[3]):
-        scan(job, 0, line, near, face, keys)
-    for line in range(job.bounds[0], job.bounds[2]):
-        scan(job, 1, line, near, face, keys)
+    if meets_empty(job, face):
+        for line in range(job.bounds[1], job.bounds[3]):
+            scan(job, 0, line, near, face, keys)
+        for line in range(job.bounds[0], job.bounds[2]):
+            scan(job, 1, line, near, face, keys)
 
 
 @wp.struct
 class Crossing:
-    """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, and the edge functions
-    at both, which are 0 at the outline."""
+    """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, and its edge function
+    at both, which is 0 at the outline."""
 
     hit: int
     empty: int
@@ -793,12 +820,8 @@ class _Interpolate(torch.autograd.Function):
             *(wp.from_torch(grad_clip, dtype=wp.vec3d), wp.from_torch(grad_attributes)),
         ]
         _launch(interpolate_backward_kernel, face.shape[0] if grad_out.numel() else 0, inputs)
-        return (
-            None,
-            grad_clip.to(clip.dtype) if with_clip else None,
-            None,
-            grad_attributes if with_attributes else None,
-        )
+        to_clip = grad_clip.to(clip.dtype) if with_clip else None
+        return None, to_clip, None, grad_attributes if with_attributes else None
 
 
 class _Texture(torch.autograd.Function):

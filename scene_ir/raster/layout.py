@@ -66,7 +66,7 @@ class Layout:
 @dataclass(frozen=True, slots=True)
 class Fragments:
     """What `rasterize` found. face: (T,) int32, index into the faces, -1 where nothing is hit;
-    depth: (T,) m, w of the nearest hit, inf where there is none, not differentiable (interpolate w where it must be).
+    depth: (T,) m, w of the nearest hit, inf where there is none, not differentiable (interpolate w instead).
     face_ranges: (N, 2) int64 and near: m, as they were given.
     """
 

@@ -2,8 +2,8 @@
 
 A triangle with clip-space vertices c0, c1, c2 (rows (u w, v w, w)) meets the ray of pixel p = (x, y, 1) at
 w p = sum b_i c_i. Its edge functions are e_i = p . (c_j x c_k) for (i, j, k) cyclic; b_i = e_i / sum e and
-w = det / sum e with det = c0 . (c1 x c2), so p is inside where no e_i differs in sign from det (Olano and Greer 1997).
-This holds too where vertices lie behind the camera; nothing is ever divided by a vertex's w to decide a hit.
+w = det / sum e with det = c0 . (c1 x c2), so p is inside where no e_i differs in sign from det (Olano and Greer
+1997). This holds too where vertices lie behind the camera: no hit is decided by dividing by a vertex's w.
 Since c_j x c_k = -(c_k x c_j) also in floating point, two triangles agree about their common edge.
 """
 
@@ -20,9 +20,9 @@ from scene_ir.raster.layout import Fragments, Layout
 PAIRS_PER_CHUNK = 1 << 21
 """Triangle-pixel pairs looked at together: bounds the memory to a few hundred MB."""
 DEGENERATE = 1e-15
-"""A triangle is edge-on where |det| is at most this times the product of its vertices' lengths: rounding of float64."""
+"""A triangle is edge-on where |det| is at most this times the product of its vertices' 1-norms: rounding."""
 SLACK_PX = 1e-3
-"""Widens pixel bounds against the rounding of u = (u w) / w; which pixels are hit is decided by the edge functions."""
+"""Widens pixel bounds against the rounding of u = (u w) / w; the edge functions decide which pixels are hit."""
 SNAP_PX = 1e-9
 """An outline this close to a pixel centre is tried against the pairs on both of its sides."""
 
@@ -34,7 +34,7 @@ def rasterize(
     size, none = layout.size, faces.shape[0]
     depth = clip.new_full((size,), torch.inf)
     face = torch.full((size,), none, dtype=torch.int64, device=clip.device)
-    for jobs in _chunks(_Jobs.of(clip, faces, face_ranges, layout, near), rows_only=None):
+    for jobs in _chunks(_Jobs.of(clip, faces, face_ranges, layout, near), lines_along=None):
         bounds = jobs.bounds
         width = (bounds[:, 2] - bounds[:, 0]).clamp(min=0)
         job, within = _expand(width * (bounds[:, 3] - bounds[:, 1]).clamp(min=0))
@@ -120,11 +120,11 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
 def _outline_edges(
     fragments: Fragments, clip: Tensor, faces: Tensor, axis: int, start: Tensor, end: Tensor
 ) -> Tensor:
-    """Which edge makes the outline between packed pixels `start` and `end`, neighbours along `axis` of which one is
-    hit: face * 3 + edge (P,), -1 where there is none.
+    """Which edge makes the outline between packed pixels `start` and `end`, neighbours along `axis` of which one
+    is hit: face * 3 + edge (P,), -1 where there is none.
 
-    Every triangle is cut with the pixel rows (axis 0) or columns (axis 1); it covers an interval of such a line. As
-    no triangle covers the empty pixel, the interval that reaches farthest towards it ends at the outline.
+    Every triangle is cut with the pixel rows (axis 0) or columns (axis 1); it covers an interval of such a line.
+    As no triangle covers the empty pixel, the interval that reaches farthest towards it ends at the outline.
     """
     layout = fragments.layout
     slot = torch.full((fragments.face.shape[0],), -1, dtype=torch.int64, device=clip.device)
@@ -133,7 +133,7 @@ def _outline_edges(
     best_edge = torch.full((start.shape[0],), -1, dtype=torch.int64, device=clip.device)
     jobs_all = _Jobs.of(clip.detach(), faces, fragments.face_ranges, layout, fragments.near)
     hit = fragments.face >= 0
-    for jobs in _chunks(jobs_all, rows_only=1 - axis):
+    for jobs in _chunks(jobs_all, lines_along=1 - axis):
         lines = (jobs.bounds[:, 3 - axis] - jobs.bounds[:, 1 - axis]).clamp(min=0)
         job, within = _expand(lines)
         line = jobs.bounds[job, 1 - axis] + within
@@ -177,7 +177,7 @@ def _outline_edges(
 
 @dataclass(frozen=True, slots=True)
 class _Jobs:
-    """Triangles to draw, one entry (J,) for each draw and each of its faces; those that cannot be seen left out."""
+    """Triangles to draw, one entry (J,) for each draw and each of its faces, without those that are not seen."""
 
     face: Tensor  # (J,) index into faces
     rect: Tensor  # (J, 4) of the draw
@@ -196,7 +196,7 @@ class _Jobs:
         det = (corner[:, 0, 0] * normal[:, 0, 0] + corner[:, 0, 1] * normal[:, 0, 1]) + (
             corner[:, 0, 2] * normal[:, 0, 2]
         )
-        seen = det.abs() > DEGENERATE * torch.linalg.vector_norm(corner, dim=2).prod(dim=1)
+        seen = det.abs() > DEGENERATE * corner.abs().sum(dim=2).prod(dim=1)
         seen &= (corner[..., 2] >= near).any(dim=1)
         rect = layout.rects[draw]
         jobs = (face, rect, layout.offsets[draw], _bounds(corner, rect, near), normal, det, det.sign())
@@ -208,10 +208,10 @@ class _Jobs:
         return self.offset[job] + (y - rect[:, 1]) * (rect[:, 2] - rect[:, 0]) + (x - rect[:, 0])
 
 
-def _chunks(jobs: _Jobs, rows_only: int | None) -> Iterator[_Jobs]:
-    """The jobs in order, cut where their pixels (their lines along `rows_only`, where given) exceed a chunk."""
+def _chunks(jobs: _Jobs, lines_along: int | None) -> Iterator[_Jobs]:
+    """The jobs in order, cut where their pixels (or lines along an axis, where one is given) fill a chunk."""
     extent = (jobs.bounds[:, 2:] - jobs.bounds[:, :2]).clamp(min=0)
-    work = (extent.prod(dim=1) if rows_only is None else extent[:, rows_only]).cumsum(0)
+    work = (extent.prod(dim=1) if lines_along is None else extent[:, lines_along]).cumsum(0)
     chunk = torch.div(work, PAIRS_PER_CHUNK, rounding_mode="floor")
     _, counts = torch.unique_consecutive(chunk, return_counts=True)
     fields = (jobs.face, jobs.rect, jobs.offset, jobs.bounds, jobs.normal, jobs.det, jobs.sign)
@@ -229,7 +229,7 @@ def _farthest(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts (J,): the owner (P,) of each of their sum's elements and the element's place (P,) at its owner."""
+    """For counts (J,): the owner (P,) of each of their sum's elements, and the element's place (P,) there."""
     owner = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
     start = counts.cumsum(0) - counts
     return owner, torch.arange(owner.shape[0], device=counts.device) - start[owner]
@@ -258,7 +258,7 @@ def _edge(normal: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
-    """Pixels (J, 4), half-open and inside rect (J, 4), that hold the part with w >= near of triangles (J, 3, 3)."""
+    """Pixels (J, 4), half-open, inside rect (J, 4), that hold the part with w >= near of triangles (J, 3, 3)."""
     after = corner[:, [1, 2, 0]]
     w, w_after = corner[..., 2], after[..., 2]
     front, crosses = w >= near, (w >= near) != (w_after >= near)

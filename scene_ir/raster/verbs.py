@@ -18,12 +18,21 @@ from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import Fragments, Layout
-from scene_ir.types import check_shape
+from scene_ir.types import check_finite, check_shape
 
 __all__ = [
-    "NEAR_M", "Backend", "Border", "Fragments", "Layout", "antialias", "bounding_rects", "interpolate", "rasterize",
-    "texture", "texture_packed",
-]  # fmt: skip
+    "NEAR_M",
+    "Backend",
+    "Border",
+    "Fragments",
+    "Layout",
+    "antialias",
+    "bounding_rects",
+    "interpolate",
+    "rasterize",
+    "texture",
+    "texture_packed",
+]
 
 NEAR_M = 0.05
 """Surfaces closer than this w, m, are cut away: nearer than anything in front of a car's camera."""
@@ -42,13 +51,14 @@ def rasterize(
 ) -> Fragments:
     """Find the nearest triangle at each pixel centre of each draw.
 
-    clip: (V, 3) = (u w, v w, w). faces: (F, 3) int, both windings are seen. face_ranges: (N, 2) int, draw i is faces
-    [start, end) inside layout.rects[i]; ranges may overlap. near: m, surfaces with w < near are cut away.
-    Triangles that share an edge never both hit, nor both miss, a pixel centre on it; of equal depths the lower face
-    index wins; triangles seen edge-on are skipped. Raises ShapeError or RangeError. Source: Olano and Greer 1997,
-    "Triangle scan conversion using 2D homogeneous coordinates".
+    clip: (V, 3) = (u w, v w, w). faces: (F, 3) int, both windings are seen. face_ranges: (N, 2) int, draw i is
+    faces [start, end) inside layout.rects[i]; ranges may overlap. near: m, surfaces with w < near are cut away.
+    Of two triangles on either side of a common edge exactly one hits a pixel centre on it; of equal depths the
+    lower face index wins; triangles seen edge-on are skipped. Raises ShapeError or RangeError.
+    Source: Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates".
     """
     _check_mesh(clip, faces, backend)
+    check_finite("raster.clip", clip)
     count = layout.rects.shape[0]
     check_shape("raster.face_ranges", face_ranges, count, 2, floating=False)
     if near <= 0:
@@ -121,11 +131,11 @@ def texture_packed(
 def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backend = "warp") -> Tensor:
     """Coverage (T,) in [0, 1] of each pixel by its draw, with outlines blended against empty neighbours.
 
-    clip, faces: as given to `rasterize`. Between a hit pixel and an empty 4-neighbour of the same
-    draw the outline crosses the segment of their centres at t in [0, 1], measured from the hit: the hit pixel keeps
-    1/2 + t, the empty one gets t - 1/2, each at most 1 and at least 0; of the horizontal and the vertical estimate
-    the one that changes the pixel more counts. So a straight outline that sweeps over the pixels changes coverage
-    continuously. Differentiable to clip, through the vertices of the edge that makes the outline.
+    clip, faces: as given to `rasterize`. Between a hit pixel and an empty 4-neighbour of the same draw the outline
+    crosses the segment of their centres at t in [0, 1], measured from the hit: the hit pixel keeps 1/2 + t, the
+    empty one gets t - 1/2, each at most 1 and at least 0; of the horizontal and the vertical estimate the one that
+    changes the pixel more counts. So a straight outline that sweeps over the pixels changes coverage continuously.
+    Differentiable to clip, through the vertices of the edge that makes the outline.
     The idea of differentiating analytic edge coverage is from Laine et al. 2020, "Modular primitives for
     high-performance differentiable rendering".
     """
@@ -138,8 +148,8 @@ def bounding_rects(
 ) -> Tensor:
     """Pixel rectangles (N, 4) int64, half-open and inside the image, that hold vertices [start, end) of each draw.
 
-    clip: (V, 3). vertex_ranges: (N, 2) int. margin: px on each side. A draw with vertices on both sides of the near
-    plane gets the whole image; one wholly behind it, or without vertices, an empty rectangle.
+    clip: (V, 3). vertex_ranges: (N, 2) int. margin: px on each side. A draw with vertices on both sides of the
+    near plane gets the whole image; one wholly behind it, or without vertices, an empty rectangle.
     """
     check_shape("raster.clip", clip, None, 3)
     check_shape("raster.vertex_ranges", vertex_ranges, None, 2, floating=False)

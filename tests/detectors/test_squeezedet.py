@@ -75,7 +75,8 @@ def test_parameter_count_is_the_published_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "rows", "columns"), [(384, 1248, 24, 78), (375, 1242, 24, 78), (64, 65, 4, 5), (16, 16, 1, 1)]
+    ("height", "width", "rows", "columns"),
+    [(384, 1248, 24, 78), (375, 1242, 24, 78), (64, 65, 4, 5), (16, 16, 1, 1)],
 )
 def test_grid(height: int, width: int, rows: int, columns: int) -> None:
     with torch.no_grad():
@@ -154,10 +155,9 @@ def test_channels_are_read_as_rgb() -> None:
 def test_confidence_term_by_hand() -> None:
     parts = silent(1, 64, 160)
     at = anchor_at(2, 5, 8, 10)  # 72 x 43 around (87.5, 39.5)
-    anchor = parts["boxes_xyxy"][0, at]
-    # Predicted box: the anchor. True box: 18 px further right, IoU = 54 / 90 = 0.6.
-    truth = anchor + torch.tensor([18.0, 0, 18.0, 0])
-    truth[2] = truth[2].clamp_max(159)
+    truth = parts["boxes_xyxy"][0, at].clone()
+    # The predicted box is 18 px further right than the true one: IoU = 54 / 90 = 0.6.
+    parts["boxes_xyxy"][0, at] += torch.tensor([18.0, 0, 18.0, 0])
     parts["confidence_logits"][0, at] = 0.0  # 0.5
     other = anchor_at(0, 0, 0, 10)
     parts["confidence_logits"][0, other] = math.log(0.2 / 0.8)
@@ -289,7 +289,9 @@ def test_decode_planted_predictions() -> None:
     assert len(nothing) == 0
     share = math.exp(4) / (math.exp(4) + 2)
     assert found.labels.tolist() == [0, 1, 2]
-    assert found.scores.tolist() == pytest.approx([0.9 * share, 0.8 * share, 0.5 * math.exp(9) / (math.exp(9) + 2)])
+    assert found.scores.tolist() == pytest.approx(
+        [0.9 * share, 0.8 * share, 0.5 * math.exp(9) / (math.exp(9) + 2)]
+    )
     assert found.boxes_xyxy[0].tolist() == [0.0, 39.5 - 21.5, 23.5 + 36, 39.5 + 21.5]
     assert found.boxes_xyxy[1, 2] == 159
 

@@ -73,6 +73,7 @@ def assert_same(a: Any, b: Any, where: str = "scene") -> None:
         assert a.dtype == b.dtype, where
         assert torch.equal(a.detach().nan_to_num(12345.0), b.nan_to_num(12345.0)), where
         assert torch.equal(a.isnan(), b.isnan()), where
+        assert torch.equal(a.signbit(), b.signbit()), where
     elif dataclasses.is_dataclass(a):
         for field in dataclasses.fields(a):
             assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
@@ -106,6 +107,7 @@ def float64_camera() -> Camera:
             id="float64",
         ),
         pytest.param(rich_scene().with_objects(source=()), id="no-sources"),
+        pytest.param(rich_scene(background=-torch.zeros(3, H, W)), id="negative-zero"),
     ],
 )
 def test_round_trip_is_exact(scene: SceneIR, tmp_path: Path) -> None:
@@ -159,6 +161,16 @@ def test_a_failed_save_keeps_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
+def test_meshes_that_a_glb_cannot_hold_are_refused(tmp_path: Path) -> None:
+    mesh = rich_scene().meshes[0]
+    double = dataclasses.replace(mesh, vertices=mesh.vertices.double())
+    with pytest.raises(
+        FormatError, match=r"scene\.meshes\[1\]\.vertices: expected torch\.float32, found torch\.float64"
+    ):
+        save_scene(rich_scene(meshes=(mesh, double)), tmp_path / "scene")
+    assert not list(tmp_path.iterdir())
+
+
 def test_provenance_is_text(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"provenance\['frame'\].*text.*8"):
         save_scene(rich_scene(provenance={"frame": 8}), tmp_path / "scene")
@@ -201,6 +213,11 @@ def damaged(folder: Path) -> None:
     (folder / "arrays.npz").write_bytes(bytes(data))
 
 
+def cut_mesh(folder: Path) -> None:
+    path = folder / "meshes" / "0.glb"
+    path.write_bytes(path.read_bytes()[:200])
+
+
 BAD = [
     ("not-json", lambda f: (f / "scene.json").write_text("{"), r"scene\.json:1:2: expected JSON"),
     ("binary", lambda f: (f / "scene.json").write_bytes(b"\xff\xfe\x00"), r"scene\.json: expected UTF-8 text"),
@@ -210,7 +227,7 @@ BAD = [
         r"scene\.json: expected a readable file, found no such file",
     ),
     ("no-npz", lambda f: (f / "arrays.npz").unlink(), r"arrays\.npz: expected a readable file"),
-    ("no-mesh", lambda f: (f / "meshes" / "1.npz").unlink(), r"1\.npz: expected a readable file"),
+    ("no-mesh", lambda f: (f / "meshes" / "1.glb").unlink(), r"1\.glb: expected a mesh file, found no such file"),
     ("no-png", lambda f: (f / "photograph.png").unlink(), r"photograph\.png: expected a readable file"),
     ("png-cut", lambda f: (f / "photograph.png").write_bytes(b"\x89PNG"), r"photograph\.png: expected an image"),
     ("not-npz", lambda f: (f / "arrays.npz").write_bytes(b"abc"), r"arrays\.npz: expected an NPZ"),
@@ -270,12 +287,9 @@ BAD = [
         arrays("arrays.npz", source__1__foreground=None),
         r"source\.1\.foreground: expected an array",
     ),
-    ("faces", arrays("meshes/0.npz", faces=np.full((2, 3), 9)), r"0\.npz: mesh\.faces: expected indices in"),
-    (
-        "colours",
-        arrays("meshes/0.npz", colours=np.zeros((1, 3), np.float32)),
-        r"0\.npz: mesh\.colours: expected shape",
-    ),
+    ("mesh-cut", cut_mesh, r"meshes/0\.glb: expected a readable mesh"),
+    ("mesh-count", edit("meshes", value=3), r"meshes/2\.glb: expected a mesh file, found no such file"),
+    ("mesh-kind", edit("meshes", value=[]), r"scene\.json: meshes: expected an integer, found list"),
     (
         "png-size",
         lambda f: files.write_png(f / "photograph.png", np.zeros((5, 4, 3), np.uint8)),

@@ -1,0 +1,298 @@
+"""Taking a photograph apart: from mattes and a background to `Source`s that give the photograph back, exactly.
+
+Given photograph I, background B and matte a, the foreground is F = (I - (1 - a) B) / a. That is an identity for any
+matte, so the matte is raised only as far as F needs to stay in gamut; vehicles are solved from the farthest to the
+nearest, each against what lies behind it, completions of hidden parts included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+import torch
+from torch import Tensor
+
+from scene_ir import blend, surfaces, texture
+from scene_ir.compositor import Compositor, Drawn, RenderSettings
+from scene_ir.errors import ShapeError
+from scene_ir.geometry import to_clip
+from scene_ir.raster import verbs
+from scene_ir.types import Crop, Objects, SceneIR, Source
+
+_EXTENSION_PX = 4.5
+"""How far colours are continued under a nearer object: beyond `texture.HIDDEN_PX`, plus the lookups' kernel."""
+_KEEP = 0.02
+"""A given background is kept under a shadow where background times shadow is this near to the photograph."""
+_LEVELS = 255.0
+"""Backgrounds are stored with 8 bit."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolveSettings:
+    """margin_px: how far the proxy reaches beyond the mesh; min_inflation_m: but at least so far; complete_shadows:
+    whether shadows are continued under the vehicles, where the photograph could not show them; backend: see
+    `RenderSettings`.
+    """
+
+    margin_px: float = 3.0
+    min_inflation_m: float = 0.02
+    complete_shadows: bool = True
+    backend: verbs.Backend = "warp"
+
+
+def solve_sources(
+    scene: SceneIR,
+    alphas: Sequence[Crop],
+    shadows: Sequence[Crop | None] | None = None,
+    settings: SolveSettings | None = None,
+) -> SceneIR:
+    """The scene with `objects.source` and a background such that its unperturbed render is its photograph.
+
+    scene: with photograph, background and placed objects; sources that it has are replaced. alphas: one Crop (1, h, w)
+    an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one Crop
+    (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the background, it
+    becomes the photograph (freed of the shadows).
+    """
+    settings = settings or SolveSettings()
+    count = len(scene.objects)
+    shadows = shadows if shadows is not None else [None] * count
+    if len(alphas) != count or len(shadows) != count:
+        raise ShapeError("mattes and shadows", f"one an object, {count}", f"{len(alphas)} and {len(shadows)}")
+    with torch.no_grad():
+        return _solve(scene, list(alphas), list(shadows), settings)
+
+
+def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> tuple[Crop, ...]:
+    """For each object a Crop (3, h, w): the factor by which its box, in the scene's sun, darkens the ground."""
+    bare = replace(scene, objects=replace(scene.objects, source=()))
+    with torch.no_grad():
+        compositor = Compositor(bare, settings)
+        layers = compositor.layers(compositor.scene.objects)
+    rects = layers.shadow_layout.rects.tolist()
+    return tuple(
+        Crop(layers.shadow[packed].T.reshape(3, *size), rects[i][0], rects[i][1])
+        for i, (packed, size) in enumerate(layers.shadow_layout.spans())
+    )
+
+
+def _solve(
+    scene: SceneIR, alphas: list[Crop], shadows: list[Crop | None], settings: SolveSettings
+) -> SceneIR:
+    objects, image = scene.objects, scene.photograph
+    frame_hw = (scene.camera.height, scene.camera.width)
+    blank = [_source(scene, i, alphas[i], shadows[i], settings) for i in range(len(objects))]
+    staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
+    compositor = Compositor(staged, RenderSettings(settings.backend))
+    drawn = compositor.draw(compositor.scene.objects)
+    mattes = [_cut(alphas[i], drawn, i, image) for i in range(len(objects))]
+    covered = torch.zeros(frame_hw, dtype=torch.bool)
+    for matte in mattes:
+        _window(covered[None], matte)[0] |= matte.values[0] > 0
+    factors = _shadow_crops(compositor, drawn, shadows, covered, settings)
+    background = _balance(image, scene.background, factors, covered)
+
+    canvas = background.clone()
+    for factor in factors:
+        _window(canvas, factor).mul_(factor.values)
+    order = blend.paint_order(
+        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)
+    )
+    solved: dict[int, Source] = {}
+    for place, i in enumerate(order):
+        hidden = texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
+        nearer = torch.zeros(frame_hw, dtype=torch.bool)
+        for j in order[place + 1 :]:
+            _window(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
+        shell = _hits(drawn.shell, i)
+        foreground = _foreground(mattes[i], image, canvas, nearer, shell)
+        shadow = factors[i] if shadows[i] is not None else None
+        source = replace(blank[i], foreground=foreground, shadow=shadow)
+        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)))
+        alone = Compositor(one, RenderSettings(settings.backend), hidden=[hidden])
+        source = replace(source, paint=_paint_of(alone))
+        one = replace(one, objects=replace(one.objects, source=(source,)))
+        canvas = _with_layer(Compositor(one, RenderSettings(settings.backend), hidden=[hidden]))
+        solved[i] = source
+    sources = tuple(solved[i] for i in range(len(objects)))
+    return replace(scene, background=background, objects=replace(objects, source=sources))
+
+
+def _source(scene: SceneIR, index: int, alpha: Crop, shadow: Crop | None, settings: SolveSettings) -> Source:
+    """A source with its geometry, not yet solved."""
+    objects = scene.objects
+    translation = objects.translation[index]
+    distance = max(float(to_clip(translation, scene.camera.matrix)[2]), 1.0)
+    inflation = max(settings.min_inflation_m, settings.margin_px * distance / float(scene.camera.intrinsics[0, 0]))
+    alpha_rgba = torch.cat([torch.zeros_like(alpha.values).expand(3, -1, -1), alpha.values])
+    return Source(
+        translation, objects.yaw[index], objects.size_lhw[index], objects.ffd[index],
+        replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation),
+    )  # fmt: skip
+
+
+def _only(objects: Objects, index: int) -> Objects:
+    """Object `index` alone, without source."""
+    names = (
+        "mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d", "truncation",
+        "occlusion",
+    )  # fmt: skip
+    return replace(objects, source=(), **{n: getattr(objects, n)[index : index + 1] for n in names})
+
+
+def _window(frame: Tensor, crop: Crop) -> Tensor:
+    """The view of a frame (C, H, W) that a crop lies on."""
+    h, w = crop.values.shape[1:]
+    return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
+
+
+def _hits(fragments: verbs.Fragments, index: int) -> Crop:
+    """Where draw `index` hit something: Crop (1, h, w) of 0 and 1."""
+    packed, size = fragments.layout.spans()[index]
+    x0, y0 = fragments.layout.rects[index, :2].tolist()
+    return Crop((fragments.face[packed] >= 0).reshape(1, *size).float(), x0, y0)
+
+
+def _cut(alpha: Crop, drawn: Drawn, index: int, like: Tensor) -> Crop:
+    """The matte where the proxy can carry it, trimmed to where it is above 0."""
+    shell = _hits(drawn.shell, index)
+    x0, y0 = shell.x0, shell.y0
+    rect = (x0, y0, x0 + shell.values.shape[2], y0 + shell.values.shape[1])
+    height, width = like.shape[1:]
+    values = texture.crop_of(alpha, rect, (height, width)).to(like).clamp(0.0, 1.0) * shell.values.to(like)
+    rows = (values[0] > 0).any(dim=1).nonzero()[:, 0]
+    columns = (values[0] > 0).any(dim=0).nonzero()[:, 0]
+    if rows.numel() == 0:
+        return Crop(values[:, :0, :0], x0, y0)
+    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    return Crop(values[:, top:bottom, left:right].contiguous(), x0 + left, y0 + top)
+
+
+def _shadow_crops(
+    compositor: Compositor,
+    drawn: Drawn,
+    shadows: list[Crop | None],
+    covered: Tensor,
+    settings: SolveSettings,
+) -> list[Crop]:
+    """The shadows' factors (3, h, w) on the patches that carry them, continued under the vehicles."""
+    density = compositor.ground_density(drawn)
+    out = []
+    for i, (packed, size) in enumerate(drawn.ground.layout.spans()):
+        x0, y0 = drawn.ground.layout.rects[i, :2].tolist()
+        shadow = shadows[i]
+        if shadow is None or min(size) == 0:
+            out.append(Crop(density.new_ones(3, 0, 0), x0, y0))
+            continue
+        rect = (x0, y0, x0 + size[1], y0 + size[0])
+        height, width = covered.shape
+        inverted = replace(shadow, values=1.0 - shadow.values.to(density))
+        dark = texture.crop_of(inverted, rect, (height, width)).clamp(0.0, 1.0)
+        expected = density[packed].reshape(size)
+        if settings.complete_shadows:
+            dark = _continue_shadow(dark, expected, covered[y0 : rect[3], x0 : rect[2]])
+        hit = (drawn.ground.face[packed] >= 0).reshape(1, *size)
+        out.append(Crop(1.0 - dark * hit, x0, y0))
+    return out
+
+
+def _continue_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
+    """Darkness (3, h, w) with its unseen pixels, `covered` (h, w), taken from the expected one (h, w), fitted to the
+    seen ones in strength and, near them, in value."""
+    seen = (~covered).to(dark)
+    sure = seen * (expected > 0.05)
+    strength = (dark * expected * sure).sum(dim=(1, 2)) / (expected.square() * sure).sum().clamp(min=1e-6)
+    strength = strength.clamp(0.3, 1.2) if float(sure.sum()) > 20.0 else torch.ones_like(strength)
+    model = (strength[:, None, None] * expected).clamp(0.0, 0.95)
+
+    def smooth(values: Tensor) -> Tensor:
+        return torch.from_numpy(scipy.ndimage.gaussian_filter(values.numpy(), (0, 3, 3), mode="nearest"))
+
+    weight = smooth(seen[None])
+    rest = smooth((dark - model) * seen) / weight.clamp(min=1e-3) * (2.0 * weight).clamp(max=1.0)
+    return torch.where(covered, (model + rest).clamp(0.0, 0.95), dark)
+
+
+def _balance(image: Tensor, background: Tensor, factors: list[Crop], covered: Tensor) -> Tensor:
+    """The background for which background times shadows is the photograph where no vehicle covers it.
+
+    Changes `factors` in place where the quantised background asks for it.
+    """
+    product = torch.ones_like(image)
+    for factor in factors:
+        _window(product, factor).mul_(factor.values)
+    free = ~covered
+    plain = free & (product == 1.0).all(dim=0)
+    near = ((image - background * product).abs().amax(dim=0) <= _KEEP) & free
+    lifted = (image / product.clamp(min=0.05)).clamp(max=1.0)
+    out = torch.where(near | covered, background, lifted).clamp(0.0, 1.0)
+    out = torch.where(plain, image, (out * _LEVELS).round() / _LEVELS)
+    # The darkest shadow of a pixel takes up what rounding left; where that would brighten, the background does.
+    darkest = torch.full(covered.shape, torch.inf, dtype=image.dtype)
+    chosen = torch.full(covered.shape, -1)
+    for i, factor in enumerate(factors):
+        mean = factor.values.mean(dim=0) if factor.values.numel() else factor.values.new_zeros(0, 0)
+        lowest, choice = _window(darkest[None], factor)[0], _window(chosen[None], factor)[0]
+        better = (mean < lowest) & (mean < 1.0)
+        choice[better] = i
+        lowest[better] = mean[better]
+    failed = torch.zeros_like(covered)
+    for i, factor in enumerate(factors):
+        mine = ((_window(chosen[None], factor)[0] == i) & _window(free[None], factor)[0])[None]
+        below, goal = _window(out, factor), _window(image, factor)
+        others = _window(product, factor) / factor.values.clamp(min=1e-6)
+        wanted = goal / (below * others).clamp(min=1e-6)
+        below.copy_(torch.where(mine & (wanted > 1.0), goal / others, below))
+        factor.values.copy_(torch.where(mine, wanted.clamp(max=1.0), factor.values))
+        exact = (below * others * factor.values - goal).abs().amax(dim=0) < 1e-6
+        _window(failed[None], factor)[0] |= mine[0] & ((below > 1.0).any(dim=0) | ~exact)
+    for factor in factors:
+        factor.values.masked_fill_(_window(failed[None], factor), 1.0)
+    return torch.where(failed, image, out)
+
+
+def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, shell: Crop) -> Crop:
+    """Premultiplied foreground and matte (4, h, w) over the canvas, continued a little under nearer objects."""
+    h, w = matte.values.shape[1:]
+    if h == 0 or w == 0:
+        return Crop(image.new_zeros(4, 0, 0), matte.x0, matte.y0)
+    goal, behind = _window(image, matte), _window(canvas, matte)
+    opacity = matte.values[0]
+    need = torch.where(
+        goal < behind, (behind - goal) / behind.clamp(min=1e-6), (goal - behind) / (1.0 - behind).clamp(min=1e-6)
+    )
+    raised = torch.maximum(opacity, need.amax(dim=0)).clamp(max=1.0)
+    seen = (opacity > 0) & ~_window(nearer[None], matte)[0]
+    raised = raised * seen
+    colour = torch.where(seen, goal - (1.0 - raised) * behind, torch.zeros_like(goal))
+    values = torch.cat([colour, raised[None]])
+    if bool(seen.all()) or not bool(seen.any()):
+        return replace(matte, values=values)
+    distance, nearest = scipy.ndimage.distance_transform_edt(~seen.numpy(), return_indices=True)
+    index = torch.from_numpy(np.ascontiguousarray(nearest))
+    continued = values[:, index[0], index[1]]
+    rect = (matte.x0, matte.y0, matte.x0 + w, matte.y0 + h)
+    carried = texture.crop_of(shell, rect, (image.shape[1], image.shape[2]))[0] > 0
+    use = (torch.from_numpy(distance) <= _EXTENSION_PX) & _window(nearer[None], matte)[0] & carried & ~seen
+    return replace(matte, values=torch.where(use, continued, values))
+
+
+def _paint_of(alone: Compositor) -> Tensor:
+    """The paint (3,) for which the template's own colours look as the photograph shows them, by the median."""
+    template, photographed, _ = alone.paint_samples(alone.scene.objects)
+    if template.shape[0] < 8:
+        return template.new_ones(3)
+    ratio = photographed.median(dim=0).values / template.median(dim=0).values.clamp(min=0.02)
+    return ratio.clamp(0.02, 2.5)
+
+
+def _with_layer(alone: Compositor) -> Tensor:
+    """The background of a scene of one object with that object laid over it, without its shadow."""
+    objects = alone.scene.objects
+    layers = alone.layers(objects)
+    spans = blend.spans(layers.layout.rects, layers.layout.offsets)
+    plan = blend.Plan((), tuple(s for s in spans if min(s[2]) > 0))
+    background = alone.scene.background
+    return blend.blend(background, layers.shadow[:0], layers.colour[:, :3].contiguous(), layers.opacity, plan)

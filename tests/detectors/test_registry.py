@@ -1,0 +1,101 @@
+"""Detectors by name and by file; files that are something else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from detectors.registry import SHIPPED, load_detector, save_detector
+from detectors.squeezedet import SqueezeDet
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    detector = SqueezeDet(classes=("Car", "Truck"), t_star=0.25)
+    detector.initialise(torch.Generator().manual_seed(0))
+    path = tmp_path / "own.safetensors"
+    save_detector(detector, path, {"note": "made for a test"})
+    return path
+
+
+def test_round_trip(weights: Path) -> None:
+    detector = load_detector(weights)
+    assert (detector.name, detector.classes, detector.t_star) == ("squeezedet", ("Car", "Truck"), 0.25)
+    assert not detector.training
+    assert not any(p.requires_grad for p in detector.parameters())
+    weight = detector.get_parameter("convdet.weight")
+    assert weight.dtype == torch.float32
+    assert weight.is_contiguous(memory_format=torch.channels_last)
+    expected = SqueezeDet(classes=("Car", "Truck"))
+    expected.initialise(torch.Generator().manual_seed(0))
+    assert torch.equal(weight, expected.convdet.weight.half().float())
+    assert weights.stat().st_size < 5e6
+    assert [p.name for p in weights.parent.iterdir()] == ["own.safetensors"]
+
+
+def test_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(
+        ValueError, match=r"detector: expected one of squeezedet or a path\.safetensors, found 'yolo9'"
+    ):
+        load_detector("yolo9")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"gone\.safetensors: expected a weights file, found none"):
+        load_detector(tmp_path / "gone.safetensors")
+
+
+def test_damaged_file(tmp_path: Path) -> None:
+    path = tmp_path / "noise.safetensors"
+    path.write_bytes(b"this is no safetensors file, whatever its name says")
+    with pytest.raises(ValueError, match=r"noise\.safetensors: expected a safetensors file, found"):
+        load_detector(path)
+
+
+def rewrite(weights: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> None:
+    save_file(tensors, weights, metadata)
+
+
+def state() -> dict[str, torch.Tensor]:
+    return {k: v.contiguous() for k, v in SqueezeDet().state_dict().items()}
+
+
+def test_other_architecture(weights: Path) -> None:
+    rewrite(weights, {"backbone.0.weight": torch.zeros(2), "head.bias": torch.zeros(1)}, {})
+    with pytest.raises(ValueError) as caught:
+        load_detector(weights)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "own.safetensors: expected the 64 tensors of squeezedet, found 64 missing (conv1.bias, ...)" in message
+    assert "2 unexpected (backbone.0.weight, ...)" in message
+    rewrite(weights, state(), {"architecture": "resnet"})
+    with pytest.raises(ValueError, match="expected architecture squeezedet, found 'resnet'"):
+        load_detector(weights)
+
+
+def test_other_shapes_and_values(weights: Path) -> None:
+    rewrite(weights, state(), {"classes": '["Car"]'})
+    with pytest.raises(ValueError, match=r"convdet\.\w+: expected shape \(54,.* of squeezedet with 1 classes"):
+        load_detector(weights)
+    broken = state()
+    broken["conv1.bias"][3] = float("nan")
+    rewrite(weights, broken, {})
+    with pytest.raises(ValueError, match=r"conv1\.bias: expected finite numbers"):
+        load_detector(weights)
+    rewrite(weights, state(), {"t_star": "high"})
+    with pytest.raises(ValueError, match="expected metadata classes"):
+        load_detector(weights)
+
+
+@pytest.mark.skipif(
+    not SHIPPED["squeezedet"].is_file(), reason="detectors/weights/squeezedet.safetensors is not there"
+)
+def test_shipped_detector_is_whole() -> None:
+    detector = load_detector("squeezedet")
+    assert detector.classes == ("Car", "Truck", "Pedestrian", "Cyclist")
+    assert 0.05 < detector.t_star < 0.99
+    card = SHIPPED["squeezedet"].with_suffix(".md")
+    assert f"{detector.t_star:.3f}" in card.read_text()

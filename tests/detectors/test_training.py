@@ -1,0 +1,147 @@
+"""The training loop: it learns, it resumes to the bit, it refuses what it cannot use."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from detectors.augment import AugmentSettings
+from detectors.boxes import iou_matrix
+from detectors.squeezedet import SqueezeDet
+from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, batch_of, schedule, train
+from detectors.types import Targets
+
+SMALL = TrainingSettings(
+    steps=6,
+    batch=2,
+    rate=1e-4,
+    warmup_steps=2,
+    checkpoint_every=2,
+    augment=AugmentSettings(window_hw=(48, 64)),
+)
+
+
+def painted(count: int) -> list[Sample]:
+    """Frames with one bright block each."""
+    generator = np.random.default_rng(0)
+    frames = []
+    for _ in range(count):
+        image = generator.integers(90, 130, (64, 96, 3), dtype=np.uint8)
+        x, y = int(generator.integers(2, 50)), int(generator.integers(2, 25))
+        image[y : y + 36, x : x + 40] = (250, 240, 30)
+        box = torch.tensor([[x, y, x + 39, y + 35]]).float()
+        frames.append((image, Targets(box, torch.tensor([0]), torch.tensor([False]))))
+    return frames
+
+
+def fresh() -> SqueezeDet:
+    detector = SqueezeDet(classes=("Car", "Truck"))
+    detector.initialise(torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        detector.conv1.weight *= 0.01  # inputs are in 0..255; pretrained weights know that, drawn ones do not
+    return detector
+
+
+@pytest.mark.parametrize("optimiser", ["adamw", "sgd"])
+def test_resumed_equals_uninterrupted(tmp_path: Path, optimiser: str) -> None:
+    settings = replace(SMALL, optimiser=optimiser)
+    whole = train(fresh(), painted(3), settings, tmp_path / "whole")
+    train(fresh(), painted(3), settings, tmp_path / "parts", stop_after=5)  # killed after the checkpoint of step 4
+    parts = train(fresh(), painted(3), settings, tmp_path / "parts")
+    for name, value in whole.state_dict().items():
+        assert torch.equal(parts.state_dict()[name], value), name
+    log = [list(csv.DictReader((tmp_path / run / LOG).read_text().splitlines())) for run in ("whole", "parts")]
+    assert [row["step"] for row in log[0]] == ["1", "2", "3", "4", "5", "6"]
+    for first, second in zip(*log, strict=True):
+        assert {**first, "seconds": ""} == {**second, "seconds": ""}
+
+
+def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
+    detector = fresh()
+    before = detector.convdet.weight.clone()
+    trained = train(detector, painted(2), replace(SMALL, steps=2), tmp_path)
+    assert not trained.training
+    assert not torch.equal(trained.convdet.weight, before)
+
+
+@pytest.mark.slow
+def test_learns_a_few_frames_by_heart(tmp_path: Path) -> None:
+    augment = AugmentSettings(
+        window_hw=(64, 96), scale_probability=0, flip_probability=0, noise_probability=0, blur_probability=0
+    )
+    settings = replace(
+        SMALL, steps=150, batch=2, rate=1e-3, warmup_steps=10, augment=augment, checkpoint_every=150
+    )
+    frames = painted(2)
+    detector = SqueezeDet(classes=("Car", "Truck"), dropout=0.0)
+    detector.load_state_dict(fresh().state_dict())
+    detector = train(detector, frames, settings, tmp_path)
+    for image, targets in frames:
+        found = detector.decode(detector(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255))[0]
+        assert float(iou_matrix(found.boxes_xyxy[:1], targets.boxes_xyxy)) > 0.75
+        assert float(found.scores[0]) > 0.5
+
+
+def test_evaluate_sees_the_averaged_detector(tmp_path: Path) -> None:
+    seen: list[tuple[int, bool, torch.Tensor]] = []
+
+    def evaluate(detector: torch.nn.Module, step: int) -> None:
+        seen.append((step, detector.training, detector.get_parameter("convdet.weight").clone()))
+
+    plain = train(fresh(), painted(2), replace(SMALL, steps=4), tmp_path / "plain")
+    trained = train(fresh(), painted(2), replace(SMALL, steps=4, evaluate_every=2), tmp_path / "judged", evaluate)
+    assert [(step, mode) for step, mode, _ in seen] == [(2, False), (4, False), (4, False)]
+    assert torch.equal(seen[-1][2], trained.get_parameter("convdet.weight"))
+    assert torch.equal(plain.get_parameter("convdet.weight"), trained.get_parameter("convdet.weight"))
+
+
+def test_batches_cover_every_frame_once_an_epoch() -> None:
+    frames = painted(6)
+
+    class Counting(list[Sample]):
+        asked: tuple[int, ...] = ()
+
+        def __getitem__(self, index: int) -> Sample:  # type: ignore[override]
+            self.asked = (*self.asked, index)
+            return frames[index]
+
+    counting = Counting(frames)
+    for step in range(6):
+        batch_of(counting, step, SMALL)
+    assert sorted(counting.asked[:6]) == list(range(6))
+    assert sorted(counting.asked[6:]) == list(range(6))
+    assert counting.asked[:6] != counting.asked[6:]
+
+
+def test_schedule_warms_up_and_falls() -> None:
+    settings = replace(SMALL, steps=100, rate=1.0, warmup_steps=10)
+    rates = [schedule(step / 100, step, settings) for step in range(100)]
+    assert rates[0] == pytest.approx(0.1)
+    assert max(rates) == pytest.approx(rates[9], abs=0.01)
+    assert rates[9:] == sorted(rates[9:], reverse=True)
+    assert rates[-1] < 0.02
+
+
+def test_what_cannot_be_used_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="dataset: expected at least one frame, found 0"):
+        train(fresh(), [], SMALL, tmp_path)
+    with pytest.raises(ValueError, match="optimiser: expected adamw or sgd, found 'lion'"):
+        replace(SMALL, optimiser="lion")
+    with pytest.raises(ValueError, match="batch: expected a number above 0"):
+        replace(SMALL, batch=0)
+    train(fresh(), painted(2), replace(SMALL, steps=2), tmp_path)
+    with pytest.raises(ValueError, match=rf"{CHECKPOINT}: expected settings .*, found "):
+        train(fresh(), painted(2), replace(SMALL, steps=3), tmp_path)
+
+
+def test_a_loss_that_is_not_finite_names_the_step(tmp_path: Path) -> None:
+    detector = fresh()
+    with torch.no_grad():
+        detector.convdet.bias.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="step 0: expected a finite loss"):
+        train(detector, painted(2), SMALL, tmp_path)
