@@ -59,8 +59,8 @@ _HALVINGS = 5
 """Bisection steps a block: the scale of a block is found to 1/32."""
 _TOLERANCE = 1e-6
 """Slack of every comparison (m, m2, shares, strain), far above rounding and far below what matters."""
-_FOOTPRINT_GRID = (9, 5)
-"""Points along and across a footprint at which the road map is read."""
+_FOOTPRINT_GRID = (10, 16)
+"""Cells along and across a footprint in whose centres the road map is read."""
 _RAY_ROWS, _RAY_COLUMNS = 10, 6
 """Rows and columns of an image box through which rays are sent to see what hides a car."""
 _STRAIN_GRID = (5, 5, 5)
@@ -493,11 +493,14 @@ _CORNERS = np.array(
 """Corners of a box between its bounds; the first four run around the bottom."""
 _FOOTPRINT = np.stack(
     np.meshgrid(
-        np.linspace(0, 1, _FOOTPRINT_GRID[0]), [1.0], np.linspace(0, 1, _FOOTPRINT_GRID[1]), indexing="ij"
+        (np.arange(_FOOTPRINT_GRID[0]) + 0.5) / _FOOTPRINT_GRID[0],
+        [1.0],
+        (np.arange(_FOOTPRINT_GRID[1]) + 0.5) / _FOOTPRINT_GRID[1],
+        indexing="ij",
     ),
     axis=-1,
 ).reshape(-1, 3)
-
+"""Points of a footprint (K, 3) between a car's bounds."""
 _RAYS = np.stack(
     np.meshgrid(
         (np.arange(_RAY_ROWS) + 0.5) / _RAY_ROWS, (np.arange(_RAY_COLUMNS) + 0.5) / _RAY_COLUMNS, indexing="ij"

@@ -27,7 +27,7 @@ _LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
 _DARKENING = (3.0, 2.5, 1.7)
 """Optical depth of red, green and blue at time code 1: night is blue and dark, not black."""
-_WARMTH = (0.62, 0.16, -0.34)
+_WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
 
 
@@ -107,7 +107,7 @@ def apply_weather(image: Tensor, inverse_depth: Tensor, environment: Environment
     # Time of day: warm light at one half, then blue darkness.
     gain = torch.expm1(-image.new_tensor(_DARKENING) * time * time) + (
         image.new_tensor(_WARMTH) * time * torch.exp(-3.5 * time * time)
-    ) * 0.8 - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip
+    ) - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip
     image = image + gain[:, None, None] * image
     air = air + gain * air
 

@@ -48,13 +48,14 @@ def solve_sources(
     alphas: Sequence[Crop],
     shadows: Sequence[Crop | None] | None = None,
     settings: SolveSettings | None = None,
+    margins_px: Sequence[float] | None = None,
 ) -> SceneIR:
     """The scene with `objects.source` and a background such that its unperturbed render is its photograph.
 
     scene: with photograph, background and placed objects; sources that it has are replaced. alphas: one Crop (1, h, w)
     an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one Crop
     (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the background, it
-    becomes the photograph (freed of the shadows).
+    becomes the photograph (freed of the shadows). margins_px: for each object instead of `settings.margin_px`.
     """
     settings = settings or SolveSettings()
     count = len(scene.objects)
@@ -62,7 +63,8 @@ def solve_sources(
     if len(alphas) != count or len(shadows) != count:
         raise ShapeError("mattes and shadows", f"one an object, {count}", f"{len(alphas)} and {len(shadows)}")
     with torch.no_grad():
-        return _solve(scene, list(alphas), list(shadows), settings)
+        margins = list(margins_px) if margins_px is not None else [settings.margin_px] * count
+        return _solve(scene, list(alphas), list(shadows), margins, settings)
 
 
 def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> tuple[Crop, ...]:
@@ -79,11 +81,15 @@ def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> 
 
 
 def _solve(
-    scene: SceneIR, alphas: list[Crop], shadows: list[Crop | None], settings: SolveSettings
+    scene: SceneIR,
+    alphas: list[Crop],
+    shadows: list[Crop | None],
+    margins_px: list[float],
+    settings: SolveSettings,
 ) -> SceneIR:
     objects, image = scene.objects, scene.photograph
     frame_hw = (scene.camera.height, scene.camera.width)
-    blank = [_source(scene, i, alphas[i], shadows[i], settings) for i in range(len(objects))]
+    blank = [_source(scene, i, alphas[i], shadows[i], margins_px[i], settings) for i in range(len(objects))]
     staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
     compositor = Compositor(staged, RenderSettings(settings.backend))
     drawn = compositor.draw(compositor.scene.objects)
@@ -120,12 +126,14 @@ def _solve(
     return replace(scene, background=background, objects=replace(objects, source=sources))
 
 
-def _source(scene: SceneIR, index: int, alpha: Crop, shadow: Crop | None, settings: SolveSettings) -> Source:
+def _source(
+    scene: SceneIR, index: int, alpha: Crop, shadow: Crop | None, margin_px: float, settings: SolveSettings
+) -> Source:
     """A source with its geometry, not yet solved."""
     objects = scene.objects
     translation = objects.translation[index]
     distance = max(float(to_clip(translation, scene.camera.matrix)[2]), 1.0)
-    inflation = max(settings.min_inflation_m, settings.margin_px * distance / float(scene.camera.intrinsics[0, 0]))
+    inflation = max(settings.min_inflation_m, margin_px * distance / float(scene.camera.intrinsics[0, 0]))
     alpha_rgba = torch.cat([torch.zeros_like(alpha.values).expand(3, -1, -1), alpha.values])
     return Source(
         translation, objects.yaw[index], objects.size_lhw[index], objects.ffd[index],

@@ -23,7 +23,7 @@ TURN_TOLERANCE = (0.08, 0.25)
 """Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
 OPEN_TURN = (0.02, 0.1)
 """Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
-OUTLINE_PX = (2.0, 5.0)
+OUTLINE_PX = (1.0, 2.2)
 """Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the inside."""
 HIDDEN_PX = (1.0, 3.0)
 """Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
@@ -32,6 +32,8 @@ CHANNELS = 7
 _PAD = 2
 """Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
 _LIGHTNESS_GAIN, _CHROMA_GAIN, _GLOSS_GAIN, _DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
+_GAMUT_SHARPNESS = 20.0
+"""Colours bend within about 1/20 of black and white."""
 _DUST_RGB = (0.47, 0.42, 0.35)
 """Dry road dust."""
 
@@ -189,8 +191,14 @@ def lab(rgb: Tensor) -> Tensor:
 
 
 def rgb_of(lab_rows: Tensor) -> Tensor:
-    """sRGB rows (R, 3), not clipped, of CIE L*a*b* rows (R, 3)."""
-    return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
+    """sRGB rows (R, 3) in (0, 1) of CIE L*a*b* rows (R, 3).
+
+    Colours out of gamut bend back softly; so near black and white the result is not the inverse of `lab`: take
+    differences of two results.
+    """
+    rgb = kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
+    softplus = torch.nn.functional.softplus
+    return softplus(rgb, beta=_GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=_GAMUT_SHARPNESS)
 
 
 _GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90), (0.52, 0.66, 0.86)

@@ -89,7 +89,9 @@ def find(
     old = before.false_positive.to(benign_detections.labels.device)
     repeated = boxes.iou_matrix(detections.boxes_xyxy, benign_detections.boxes_xyxy[old]) > IOU
     repeated &= detections.labels[:, None] == benign_detections.labels[old][None]
-    phantoms = after.false_positive & ~repeated.any(dim=1).cpu()
+    # A box without an area, cut off at the border, overlaps nothing, not even itself.
+    visible = boxes.area(detections.boxes_xyxy) > 0
+    phantoms = after.false_positive & (visible & ~repeated.any(dim=1)).cpu()
     return Failures(lost=tuple(lost.nonzero()[:, 0].tolist()), phantoms=tuple(phantoms.nonzero()[:, 0].tolist()))
 
 

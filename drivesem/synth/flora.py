@@ -65,7 +65,7 @@ def _crown(
 def tree(identifier: int, detail: int) -> Soup:
     """A tree about its trunk's foot, 1 m of height a metre (scale it): total height 1.
 
-    identifier: shape in the pool. detail: 0 (far) to 2 (near): how many and how small the leaves are.
+    identifier: shape in the pool. detail: 0 (far) to 3 (near): how many and how small the leaves are.
     """
     rng = np.random.default_rng([0x7EE, identifier])
     conifer = rng.random() < 0.15
@@ -95,7 +95,7 @@ def tree(identifier: int, detail: int) -> Soup:
         centres[:, 1] = np.minimum(centres[:, 1], -low - radii[:, 1] * 0.8)
         for i in range(3):
             parts.append(stick((lean[0], -trunk, lean[1]), centres[i], (0.011, 0.004), Material.BARK, bark, 5))
-    number, size_m = ((450, 0.05), (1300, 0.032), (3600, 0.0195))[detail]
+    number, size_m = ((450, 0.05), (1300, 0.032), (3600, 0.0195), (14000, 0.0105))[detail]
     parts += _crown(centres, radii, number, size_m, colour, np.random.default_rng([0x7EF, identifier, detail]))
     return join(parts)
 
@@ -109,7 +109,7 @@ def bush(identifier: int, detail: int) -> Soup:
     size = rng.uniform(0.2, 0.34, count)
     centres = np.stack([rng.uniform(-0.3, 0.3, count), -size * 0.75, rng.uniform(-0.3, 0.3, count)], axis=1)
     centres[0, 1] = -0.6
-    number, size_m = ((140, 0.12), (420, 0.075), (1300, 0.042))[detail]
+    number, size_m = ((140, 0.12), (420, 0.075), (1300, 0.042), (5000, 0.022))[detail]
     radii = np.repeat(size[:, None], 3, axis=1)
     return join(_crown(centres, radii, number, size_m, colour, rng))
 
@@ -118,7 +118,7 @@ def hedge(length_m: float, height_m: float, depth_m: float, detail: int, rng: np
     """A hedge along x, centred on the origin, standing on the ground; `detail` as for trees."""
     colour = leaf_colour(rng, 0.02)
     core = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m / 2 - 0.1, depth_m / 2 - 0.12]
-    density, size_m = ((9.0, 0.3), (30.0, 0.16), (75.0, 0.1))[detail]
+    density, size_m = ((9.0, 0.3), (30.0, 0.16), (75.0, 0.1), (260.0, 0.05))[detail]
     area_side, area_top = length_m * height_m, length_m * depth_m
     points, outward = [], []
     for sign in (-1.0, 1.0):

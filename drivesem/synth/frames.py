@@ -24,6 +24,7 @@ from drivesem.synth.render import (
     Setting,
     Shadow,
     View,
+    blocks,
     fine_matrix,
     rasterise,
     render,
@@ -41,6 +42,7 @@ _OCCLUSION_STEPS = (0.8, 0.5, 0.2)
 """Visible fractions above which an object counts as occlusion 0, 1, 2; below all, 3."""
 _LEAST_VISIBLE = 0.05
 _LEAST_HEIGHT_PX = 10.0
+_LEAST_WIDTH_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,13 +164,14 @@ def _truths(actors: list[Actor], soups: list[Soup], picture: Picture, view: View
             continue
         shown = (picture.owner[y0:y1, x0:x1] == i + 1) & own
         rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
-        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1], y0 + rows[-1]]) / n
+        # Sample k of an axis covers [k / n - 1/2, (k + 1) / n - 1/2] px, as pixel j covers [j - 1/2, j + 1/2].
+        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1]) / n - 0.5
         box = np.clip(box, 0, [width - 1, height - 1, width - 1, height - 1])
         visible = float(shown.sum() / own.sum())
         cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
         whole = np.prod(full[i][2:] - full[i][:2])
         truncation = float(np.clip(1 - np.prod(cut[2:] - cut[:2]) / max(whole, 1e-6), 0, 1))
-        opacity = own.reshape((y1 - y0) // n, n, (x1 - x0) // n, n).mean(axis=(1, 3), dtype=np.float32)
+        opacity = sum(b.astype(np.float32) for b in blocks(own)) / np.float32(n * n)
         found.append(
             Truth(
                 actor=actor,
@@ -189,9 +192,10 @@ def _labels(truths: list[Truth]) -> Labels:
     kept, ignored = [], []
     for truth in truths:
         small = truth.box_xyxy[3] - truth.box_xyxy[1] < _LEAST_HEIGHT_PX
-        if truth.visible >= _LEAST_VISIBLE and not small:
+        wide = truth.box_xyxy[2] - truth.box_xyxy[0] >= _LEAST_WIDTH_PX
+        if truth.visible >= _LEAST_VISIBLE and wide and not small:
             kept.append(truth)
-        elif truth.visible > 0:
+        elif truth.visible > 0 and (truth.box_xyxy[2:] > truth.box_xyxy[:2] + 0.5).all():
             ignored.append(truth.box_xyxy)
 
     def table(rows: list, width: int) -> torch.Tensor:
@@ -209,11 +213,11 @@ def _labels(truths: list[Truth]) -> Labels:
     )
 
 
-def _share(material: np.ndarray, chosen: tuple[Material, ...], camera: Camera) -> torch.Tensor:
+def _share(material: np.ndarray, chosen: tuple[Material, ...]) -> torch.Tensor:
     """Share (H, W) of each pixel's samples made of the chosen materials."""
-    n = SUPERSAMPLING
-    hit = np.isin(material, chosen).reshape(camera.height, n, camera.width, n)
-    return torch.from_numpy(hit.mean(axis=(1, 3), dtype=np.float32))
+    table = np.isin(np.arange(len(Material)), chosen).astype(np.float32)
+    parts = blocks(material)
+    return torch.from_numpy(sum(table[p] for p in parts) / np.float32(len(parts)))
 
 
 def _environment(picture: Picture, setting: Setting) -> Environment:
@@ -224,9 +228,9 @@ def _environment(picture: Picture, setting: Setting) -> Environment:
         foliage=torch.zeros(3),
         sun=torch.tensor(setting.light.sun, dtype=torch.float32),
         ground=torch.tensor([*up, view.height_m], dtype=torch.float32),
-        sky=_share(picture.material, (Material.SKY,), view.camera),
-        foliage_map=_share(picture.material, (Material.LEAF, Material.GRASS), view.camera),
-        road=_share(picture.material, (Material.ROAD, Material.PARKING), view.camera),
+        sky=_share(picture.material, (Material.SKY,)),
+        foliage_map=_share(picture.material, (Material.LEAF, Material.GRASS)),
+        road=_share(picture.material, (Material.ROAD, Material.PARKING)),
     )
 
 

@@ -336,8 +336,8 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
     fitted = statistics()
     if settings.vehicles is None:
         share = fitted.vehicles_per_frame.copy()
-        share[0] *= 0.5
-        wanted = int(rng.choice(len(share), p=share / share.sum())) + int(rng.integers(0, 3))
+        share[0] *= 0.3
+        wanted = int(rng.choice(len(share), p=share / share.sum())) + int(rng.integers(0, 5))
     else:
         wanted = int(rng.integers(settings.vehicles[0], settings.vehicles[1] + 1))
     candidates = _candidates(road, rng)

@@ -57,11 +57,11 @@ def draw_light(rng: np.random.Generator, up: np.ndarray, sunny: bool) -> Light:
     warm = float(np.clip((np.deg2rad(30) - elevation) / np.deg2rad(30), 0, 1))
     strength = {"sun": 1.0, "overcast": 0.0, "fog": 0.05, "dusk": 0.55}[weather]
     sun_colour = strength * np.array([1.0, 0.95 - 0.2 * warm, 0.86 - 0.42 * warm])
-    blue = np.array([0.34, 0.52, 0.95]) * rng.uniform(0.75, 1.15)
-    pale = np.array([0.92, 0.97, 1.05]) * rng.uniform(0.85, 1.35)
+    blue = np.array([0.17, 0.32, 0.74]) * rng.uniform(0.7, 1.25)
+    pale = np.array([0.66, 0.80, 1.02]) * rng.uniform(0.7, 1.35)
     clouds = float(rng.choice([0.0, 0.35, 0.6, 0.9], p=[0.4, 0.25, 0.2, 0.15]))
-    ambient = np.array([0.23, 0.265, 0.32]) * rng.uniform(0.7, 1.25)
-    haze = float(rng.uniform(0.0003, 0.0018))
+    ambient = np.array([0.165, 0.19, 0.235]) * rng.uniform(0.6, 1.25)
+    haze = float(rng.uniform(0.0002, 0.0011))
     if weather in ("overcast", "fog"):
         grey = rng.uniform(0.75, 1.05)
         blue, pale, clouds = np.full(3, 0.75) * grey, np.array([0.95, 0.97, 1.0]) * grey, 1.0
@@ -75,11 +75,11 @@ def draw_light(rng: np.random.Generator, up: np.ndarray, sunny: bool) -> Light:
 
 def draw_response(rng: np.random.Generator, weather: str) -> Response:
     """A random camera response: KITTI's cameras, exposure bracketed for the weather."""
-    base = {"sun": 2.0, "overcast": 2.3, "fog": 1.7, "dusk": 2.4}[weather]
+    base = {"sun": 2.2, "overcast": 2.3, "fog": 1.7, "dusk": 2.4}[weather]
     return Response(
         exposure=base * float(rng.lognormal(0, 0.2)),
         white_balance=np.array([1.0, 1.0, 1.0]) * rng.normal(1.0, (0.04, 0.01, 0.05)),
-        contrast=float(rng.uniform(1.05, 1.3)),
+        contrast=float(rng.uniform(1.15, 1.55)),
         vignette=float(rng.uniform(0.02, 0.15)),
         blur_px=float(rng.uniform(0.35, 0.6)),
         noise=float(rng.uniform(0.004, 0.013)),

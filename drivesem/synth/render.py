@@ -11,7 +11,7 @@ import torch
 from drivesem.synth.layout import Road
 from drivesem.synth.light import Light, Response, develop, sky_radiance
 from drivesem.synth.noise import NoiseSet
-from drivesem.synth.shading import Samples, shade
+from drivesem.synth.shading import Samples, shade, unit
 from drivesem.synth.soup import GROUND, Material, Soup
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
@@ -92,15 +92,31 @@ class Picture:
 def _in_front(points: np.ndarray, view: View) -> np.ndarray:
     """Faces (F,) that may be seen: not wholly beyond one border of the image."""
     k = view.camera.intrinsics.numpy()
-    x, y, z = points[..., 0], points[..., 1], np.maximum(points[..., 2], 1e-3)
-    left, right = -k[0, 2] / k[0, 0], (view.camera.width - k[0, 2]) / k[0, 0]
-    top, bottom = -k[1, 2] / k[1, 1], (view.camera.height - k[1, 2]) / k[1, 1]
-    out = (points[..., 2] < 0.05).all(axis=1)
-    out |= (x < left * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
-    out |= (x > right * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
-    out |= (y < top * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
-    out |= (y > bottom * z).all(axis=1) & (points[..., 2] > 0).all(axis=1)
+    z = [points[:, i, 2] for i in range(3)]
+    near = np.minimum(np.minimum(z[0], z[1]), z[2]) > 0
+    out = np.maximum(np.maximum(z[0], z[1]), z[2]) < 0.05
+    for axis, size in ((0, view.camera.width), (1, view.camera.height)):
+        low, high = -k[axis, 2] / k[axis, axis], (size - k[axis, 2]) / k[axis, axis]
+        value = [points[:, i, axis] for i in range(3)]
+        out |= near & _all3([v < np.float32(low) * d for v, d in zip(value, z, strict=True)])
+        out |= near & _all3([v > np.float32(high) * d for v, d in zip(value, z, strict=True)])
     return ~out
+
+
+def _all3(masks: list[np.ndarray]) -> np.ndarray:
+    return masks[0] & masks[1] & masks[2]
+
+
+def _extent(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest (F,) of three corners' values (F, 3)."""
+    a, b, c = values[:, 0], values[:, 1], values[:, 2]
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def blocks(values: np.ndarray) -> list[np.ndarray]:
+    """The samples of all pixels, one (H, W) array for each place inside a pixel."""
+    n = SUPERSAMPLING
+    return [values[dy::n, dx::n] for dy in range(n) for dx in range(n)]
 
 
 def fine_matrix(view: View) -> np.ndarray:
@@ -148,10 +164,9 @@ def _sun_maps(soup: Soup, setting: Setting) -> _SunMaps | None:
     placed = corners @ rows.T.astype(np.float32) + shift.astype(np.float32)
     depth = np.full((len(_SHADOW_VIEWS_M), 2, _SHADOW_TEXELS, _SHADOW_TEXELS), np.inf, np.float32)
     size = _SHADOW_TEXELS
+    ends = [_extent(placed[..., 0]), _extent(placed[..., 1])]
     for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
-        flat = placed[..., :2]
-        low, high = flat.min(axis=1), flat.max(axis=1)
-        inside = (high[:, 0] > x0) & (low[:, 0] < x1) & (high[:, 1] > z0) & (low[:, 1] < z1)
+        inside = (ends[0][1] > x0) & (ends[0][0] < x1) & (ends[1][1] > z0) & (ends[1][0] < z1)
         for j, chosen in enumerate((inside & ~actor, inside & actor)):
             points = placed[chosen]
             if not len(points):
@@ -274,22 +289,24 @@ def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
     shown = _shade_sites(seen, setting, maps, shadows, (where, face.reshape(-1)[index], w, inverse))
     shown = develop(shown, setting.response)
     image[whole] = shown[: len(whole)]
-    image[parts] = shown[len(whole) :].reshape(-1, n * n, 3).mean(axis=1)
-    depth_m = depth.reshape(height, n, width, n).min(axis=(1, 3))
+    fine_shown = shown[len(whole) :].reshape(-1, n * n, 3)
+    image[parts] = sum(fine_shown[:, i] for i in range(n * n)) / np.float32(n * n)
+    depth_m = np.minimum.reduce(blocks(depth))
     return Picture(_camera(image.reshape(height, width, 3), setting), depth_m, owner, material)
 
 
 def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, owner: np.ndarray) -> tuple:
     """Pixels (flat indices) shaded once, and those where every sample is shaded: outlines, leaves, thin things."""
-    n = SUPERSAMPLING
-    shape = (face.shape[0] // n, n, face.shape[1] // n, n)
-    first = face[::n, ::n]
-    same_face = (face.reshape(shape) == first[:, None, :, None]).all(axis=(1, 3))
-    key = material.astype(np.int32) * 4096 + owner
-    alike = (key.reshape(shape) == key[::n, ::n][:, None, :, None]).all(axis=(1, 3))
-    blocks = depth.reshape(shape)
-    near, far = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
-    smooth = alike & (far < near * np.float32(1.03)) & (material[::n, ::n] != Material.LEAF)
+    faces, depths = blocks(face), blocks(depth)
+    keys = blocks(material.astype(np.int32) * 4096 + owner)
+    same_face, alike = faces[1] == faces[0], keys[1] == keys[0]
+    near, far = depths[0], depths[0]
+    for i in range(1, len(faces)):
+        same_face = same_face & (faces[i] == faces[0])
+        alike = alike & (keys[i] == keys[0])
+        near, far = np.minimum(near, depths[i]), np.maximum(far, depths[i])
+    leaf = blocks(material)[0] == Material.LEAF
+    smooth = alike & (far < near * np.float32(1.03)) & ~leaf
     once = same_face | smooth
     return np.flatnonzero(once), np.flatnonzero(~once)
 
@@ -304,7 +321,7 @@ def _shade_sites(
     out = np.empty((len(face), 3), np.float32)
     sky = np.flatnonzero(face < 0)
     if len(sky):
-        direction = ray[sky] / np.linalg.norm(ray[sky], axis=1, keepdims=True)
+        direction = unit(ray[sky])
         out[sky] = sky_radiance(setting.light, direction, setting.noise)
         if setting.light.weather == "fog":
             out[sky] = setting.light.horizon.astype(np.float32) * 0.8
@@ -312,13 +329,16 @@ def _shade_sites(
     if not len(land):
         return out
     face = face[land]
-    used, local = np.unique(face, return_inverse=True)
+    marked = np.zeros(len(seen), bool)
+    marked[face] = True
+    used = np.flatnonzero(marked)
+    rank = np.cumsum(marked, dtype=np.int32) - 1
+    local = rank[face]
     attributes = _attribute_maps(seen, used)
     point = ray[land] * w[land, None]
     values = np.einsum("nij,nj->ni", attributes[local], point)
-    normal = values[:, :3]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-    away = (normal * point).sum(axis=1) > 0
+    normal = unit(values[:, :3])
+    away = np.einsum("ni,ni->n", normal, point) > 0
     normal[away] *= -1
     world = view.to_world(point + view.centre.astype(np.float32))
     material, owner = seen.material[face], seen.owner[face]

@@ -39,6 +39,11 @@ class Samples:
         return Samples(*(getattr(self, name)[index] for name in self.__slots__))
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) scaled to length 1."""
+    return vectors / np.sqrt(np.maximum(np.einsum("ni,ni->n", vectors, vectors), 1e-12))[:, None]
+
+
 def _fade(pixel_m: np.ndarray, detail_m: float) -> np.ndarray:
     """1 where a detail of this size is well resolved, 0 where it is below a pixel."""
     return np.clip(1.4 - pixel_m * _F(1.0 / detail_m), 0, 1)
@@ -141,8 +146,8 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     sill = np.mod(row / storey, 1.0) - 0.5
     inside = inside * np.clip(1.0 - 1.4 * sill / np.maximum(tall, 0.1), 0.3, 1.0)
     albedo += (inside[:, None] * _F([1.0, 0.97, 0.92]) - albedo) * pane[:, None]
-    view = s.point / np.linalg.norm(s.point, axis=1, keepdims=True)
-    cosine = np.clip(-(view * s.normal).sum(axis=1), 0, 1)
+    view = unit(s.point)
+    cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = view + 2 * cosine[:, None] * s.normal
     fresnel = 0.06 + 0.94 * (1 - cosine) ** 5
     tilt = mirror + (0.02 * cell)[:, None] * light.up.astype(_F)
@@ -167,8 +172,8 @@ def _polish(
     s: Samples, light: Light, noise: NoiseSet, base: np.ndarray, gloss: tuple[float, float, float]
 ) -> np.ndarray:
     """Radiance mirrored by a smooth coat: gloss is (reflectance at right angles, weight, sharpness of the sun)."""
-    view = s.point / np.linalg.norm(s.point, axis=1, keepdims=True)
-    cosine = np.clip(-(view * s.normal).sum(axis=1), 0, 1)
+    view = unit(s.point)
+    cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)
     fresnel = gloss[0] + (1 - gloss[0]) * (1 - cosine) ** 5
     env = reflected_radiance(light, mirror, noise, np.full(3, 0.12))
@@ -190,9 +195,9 @@ def shade(s: Samples, road: Road, light: Light, noise: NoiseSet, camera_height_m
         index = order[bounds[material] : bounds[material + 1]]
         if len(index):
             out[index] = _surface(s.take(index), material, road, light, noise, (bounce, camera_height_m))
-    distance = np.linalg.norm(s.point, axis=1)
+    distance = np.sqrt(np.einsum("ni,ni->n", s.point, s.point))
     through = np.exp(-light.haze_per_m * distance)[:, None].astype(_F)
-    air = light.horizon * 0.75
+    air = light.horizon * 0.6
     return out * through + air.astype(_F) * (1 - through)
 
 

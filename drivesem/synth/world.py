@@ -153,7 +153,7 @@ def _ribbon(
 
 
 def _detail(distance_m: float) -> int:
-    return 2 if distance_m < 17 else 1 if distance_m < 42 else 0
+    return 3 if distance_m < 10 else 2 if distance_m < 19 else 1 if distance_m < 42 else 0
 
 
 def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
@@ -424,9 +424,8 @@ def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(flat, axis=1, keepdims=True)
     unit = flat / np.maximum(area, 1e-12)
-    keys = np.round(corners.reshape(-1, 3) * 2000).astype(np.int64)
-    _, point = np.unique(keys, axis=0, return_inverse=True)
-    point = point.reshape(-1)
+    grid = np.round(corners.reshape(-1, 3) * 2000).astype(np.int64) + 2**19
+    _, point = np.unique((grid[:, 0] << 40) | (grid[:, 1] << 20) | grid[:, 2], return_inverse=True)
     face = np.repeat(np.arange(len(corners)), 3)
     order = np.argsort(point, kind="stable")
     starts = np.searchsorted(point[order], np.arange(point.max() + 2))

@@ -17,6 +17,7 @@ from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import project_boxes
 from scene_ir.raster import verbs
+from scene_ir.sources import SolveSettings, solve_sources
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -24,6 +25,7 @@ from scene_ir.types import (
     WEATHER_DIM,
     Camera,
     Category,
+    Crop,
     Environment,
     Frame,
     Labels,
@@ -37,6 +39,9 @@ Mask = NDArray[np.bool_]
 
 VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 """Labels that become objects; all others stay in the background. Vans count as cars, as in the paper."""
+
+_UNDERBODY = 0.3
+"""Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +70,7 @@ class _Cut:
     placement: Placement
     mask: Mask
     unknown: Mask
+    outline: Mask
     agreement: float
 
 
@@ -82,7 +88,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     rows = _vehicle_rows(frame.identifier, labels, camera, settings)
     image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     ground = maps.fit_ground(labels, _posed_rows(labels))
-    cuts = _cut_out(image, frame, rows, settings)
+    cuts = [_without_underbody(cut, ground, camera) for cut in _cut_out(image, frame, rows, settings)]
     vehicles = np.zeros(image.shape[:2], bool)
     for cut in cuts:
         vehicles |= silhouette.grow(cut.mask, 2)
@@ -93,7 +99,25 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     environment, depth = _environment(background, ground, horizon, camera, vehicles)
     if frame.depth is not None:
         depth = frame.depth.float()
-    return _assemble(frame, cuts, (background, mattes, shadows), environment, depth, settings)
+    objects, meshes = _objects(labels, cuts)
+    provenance = dict(frame.provenance) | {"frame": frame.identifier, "derender": "template fit and patch fill"}
+    for index, cut in enumerate(cuts):
+        provenance[f"objects[{index}].label"] = str(cut.row)
+        provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
+    scene = SceneIR(
+        camera, meshes, objects, environment, frame.photograph.float(),
+        torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1))), depth, labels.ignore_xyxy, provenance,
+    )  # fmt: skip
+    if not cuts:
+        return scene
+    margins = [_reach_px(cut, opacity, settings) for cut, opacity in zip(cuts, mattes, strict=True)]
+    return solve_sources(
+        scene,
+        [_crop(a[None]) for a in mattes],
+        [_crop(1 - f.transpose(2, 0, 1), inverted=True) for f in shadows],
+        SolveSettings(backend=settings.backend),
+        margins,
+    )
 
 
 def _posed_rows(labels: Labels) -> list[int]:
@@ -141,7 +165,7 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
         if frame.masks is not None:
             mask = (frame.masks[row] > 0.5).numpy() & ~mine
         else:
-            band = (0.10 * height + 1.0, 0.11 * height + 1.5)
+            band = (0.10 * height + 1.0, 0.05 * height + 1.5, 0.11 * height + 1.5)
             mask = silhouette.instance_mask(bytes_image, outlines[0], mine, band)
             mask &= _label_box(labels, row, mask.shape)
         scores = [silhouette.iou(outline, mask, mine) for outline in outlines]
@@ -163,19 +187,28 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
         mask, outline = masks[index] & ~mine, outlines[index]
         if frame.masks is None and settings.fit:
             height = _height(outline)
-            band = (0.03 * height + 1.5, 0.05 * height + 1.5)
+            band = (0.03 * height + 1.5, 0.02 * height + 1.5, 0.03 * height + 1.5)
             closer = silhouette.instance_mask(bytes_image, outline | masks[index], mine, band)
             closer &= _label_box(labels, row, mask.shape)
             if silhouette.iou(closer, outline, mine) >= settings.min_iou:
                 mask = closer
         if mask.any():
             agreement = silhouette.iou(mask, outline, mine)
-            cuts.append(_Cut(row, chosen[index], mask, mine, agreement))
+            cuts.append(_Cut(row, chosen[index], mask, mine, outline, agreement))
     return sorted(cuts, key=lambda cut: cut.row)
 
 
+def _without_underbody(cut: _Cut, ground: torch.Tensor, camera: Camera) -> _Cut:
+    """The mask without the dark ground between and beside the wheels: that is shadow, and lies on the ground."""
+    distance = shadow.footprint_distance(cut.placement, ground, camera)
+    _, top, _, bottom = silhouette.extent(cut.outline)
+    low = np.arange(camera.height)[:, None] > bottom - _UNDERBODY * (bottom - top)
+    beneath = low & (distance < 0.4) & ~silhouette.grow(cut.outline, 1.5)
+    return replace(cut, mask=cut.mask & ~beneath) if (cut.mask & ~beneath).any() else cut
+
+
 def _hidden_by_others(labels: Labels, rows: list[int], camera: Camera) -> dict[int, Mask]:
-    """For each vehicle the pixels of nearer people: the middle of their boxes, which the car cannot own."""
+    """For each vehicle the pixels of nearer people and the like, ellipses in their boxes: the car cannot own them."""
     shape = (camera.height, camera.width)
     people = [i for i in _posed_rows(labels) if labels.kind[i] not in VEHICLES]
     hidden = {}
@@ -183,8 +216,10 @@ def _hidden_by_others(labels: Labels, rows: list[int], camera: Camera) -> dict[i
         mask = np.zeros(shape, bool)
         for other in people:
             if float(labels.translation[other, 2]) < float(labels.translation[row, 2]):
-                x0, y0, x1, y1 = (round(v) for v in labels.boxes_xyxy[other].tolist())
-                mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = True
+                x0, y0, x1, y1 = labels.boxes_xyxy[other].tolist()
+                v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+                across, down = (2 * u - x0 - x1) / max(x1 - x0, 1), (2 * v - y0 - y1) / max(y1 - y0, 1)
+                mask |= across**2 + down**2 <= 1
         hidden[row] = mask
     return hidden
 
@@ -242,8 +277,7 @@ def _layers(
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
     near = np.stack(distances).argmin(0)
     factors = [
-        shadow.factors(image, background, (shadow_share > 0) & (near == i) & (opaque < 1), cut.mask, distances[i])
-        for i, cut in enumerate(cuts)
+        shadow.factors(image, background, (shadow_share > 0) & (near == i) & (opaque == 0)) for i in range(len(cuts))
     ]
     return background, mattes, factors
 
@@ -267,3 +301,50 @@ def _environment(
         *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, foliage, road)),
     )
     return environment, torch.from_numpy(depth)
+
+
+def _objects(labels: Labels, cuts: list[_Cut]) -> tuple[Objects, tuple[Mesh, ...]]:
+    """The vehicles as placed by the fit, without sources, and the templates they use."""
+    meshes: list[Mesh] = []
+    index = []
+    for cut in cuts:
+        names = [m.name for m in meshes]
+        if cut.placement.mesh.name not in names:
+            meshes.append(cut.placement.mesh)
+            names.append(cut.placement.mesh.name)
+        index.append(names.index(cut.placement.mesh.name))
+    rows = [cut.row for cut in cuts]
+    count = len(cuts)
+
+    def stacked(name: str, *shape: int) -> torch.Tensor:
+        parts = [getattr(cut.placement, name).detach().float() for cut in cuts]
+        return torch.stack(parts) if parts else torch.zeros(0, *shape)
+
+    objects = Objects(
+        torch.tensor(index, dtype=torch.int64),
+        stacked("translation", 3),
+        stacked("yaw"),
+        stacked("size_lhw", 3),
+        stacked("ffd", LATTICE_POINTS, 3),
+        torch.zeros(count, TEXTURE_DIM),
+        torch.tensor([int(VEHICLES[labels.kind[row]]) for row in rows], dtype=torch.int64),
+        labels.boxes_xyxy[rows].float(),
+        labels.truncation[rows].float(),
+        labels.occlusion[rows],
+    )
+    return objects, tuple(meshes)
+
+
+def _reach_px(cut: _Cut, opacity: Array, settings: DerenderSettings) -> float:
+    """How far the matte reaches beyond the mesh's outline, px, and a little more; bounded by the car's height."""
+    beyond = cv2.distanceTransform((~cut.outline).astype(np.uint8), cv2.DIST_L2, 5)
+    limit = settings.max_inflation * _height(cut.outline)
+    return float(np.clip(beyond[opacity > 0].max(initial=0) + 1.5, settings.min_reach_px, max(limit, settings.min_reach_px)))
+
+
+def _crop(values: Array, inverted: bool = False) -> Crop:
+    """The part (C, h, w) of a frame (C, H, W) that is not zero; of `inverted` values, one minus it."""
+    used = (values > 0).any(0)
+    x0, y0, x1, y1 = silhouette.extent(used) if used.any() else (0, 0, 0, 0)
+    part = np.ascontiguousarray(values[:, y0:y1, x0:x1], dtype=np.float32)
+    return Crop(torch.from_numpy(1 - part if inverted else part), x0, y0)

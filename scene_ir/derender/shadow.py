@@ -20,14 +20,12 @@ Mask = NDArray[np.bool_]
 @dataclass(frozen=True, slots=True)
 class ShadowSettings:
     """reach_m: how far from the footprint a shadow is looked for; contact_m: width of the strip around the footprint
-    that counts as touching; dark: share of the lit ground's brightness below which ground is shaded; core: darkest
-    factor right under the body where nothing of it is seen.
+    that counts as touching; dark: share of the lit ground's brightness below which ground is shaded.
     """
 
     reach_m: float = 2.0
     contact_m: float = 0.25
     dark: float = 0.72
-    core: float = 0.3
 
 
 def footprint_distance(placement: Placement, ground: torch.Tensor, camera: Camera) -> Array:
@@ -85,23 +83,7 @@ def find(
     return found
 
 
-def factors(
-    image: Array, background: Array, region: Mask, vehicles: Mask, distance: Array, settings: ShadowSettings | None = None
-) -> Array:
-    """The factor (H, W, 3) in [0, 1] by which one car darkens the ground; 1 away from it.
-
-    In `region` it is photograph / background. Under the car, where nothing is seen of it, it runs on from what is
-    seen and gets dark towards the middle of the footprint (`distance` < 0).
-    """
-    settings = settings or ShadowSettings()
+def factors(image: Array, background: Array, region: Mask) -> Array:
+    """The factor (H, W, 3) in [0, 1] by which one car darkens the ground: photograph / background in its `region`."""
     seen = np.clip(image / np.maximum(background, 1 / 255), 0, 1)
-    factor = np.where(region[..., None], seen, 1).astype(np.float32)
-    beneath = vehicles & (distance < 0.6)
-    if beneath.any():
-        known = (~beneath).astype(np.float32)
-        smooth = cv2.GaussianBlur(factor, (0, 0), 1.0)
-        continued = push_pull(smooth, known)
-        contact = settings.core + (1 - settings.core) * np.clip((distance + 0.15) / 0.35, 0, 1)
-        under = np.minimum(continued, contact[..., None])
-        factor = np.where(beneath[..., None], under, factor)
-    return factor.astype(np.float32)
+    return np.where(region[..., None], seen, 1).astype(np.float32)

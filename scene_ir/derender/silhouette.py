@@ -28,6 +28,9 @@ _WORK_PX = 160
 _BAND = 0.12
 """Width of the band in which mask and outline pull at each other, as a fraction of the window."""
 
+_LOW_PART = 0.3
+"""Lower part of a car, as a fraction of its height, beside which its shadow lies."""
+
 
 @dataclass(frozen=True, slots=True)
 class Placement:
@@ -115,20 +118,23 @@ def grow(mask: Mask, radius: float) -> Mask:
 
 
 def instance_mask(
-    image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float], rounds: int = 4
+    image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float, float], rounds: int = 4
 ) -> Mask:
     """The car's pixels by GrabCut (Rother 2004) in a band around the template's outline.
 
     image (H, W, 3) RGB; outline: the placed template; unknown: pixels of nearer things, which are nobody's;
-    band_px: how far inside and outside of the outline the border is searched -> mask (H, W), without `unknown`.
+    band_px: how far the border is searched inside of the outline, outside of it near the ground (where shadows look
+    like cars), and outside of it higher up -> mask (H, W), without `unknown`.
     """
     visible = outline & ~unknown
     if not visible.any():
         return visible
-    inside, outside = band_px
+    inside, outside_low, outside_high = band_px
     x0, y0, x1, y1 = extent(outline)
-    margin = int(2 * outside + 12)
     height, width = outline.shape
+    low = np.arange(height)[:, None] > y1 - _LOW_PART * (y1 - y0)
+    reach = np.where(low, grow(outline, outside_low), grow(outline, outside_high))
+    margin = int(2 * outside_high + 12)
     x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     window = (slice(y0, y1), slice(x0, x1))
     scale = float(np.clip(120 / max(extent(outline)[3] - extent(outline)[1], 1), 1, 4))
@@ -139,7 +145,7 @@ def instance_mask(
 
     crop = cv2.resize(image[window], size, interpolation=cv2.INTER_CUBIC)
     labels = np.full(size[::-1], cv2.GC_BGD, np.uint8)
-    labels[enlarge(grow(outline, outside))] = cv2.GC_PR_BGD
+    labels[enlarge(reach)] = cv2.GC_PR_BGD
     labels[enlarge(outline)] = cv2.GC_PR_FGD
     core = enlarge(grow(outline, -inside))
     labels[core] = cv2.GC_FGD

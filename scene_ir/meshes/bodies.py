@@ -9,9 +9,6 @@ import numpy as np
 
 from scene_ir.meshes.solids import Material, Solid, coons, mirrored, revolve
 
-_ARC = np.linspace(np.pi, 0.0, 9)
-"""Angles of the stations of a wheel arch."""
-
 
 @dataclass(frozen=True, slots=True)
 class Body:
@@ -48,6 +45,7 @@ class Body:
     """Length over which the plan narrows towards both ends, m."""
     side_levels: np.ndarray | None = None
     """(K + 1,) fractions along the side; else they go over from the front's to the rear's."""
+    arch_steps: int = 8
     arch_reach: float = 1.0
     """Levels at this fraction and above do not bend over the arches."""
 
@@ -56,7 +54,7 @@ def _side_stations(body: Body) -> np.ndarray:
     """x (n + 1,) of the stations along the side, front to rear, corners left out at both ends."""
     stations = [body.stations]
     for axle in body.axles:
-        arc = axle + body.arch_radius * np.cos(np.pi - _ARC)
+        arc = axle + body.arch_radius * np.cos(np.linspace(0.0, np.pi, body.arch_steps + 1))
         stations += [arc, axle + np.array([-1.0, 1.0]) * (body.arch_radius + 0.004)]
         lo, hi = axle - body.arch_radius - 0.02, axle + body.arch_radius + 0.02
         stations[0] = stations[0][(stations[0] < lo) | (stations[0] > hi)]

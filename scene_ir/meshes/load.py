@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,8 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Mesh, Part
@@ -32,7 +33,11 @@ _UP = {"y": "+y", "z": "+z", "-y": "-y"}
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Node transform of our GLBs: glTF's y points up, ours down, so that viewers show the mesh upright."""
 _NAMES = (
-    (Part.LIGHT, r"light|lamp|blinker|indicator|luz"),
+    (
+        Part.LIGHT,
+        r"(head|tail|brake|fog|turn|stop)[ _-]?light|lights?\b|lights?[_-](front|rear|back|left|right|[lr]\b|\d)"
+        r"|lamp|blinker|indicator",
+    ),
     (Part.OTHER, r"rim\b|rims|alloy|hubcap|brake|seat|interior|dash|steer|grill|plate|underbody|engine|chassis"),
     (Part.TYRE, r"tyre|tire|wheel|rubber|pneu"),
     (Part.GLASS, r"glass|window|windshield|windscreen|vitre|vidrio"),
@@ -64,7 +69,7 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
     if up not in _UP:
         raise RangeError("up", " or ".join(_UP), up)
     if front != "auto" and (front not in _AXES or front[1] == _UP[up][1]):
-        raise RangeError("front", f"auto or a horizontal axis such as {'+x' if up != 'x' else '+z'}", front)
+        raise RangeError("front", "auto or an axis at right angles to up, such as +x", front)
     if not metres_per_unit > 0:
         raise RangeError("metres_per_unit", "a positive number", metres_per_unit)
     scene = _read(file)
@@ -72,24 +77,24 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
     if own is not None:
         extent = own.vertices.amax(dim=0) - own.vertices.amin(dim=0)
         return Imported(own, (float(extent[0]), float(extent[1]), float(extent[2])))
-    vertices, faces, part, colours, uv, towards_front = _flatten(scene, file)
-    rotation = _axes(vertices, faces, _AXES[_UP[up]], front, towards_front)
-    turned = vertices @ rotation.T
+    soup = _flatten(scene, file)
+    turned = soup.vertices @ _axes(soup, _AXES[_UP[up]], front).T
     low, high = turned.min(axis=0), turned.max(axis=0)
     extent = high - low
     if not np.all(extent > 0):
         raise FormatError(str(file), "a solid with length, height and width", f"extents {extent.tolist()}")
     unit = (turned - low) / extent - np.array([0.5, 1.0, 0.5])
+    faces = soup.faces
     corners = unit[faces]
     if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1].copy()
     mesh = Mesh(
         vertices=torch.from_numpy(unit.astype(np.float32)),
         faces=torch.from_numpy(faces),
-        part=torch.from_numpy(part),
+        part=torch.from_numpy(soup.part),
         name=file.stem,
-        colours=torch.from_numpy(colours.astype(np.float32)),
-        uv=None if uv is None else torch.from_numpy(uv.astype(np.float32)),
+        colours=torch.from_numpy(soup.colours.astype(np.float32)),
+        uv=None if soup.uv is None else torch.from_numpy(soup.uv.astype(np.float32)),
     )
     length, height, width = (float(e) * metres_per_unit for e in extent)
     return Imported(mesh, (length, height, width))
@@ -118,21 +123,20 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     )
     if mesh.colours is not None:
         colours = mesh.colours.detach().cpu().numpy().astype(np.float32)
-        shape.visual.vertex_colors = np.round(colours.clip(0, 1) * 255).astype(np.uint8)
+        shape.visual = ColorVisuals(shape, vertex_colors=np.round(colours.clip(0, 1) * 255).astype(np.uint8))
         shape.vertex_attributes["_rgb"] = colours
     if mesh.uv is not None:
         shape.vertex_attributes["_uv"] = mesh.uv.detach().cpu().numpy().astype(np.float32)
     scene = trimesh.Scene()
     scene.add_geometry(shape, geom_name="mesh", node_name="vehicle", transform=_FLIP)
     content = scene.export(file_type="glb", include_normals=False)
-    handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+    assert isinstance(content, bytes)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
     try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+        temporary.write_bytes(content)
         os.replace(temporary, file)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _read(file: Path) -> trimesh.Scene:
@@ -141,13 +145,10 @@ def _read(file: Path) -> trimesh.Scene:
     if not file.is_file():
         raise FormatError(str(file), "a mesh file", "no such file")
     try:
-        return trimesh.load_scene(
-            file, process=False, **({"group_material": True} if file.suffix == ".obj" else {})
-        )
+        return trimesh.load_scene(file, process=False)
     except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
-        raise FormatError(
-            str(file), "a readable mesh", f"{type(error).__name__}: {error}".splitlines()[0]
-        ) from None
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise FormatError(str(file), "a readable mesh", reason) from None
 
 
 def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
@@ -172,10 +173,22 @@ def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
     )
 
 
-def _flatten(
-    scene: trimesh.Scene, file: Path
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None, NDArray]:
-    """All geometry in the scene's frame: vertices, faces, part, colours, uv, and where parts named front lie."""
+@dataclass(frozen=True, slots=True)
+class _Soup:
+    """All geometry of a file in its scene's frame. vertices (V, 3), faces (F, 3), part (F,), colours (V, 3), uv.
+
+    forward (3,): from the nodes named back or rear to those named front; zero where names do not tell.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    part: NDArray[np.int64]
+    colours: NDArray[np.float64]
+    uv: NDArray[np.float64] | None
+    forward: NDArray[np.float64]
+
+
+def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
     vertices, faces, names, colours, uvs, sides = [], [], [], [], [], []
     start = 0
     for node in sorted(scene.graph.nodes_geometry):
@@ -210,7 +223,7 @@ def _flatten(
         for sign in (1.0, -1.0):
             forward += sign * np.mean([centre for s, centre in sides if s == sign], axis=0)
     uv = np.concatenate([u for u in uvs if u is not None]) if all(u is not None for u in uvs) else None
-    return everything, np.concatenate(faces), _parts(names), np.concatenate(colours), uv, forward
+    return _Soup(everything, np.concatenate(faces), _parts(names), np.concatenate(colours), uv, forward)
 
 
 def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
@@ -228,25 +241,27 @@ def _vertex_colours(shape: trimesh.Trimesh) -> NDArray[np.float64]:
     """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order."""
     count = len(shape.vertices)
     visual = shape.visual
-    if not isinstance(visual, trimesh.visual.TextureVisuals):
+    if isinstance(visual, ColorVisuals):
         return np.asarray(visual.vertex_colors)[:, :3] / 255.0 if visual.defined else _plain(count)
-    material, uv = visual.material, visual.uv
-    if isinstance(material, trimesh.visual.material.PBRMaterial):
-        factor = material.baseColorFactor
+    if not isinstance(visual, TextureVisuals):
+        return _plain(count)
+    material, uv, image, tint = visual.material, visual.uv, None, None
+    if isinstance(material, PBRMaterial):
         image = material.baseColorTexture
-        # glTF's factor is linear light, its textures and our colours are sRGB
-        tint = np.ones(3) if factor is None else _srgb(np.asarray(factor, dtype=float)[:3] / 255.0)
-    else:
-        image = getattr(material, "image", None)
-        tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0 if image is None else np.ones(3)
+        if material.baseColorFactor is not None:
+            # glTF's factor is linear light, its textures and our colours are sRGB
+            tint = _srgb(np.asarray(material.baseColorFactor, dtype=float)[:3] / 255.0)
+    elif isinstance(material, SimpleMaterial):
+        image = material.image
+        if image is None:
+            tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0
     if image is None or uv is None or len(uv) != count:
-        defined = image is not None or not isinstance(material, trimesh.visual.material.PBRMaterial)
-        return np.tile(tint, (count, 1)) if defined or material.baseColorFactor is not None else _plain(count)
+        return _plain(count) if tint is None else np.tile(tint, (count, 1))
     pixels = np.asarray(image.convert("RGB"), dtype=float) / 255.0
     height, width = pixels.shape[:2]
     columns = np.floor(np.mod(uv[:, 0], 1.0) * width).astype(int).clip(0, width - 1)
     rows = np.floor(np.mod(1.0 - uv[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
-    return pixels[rows, columns] * tint
+    return pixels[rows, columns] * (1.0 if tint is None else tint)
 
 
 def _plain(count: int) -> NDArray[np.float64]:
@@ -258,20 +273,18 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
 
 
-def _axes(
-    vertices: NDArray, faces: NDArray, up: tuple[float, float, float], front: str, towards_front: NDArray
-) -> NDArray[np.float64]:
+def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np.float64]:
     """Rotation (3, 3) from the file's axes to ours: rows are our x (front), y (down), z."""
     down = -np.asarray(up)
     if front != "auto":
         forward = np.asarray(_AXES[front])
     else:
-        extent = np.ptp(vertices, axis=0)
+        extent = np.ptp(soup.vertices, axis=0)
         horizontal = np.where(np.abs(down) > 0.5, -np.inf, extent)
         forward = np.eye(3)[int(np.argmax(horizontal))]
-        lead = float(forward @ towards_front)
+        lead = float(forward @ soup.forward)
         if lead == 0.0:
-            lead = _bonnet_side(vertices, faces, forward, -down)
+            lead = _bonnet_side(soup.vertices, soup.faces, forward, -down)
         if lead < 0:
             forward = -forward
     return np.stack([forward, down, np.cross(forward, down)])

@@ -362,7 +362,7 @@ def _vary_bus(variant: int) -> BusOutline:
         screen_sill=float(rng.uniform(0.95, 1.15)),
         header=height - float(rng.uniform(0.38, 0.60)),
         rear_sill=float(rng.uniform(1.55, 1.95)),
-        panes=int(rng.integers(5, 9)),
+        panes=int(rng.integers(4, 6) if length > 12.2 else rng.integers(5, 8)),
         bow=float(rng.uniform(0.06, 0.24)),
         third_axle=bool(length > 12.2),
         pod=bool(rng.random() < 0.6),

@@ -18,6 +18,8 @@ _M = 6
 """Steps of a body's grid from the middle to the corners."""
 _MIRROR = 0.035
 """How far door mirrors stand out over the body, each side, m."""
+_CAB_CLEARANCE = 0.36
+"""Height of a lorry's front bumper above the ground, m."""
 _GAP = 0.014
 """Width of the gaps around doors, m."""
 
@@ -83,24 +85,25 @@ def _greenhouse(car: CarOutline, top: Callable[[np.ndarray], np.ndarray], half_w
     rim_y = lid[m, 1:n, 1]
     lid[inside][..., 1] = rim_y + (roof - rim_y) * (1 - (lid[inside][..., 2] / lid[m, 1:n, 2]) ** 2)
     lid[0, [0, -1], 1] = wall[-1, [0, -1], 1]
-    floor = coons(wall[0], m, n)
-    material = np.full((len(profile) - 1, 2 * m + n), int(Material.PAINT))
-    glass = slice(1, 3)
-    material[glass, : m - 1] = Material.GLASS
-    material[glass, m + n + 1 :] = Material.GLASS
-    for pane, s in enumerate(range(1, n, 2)):
-        if pane not in car.blind:
-            material[glass, m + s] = Material.GLASS
-    for s in range(2, n - 1, 2):
-        if (s - 1) // 2 not in car.blind:
-            material[glass, m + s] = Material.TRIM
-    if car.blind:
-        material[glass, m + n + 1 :] = Material.PAINT
-    if car.pillar_lights:
-        material[glass, m + n - 1 : m + n + 1] = Material.TAIL_LIGHT
+    material = _greenhouse_material(car, m, n)
     lid_material = np.full((m, n), int(Material.PAINT))
     floor_material = np.full((m, n), int(Material.UNDERBODY))
-    return Skin(wall, lid, floor, material, lid_material, floor_material).solid()
+    return Skin(wall, lid, coons(wall[0], m, n), material, lid_material, floor_material).solid()
+
+
+def _greenhouse_material(car: CarOutline, m: int, n: int) -> np.ndarray:
+    """Materials (5, 2 m + n) of the cabin's wall: glass between the pillars, in its second and third row."""
+    material = np.full((5, 2 * m + n), int(Material.PAINT))
+    glass = slice(1, 3)
+    material[glass, : m - 1] = Material.GLASS
+    material[glass, m + n + 1 :] = Material.PAINT if car.blind else Material.GLASS
+    for step in range(1, n - 1):
+        # odd steps are panes, even ones the pillars behind them
+        if (step - 1) // 2 not in car.blind:
+            material[glass, m + step] = Material.GLASS if step % 2 else Material.TRIM
+    if car.pillar_lights:
+        material[glass, m + n - 1 : m + n + 1] = Material.TAIL_LIGHT
+    return material
 
 
 def _top_line(car: CarOutline) -> Callable[[np.ndarray], np.ndarray]:
@@ -195,7 +198,7 @@ def _car_body(
         # lower edge, bumper's edges, plate's edges, lights' edges, shoulder, top
         front_levels=np.array([0.0, 0.16, lo * 0.52, lo * 0.80, lo, hi, 0.5 + 0.5 * hi, 1.0]),
         rear_levels=np.array(
-            [0.0, 0.16, tail_lo * 0.55, tail_lo * 0.85, tail_lo, tail_hi, 0.5 + 0.5 * tail_hi, 1.0]
+            [0.0, 0.16, tail_lo * 0.40, tail_lo * 0.85, tail_lo, tail_hi, 0.5 + 0.5 * tail_hi, 1.0]
         ),
         front_recess=np.array([0.05, 0.0, 0.0, 0.02, 0.045, 0.11, 0.17, 0.26]),
         rear_recess=np.array([0.05, 0.0, 0.0, 0.02, 0.03, 0.05, 0.07, 0.12]) * car.tail_slope,
@@ -221,7 +224,7 @@ def _car_body(
     material[1:, gaps] = Material.TRIM
     material[0] = Material.TRIM
     material[1, : car.intake] = Material.TRIM
-    material[1, m + n + car.intake :] = Material.TRIM
+    material[1, -car.intake :] = Material.TRIM
     if car.cladding:
         material[1] = Material.TRIM
     material[4, :4] = car.grille
@@ -286,6 +289,7 @@ def _bus(bus: BusOutline, name: str) -> Mesh:
         tyre_width=0.30,
         ease=0.35,
         arch_reach=level(bus.sill),
+        arch_steps=4 if bus.third_axle else 6,
         side_levels=np.array(side),
     )
     wall, lid, floor, inner = body_grid(body)
@@ -295,7 +299,9 @@ def _bus(bus: BusOutline, name: str) -> Mesh:
     centre = (inner[:-1] + inner[1:]) / 2
     pane = (centre < pillars[0] + 0.03) & (centre > pillars[-1] - 0.03)
     post = np.min(np.abs(centre[:, None] - pillars[None]), axis=1) < 0.034
-    material[4, m + 1 : m + n - 1] = np.where(pane, np.where(post, int(Material.TRIM), int(Material.GLASS)), 0)
+    material[4, m + 1 : m + n - 1] = np.where(
+        pane, np.where(post, int(Material.TRIM), int(Material.GLASS)), int(Material.PAINT)
+    )
     # the driver's window reaches from the screen to the first pillar
     material[4, m : m + 1 + int(np.sum(centre > pillars[0]))] = Material.GLASS
     material[4, :m] = Material.GLASS
@@ -327,13 +333,10 @@ def _bus(bus: BusOutline, name: str) -> Mesh:
     return assemble(solids, name)
 
 
-def _truck(truck: TruckOutline, name: str) -> Mesh:
-    """A lorry: cab, box for the load, frame, wheels."""
-    half = truck.length / 2
-    clearance, cab_half = 0.36, truck.cab_width / 2
+def _truck_cab(truck: TruckOutline) -> Solid:
+    """A lorry's cab over its front axle."""
+    half, clearance = truck.length / 2, _CAB_CLEARANCE
     span = truck.cab_height - clearance
-    radius = truck.wheel_radius * 1.12
-    axle = half - truck.front_overhang
 
     def level(height: float) -> float:
         return (height - clearance) / span
@@ -344,7 +347,7 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
     door = truck.cab_length / 2 - 0.30
     cab = Body(
         length=truck.cab_length,
-        half_width=cab_half,
+        half_width=truck.cab_width / 2,
         clearance=clearance,
         front_levels=levels,
         rear_levels=levels,
@@ -358,8 +361,8 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
         corner=0.93,
         front_columns=np.array([0.0, 0.24, 0.44, 0.64, 0.76, 0.94, 1.0]),
         rear_columns=np.array([0.0, 0.24, 0.44, 0.64, 0.76, 0.94, 1.0]),
-        axles=(axle - middle,),
-        arch_radius=radius,
+        axles=(half - truck.front_overhang - middle,),
+        arch_radius=truck.wheel_radius * 1.12,
         hub=truck.wheel_radius,
         stations=np.array([door, door - 0.06, -truck.cab_length / 2 + 0.42, -truck.cab_length / 2 + 0.36]),
         tyre_width=0.30,
@@ -383,9 +386,16 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
     material[1, :1] = Material.PLATE
     lid_material = np.full((m, n), int(Material.PAINT))
     floor_material = np.full((m, n), int(Material.UNDERBODY))
-    solids = [shifted(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), middle)]
+    return shifted(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), middle)
+
+
+def _truck(truck: TruckOutline, name: str) -> Mesh:
+    """A lorry: cab, box for the load, frame, wheels."""
+    half, width, cab_half = truck.length / 2, truck.width / 2, truck.cab_width / 2
+    radius = truck.wheel_radius * 1.12
+    axle = half - truck.front_overhang
     load_front = half - truck.cab_length - 0.12
-    width = truck.width / 2
+    solids = [_truck_cab(truck)]
     solids.append(
         box((-half + 0.02, truck.floor, -width), (load_front, truck.height, width), truck.load, bevel=0.03)
     )

@@ -22,6 +22,7 @@ from scene_ir.raster.layout import Fragments, Layout
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
 from scene_ir.raster.reference import SLACK_PX as _SLACK_PX
 from scene_ir.raster.reference import SNAP_PX as _SNAP_PX
+from scene_ir.raster.reference import first_largest
 
 
 @contextmanager
@@ -709,6 +710,15 @@ def crossing(
     return found
 
 
+@wp.func
+def side_of(i: int, pixel: int):
+    """0 where `pixel` is the first of the pair that starts at i, 1 where it is the second."""
+    side = 0
+    if pixel != i:
+        side = 1
+    return side
+
+
 @wp.kernel
 def change_kernel(
     keys: wp.array2d(dtype=wp.int64),
@@ -724,10 +734,10 @@ def change_kernel(
         code = wp.int32(keys[axis, i] & wp.int64(0xFFFFFFFF))
         found = crossing(axis, i, code, face, rects, offsets, clip, faces)
         t = found.e_hit / (found.e_hit - found.e_empty)
+        pixel = found.empty
         if t < HALF:
-            wp.atomic_add(change, axis, found.hit, HALF - t)
-        else:
-            wp.atomic_add(change, axis, found.empty, t - HALF)
+            pixel = found.hit
+        change[2 * axis + side_of(i, pixel), pixel] = wp.abs(HALF - t)
 
 
 @wp.kernel
@@ -746,9 +756,12 @@ def change_backward_kernel(
         code = wp.int32(keys[axis, i] & wp.int64(0xFFFFFFFF))
         found = crossing(axis, i, code, face, rects, offsets, clip, faces)
         length = found.e_hit - found.e_empty
-        grad_t = -grad_change[axis, found.hit]
-        if found.e_hit / length >= HALF:
-            grad_t = grad_change[axis, found.empty]
+        pixel = found.empty
+        sign = ONE
+        if found.e_hit / length < HALF:
+            pixel = found.hit
+            sign = -ONE
+        grad_t = sign * grad_change[2 * axis + side_of(i, pixel), pixel]
         # t = e_hit / (e_hit - e_empty), and e = p . (a x b)
         scale = grad_t / (length * length)
         q = (found.p_empty * found.e_hit - found.p_hit * found.e_empty) * scale
@@ -858,23 +871,22 @@ class _Antialias(torch.autograd.Function):
         mesh, layout = _mesh(clip, faces), _layout(fragments.layout)
         jobs, count = _jobs(fragments.face_ranges)
         keys = torch.full((2, size), -1, dtype=torch.int64, device=clip.device)
-        change = torch.zeros(2, size, dtype=torch.float64, device=clip.device)
+        change = torch.zeros(4, size, dtype=torch.float64, device=clip.device)
         inputs = [*mesh, *jobs, *layout, fragments.near, face, wp.from_torch(keys)]
         _launch(outline_kernel, count if size else 0, inputs)
         inputs = [wp.from_torch(keys), face, *layout, *mesh, wp.from_torch(change)]
         _launch(change_kernel, (2, size) if size else 0, inputs)
-        amount = torch.maximum(change[0], change[1])
-        ctx.save_for_backward(fragments.face, clip, faces, keys, change)
+        amount, side = first_largest(change)
+        ctx.save_for_backward(fragments.face, clip, faces, keys, side)
         ctx.layout = fragments.layout
         return torch.where(fragments.face >= 0, 1 - amount, amount).to(clip.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out: Tensor):
-        face, clip, faces, keys, change = ctx.saved_tensors
+        face, clip, faces, keys, side = ctx.saved_tensors
         grad = torch.where(face >= 0, -grad_out, grad_out).to(torch.float64)
-        by_row = change[0] >= change[1]
-        grad_change = torch.stack([grad * by_row, grad * ~by_row])
+        grad_change = grad.new_zeros(4, face.shape[0]).scatter(0, side[None], grad[None])
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         inputs = [
             *(wp.from_torch(keys), wp.from_torch(face), *_layout(ctx.layout), *_mesh(clip, faces)),

@@ -93,7 +93,7 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
     pixel = torch.arange(size, device=clip.device)
     xy = layout.pixels()
     rect = layout.rects[layout.draw()]
-    loss, gain = [], []
+    change = []  # (T,) each: how much a pixel loses or gains towards one of its four neighbours
     for axis, step in ((0, torch.ones_like(pixel)), (1, rect[:, 2] - rect[:, 0])):
         start = pixel[xy[:, axis] + 1 < rect[:, 2 + axis]]
         end = start + step[start]
@@ -110,11 +110,11 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
         e_inner, e_outer = (_edge(normal[:, None], *xy[p].unbind(-1))[:, 0] for p in (inner, outer))
         t = e_inner / (e_inner - e_outer)
         zero = torch.zeros(size, dtype=torch.float64, device=clip.device)
-        loss.append(zero.index_add(0, inner, torch.where(t < 0.5, 0.5 - t, 0.0)))
-        gain.append(zero.index_add(0, outer, torch.where(t < 0.5, 0.0, t - 0.5)))
-    larger_loss = torch.where(loss[0] >= loss[1], loss[0], loss[1])
-    larger_gain = torch.where(gain[0] >= gain[1], gain[0], gain[1])
-    return torch.where(hit, 1 - larger_loss, larger_gain).to(clip.dtype)
+        changed, amount = torch.where(t < 0.5, inner, outer), torch.where(t < 0.5, 0.5 - t, t - 0.5)
+        for side in (changed == start, changed == end):
+            change.append(zero.index_put((changed[side],), amount[side]))
+    largest, _ = first_largest(torch.stack(change))
+    return torch.where(hit, 1 - largest, largest).to(clip.dtype)
 
 
 def _outline_edges(
@@ -145,8 +145,8 @@ def _outline_edges(
         beyond = jobs.det[job].abs() / fragments.near - base.sum(dim=1)
         base = torch.cat([base, beyond[:, None]], dim=1)
         cut = -base / slope
-        low, low_edge = _farthest(torch.where(slope > 0, cut, -torch.inf))
-        high, high_edge = _farthest(torch.where(slope < 0, -cut, -torch.inf))
+        low, low_edge = first_largest(torch.where(slope > 0, cut, -torch.inf).T)
+        high, high_edge = first_largest(torch.where(slope < 0, -cut, -torch.inf).T)
         high = -high
         covers = (low <= high) & ~((slope == 0) & (base < 0)).any(dim=1)
         rect = jobs.rect[job]
@@ -219,12 +219,13 @@ def _chunks(jobs: _Jobs, lines_along: int | None) -> Iterator[_Jobs]:
         yield _Jobs(*parts)
 
 
-def _farthest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum (P,) of values (P, E) over E and its index (P,), the first of equal ones."""
-    best, index = values[:, 0], torch.zeros(values.shape[0], dtype=torch.int64, device=values.device)
-    for i in range(1, values.shape[1]):
-        index = torch.where(values[:, i] > best, i, index)
-        best = torch.maximum(best, values[:, i])
+def first_largest(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum (P,) of values (E, P) over E and its index (P,) int64: of equal ones the first, on every device."""
+    best, index = values[0], torch.zeros(values.shape[1], dtype=torch.int64, device=values.device)
+    for i in range(1, values.shape[0]):
+        further = values[i] > best
+        index = torch.where(further, i, index)
+        best = torch.where(further, values[i], best)
     return best, index
 
 

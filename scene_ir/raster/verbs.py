@@ -133,9 +133,10 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backen
 
     clip, faces: as given to `rasterize`. Between a hit pixel and an empty 4-neighbour of the same draw the outline
     crosses the segment of their centres at t in [0, 1], measured from the hit: the hit pixel keeps 1/2 + t, the
-    empty one gets t - 1/2, each at most 1 and at least 0; of the horizontal and the vertical estimate the one that
-    changes the pixel more counts. So a straight outline that sweeps over the pixels changes coverage continuously.
-    Differentiable to clip, through the vertices of the edge that makes the outline.
+    empty one gets t - 1/2, each at most 1 and at least 0; of its neighbours the one that changes a pixel most
+    counts. So an outline that sweeps over the pixels changes coverage continuously, and one along rows or columns
+    covers exact areas; parts narrower than a pixel are covered too much where they are hit, and not where they are
+    not. Differentiable to clip, through the vertices of the edge that makes the outline.
     The idea of differentiating analytic edge coverage is from Laine et al. 2020, "Modular primitives for
     high-performance differentiable rendering".
     """

@@ -22,7 +22,7 @@ def _names(lines) -> set[str]:
     return {line.split(": ")[1] for line in lines}
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**31), scale=st.floats(0.1, 3.0), number=st.sampled_from(sorted(COMBOS)))
 def test_projection_is_inside_idempotent_and_confirmed_by_the_second_check(street, seed, scale, number):
     scene = street(positions_xz=CROWDED, road_edge_x_m=4.0)
@@ -83,9 +83,10 @@ def test_strain_and_the_lowest_layer(street):
     result = project(space, scene, theta)
     offsets = ffd.from_symmetric(result.theta.reshape(4, 96)).double()
     assert float(offsets.reshape(4, 4, 4, 4, 3)[:, :, -1, :, 1].abs().max()) == 0
-    points = torch.rand(400, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    strain = torch.linalg.svdvals(ffd.jacobian(points - torch.tensor([0.5, 1.0, 0.5]), offsets))
-    assert 0.69 < float(strain.min())
+    axis = torch.linspace(0, 1, 9, dtype=torch.float64)
+    points = torch.cartesian_prod(axis - 0.5, axis - 1, axis - 0.5)
+    strain = torch.linalg.svdvals(ffd.jacobian(points, offsets))
+    assert float(strain.min()) > 0.69
     assert float(strain.max()) < 1.41
     # Scaled back no further than needed: each car's strain is at its bound, to the bisection's resolution.
     per_car = torch.maximum((1 - strain.amin(dim=(1, 2))) / 0.3, (strain.amax(dim=(1, 2)) - 1) / 0.4)
@@ -123,7 +124,7 @@ def test_a_car_beside_the_road_may_go_anywhere(street):
 
 
 def test_a_car_stays_in_the_picture(street):
-    scene = street(positions_xz=((7.6, 9.0),), yaw=0.0)
+    scene = street(positions_xz=((6.9, 9.0),), yaw=0.0)
     space = ParameterSpace(scene, ("translate",))
     theta = torch.tensor([0.25, 0.0])
     assert _names(violations(space, scene, theta)) == {"frame"}
@@ -238,9 +239,10 @@ def test_the_second_check_finds_collisions_roads_and_hiding(street):
     narrow = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
     left = narrow.with_objects(translation=narrow.objects.translation + torch.tensor([0.9, 0.0, 0.0]))
     assert any("left the road" in line for line in check_scene(narrow, left))
-    # A van's length away and sideways: behind the near car, seen from the camera.
-    pair = street(positions_xz=((0.0, 6.0), (2.6, 40.0)), yaw=-math.pi / 2)
-    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [2.6, 0, 0]]))
+    # The near one is taller than the camera stands, so that it can hide the far one.
+    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
     assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
 
 
@@ -251,7 +253,7 @@ def test_overlap_area_of_known_shapes():
     assert overlap_area(square, square) == pytest.approx(4.0)
     diamond = np.array([[1.0, -1], [3, 1], [1, 3], [-1, 1]])
     assert overlap_area(square, diamond) == pytest.approx(4.0)
-    assert overlap_area(square, diamond + [1.0, 1.0]) == pytest.approx(3.5 - 0.5 + 0.5)
+    assert overlap_area(square, diamond + 1) == pytest.approx(2.0)
 
 
 @settings(max_examples=50, deadline=None)

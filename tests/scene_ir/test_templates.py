@@ -34,15 +34,14 @@ def test_every_component_is_closed_and_wound_outwards(kind: str, variant: int) -
         assert piece.volume > 0
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_fills_the_unit_box_with_a_sensible_number_of_triangles(kind: str, variant: int) -> None:
-    mesh = template(kind, variant)
-    assert 1500 <= mesh.faces.shape[0] <= 5000
-    assert mesh.vertices.dtype == torch.float32
-    torch.testing.assert_close(mesh.vertices.amin(0), torch.tensor([-0.5, -1.0, -0.5]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(mesh.vertices.amax(0), torch.tensor([0.5, 0.0, 0.5]), atol=1e-6, rtol=0)
-    assert float(mesh.vertices.abs().max()) <= 1.0
+def test_fills_the_unit_box_with_a_sensible_number_of_triangles(kind: str) -> None:
+    for variant in (*range(24), *range(100, 108)):
+        mesh = template(kind, variant)
+        assert 1500 <= mesh.faces.shape[0] <= 5000
+        assert mesh.vertices.dtype == torch.float32
+        assert mesh.vertices.amin(0).tolist() == pytest.approx([-0.5, -1.0, -0.5], abs=1e-6)
+        assert mesh.vertices.amax(0).tolist() == pytest.approx([0.5, 0.0, 0.5], abs=1e-6)
 
 
 @pytest.mark.parametrize("variant", [0, 3, 101])

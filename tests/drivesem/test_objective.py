@@ -1,0 +1,146 @@
+import pytest
+import torch
+
+from detectors.base import Detector, RawPredictions
+from detectors.squeezedet import SqueezeDet
+from detectors.types import CLASSES, Detections
+from drivesem.attacks.si_fgsm import SiFGSM
+from drivesem.feasibility_check import check_scene
+from drivesem.feasible import FeasibleSet
+from drivesem.labels import Difficulty
+from drivesem.objective import Objective
+from drivesem.space import ParameterSpace
+from scene_ir.compositor import Compositor, RenderSettings
+from scene_ir.errors import RangeError
+from scene_ir.types import Crop, Render
+
+NEAR = ((-2.0, 9.0), (2.4, 13.0))
+EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1)
+
+
+class StubCompositor:
+    """An image whose mean is the sum of the cars' z, and opacities without a meaning."""
+
+    def render(self, scene) -> Render:
+        h, w = scene.camera.height, scene.camera.width
+        value = scene.objects.translation[:, 2].sum()
+        crops = tuple(Crop(torch.ones(1, 2, 2), 4 * i, 0) for i in range(len(scene.objects)))
+        ids = torch.zeros(h, w, dtype=torch.int64)
+        for i, crop in enumerate(crops):
+            ids[0:2, crop.x0 : crop.x0 + 2] = i + 1
+        return Render(image=value.expand(3, h, w), depth=torch.ones(h, w), object_id=ids, opacity=crops)
+
+
+class StubDetector(Detector):
+    """Loss: a function of the image's mean. Detects each box given to it, until the mean exceeds `blind_above`."""
+
+    name, classes, t_star = "stub", CLASSES, 0.5
+
+    def __init__(self, boxes_xyxy, function=torch.sin, blind_above=float("inf")) -> None:
+        super().__init__()
+        self.boxes_xyxy, self.function, self.blind_above = boxes_xyxy, function, blind_above
+        self.aimed_at = []
+
+    def forward(self, images):
+        n = len(self.boxes_xyxy)
+        mean = images.mean().expand(1, n)
+        boxes = self.boxes_xyxy[None]
+        return RawPredictions(boxes, boxes, mean[..., None].expand(1, n, len(CLASSES)), mean, (2, 2))
+
+    def loss(self, raw, targets):
+        self.aimed_at.append(targets[0].boxes_xyxy)
+        return {"confidence": self.function(raw.confidence_logits.mean())}
+
+    def decode(self, raw):
+        n = len(self.boxes_xyxy) if float(raw.confidence_logits.mean()) < self.blind_above else 0
+        return [Detections(self.boxes_xyxy[:n], torch.zeros(n, dtype=torch.int64), torch.full((n,), 0.9))]
+
+
+def _objective(scene, detector, mode="moved", **settings):
+    space = ParameterSpace(scene, ("translate",))
+    return Objective(StubCompositor(), space, detector, mode, difficulty=EVERYTHING, **settings)
+
+
+def test_loss_and_gradient_are_those_of_the_whole_chain(street):
+    scene = street(positions_xz=NEAR, dtype=torch.float64)
+    objective = _objective(scene, StubDetector(scene.objects.box2d))
+    theta = torch.tensor([0.01, 0.02, -0.03, 0.04], dtype=torch.float64)
+    loss, gradient = objective.loss_and_grad(theta)
+    assert loss == pytest.approx(float(objective(theta)))
+    h = 1e-6
+    for i in range(4):
+        step = torch.zeros(4, dtype=torch.float64)
+        step[i] = h
+        slope = (float(objective(theta + step)) - float(objective(theta - step))) / (2 * h)
+        assert float(gradient[i]) == pytest.approx(slope, rel=1e-5, abs=1e-8)
+
+
+def test_a_loss_that_is_not_finite_is_an_error(street):
+    scene = street(positions_xz=NEAR)
+    with pytest.raises(RangeError, match="objective: confidence: expected a finite loss"):
+        _objective(scene, StubDetector(scene.objects.box2d, lambda x: x / 0))
+
+
+def test_a_gradient_that_is_not_finite_names_the_coordinate(street):
+    scene = street(positions_xz=NEAR)
+    # sqrt(x - x): the value is 0, the slope is not.
+    objective = _objective(scene, StubDetector(scene.objects.box2d, lambda x: (x - x.detach()).sqrt()))
+    with pytest.raises(RangeError, match=r"gradient of objects\[0\]\.translate\.along: expected a finite value"):
+        objective.loss_and_grad(objective.space.theta0)
+
+
+def test_an_unknown_term_is_named(street):
+    scene = street(positions_xz=NEAR)
+    with pytest.raises(RangeError, match="objective term: expected one of confidence, found 'class'"):
+        _objective(scene, StubDetector(scene.objects.box2d), term="class")
+
+
+@pytest.mark.parametrize("mode", ["moved", "paper"])
+def test_the_loss_aims_at_the_labels_of_its_mode(street, mode):
+    scene = street(positions_xz=NEAR)
+    detector = StubDetector(scene.objects.box2d)
+    objective = _objective(scene, detector, mode)
+    theta = torch.tensor([0.0, -0.1, 0.0, 0.0])
+    objective(theta)
+    rendered = objective.evaluate(theta)
+    expected = rendered.moved if mode == "moved" else rendered.paper
+    assert torch.equal(detector.aimed_at[-1], expected.targets.boxes_xyxy)
+    assert torch.equal(detector.aimed_at[-2], expected.targets.boxes_xyxy)
+    assert torch.equal(rendered.paper.boxes_xyxy, scene.objects.box2d)
+    assert not torch.equal(rendered.moved.boxes_xyxy, scene.objects.box2d)
+
+
+def test_theta0_is_the_benign_render_and_no_failure(street):
+    scene = street(positions_xz=NEAR)
+    objective = _objective(scene, StubDetector(scene.objects.box2d))
+    assert objective.evaluate(objective.space.theta0) is objective.benign
+    score = objective.score(objective.space.theta0)
+    assert (score.lost, score.phantoms, score.success, score.success_paper) == (0, 0, False, False)
+
+
+def test_both_label_modes_are_judged(street):
+    scene = street(positions_xz=NEAR)
+    # A detector that sees nothing any more fails both; one that stays where the cars were fails `moved` only.
+    blind = _objective(scene, StubDetector(scene.objects.box2d, blind_above=22.2))
+    gone = blind.score(torch.tensor([0.1, 0.0, 0.0, 0.0]))
+    assert (gone.lost, gone.phantoms, gone.success, gone.success_paper) == (2, 0, True, True)
+    still = _objective(scene, StubDetector(scene.objects.box2d))
+    stayed = still.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
+    assert (stayed.lost, stayed.phantoms, stayed.success, stayed.success_paper) == (1, 1, True, False)
+
+
+def test_the_whole_chain_with_the_real_renderer_and_an_untrained_detector(street):
+    scene = street(positions_xz=NEAR)
+    detector = SqueezeDet(t_star=0.3)
+    detector.initialise(torch.Generator().manual_seed(0))
+    detector.eval().requires_grad_(False)
+    space = ParameterSpace(scene, ("translate", "rotate", "mesh"))
+    settings = RenderSettings(backend="reference")
+    objective = Objective(Compositor(scene, settings), space, detector)
+    problem = objective.problem(FeasibleSet(space))
+    result = SiFGSM(steps=2)(problem, space.theta0)
+    assert torch.equal(result.theta, SiFGSM(steps=2)(problem, space.theta0).theta)
+    assert result.queries == 2
+    assert result.loss_trace[0] == pytest.approx(objective.benign.loss)
+    assert max(result.loss_trace) > result.loss_trace[0]
+    assert check_scene(scene, space.apply(scene, result.theta)) == []

@@ -1,0 +1,131 @@
+"""Weather, time of day and foliage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from scene_ir import environment as env
+from scene_ir.types import Environment
+
+H, W = 40, 64
+FOG, RAIN, TIME, OVERCAST = range(4)
+
+
+def _inputs(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Environment, Tensor]:
+    """Picture, inverse depth (sky above row 10), environment, air."""
+    generator = torch.Generator().manual_seed(1)
+    image = 0.15 + 0.7 * torch.rand(3, H, W, generator=generator, dtype=dtype)
+    rows = torch.arange(H, dtype=dtype)[:, None].expand(H, W)
+    inverse = ((rows - 10) / 60).clamp(min=0.0)
+    foliage = torch.zeros(H, W, dtype=dtype)
+    foliage[8:20, 10:50] = 0.9
+    scenery = Environment(
+        torch.zeros(4, dtype=dtype), torch.zeros(3, dtype=dtype), torch.tensor([0.0, -1.0, 0.0], dtype=dtype),
+        torch.tensor([0.0, -1.0, 0.0, 1.65], dtype=dtype), (rows < 10).to(dtype), foliage, (rows > 24).to(dtype),
+    )  # fmt: skip
+    return image, inverse, scenery, torch.tensor([0.75, 0.8, 0.86], dtype=dtype)
+
+
+def _weather(code: Tensor) -> tuple[Tensor, Tensor]:
+    image, inverse, scenery, air = _inputs(code.dtype)
+    return image, env.apply_weather(image, inverse, replace(scenery, weather=code), air)
+
+
+def _foliage(code: Tensor) -> tuple[Tensor, Tensor]:
+    image, _, scenery, air = _inputs(code.dtype)
+    return image, env.apply_foliage(image, replace(scenery, foliage=code), air)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("function", "size"), [(_weather, 4), (_foliage, 3)])
+def test_code_zero_leaves_every_bit(function, size: int, dtype: torch.dtype) -> None:
+    before, after = function(torch.zeros(size, dtype=dtype))
+    assert torch.equal(before, after)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.35])
+@pytest.mark.parametrize(("function", "size"), [(_weather, 4), (_foliage, 3)])
+def test_gradient_to_the_code_exists_also_at_zero(function, size: int, start: float) -> None:
+    code = torch.full((size,), start, dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(3, H, W, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def value(at: Tensor) -> Tensor:
+        return (function(at)[1] * weights).sum()
+
+    (analytic,) = torch.autograd.grad(value(code), code)
+    with torch.no_grad():
+        steps = torch.eye(size, dtype=torch.float64) * 1e-5
+        numeric = torch.stack([(value(code + s) - value(code - s)) / 2e-5 for s in steps])
+    assert bool((analytic.abs() > 1e-3).all())
+    torch.testing.assert_close(analytic, numeric, rtol=1e-4, atol=1e-5)
+
+
+def _code(index: int, value: float) -> Tensor:
+    return torch.eye(4, dtype=torch.float64)[index] * value
+
+
+def test_fog_follows_koschmieder() -> None:
+    image, after = _weather(_code(FOG, 0.5))
+    _, inverse, _, air = _inputs()
+    depth = 1.0 / inverse.clamp(min=1.0 / env.HAZE_CAP_M)
+    clear = torch.exp(-0.015 * depth)
+    torch.testing.assert_close(after, image * clear + air[:, None, None] * (1 - clear))
+
+
+def test_night_is_dark_and_blue_dusk_is_warm() -> None:
+    image, night = _weather(_code(TIME, 1.0))
+    _, dusk = _weather(_code(TIME, 0.4))
+    mean, dark, warm = (x.flatten(1).mean(dim=1) for x in (image, night, dusk))
+    assert float(dark.mean()) < 0.3 * float(mean.mean())
+    assert float(dark[2] / dark[0]) > 1.3 * float(mean[2] / mean[0])
+    assert float(warm[0] / warm[2]) > 1.1 * float(mean[0] / mean[2])
+
+
+def test_overcast_and_rain_take_colour_and_contrast() -> None:
+    for index in (RAIN, OVERCAST):
+        image, after = _weather(_code(index, 1.0))
+        ground = slice(12, 24)
+        saturation = lambda x: float((x.amax(dim=0) - x.amin(dim=0))[ground].mean())  # noqa: E731
+        assert saturation(after) < 0.8 * saturation(image)
+        assert float(after[:, ground].std()) < float(image[:, ground].std())
+
+
+def test_weather_stays_in_range_and_is_deterministic() -> None:
+    code = torch.ones(4, dtype=torch.float64) * 0.8
+    _, after = _weather(code)
+    assert float(after.min()) > -0.05
+    assert float(after.max()) < 1.05
+    assert torch.equal(after, _weather(code)[1])
+
+
+def test_foliage_changes_nothing_else() -> None:
+    image, after = _foliage(torch.tensor([0.8, -0.4, 0.5], dtype=torch.float64))
+    outside = _inputs()[2].foliage_map == 0
+    assert torch.equal(image[:, outside], after[:, outside])
+    assert float((image - after)[:, ~outside].abs().mean()) > 0.02
+
+
+def test_autumn_is_redder_and_thin_crowns_show_the_air() -> None:
+    inside = _inputs()[2].foliage_map > 0
+    spring, autumn = (_foliage(torch.tensor([h, 0, 0], dtype=torch.float64))[1][:, inside] for h in (-1.0, 1.0))
+    assert float((autumn[0] - autumn[1]).mean()) > float((spring[0] - spring[1]).mean()) + 0.05
+    thin, thick = (_foliage(torch.tensor([0, 0, d], dtype=torch.float64))[1][:, inside] for d in (-1.0, 1.0))
+    assert float(thin.mean()) > float(thick.mean()) + 0.1
+
+
+def test_sky_colour_is_the_photographs_and_has_a_default() -> None:
+    image, _, scenery, _ = _inputs()
+    image[:, :10] = torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64)[:, None, None]
+    found = env.sky_colour(image, scenery.sky)
+    torch.testing.assert_close(found, torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64))
+    none = env.sky_colour(image, torch.zeros_like(scenery.sky))
+    assert bool((none > 0.7).all())
+
+
+def test_shadows_soften_in_bad_weather_only() -> None:
+    assert float(env.shadow_softening(torch.zeros(4))) == 1.0
+    assert float(env.shadow_softening(torch.tensor([0.0, 0.0, 0.0, 1.0]))) < 0.6
