@@ -434,7 +434,8 @@ class _StrainBound:
             self._low = np.minimum(strain[0], smallest) - slack
             self._high = np.maximum(strain[1], largest) + slack
             self._floor = np.maximum(0.0, lowest) + slack
-            self._inverted = (_determinant(self._jacobian(source)) <= 0).any(axis=1)
+            inverted = _determinant(self._jacobian(source)) <= 0
+            self._inverted: NDArray[np.bool_] = np.logical_or.reduce(inverted, axis=1)
 
     def _jacobian(self, offsets: Array) -> Array:
         """(N, G, 3, 3) of offsets (N, 64, 3)."""
@@ -461,7 +462,8 @@ class _StrainBound:
         high = _positive(self._high[:, None, None, None] ** 2 * eye - gram)
         upright = (_determinant(jacobian) > 0) | self._inverted[:, None]
         height = self._y + (self._weights @ offsets)[..., 1]
-        return (low & high & upright).all(axis=1) & (height.max(axis=1) <= self._floor)
+        good = np.stack([low, high, upright]).all(axis=(0, 2))
+        return np.logical_and(good, height.max(axis=1) <= self._floor)
 
 
 def _jacobian_weights(unit: Tensor) -> Array:
@@ -567,12 +569,12 @@ def _visible(enter: Array, rows: int) -> tuple[NDArray[np.bool_], Array, Array]:
     count = len(enter)
     index = np.arange(count)
     own = enter[index, index]
-    before = (enter < own[:, None]) & np.isfinite(own)[:, None]
-    before[index, index] = False
     met = np.isfinite(own)
+    before = np.logical_and(enter < own[:, None], met[:, None])
+    before[index, index] = False
     shown = met & ~before.any(axis=1)
     height = shown.reshape(count, rows, -1).any(axis=2).mean(axis=1)
-    return before.any(axis=2), height, shown.sum(axis=1) / np.maximum(met.sum(axis=1), 1)
+    return np.logical_or.reduce(before, axis=2), height, shown.sum(axis=1) / np.maximum(met.sum(axis=1), 1)
 
 
 def _surface(mesh: Mesh) -> tuple[Array, Array]:
@@ -612,8 +614,8 @@ def _any(violated: dict[str, NDArray[np.bool_]]) -> bool:
 
 def _cars(violated: dict[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Cars (N,) that take part in any violation."""
-    pairs = np.logical_or.reduce(list(violated.values()))
-    return pairs.any(axis=0) | pairs.any(axis=1)
+    pairs: NDArray[np.bool_] = np.logical_or.reduce(np.stack(list(violated.values())), axis=0)
+    return np.logical_or.reduce(pairs | pairs.T, axis=0)
 
 
 def _array(tensor: Tensor) -> Array:

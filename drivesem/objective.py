@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +18,9 @@ from drivesem.space import ParameterSpace
 from scene_ir.compositor import Compositor
 from scene_ir.errors import RangeError
 from scene_ir.types import Render, SceneIR
+
+_REMEMBERED = 3
+"""Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +60,7 @@ class Objective:
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, difficulty)
         self._benign = self._judged(space.scene, base_render)
+        self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
 
     @property
     def benign(self) -> Rendered:
@@ -86,8 +91,13 @@ class Objective:
         """Render, detect and label at theta (D,), without gradients."""
         if torch.equal(theta, self.space.theta0):
             return self._benign
+        for known, rendered in self._recent:
+            if torch.equal(theta, known):
+                return rendered
         scene = self.space.apply(self.space.scene, theta)
-        return self._judged(scene, self.compositor.render(scene))
+        rendered = self._judged(scene, self.compositor.render(scene))
+        self._recent.append((theta.clone(), rendered))
+        return rendered
 
     def failures(self, rendered: Rendered, mode: LabelMode) -> failures.Failures:
         """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""

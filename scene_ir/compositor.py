@@ -122,22 +122,48 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Fringe:
-    """Pixels that a mesh covers partly, but whose centres it misses: they continue what their neighbours show.
+    """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses have
+    nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing jumps
+    when the outline passes over a pixel's centre.
 
-    hit (Rm,) 1 or 0; row (K,) int64: rows to fill; neighbour (K, 4) int64 rows; weight (K, 4), 0 where there is none.
+    hit (Rm,) 1 or 0; row (K,) int64: rows at the outline; own (K,) in [0, 1]: how much they keep of their own values;
+    neighbour (K, 4) int64 rows; weight (K, 4), of sum 1, or 0 where no neighbour is hit.
     """
 
     hit: Tensor
     row: Tensor
+    own: Tensor
     neighbour: Tensor
     weight: Tensor
 
+    @classmethod
+    def of(cls, layout: verbs.Layout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor) -> _Fringe:
+        """hit, coverage, owner (T,): of all packed pixels; mesh_pixel (Rm,) int64: those that have a row."""
+        row = (coverage.detach()[mesh_pixel] < 1).nonzero()[:, 0]
+        pixel = mesh_pixel[row]
+        draw = owner[pixel]
+        x0, y0, x1, y1 = layout.rects[draw].unbind(-1)
+        width, within = x1 - x0, pixel - layout.offsets[draw]
+        column, line = within % width, within // width
+        steps = torch.stack([torch.full_like(width, -1), torch.ones_like(width), -width, width], dim=1)
+        exists = torch.stack([column > 0, column < width - 1, line > 0, line < y1 - y0 - 1], dim=1)
+        neighbour = torch.where(exists, pixel[:, None] + steps, pixel[:, None])
+        known = exists & hit[neighbour]
+        weight = ((2.0 * coverage[neighbour] - 1.0).clamp(min=0.0) + 1e-3) * known
+        weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-3)
+        own = smoothstep(coverage[pixel], 0.5, 1.0) * hit[pixel]
+        own = torch.where(known.any(dim=1), own, torch.ones_like(own))
+        rank = torch.zeros_like(hit, dtype=torch.int64)
+        rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=hit.device)
+        return cls(hit[mesh_pixel].to(coverage), row, own, rank[neighbour], weight)
+
     def fill(self, values: Tensor) -> Tensor:
-        """Values (Rm, Q) with those of fringe rows replaced by the mean of the hit neighbours'."""
+        """Values (Rm, Q), read at the hits, continued over the outline."""
         known = values * self.hit[:, None]
         if self.row.numel() == 0:
             return known
-        return known.index_add(0, self.row, (known[self.neighbour] * self.weight[..., None]).sum(dim=1))
+        mean = (known[self.neighbour] * self.weight[..., None]).sum(dim=1)
+        return known.index_add(0, self.row, (1.0 - self.own)[:, None] * (mean - known[self.row]))
 
 
 class Compositor:
@@ -304,7 +330,7 @@ class Compositor:
         x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
         within, width = pixel - layout.offsets[rows_owner], x1 - x0
         xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
-        fringe = _fringe(layout, hit, mesh_pixel, owner, self._like.dtype)
+        fringe = _Fringe.of(layout, hit, drawn.coverage, mesh_pixel, owner)
         return _Rows(pixel, rows_owner, xy.to(self._like), share, counts, mesh_pixel.shape[0], fringe)
 
     def _mesh_attributes(self, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
@@ -351,10 +377,10 @@ class Compositor:
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
         alpha = seen[:, 3]
         weight = (
-            texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * (1.0 - seen[:, 4])
+            texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
         )
         behind = 1.0 - smoothstep(z_then[:m] - seen[:m, 6], *texture.DEPTH_TOLERANCE_M)
-        weight = weight * torch.cat([behind, seen[m:, 5]])
+        weight = weight * torch.cat([behind, smoothstep(seen[m:, 5], 0.0, 1.0)])
         rim = 1.0 - smoothstep(cos_then[:m], 0.3, 0.5)
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
         fill = 1.0 - weight[:m] + weight[:m] * opened
@@ -405,7 +431,7 @@ class Compositor:
         height, width = self._frame_hw
         weight = (
             texture.inside_weight(uv, height, width)
-            * (1.0 - seen[:, 4]).clamp(min=0.0)
+            * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
             * smoothstep(seen[:, 3], 0.5, 0.95)
             * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
             * texture.facing_weight(cos_now[need] - cos_then, cos_then)
@@ -540,25 +566,6 @@ def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
     moved = (delta[:, :2] - xy * delta[:, 2:]) / safe
     moved = torch.where(before, moved, torch.full_like(moved, 1e5))
     return torch.cat([moved, then, then - delta[:, 2:], attributes[:, 4:]], dim=1)
-
-
-def _fringe(layout: verbs.Layout, hit: Tensor, mesh_pixel: Tensor, owner: Tensor, dtype: torch.dtype) -> _Fringe:
-    """Of the mesh rows, those whose pixel centres are missed, and the rows of their hit 4-neighbours."""
-    row_hit = hit[mesh_pixel]
-    row = (~row_hit).nonzero()[:, 0]
-    pixel = mesh_pixel[row]
-    draw = owner[pixel]
-    x0, y0, x1, y1 = layout.rects[draw].unbind(-1)
-    width, within = x1 - x0, pixel - layout.offsets[draw]
-    column, line = within % width, within // width
-    steps = torch.stack([torch.full_like(width, -1), torch.ones_like(width), -width, width], dim=1)
-    exists = torch.stack([column > 0, column < width - 1, line > 0, line < y1 - y0 - 1], dim=1)
-    neighbour = torch.where(exists, pixel[:, None] + steps, pixel[:, None])
-    known = exists & hit[neighbour]
-    rank = torch.zeros_like(hit, dtype=torch.int64)
-    rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=hit.device)
-    weight = known.to(dtype) / known.sum(dim=1, keepdim=True).clamp(min=1).to(dtype)
-    return _Fringe(row_hit.to(dtype), row, rank[neighbour], weight)
 
 
 def _active(code: Tensor) -> bool:

@@ -308,6 +308,7 @@ def main() -> None:
         rate=arguments.rate,
         seed=arguments.seed,
         bfloat16=not arguments.no_bfloat16,
+        checkpoint_every=50,
         evaluate_every=arguments.evaluate_every if arguments.held_out else 0,
     )
     detector = SqueezeDet(dropout=arguments.dropout)

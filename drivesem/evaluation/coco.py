@@ -90,12 +90,13 @@ def _run(targets: Sequence[Targets], detections: Sequence[Detections], classes: 
         datasets = []
         for annotations in (truth, found):
             dataset = COCO()
-            dataset.dataset = {
+            content: Any = {
                 "images": [{"id": i + 1} for i in range(len(targets))],
                 "categories": [{"id": k + 1, "name": name} for k, name in enumerate(classes)],
                 # pycocotools takes id 0 for "no match": they begin at 1.
                 "annotations": [a | {"id": n + 1} for n, a in enumerate(annotations)],
             }
+            dataset.dataset = content
             dataset.createIndex()
             datasets.append(dataset)
         evaluator = COCOeval(*datasets, iouType="bbox")

@@ -13,11 +13,11 @@ _GREENS = np.array(
     np.float32,
 )
 """Linear albedo of foliage: leaves reflect 3 to 14 % in the visible range, most in green."""
-_AUTUMN = np.array([[0.22, 0.12, 0.03], [0.20, 0.075, 0.035], [0.17, 0.14, 0.04]], np.float32)
+_AUTUMN = np.array([[0.16, 0.095, 0.03], [0.13, 0.055, 0.03], [0.14, 0.125, 0.04]], np.float32)
 _BARK = np.array([[0.085, 0.07, 0.055], [0.12, 0.11, 0.095], [0.06, 0.05, 0.04]], np.float32)
 
 
-def leaf_colour(rng: np.random.Generator, autumn: float = 0.08) -> np.ndarray:
+def leaf_colour(rng: np.random.Generator, autumn: float = 0.05) -> np.ndarray:
     """A linear albedo (3,) for foliage; `autumn`: the probability of yellow or red leaves."""
     pool = _AUTUMN if rng.random() < autumn else _GREENS
     return (pool[rng.integers(len(pool))] * rng.uniform(0.8, 1.25, 3)).astype(np.float32)
@@ -69,7 +69,7 @@ def tree(identifier: int, detail: int) -> Soup:
     """
     rng = np.random.default_rng([0x7EE, identifier])
     conifer = rng.random() < 0.15
-    colour = leaf_colour(rng)
+    colour = leaf_colour(rng, 0.0 if conifer else 0.06)
     bark = _BARK[rng.integers(len(_BARK))]
     trunk = rng.uniform(0.18, 0.34) * (0.5 if conifer else 1.0)
     lean = rng.normal(0, 0.015, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,6 @@ import torch
 from drivesem.synth.layout import (
     Actor,
     LayoutSettings,
-    Road,
     place_people,
     place_vehicles,
     plan_road,
@@ -59,16 +59,18 @@ class SynthSettings:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Exact ground truth of one actor. translation (3,) m, yaw rad: camera axes, KITTI's convention. box_xyxy (4,) px;
-    visible: share of its own silhouette in the image that nothing hides; truncation in [0, 1]; opacity: its own
-    silhouette (1, h, w), in [0, 1].
+    """Exact ground truth of one actor. translation (3,) m, yaw rad: camera axes, KITTI's convention. index: of
+    the actor in its plan. box_xyxy (4,) px; visible: share of its own silhouette in the image that nothing hides;
+    screened: share that the surroundings hide; truncation in [0, 1]; opacity: its own silhouette (1, h, w), in [0, 1].
     """
 
     actor: Actor
     translation: np.ndarray
     yaw: float
+    index: int
     box_xyxy: np.ndarray
     visible: float
+    screened: float
     occlusion: int
     truncation: float
     opacity: Crop
@@ -77,8 +79,9 @@ class Truth:
 @dataclass(frozen=True, slots=True)
 class SynthFrame:
     """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels: KITTI's
-    classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; environment: codes 0 and exact maps;
-    manifest: seed and shapes used.
+    classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; owner (2H, 2W): what each sample
+    shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background where there is one, of each
+    pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed and shapes used.
     """
 
     image: np.ndarray
@@ -87,10 +90,16 @@ class SynthFrame:
     labels: Labels
     truths: tuple[Truth, ...]
     depth_m: np.ndarray
-    camera: Camera
+    owner: np.ndarray
+    ground_material: np.ndarray
+    setting: Setting
     environment: Environment
-    road: Road
     manifest: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that took it."""
+        return self.setting.view.camera
 
 
 def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
@@ -129,7 +138,7 @@ def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
                 soup.owner)  # fmt: skip
 
 
-def _full_boxes(actors: list[Actor], view: View) -> np.ndarray:
+def full_boxes(actors: Sequence[Actor], view: View) -> np.ndarray:
     """Boxes (N, 4) px of the actors' 3D boxes, not cut at the image border; NaN behind the camera."""
     if not actors:
         return np.zeros((0, 4))
@@ -139,10 +148,11 @@ def _full_boxes(actors: list[Actor], view: View) -> np.ndarray:
     return project_boxes(size, yaw, spot, view.camera.matrix.double()).numpy()
 
 
-def _truths(actors: list[Actor], soups: list[Soup], picture: Picture, view: View) -> list[Truth]:
+def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view: View) -> list[Truth]:
+    """Ground truth of the actors that reach into the image. owner (2H, 2W): what each sample shows."""
     n = SUPERSAMPLING
     height, width = view.camera.height, view.camera.width
-    full = _full_boxes(actors, view)
+    full = full_boxes(actors, view)
     rects = np.zeros((len(actors), 4), np.int64)
     for i, box in enumerate(full):
         if np.isfinite(box).all():
@@ -162,12 +172,14 @@ def _truths(actors: list[Actor], soups: list[Soup], picture: Picture, view: View
         start += count
         if own.sum() < 4:
             continue
-        shown = (picture.owner[y0:y1, x0:x1] == i + 1) & own
+        seen = owner[y0:y1, x0:x1]
+        shown = (seen == i + 1) & own
         rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
         # Sample k of an axis covers [k / n - 1/2, (k + 1) / n - 1/2] px, as pixel j covers [j - 1/2, j + 1/2].
         box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1]) / n - 0.5
         box = np.clip(box, 0, [width - 1, height - 1, width - 1, height - 1])
         visible = float(shown.sum() / own.sum())
+        screened = float(((seen == 0) & own).sum() / own.sum())
         cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
         whole = np.prod(full[i][2:] - full[i][:2])
         truncation = float(np.clip(1 - np.prod(cut[2:] - cut[:2]) / max(whole, 1e-6), 0, 1))
@@ -178,7 +190,9 @@ def _truths(actors: list[Actor], soups: list[Soup], picture: Picture, view: View
                 translation=_stand(actor, view),
                 yaw=actor.yaw,
                 box_xyxy=box,
+                index=i,
                 visible=visible,
+                screened=screened,
                 occlusion=int(sum(visible <= t for t in _OCCLUSION_STEPS)),
                 truncation=truncation if truncation > 0.005 else 0.0,
                 opacity=Crop(torch.from_numpy(opacity)[None], int(x0) // n, int(y0) // n),
@@ -241,19 +255,20 @@ def stream(seed: int, index: int, split: str, name: int) -> np.random.Generator:
     return np.random.default_rng([0xD51F, SPLITS.index(split), seed, index, name])
 
 
-def generate_frame(
-    seed: int,
-    index: int,
-    split: str = "train",
-    settings: SynthSettings | None = None,
-    with_background: bool = False,
-    attempt: int = 0,
-) -> SynthFrame:
-    """Frame `index` of the stream `seed` of a split ("train" or "heldout"): same arguments, same bytes.
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A frame before it is rendered. actors stand on road; setting: camera, light and the rest."""
 
-    with_background: also render the street without its actors and their shadows. attempt: another draw of the same
-    frame. Raises RangeError for an unknown split.
-    """
+    actors: tuple[Actor, ...]
+    setting: Setting
+    split: str
+    surroundings_seed: np.random.Generator
+
+
+def plan_frame(
+    seed: int, index: int, split: str = "train", settings: SynthSettings | None = None, attempt: int = 0
+) -> Plan:
+    """What frame `index` of the stream `seed` will show; see `generate_frame`."""
     settings = settings or SynthSettings()
     rng = [stream(seed, index, split, 16 * attempt + i) for i in range(5)]
     layout = settings.layout or LayoutSettings(variants=VARIANTS[split])
@@ -262,7 +277,6 @@ def generate_frame(
     actors = place_vehicles(rng[1], road, layout)
     if layout.people:
         actors += place_people(rng[2], road, actors)
-    static, used = surroundings(road, POOLS[split], rng[3])
     light = draw_light(rng[4], view.up, settings.sunny)
     setting = Setting(
         view=view,
@@ -272,13 +286,40 @@ def generate_frame(
         noise=noise_set(SPLITS.index(split)),
         grain_seed=(seed, index, SPLITS.index(split), attempt),
     )
+    return Plan(tuple(actors), setting, split, rng[3])
+
+
+def actor_soups(plan: Plan) -> list[Soup]:
+    """The actors' triangles in camera axes about the centre of projection, actor i owned by i + 1."""
+    return [_place_actor(a, i + 1, plan.setting.view) for i, a in enumerate(plan.actors)]
+
+
+def actors_alone(plan: Plan) -> list[Truth]:
+    """Ground truth as if nothing but the actors stood in the world: what they hide of one another."""
+    view, n = plan.setting.view, SUPERSAMPLING
+    soups = actor_soups(plan)
+    if not soups:
+        return []
+    world = join(soups)
+    size = (n * view.camera.height, n * view.camera.width)
+    rect = np.array([[0, 0, size[1], size[0]]])
+    face, _ = rasterise(world.corners, fine_matrix(view), rect, np.array([[0, len(world)]]))
+    owner = np.where(face >= 0, world.owner[np.maximum(face, 0)], -1).reshape(size)
+    return measure(plan.actors, soups, owner, view)
+
+
+def render_frame(plan: Plan, background_if: Callable[[Sequence[Truth]], bool] | None = None) -> SynthFrame:
+    """Render a plan; also the street without its actors and their shadows if `background_if` says so of the truths."""
+    setting, view = plan.setting, plan.setting.view
+    static, used = surroundings(setting.road, POOLS[plan.split], plan.surroundings_seed)
     street = _into_camera(static, view)
-    soups = [_place_actor(a, i + 1, view) for i, a in enumerate(actors)]
-    shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in actors]
+    soups = actor_soups(plan)
+    shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
     picture = render(join([street, *soups]), shadows, setting)
-    empty = render(street, [], setting) if with_background else None
-    truths = _truths(actors, soups, picture, view)
-    shapes = sorted({f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")})
+    truths = measure(plan.actors, soups, picture.owner, view)
+    empty = render(street, [], setting) if background_if is not None and background_if(truths) else None
+    vehicles = {f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")}
+    seed, index, _, attempt = setting.grain_seed
     return SynthFrame(
         image=picture.image,
         background=None if empty is None else empty.image,
@@ -286,11 +327,23 @@ def generate_frame(
         labels=_labels(truths),
         truths=tuple(truths),
         depth_m=picture.depth_m,
-        camera=view.camera,
+        owner=picture.owner,
+        ground_material=blocks((empty or picture).material)[0],
+        setting=setting,
         environment=_environment(empty or picture, setting),
-        road=road,
         manifest={
-            "seed": seed, "index": index, "split": split, "attempt": attempt, "road": road.kind,
-            "weather": light.weather, "vehicles": shapes, **used,
+            "seed": seed, "index": index, "split": plan.split, "attempt": attempt, "road": setting.road.kind,
+            "weather": setting.light.weather, "vehicles": sorted(vehicles), **used,
         },  # fmt: skip
     )
+
+
+def generate_frame(
+    seed: int, index: int, split: str = "train", settings: SynthSettings | None = None, with_background: bool = False
+) -> SynthFrame:
+    """Frame `index` of the stream `seed` of a split ("train" or "heldout"): same arguments, same bytes.
+
+    with_background: also render the street without its actors and their shadows. Raises RangeError for an unknown
+    split.
+    """
+    return render_frame(plan_frame(seed, index, split, settings), (lambda _: True) if with_background else None)

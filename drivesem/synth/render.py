@@ -272,21 +272,15 @@ def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
     owner = np.where(hit, seen.owner[safe], -1)
     whole, parts = _shading_sites(face, depth, material, owner)
     maps = _sun_maps(soup, setting)
-    inverse = np.linalg.inv(matrix)
     image = np.empty((height * width, 3), np.float32)
-    rows, columns = np.divmod(whole, width)
-    fine = (rows * n) * (n * width) + columns * n
-    middle = np.stack([columns * n + (n - 1) / 2, rows * n + (n - 1) / 2], axis=1)
-    quads = [fine + dy * n * width + dx for dy in range(n) for dx in range(n)]
-    mean_depth = sum(depth.reshape(-1)[q] for q in quads) / len(quads)
-    rows, columns = np.divmod(parts, width)
-    corner = (rows * n) * (n * width) + columns * n
+    def first_sample(pixels: np.ndarray) -> np.ndarray:
+        rows, columns = np.divmod(pixels, width)
+        return rows * (n * n * width) + columns * n
+
+    corner = first_sample(parts)
     spread = np.stack([corner + dy * n * width + dx for dy in range(n) for dx in range(n)], axis=1).reshape(-1)
-    spots = np.stack([spread % (n * width), spread // (n * width)], axis=1)
-    where = np.concatenate([middle, spots])
-    index = np.concatenate([fine, spread])
-    w = np.concatenate([mean_depth, depth.reshape(-1)[spread]])
-    shown = _shade_sites(seen, setting, maps, shadows, (where, face.reshape(-1)[index], w, inverse))
+    sites = np.concatenate([first_sample(whole), spread])
+    shown = _shade_sites(seen, setting, maps, shadows, (sites, face.reshape(-1)[sites], depth.reshape(-1)[sites]))
     shown = develop(shown, setting.response)
     image[whole] = shown[: len(whole)]
     fine_shown = shown[len(whole) :].reshape(-1, n * n, 3)
@@ -296,7 +290,7 @@ def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
 
 
 def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, owner: np.ndarray) -> tuple:
-    """Pixels (flat indices) shaded once, and those where every sample is shaded: outlines, leaves, thin things."""
+    """Pixels (flat indices) shaded once, and those where every sample is shaded: outlines, thin things."""
     faces, depths = blocks(face), blocks(depth)
     keys = blocks(material.astype(np.int32) * 4096 + owner)
     same_face, alike = faces[1] == faces[0], keys[1] == keys[0]
@@ -306,7 +300,8 @@ def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, ow
         alike = alike & (keys[i] == keys[0])
         near, far = np.minimum(near, depths[i]), np.maximum(far, depths[i])
     leaf = blocks(material)[0] == Material.LEAF
-    smooth = alike & (far < near * np.float32(1.03)) & ~leaf
+    # Deep foliage is all outline: one sample of its four is enough, as lens blur and grain hide the rest.
+    smooth = alike & ((far < near * np.float32(1.03)) | leaf)
     once = same_face | smooth
     return np.flatnonzero(once), np.flatnonzero(~once)
 
@@ -314,10 +309,14 @@ def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, ow
 def _shade_sites(
     seen: Soup, setting: Setting, maps: _SunMaps | None, shadows: list[Shadow], sites: tuple
 ) -> np.ndarray:
-    """Linear radiance (n, 3) at sites: (pixel (n, 2) of the fine image, face (n,), depth (n,), inverse (3, 3))."""
-    where, face, w, inverse = sites
+    """Linear radiance (n, 3) at sites: (flat index into the fine image (n,), face (n,), depth (n,))."""
+    index, face, w = sites
     view = setting.view
-    ray = (where @ inverse[:, :2].T + inverse[:, 2]).astype(np.float32)
+    row, column = np.divmod(index, SUPERSAMPLING * view.camera.width)
+    inverse = np.linalg.inv(fine_matrix(view)).astype(np.float32)
+    ray = np.empty((len(index), 3), np.float32)
+    for axis in range(3):
+        ray[:, axis] = column * inverse[axis, 0] + row * inverse[axis, 1] + inverse[axis, 2]
     out = np.empty((len(face), 3), np.float32)
     sky = np.flatnonzero(face < 0)
     if len(sky):
@@ -336,7 +335,7 @@ def _shade_sites(
     local = rank[face]
     attributes = _attribute_maps(seen, used)
     point = ray[land] * w[land, None]
-    values = np.einsum("nij,nj->ni", attributes[local], point)
+    values = np.matmul(attributes[local], point[:, :, None])[:, :, 0]
     normal = unit(values[:, :3])
     away = np.einsum("ni,ni->n", normal, point) > 0
     normal[away] *= -1

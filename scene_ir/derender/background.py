@@ -29,7 +29,8 @@ _SIDEWAYS = 0.4
 class FillSettings:
     """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds at
     the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far away
-    costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's border.
+    costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's border; search_px: how far from
+    the best source so far others are tried.
     """
 
     coarsest_radius: float = 4.0
@@ -37,6 +38,7 @@ class FillSettings:
     iterations: tuple[int, int] = (10, 2)
     row_weight: float = 0.05
     column_weight: float = 0.004
+    search_px: float = 160.0
     confidence_px: float = 12.0
 
 
@@ -87,7 +89,7 @@ def fill(
     for index in reversed(range(len(pyramid))):
         level_image, level_hole, level_forbidden = pyramid[index]
         if source is None:
-            start = mirror(level_image, level_forbidden)
+            start = level_image[mirrored(level_forbidden)]
         else:
             size = (level_image.shape[1], level_image.shape[0])
             start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
@@ -99,22 +101,19 @@ def fill(
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
 
 
-def mirror(image: Image, unknown: Mask) -> Image:
-    """A first guess: each unknown pixel copies what lies mirrored at the nearest end of the hole.
+def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (H, W) of a first guess: each unknown pixel copies what lies mirrored at the hole's nearest end.
 
-    image (H, W, 3), unknown (H, W) -> (H, W, 3). Sideways counts as nearer than up and down, since streets run on
-    sideways behind a car: hedge, wall, kerb, road.
+    unknown (H, W), not everywhere. Sideways counts as nearer than up and down, since streets run on sideways behind a
+    car: hedge, wall, kerb, road. Known pixels point to themselves.
     """
     height, width = unknown.shape
-    if unknown.all():
-        return image
     nearest = distance_transform_edt(unknown, sampling=(1.0, _SIDEWAYS), return_distances=False, return_indices=True)
     rows, columns = 2 * nearest - np.mgrid[0:height, 0:width]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     rows, columns = np.where(inside, rows, nearest[0]), np.where(inside, columns, nearest[1])
     known = ~unknown[rows, columns]
-    rows, columns = np.where(known, rows, nearest[0]), np.where(known, columns, nearest[1])
-    return image[rows, columns]
+    return np.where(known, rows, nearest[0]), np.where(known, columns, nearest[1])
 
 
 def _distance(mask: Mask) -> NDArray[np.float32]:
@@ -160,6 +159,7 @@ class _Level:
         self.horizon = horizon
         self.reach = np.maximum(np.abs(self.rows - horizon), 24 / scale).astype(np.float32)
         self.column_unit = 200.0 / scale
+        self.search = max(settings.search_px / scale, 4.0)
         self.confidence = np.exp(-_distance(hole)[target] * scale / settings.confidence_px).astype(np.float32)
         self.confidence = np.maximum(self.confidence, 1e-4)
 
@@ -190,12 +190,11 @@ class _Level:
         self.source[chosen, 0], self.source[chosen, 1] = rows[better], columns[better]
         self.best[chosen] = cost[better]
 
-    def _start(self, coarse: NDArray[np.int64] | None, rng: np.random.Generator) -> None:
-        """First sources: the coarser level's, else anywhere in the rows around."""
+    def _start(self, coarse: NDArray[np.int64] | None) -> None:
+        """First sources: mirrored ones, or the coarser level's where these are better."""
         everything = np.arange(self.rows.size)
-        allowed_rows, allowed_columns = np.nonzero(self.allowed)
-        pick = rng.integers(0, allowed_rows.size, self.rows.size)
-        self.source = np.stack([allowed_rows[pick], allowed_columns[pick]], 1)
+        rows, columns = mirrored(~self.allowed)
+        self.source = np.stack([rows[self.rows, self.columns], columns[self.rows, self.columns]], 1)
         self.best = self._cost(everything, self.source[:, 0], self.source[:, 1])
         if coarse is not None:
             up = coarse[np.minimum(self.rows // 2, coarse.shape[0] - 1), np.minimum(self.columns // 2, coarse.shape[1] - 1)]
@@ -214,7 +213,7 @@ class _Level:
             which = everything[neighbour >= 0]
             near = neighbour[which]
             self._try(which, self.source[near, 0] - dy, self.source[near, 1] - dx)
-        radius = float(max(self.width, self.height))
+        radius = self.search
         while radius >= 1:
             spread_y = np.minimum(radius, 0.5 * self.reach + 2)
             rows = self.source[:, 0] + rng.uniform(-1, 1, self.rows.size) * spread_y
@@ -226,19 +225,20 @@ class _Level:
         """Each hole pixel becomes the trust-weighted mean of what the patches around it say."""
         flat = self.padded.reshape(-1, 3)
         weight = self.confidence / (self.best + 0.002)
-        total = np.zeros((self.padded.shape[0] * self.stride, 3), np.float64)
-        mass = np.zeros(self.padded.shape[0] * self.stride, np.float64)
+        size = self.padded.shape[0] * self.stride
+        total, mass = np.zeros((3, size)), np.zeros(size)
         target = self._flat(self.rows, self.columns)
         source = self._flat(self.source[:, 0], self.source[:, 1])
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 offset = dy * self.stride + dx
                 share = weight * (1.0 if dy == dx == 0 else 0.5)
-                np.add.at(mass, target + offset, share)
+                colour = flat[source + offset] * share[:, None]
+                mass += np.bincount(target + offset, share, size)
                 for channel in range(3):
-                    np.add.at(total[:, channel], target + offset, share * flat[source + offset, channel])
+                    total[channel] += np.bincount(target + offset, colour[:, channel], size)
         inner = self._flat(*np.nonzero(self.hole))
-        flat[inner] = (total[inner] / np.maximum(mass[inner], 1e-12)[:, None]).astype(np.float32)
+        flat[inner] = (total[:, inner] / np.maximum(mass[inner], 1e-12)).T.astype(np.float32)
 
     def run(
         self, coarse: NDArray[np.int64] | None, rounds: int, rng: np.random.Generator
@@ -246,7 +246,7 @@ class _Level:
         """Alternate search and vote. -> the image (H, W, 3) and the sources (H, W, 2), -1 where nothing is filled."""
         everything = (self.rows, self.columns)
         self.target_patches = self._patches(*everything)
-        self._start(coarse, rng)
+        self._start(coarse)
         for round_index in range(rounds):
             self._search(rng, 1 if round_index % 2 == 0 else 2)
             self._vote()

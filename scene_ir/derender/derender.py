@@ -40,6 +40,8 @@ Mask = NDArray[np.bool_]
 VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 """Labels that become objects; all others stay in the background. Vans count as cars, as in the paper."""
 
+_FADE = 0.35
+"""Opacity from which on what is behind a car is all filled."""
 _UNDERBODY = 0.3
 """Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
@@ -94,9 +96,10 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         vehicles |= silhouette.grow(cut.mask, 2)
     horizon = maps.horizon_row(ground, camera)
     road = maps.road_map(image, horizon, vehicles)
-    layers = _layers(image, cuts, vehicles, road, ground, horizon, camera, settings.seed)
-    background, mattes, shadows = layers
-    environment, depth = _environment(background, ground, horizon, camera, vehicles)
+    background, mattes, shadows, sun = _layers(
+        image, cuts, vehicles, road, ground, horizon, camera, settings.seed
+    )
+    environment, depth = _environment(background, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
         depth = frame.depth.float()
     objects, meshes = _objects(labels, cuts)
@@ -200,7 +203,7 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
 
 def _without_underbody(cut: _Cut, ground: torch.Tensor, camera: Camera) -> _Cut:
     """The mask without the dark ground between and beside the wheels: that is shadow, and lies on the ground."""
-    distance = shadow.footprint_distance(cut.placement, ground, camera)
+    distance = shadow.ground_view(cut.placement, ground, camera).distance
     _, top, _, bottom = silhouette.extent(cut.outline)
     low = np.arange(camera.height)[:, None] > bottom - _UNDERBODY * (bottom - top)
     beneath = low & (distance < 0.4) & ~silhouette.grow(cut.outline, 1.5)
@@ -253,37 +256,45 @@ def _layers(
     horizon: float,
     camera: Camera,
     seed: int,
-) -> tuple[Array, list[Array], list[Array]]:
-    """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W) and shadow factors (H, W, 3) of the cars."""
+) -> tuple[Array, list[Array], list[Array], torch.Tensor]:
+    """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (H, W, 3), sun."""
     if not cuts:
-        return image, [], []
-    distances = [shadow.footprint_distance(cut.placement, ground, camera) for cut in cuts]
-    shaded = shadow.find(image, road, vehicles, distances)
+        return image, [], [], maps.sun_direction()
+    views = [shadow.ground_view(cut.placement, ground, camera) for cut in cuts]
+    placements = [cut.placement for cut in cuts]
+    lighting = shadow.light(image, road, vehicles, views)
+    sun = shadow.estimate_sun(lighting, vehicles, placements, views, maps.sun_direction())
+    shaded = [
+        region & shadow.reachable(placement, view, sun)
+        for region, placement, view in zip(shadow.find(lighting, vehicles, views), placements, views, strict=True)
+    ]
     hole = vehicles.copy()
-    for cut, region in zip(cuts, shaded, strict=True):
-        hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4)
+    for cut, region, view in zip(cuts, shaded, views, strict=True):
+        hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4) | (view.distance < 0.2)
     filled = fills.fill(image, hole, silhouette.grow(hole, 2), horizon, seed)
-    mattes = [matte(image, cut.mask, cut.unknown) for cut in cuts]
+    near = np.stack([view.distance for view in views])
+    mattes = [matte(image, cut.mask, cut.unknown, near.min(0) < 0.6) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
     for region in shaded:
-        inner = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
-        shadow_share = np.maximum(shadow_share, np.clip(1.25 - inner / 2.5, 0, 1))
-    replaced = np.clip(np.maximum(shadow_share, opaque * 50), 0, 1)[..., None]
+        beyond = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+        shadow_share = np.maximum(shadow_share, np.clip(1.25 - beyond / 2.5, 0, 1))
+    # Where a matte is thin, most of the pixel is background already: the fill fades into it.
+    replaced = np.clip(np.maximum(shadow_share, opaque / _FADE), 0, 1)[..., None]
     mixed = image + (filled - image) * replaced
     # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
     only_shadow = (opaque == 0)[..., None]
     mixed = np.where(only_shadow, np.maximum(mixed, image), mixed)
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
-    near = np.stack(distances).argmin(0)
+    owner = near.argmin(0)
     factors = [
-        shadow.factors(image, background, (shadow_share > 0) & (near == i) & (opaque == 0)) for i in range(len(cuts))
+        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque == 0)) for i in range(len(cuts))
     ]
-    return background, mattes, factors
+    return background, mattes, factors, sun
 
 
 def _environment(
-    background: Array, ground: torch.Tensor, horizon: float, camera: Camera, vehicles: Mask
+    background: Array, ground: torch.Tensor, sun: torch.Tensor, horizon: float, camera: Camera, vehicles: Mask
 ) -> tuple[Environment, torch.Tensor]:
     """Maps and depth of the background."""
     nothing = np.zeros(vehicles.shape, bool)
@@ -296,7 +307,7 @@ def _environment(
     environment = Environment(
         torch.zeros(WEATHER_DIM),
         torch.zeros(FOLIAGE_DIM),
-        maps.sun_direction(),
+        sun,
         ground,
         *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, foliage, road)),
     )

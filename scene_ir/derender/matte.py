@@ -24,20 +24,24 @@ class MatteSettings:
     """band_px: mixed pixels are looked for this far on both sides of the mask; generous_px: how far the prior border
     lies outside the mask (some road that travels with a car shows less than an edge of car left behind);
     softness_px: width of the prior ramp; contrast: difference of colours at which the photograph counts as much as
-    the prior.
+    the prior; odd: deviations from the surroundings (in their standard deviations) between which a pixel just outside
+    begins to be, and is, taken for a piece of the car.
     """
 
     band_px: float = 2.5
     generous_px: float = 0.7
     softness_px: float = 1.6
     contrast: float = 0.06
+    odd: tuple[float, float] = (1.8, 3.2)
 
 
-def matte(image: Array, mask: Mask, unknown: Mask, settings: MatteSettings | None = None) -> Array:
+def matte(
+    image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None
+) -> Array:
     """Opacity (H, W) in [0, 1] of the car in `mask`.
 
     image (H, W, 3) RGB in [0, 1]. unknown (H, W): pixels of nearer things. The car runs on behind their border, so
-    that no gap opens along it.
+    that no gap opens along it. ground (H, W): where what is odd is a shadow.
     """
     settings = settings or MatteSettings()
     opacity = np.zeros(mask.shape, np.float32)
@@ -62,6 +66,10 @@ def matte(image: Array, mask: Mask, unknown: Mask, settings: MatteSettings | Non
         share = ((colours - outside) * across).sum(-1) / np.maximum(length, 1e-6)
         trust = length / (length + settings.contrast**2)
         mixed = trust * np.clip(share, 0, 1) + (1 - trust) * prior
+        odd = _oddness(colours, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window])
+        low, high = settings.odd
+        piece = np.clip((odd - low) / (high - low), 0, 1) * ~ground[window]
+        mixed = np.maximum(mixed, piece)
         mixed = cv2.GaussianBlur(mixed.astype(np.float32), (3, 3), 0.6)
     low = np.clip(depth + 0.5, 0, 1)
     high = np.clip((depth + settings.band_px + 1) / 1.5, 0, 1)
@@ -76,6 +84,18 @@ def _signed_distance(mask: Mask) -> Array:
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
     return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
+
+
+def _oddness(image: Array, sure: Mask) -> Array:
+    """How far (H, W) each pixel is from the colours of the `sure` surroundings near it, in standard deviations."""
+    weight = cv2.GaussianBlur(sure.astype(np.float32), (0, 0), 4.0)
+    scale = np.maximum(weight, 1e-4)[..., None]
+    known = image * sure[..., None]
+    mean = cv2.GaussianBlur(known, (0, 0), 4.0) / scale
+    square = cv2.GaussianBlur(known * image, (0, 0), 4.0) / scale
+    spread = np.sqrt(np.maximum(square - mean * mean, 0).sum(-1)) + 0.05
+    odd = np.sqrt(((image - mean) ** 2).sum(-1)) / spread
+    return np.where(weight > 0.01, odd, 0).astype(np.float32)
 
 
 def _carried(image: Array, sure: Mask, allowed: Mask) -> Array | None:
