@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -133,6 +133,8 @@ class Objective:
 
     @torch.no_grad()
     def _judged(self, scene: SceneIR, render: Render) -> Rendered:
+        # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
+        render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
         raw = self.detector(render.image[None])
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
         aim = moved if self.label_mode == "moved" else paper

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,17 +36,18 @@ def spans(rects: Tensor, offsets: Tensor) -> list[Span]:
 def blend(canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:
     """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to all tensors.
 
-    canvas: (C, H, W), its first three channels RGB. shadow: (Ts, 3) factors. colour: (T, C) premultiplied; opacity:
-    (T,). -> (C, H, W). Pixels outside the plan's rectangles keep their bits.
+    canvas: (C, H, W), its first three channels RGB. shadow: (Ts, 3) factors. colour: (T, C) premultiplied;
+    opacity: (T,). -> (C, H, W). Pixels outside the plan's rectangles keep their bits.
     """
-    return _Blend.apply(canvas, shadow, colour, opacity, plan)  # type: ignore[no-any-return]
+    return _Blend.apply(canvas, shadow, colour, opacity, plan)
 
 
 class _Blend(torch.autograd.Function):
-    """Works in place on one copy of the picture in both directions, where autograd would copy it for each layer."""
+    """Works in place on one copy of the picture in both directions, where autograd would copy it for each
+    layer."""
 
     @staticmethod
-    def forward(ctx, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:
         out = canvas.clone(memory_format=torch.contiguous_format)
         under: list[Tensor] = []
         for packed, (rows, columns), size in plan.shadows:
@@ -62,7 +64,7 @@ class _Blend(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
         shadow, opacity = ctx.saved_tensors
         grad = grad.clone(memory_format=torch.contiguous_format)
         to_shadow = torch.zeros_like(shadow)
@@ -86,9 +88,10 @@ class _Blend(torch.autograd.Function):
 def paint_order(size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tensor) -> list[int]:
     """Indices of the objects from the farthest to the nearest, as a painter lays them down; not differentiated.
 
-    size_lhw (N, 3) m, yaw (N,) rad, translation (N, 3) m; centre (3,) m, where the camera stands. Of two footprints
-    apart, the one on the camera's side of the line between them is in front (a car beside a long truck may be farther
-    by its middle and yet hide it); where that says nothing, or in a cycle, the nearest point decides.
+    size_lhw (N, 3) m, yaw (N,) rad, translation (N, 3) m; centre (3,) m, where the camera stands. Of two
+    footprints apart, the one on the camera's side of the line between them is in front (a car beside a long truck
+    may be farther by its middle and yet hide it); where that says nothing, or in a cycle, the nearest point
+    decides.
     """
     count = int(translation.shape[0])
     corners = ground_footprint(size_lhw.detach(), yaw.detach(), translation.detach()).cpu().double().numpy()

@@ -1,9 +1,10 @@
 """Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all six kinds of parameter.
 
-A vehicle is drawn on two surfaces. Its *mesh* shows the photograph where the photograph saw that point, and completes
-what it did not see. Its *proxy*, the mesh inflated, carries what of the matte lies beyond the mesh. A pixel's lookup
-is `pixel + displacement`, the displacement interpolated from the difference of the clip coordinates then and now: with
-nothing perturbed it is exactly zero, every lookup falls on a pixel centre, and the picture is the photograph.
+A vehicle is drawn on two surfaces. Its *mesh* shows the photograph where the photograph saw that point, and
+completes what it did not see. Its *proxy*, the mesh inflated, carries what of the matte lies beyond the mesh. A
+pixel's lookup is `pixel + displacement`, the displacement interpolated from the difference of the clip coordinates
+then and now: with nothing perturbed it is exactly zero, every lookup falls on a pixel centre, and the picture is
+the photograph.
 
 Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its proxy.
 """
@@ -81,8 +82,8 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """Placed vertices. points (V, 3) m; normals (V, 3); clip (V, 3); cos (V,) towards the camera; the same of the proxy
-    (`shell_clip`, `shell_cos`); ground_clip (4N, 3), the shadows' patches."""
+    """Placed vertices. points (V, 3) m; normals (V, 3); clip (V, 3); cos (V,) towards the camera; the same of the
+    proxy (`shell_clip`, `shell_cos`); ground_clip (4N, 3), the shadows' patches."""
 
     points: Tensor
     clip: Tensor
@@ -94,7 +95,8 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); shell, ground: fragments of proxies and patches."""
+    """What the z-buffers found for one perturbation. coverage (T,); shell, ground: fragments of proxies and
+    patches."""
 
     geometry: _Geometry
     mesh: verbs.Fragments
@@ -107,8 +109,8 @@ class Drawn:
 class _Rows:
     """Pixels to be coloured, mesh rows first, each part grouped by object.
 
-    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this row
-    fills; counts (2N,) int64 rows of each mesh, then of each proxy; fringe: see `_Fringe`.
+    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this
+    row fills; counts (2N,) int64 rows of each mesh, then of each proxy; fringe: see `_Fringe`.
     """
 
     pixel: Tensor
@@ -122,12 +124,12 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Fringe:
-    """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses have
-    nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing jumps
-    when the outline passes over a pixel's centre.
+    """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses
+    have nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing
+    jumps when the outline passes over a pixel's centre.
 
-    hit (Rm,) 1 or 0; row (K,) int64: rows at the outline; own (K,) in [0, 1]: how much they keep of their own values;
-    neighbour (K, 4) int64 rows; weight (K, 4), of sum 1, or 0 where no neighbour is hit.
+    hit (Rm,) 1 or 0; row (K,) int64: rows at the outline; own (K,) in [0, 1]: how much they keep of their own
+    values; neighbour (K, 4) int64 rows; weight (K, 4), of sum 1, or 0 where no neighbour is hit.
     """
 
     hit: Tensor
@@ -176,7 +178,8 @@ class Compositor:
     def __init__(
         self, scene: SceneIR, settings: RenderSettings | None = None, hidden: Sequence[Tensor] | None = None
     ) -> None:
-        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given."""
+        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not
+        given."""
         self.settings = settings or RenderSettings()
         if self.settings.backend == "warp" and scene.photograph.dtype != torch.float32:
             scene = scene_to(scene, torch.float32)
@@ -242,7 +245,7 @@ class Compositor:
         local = fleet.local(objects.ffd, objects.size_lhw)
         points = fleet.place(local, objects.yaw, objects.translation)
         shell = fleet.place(local + self._offset, objects.yaw, objects.translation)
-        normals = surfaces.rotate(self._smooth, objects.yaw[fleet.owner])
+        normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
         ground = surfaces.place_on_ground(
             self._corners, objects.yaw, objects.translation, self.scene.environment.ground
         )
@@ -319,12 +322,12 @@ class Compositor:
         hit = drawn.mesh.face >= 0
         mesh_pixel = (hit | (covered > 0)).nonzero()[:, 0]
         owner = layout.draw()
-        pixel, share = mesh_pixel, drawn.coverage[mesh_pixel]
+        pixel, share = mesh_pixel, drawn.coverage.index_select(0, mesh_pixel)
         counts = torch.bincount(owner[mesh_pixel], minlength=count)
         if with_shell:
             shell_pixel = ((drawn.shell.face >= 0) & (covered < 1)).nonzero()[:, 0]
             pixel = torch.cat([mesh_pixel, shell_pixel])
-            share = torch.cat([share, 1.0 - drawn.coverage[shell_pixel]])
+            share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, shell_pixel)])
             counts = torch.cat([counts, torch.bincount(owner[shell_pixel], minlength=count)])
         rows_owner = owner[pixel]
         x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
@@ -338,7 +341,7 @@ class Compositor:
         dense = verbs.interpolate(
             drawn.mesh, drawn.geometry.clip, self._fleet.faces, attributes, self.settings.backend
         )
-        return rows.fringe.fill(dense[rows.pixel[: rows.mesh_rows]])
+        return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
     def _photographed_rows(
         self, objects: Objects, drawn: Drawn, rows: _Rows
@@ -358,13 +361,13 @@ class Compositor:
             drawn.mesh, geometry.clip, fleet.faces,
             attributes(geometry.clip, base.clip, geometry.cos, base.cos), self.settings.backend,
         )  # fmt: skip
-        mesh = rows.fringe.fill(_lookup(dense[rows.pixel[:m]], rows.xy[:m]))
+        mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
         dense = verbs.interpolate(
             drawn.shell, geometry.shell_clip, fleet.faces,
             attributes(geometry.shell_clip, base.shell_clip, geometry.shell_cos, base.shell_cos),
             self.settings.backend,
         )  # fmt: skip
-        shell = _lookup(dense[rows.pixel[m:]], rows.xy[m:])
+        shell = _lookup(dense.index_select(0, rows.pixel[m:]), rows.xy[m:])
         move, z_then, z_now, turned, cos_then, paint, up = torch.cat([mesh, shell]).split(
             [2, 1, 1, 1, 1, 1, 1], dim=1
         )
@@ -376,11 +379,11 @@ class Compositor:
         uv = rows.xy + move
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
         alpha = seen[:, 3]
-        weight = (
-            texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
-        )
-        behind = 1.0 - smoothstep(z_then[:m] - seen[:m, 6], *texture.DEPTH_TOLERANCE_M)
-        weight = weight * torch.cat([behind, smoothstep(seen[m:, 5], 0.0, 1.0)])
+        known = 1.0 - smoothstep(seen[:, 4], 0.0, 1.0)
+        weight = texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * known
+        near = 1.0 - smoothstep(z_then[:m] - seen[:m, 6], *texture.DEPTH_TOLERANCE_M)
+        outline = smoothstep(seen[m:, 5], 0.0, 1.0) * texture.outline_weight(turned[m:])
+        weight = weight * torch.cat([near, outline])
         rim = 1.0 - smoothstep(cos_then[:m], 0.3, 0.5)
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
         fill = 1.0 - weight[:m] + weight[:m] * opened
@@ -389,19 +392,20 @@ class Compositor:
         need = (fill != 0.0).nonzero()[:, 0]
         if need.numel():
             completed = self._completion(objects, drawn, rows, need, cos_then[:m] + turned[:m])
-            colour = colour.index_add(0, need, fill[need][:, None] * completed)
+            colour = colour.index_add(0, need, fill.index_select(0, need)[:, None] * completed)
             opacity = opacity.index_add(0, need, fill[need])
         return colour, opacity, z_now, paint, up
 
     def _own_attributes(self, objects: Objects, geometry: _Geometry) -> Tensor:
         """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
         fleet = self._fleet
-        normals = surfaces.rotate(self._sharp, objects.yaw[fleet.owner])
+        normals = surfaces.rotate(self._sharp, fleet.spread(objects.yaw))
         parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self._height)
         return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
 
     def _own_colour(self, rows: _Rows, own: Tensor, need: Tensor | None, paint: Tensor | None = None) -> Tensor:
-        """The templates' colours (K, 3) in daylight, for the rows `need` or all; paint: (N, 3) that tints the paint."""
+        """The templates' colours (K, 3) in daylight, for the rows `need` or all; paint: (N, 3) that tints the
+        paint."""
         xy, owner = (rows.xy, rows.owner) if need is None else (rows.xy[need], rows.owner[need])
         albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
         if paint is not None:
@@ -413,7 +417,8 @@ class Compositor:
         return texture.shade(normal, to_eye, albedo, sheen, height, sun)
 
     def _completion(self, objects: Objects, drawn: Drawn, rows: _Rows, need: Tensor, cos_now: Tensor) -> Tensor:
-        """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the template.
+        """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
+        template.
 
         cos_now: (Rm,) towards the camera.
         """
@@ -467,9 +472,13 @@ class Compositor:
         dense = verbs.interpolate(drawn.ground, clip, faces, fixed, self.settings.backend)
         hit = (drawn.ground.face >= 0).nonzero()[:, 0]
         xy = layout.pixels()[hit].to(self._like)
-        uv = xy + _lookup(dense[hit], xy)[:, :2]
-        counts = torch.bincount(layout.draw()[hit], minlength=len(objects))
+        uv = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
         assert self._shadows is not None
+        owner = layout.draw()[hit]
+        rect = self._shadows.rects[owner]
+        reached = ((uv > rect[:, :2] - 2) & (uv < rect[:, 2:] + 1)).all(dim=1).nonzero()[:, 0]
+        hit, uv = hit[reached], uv.index_select(0, reached)
+        counts = torch.bincount(owner[reached], minlength=len(objects))
         dark = self._shadows.sample(uv, counts, self.settings.backend, "zero")
         height, width = self._frame_hw
         dark = dark * texture.inside_weight(uv, height, width)[:, None]
@@ -537,7 +546,8 @@ def _photographed(objects: Objects) -> Objects:
 
 
 def _darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
-    """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches there."""
+    """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches
+    there."""
     if shadow is None or shadow.values.numel() == 0:
         return Crop(torch.zeros(3, 0, 0), 0, 0)
     h, w = shadow.values.shape[1:]
@@ -557,8 +567,8 @@ def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
     """From interpolated clip differences to where the photograph shows this point.
 
     attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px
-    -> (R, 4 + K): displacement in px (2), w then, w now, and the K more. A point that was behind the camera is looked up
-    far outside the photograph.
+    -> (R, 4 + K): displacement in px (2), w then, w now, and the K more. A point that was behind the camera is
+    looked up far outside the photograph.
     """
     delta, then = attributes[:, :3], attributes[:, 3:4]
     before = then > verbs.NEAR_M

@@ -1,7 +1,7 @@
 """Weather, time of day and foliage: smooth functions of picture, depth and maps; code 0 leaves every bit as it is.
 
-Each effect is `x + s(code) * change(x)` with s(0) = 0, so that it passes through the photograph and is differentiable
-there from both sides, though the weather code is bounded to [0, 1].
+Each effect is `x + s(code) * change(x)` with s(0) = 0, so that it passes through the photograph and is
+differentiable there from both sides, though the weather code is bounded to [0, 1].
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def shadow_softening(weather: Tensor) -> Tensor:
 def apply_foliage(image: Tensor, environment: Environment, air: Tensor) -> Tensor:
     """The picture (3, H, W) with its foliage changed by `environment.foliage`, (3,) in [-1, 1].
 
-    Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is a
-    curve in CIE L*; density darkens the crowns (1) or lets the air (3,) RGB show through them (-1).
+    Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is
+    a curve in CIE L*; density darkens the crowns (1) or lets the air (3,) RGB show through them (-1).
     """
     amount = environment.foliage_map.to(image)
     index = (amount.flatten() > 0.004).nonzero()[:, 0]
@@ -152,7 +152,8 @@ def _streaks(height: int, width: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _leaf_gaps(height: int, width: int) -> Tensor:
-    """Where thin foliage opens (H, W) in [0, 1]: band-limited noise of a few pixels; the same for each frame size."""
+    """Where thin foliage opens (H, W) in [0, 1]: band-limited noise of a few pixels; the same for each frame
+    size."""
     generator = torch.Generator().manual_seed(19240901)
     noise = torch.rand(1, 1, height, width, generator=generator)
     fine = kornia.filters.gaussian_blur2d(noise, (5, 5), (1.0, 1.0), border_type="replicate")

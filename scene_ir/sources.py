@@ -1,8 +1,8 @@
 """Taking a photograph apart: from mattes and a background to `Source`s that give the photograph back, exactly.
 
-Given photograph I, background B and matte a, the foreground is F = (I - (1 - a) B) / a. That is an identity for any
-matte, so the matte is raised only as far as F needs to stay in gamut; vehicles are solved from the farthest to the
-nearest, each against what lies behind it, completions of hidden parts included.
+Given photograph I, background B and matte a, the foreground is F = (I - (1 - a) B) / a. That is an identity for
+any matte, so the matte is raised only as far as F needs to stay in gamut; vehicles are solved from the farthest to
+the nearest, each against what lies behind it, completions of hidden parts included.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _LEVELS = 255.0
 
 @dataclass(frozen=True, slots=True)
 class SolveSettings:
-    """margin_px: how far the proxy reaches beyond the mesh; min_inflation_m: but at least so far; complete_shadows:
-    whether shadows are continued under the vehicles, where the photograph could not show them; backend: see
-    `RenderSettings`.
+    """margin_px: how far the proxy reaches beyond the mesh; min_inflation_m: but at least so far;
+    complete_shadows: whether shadows are continued under the vehicles, where the photograph could not show them;
+    backend: see `RenderSettings`.
     """
 
     margin_px: float = 3.0
@@ -52,10 +52,11 @@ def solve_sources(
 ) -> SceneIR:
     """The scene with `objects.source` and a background such that its unperturbed render is its photograph.
 
-    scene: with photograph, background and placed objects; sources that it has are replaced. alphas: one Crop (1, h, w)
-    an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one Crop
-    (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the background, it
-    becomes the photograph (freed of the shadows). margins_px: for each object instead of `settings.margin_px`.
+    scene: with photograph, background and placed objects; sources that it has are replaced. alphas: one Crop (1,
+    h, w) an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one
+    Crop (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the
+    background, it becomes the photograph (freed of the shadows). margins_px: for each object instead of
+    `settings.margin_px`.
     """
     settings = settings or SolveSettings()
     count = len(scene.objects)
@@ -112,8 +113,10 @@ def _solve(
         nearer = torch.zeros(frame_hw, dtype=torch.bool)
         for j in order[place + 1 :]:
             _window(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
-        shell = _hits(drawn.shell, i)
-        foreground = _foreground(mattes[i], image, canvas, nearer, shell)
+        packed, size = drawn.mesh.layout.spans()[i]
+        x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
+        coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
+        foreground = _foreground(mattes[i], image, canvas, nearer, coverage)
         shadow = factors[i] if shadows[i] is not None else None
         source = replace(blank[i], foreground=foreground, shadow=shadow)
         one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)))
@@ -164,18 +167,24 @@ def _hits(fragments: verbs.Fragments, index: int) -> Crop:
 
 
 def _cut(alpha: Crop, drawn: Drawn, index: int, like: Tensor) -> Crop:
-    """The matte where the proxy can carry it, trimmed to where it is above 0."""
+    """The matte where the proxy can carry it, trimmed to where it is above 0 and what it may be continued to."""
     shell = _hits(drawn.shell, index)
     x0, y0 = shell.x0, shell.y0
     rect = (x0, y0, x0 + shell.values.shape[2], y0 + shell.values.shape[1])
     height, width = like.shape[1:]
     values = texture.crop_of(alpha, rect, (height, width)).to(like).clamp(0.0, 1.0) * shell.values.to(like)
-    rows = (values[0] > 0).any(dim=1).nonzero()[:, 0]
-    columns = (values[0] > 0).any(dim=0).nonzero()[:, 0]
+    return _trimmed(Crop(values, x0, y0), values[0] > 0, grow=int(np.ceil(_EXTENSION_PX)))
+
+
+def _trimmed(crop: Crop, keep: Tensor, grow: int = 0) -> Crop:
+    """The smallest part of a crop that holds `keep` (h, w), and `grow` px around it."""
+    rows, columns = keep.any(dim=1).nonzero()[:, 0], keep.any(dim=0).nonzero()[:, 0]
     if rows.numel() == 0:
-        return Crop(values[:, :0, :0], x0, y0)
-    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-    return Crop(values[:, top:bottom, left:right].contiguous(), x0 + left, y0 + top)
+        return Crop(crop.values[:, :0, :0], crop.x0, crop.y0)
+    h, w = keep.shape
+    top, bottom = max(int(rows[0]) - grow, 0), min(int(rows[-1]) + 1 + grow, h)
+    left, right = max(int(columns[0]) - grow, 0), min(int(columns[-1]) + 1 + grow, w)
+    return Crop(crop.values[:, top:bottom, left:right].contiguous(), crop.x0 + left, crop.y0 + top)
 
 
 def _shadow_crops(
@@ -202,13 +211,14 @@ def _shadow_crops(
         if settings.complete_shadows:
             dark = _continue_shadow(dark, expected, covered[y0 : rect[3], x0 : rect[2]])
         hit = (drawn.ground.face[packed] >= 0).reshape(1, *size)
-        out.append(Crop(1.0 - dark * hit, x0, y0))
+        dark = dark * (hit & (dark.amax(dim=0, keepdim=True) > 0.5 / _LEVELS))
+        out.append(_trimmed(Crop(1.0 - dark, x0, y0), dark.amax(dim=0) > 0))
     return out
 
 
 def _continue_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
-    """Darkness (3, h, w) with its unseen pixels, `covered` (h, w), taken from the expected one (h, w), fitted to the
-    seen ones in strength and, near them, in value."""
+    """Darkness (3, h, w) with its unseen pixels, `covered` (h, w), taken from the expected one (h, w), fitted to
+    the seen ones in strength and, near them, in value."""
     seen = (~covered).to(dark)
     sure = seen * (expected > 0.05)
     strength = (dark * expected * sure).sum(dim=(1, 2)) / (expected.square() * sure).sum().clamp(min=1e-6)
@@ -261,8 +271,11 @@ def _balance(image: Tensor, background: Tensor, factors: list[Crop], covered: Te
     return torch.where(failed, image, out)
 
 
-def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, shell: Crop) -> Crop:
-    """Premultiplied foreground and matte (4, h, w) over the canvas, continued a little under nearer objects."""
+def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, coverage: Crop) -> Crop:
+    """Premultiplied foreground and matte (4, h, w) over the canvas, continued a little under nearer objects.
+
+    nearer: (H, W) bool, where they are; coverage: Crop (1, h, w) by the mesh, the opacity under them.
+    """
     h, w = matte.values.shape[1:]
     if h == 0 or w == 0:
         return Crop(image.new_zeros(4, 0, 0), matte.x0, matte.y0)
@@ -276,14 +289,16 @@ def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, shel
     raised = raised * seen
     colour = torch.where(seen, goal - (1.0 - raised) * behind, torch.zeros_like(goal))
     values = torch.cat([colour, raised[None]])
-    if bool(seen.all()) or not bool(seen.any()):
+    solid = seen & (raised > 0.5)
+    if bool(seen.all()) or not bool(solid.any()):
         return replace(matte, values=values)
-    distance, nearest = scipy.ndimage.distance_transform_edt(~seen.numpy(), return_indices=True)
-    index = torch.from_numpy(np.ascontiguousarray(nearest))
-    continued = values[:, index[0], index[1]]
+    found = scipy.ndimage.distance_transform_edt(~solid.numpy(), return_indices=True)
+    distance, index = (torch.from_numpy(np.ascontiguousarray(part)) for part in found)  # type: ignore[union-attr]
+    straight = (colour / raised.clamp(min=0.5))[:, index[0], index[1]]
     rect = (matte.x0, matte.y0, matte.x0 + w, matte.y0 + h)
-    carried = texture.crop_of(shell, rect, (image.shape[1], image.shape[2]))[0] > 0
-    use = (torch.from_numpy(distance) <= _EXTENSION_PX) & _window(nearer[None], matte)[0] & carried & ~seen
+    filled = texture.crop_of(coverage, rect, (image.shape[1], image.shape[2])).to(values)
+    continued = torch.cat([straight * filled, filled])
+    use = (distance <= _EXTENSION_PX) & _window(nearer[None], matte)[0] & ~seen
     return replace(matte, values=torch.where(use, continued, values))
 
 

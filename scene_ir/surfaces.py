@@ -19,8 +19,9 @@ from scene_ir.raster import verbs
 from scene_ir.types import Camera, Mesh, Part
 
 CREASE_RAD = 0.7
-"""Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling tools."""
-SHADOW_MARGIN_M = 1.0
+"""Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling
+tools."""
+SHADOW_MARGIN_M = 0.8
 """How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
 SUN_OFFSET_MAX_M = 2.2
 """Longest cast shadow that is kept: beyond it the penumbra of a low sun is too faint to be worth its pixels."""
@@ -32,8 +33,9 @@ _WELD = 1e-5
 class Surface:
     """A mesh made ready to draw, sharp edges split.
 
-    unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its mirror
-    image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0, 1].
+    unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its
+    mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0,
+    1].
     """
 
     unit: Tensor
@@ -68,13 +70,15 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
     kinds = part.cpu()
     tensors = (
         unit, new_faces, lattice_weights(unit), lattice_weights(mirror), torch.as_tensor(weld)[origin],
-        grey[origin].to(dtype), _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
+        grey[origin].to(dtype),
+        _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
     )  # fmt: skip
     return Surface(*(t.to(vertices.device) for t in tensors))
 
 
 def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Unit normals (3F, 3) of the corners: area-weighted over the faces around the point that bend less than a crease."""
+    """Unit normals (3F, 3) of the corners: area-weighted over the faces around the point that bend less than a
+    crease."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     area = np.cross(b - a, c - a)
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-20)
@@ -105,8 +109,8 @@ def _share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
 class Fleet:
     """The surfaces of N objects, one after the other.
 
-    owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into the
-    V vertices; colours (V, 3); paint, glass (V,).
+    owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into
+    the V vertices; colours (V, 3); paint, glass (V,).
     """
 
     surfaces: tuple[Surface, ...]
@@ -145,7 +149,8 @@ class Fleet:
         )
 
     def local(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
-        """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right swapped."""
+        """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right
+        swapped."""
         parts = []
         for i, surface in enumerate(self.surfaces):
             if mirrored:
@@ -156,7 +161,8 @@ class Fleet:
         return torch.cat(parts) if parts else ffd.new_zeros(0, 3)
 
     def normals(self, local: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones, along which a proxy cannot crack."""
+        """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones, along which a proxy cannot
+        crack."""
         sharp, smooth = [], []
         for surface, (start, end) in zip(self.surfaces, self.vertex_ranges.tolist(), strict=True):
             points = local[start:end]
@@ -168,9 +174,13 @@ class Fleet:
             return local, local
         return torch.cat(sharp), torch.cat(smooth)
 
+    def spread(self, values: Tensor) -> Tensor:
+        """Values (N, ...) of the objects at their vertices (V, ...)."""
+        return values.index_select(0, self.owner)
+
     def place(self, local: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
         """Camera-space points (V, 3) m of local ones. yaw (N,) rad; translation (N, 3) m."""
-        return rotate(local, yaw[self.owner]) + translation[self.owner]
+        return rotate(local, self.spread(yaw)) + self.spread(translation)
 
 
 def rotate(local: Tensor, yaw: Tensor) -> Tensor:
@@ -192,7 +202,8 @@ def camera_centre(matrix: Tensor) -> Tensor:
 
 
 def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
-    """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun (3,)."""
+    """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun
+    (3,)."""
     away = -sun / (-sun[1]).clamp(min=0.3)
     world = torch.stack([away[0].expand_as(yaw), torch.zeros_like(yaw), away[2].expand_as(yaw)], dim=-1)
     offset = rotate(world, -yaw)[:, [0, 2]] * height_m[:, None]
@@ -210,7 +221,8 @@ def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
 
 
 def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: Tensor) -> Tensor:
-    """Points (4N, 3) m, on planes parallel to the ground through the objects' feet, of (N, 4, 2) m local (x, z)."""
+    """Points (4N, 3) m, on planes parallel to the ground through the objects' feet, of (N, 4, 2) m local (x,
+    z)."""
     flat = torch.stack([corners[..., 0], torch.zeros_like(corners[..., 0]), corners[..., 1]], dim=-1).reshape(
         -1, 3
     )
@@ -223,8 +235,9 @@ def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: T
 def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
     """How dark (T,) in [0, 1] a box-like vehicle makes the ground at (x, z) (T, 2) m of its frame; smooth.
 
-    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point. The contact shadow under the body fades over
-    some tens of centimetres; the cast one is that of a box tapering to the roof, moved along the sun's offset.
+    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point. The contact shadow under the body fades
+    over some tens of centimetres; the cast one is that of a box tapering to the roof, moved along the sun's
+    offset.
     """
     half = size_lhw[:, [0, 2]] / 2
 
@@ -245,10 +258,11 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
 def crop_rects(
     clip: Tensor, faces: Tensor, vertex_ranges: Tensor, face_ranges: Tensor, camera: Camera, margin: int = 2
 ) -> Tensor:
-    """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near plane.
+    """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near
+    plane.
 
-    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2). A draw wholly behind the camera or beside the image
-    has an empty rectangle.
+    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2). A draw wholly behind the camera or beside the
+    image has an empty rectangle.
     """
     points = clip.detach().to("cpu", torch.float64)
     triangles = faces.cpu()

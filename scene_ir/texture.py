@@ -18,13 +18,17 @@ from scene_ir.raster import verbs
 from scene_ir.types import Crop, Source
 
 DEPTH_TOLERANCE_M = (0.25, 0.6)
-"""A point this much behind the photographed surface begins to be, and is, unseen: thicker than a mirror or a seat."""
+"""A point this much behind the photographed surface begins to be, and is, unseen: thicker than a mirror or a
+seat."""
 TURN_TOLERANCE = (0.08, 0.25)
 """Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
 OPEN_TURN = (0.02, 0.1)
 """Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
+OUTLINE_TURN = (0.1, 0.25)
+"""Change of that cosine at which a point begins to leave, and has left, the outline."""
 OUTLINE_PX = (1.0, 2.2)
-"""Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the inside."""
+"""Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the
+inside."""
 HIDDEN_PX = (1.0, 3.0)
 """Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
 CHANNELS = 7
@@ -68,7 +72,8 @@ class Texels:
         )
 
     def sample(self, uv: Tensor, counts: Tensor, backend: verbs.Backend, border: verbs.Border) -> Tensor:
-        """Catmull-Rom lookups (R, C) at uv (R, 2) px of the frame, the rows grouped by object, counts (N,) of each."""
+        """Catmull-Rom lookups (R, C) at uv (R, 2) px of the frame, the rows grouped by object, counts (N,) of
+        each."""
         zero = torch.zeros_like(counts)
         layout = verbs.Layout.of(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
         return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
@@ -118,7 +123,8 @@ def source_texels(
 
 
 def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
-    """(H, W) in [0, 1]: 1 well inside the mattes Crop (1, h, w) of nearer objects, 0 wherever they are transparent.
+    """(H, W) in [0, 1]: 1 well inside the mattes Crop (1, h, w) of nearer objects, 0 wherever they are
+    transparent.
 
     It depends on where the mattes are above 0 only, not on their values, which the solution raises as it goes.
     """
@@ -137,10 +143,18 @@ def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
 def facing_weight(turned: Tensor, cos_source: Tensor) -> Tensor:
     """1 where a texel was seen squarely enough for how squarely it is shown now, 0 where it would smear.
 
-    turned: cosine towards the camera now minus then; cos_source: then. Exactly 1, with zero slope, where nothing turned.
+    turned: cosine towards the camera now minus then; cos_source: then. Exactly 1, with zero slope, where nothing
+    turned.
     """
     positive = 0.5 * (cos_source + (cos_source.square() + 1e-4).sqrt())
     return 1.0 - smoothstep(turned - positive, *TURN_TOLERANCE)
+
+
+def outline_weight(turned: Tensor) -> Tensor:
+    """1 where a point of the outline still is one, 0 where it turned away or towards the camera; 1 where turned is
+    0."""
+    low, high = OUTLINE_TURN
+    return 1.0 - smoothstep(turned.square(), low * low, high * high)
 
 
 def inside_weight(uv: Tensor, height: int, width: int) -> Tensor:
@@ -155,9 +169,10 @@ def apply_texture_code(
 ) -> Tensor:
     """Premultiplied colours (R, 3) with the paint changed; untouched bits where the code is 0.
 
-    opacity (R,); code (R, 5): lightness, a*, b*, gloss, dirt in (-1, 1); paint (R,): how much of the pixel is paint;
-    height (R,): 0 at the foot of the vehicle, 1 at its roof (dirt gathers low); base_lightness (R,): CIE L* of the
-    paint, about which gloss turns contrast. The change is f(colour, code) - f(colour, 0): zero at 0, its slope is not.
+    opacity (R,); code (R, 5): lightness, a*, b*, gloss, dirt in (-1, 1); paint (R,): how much of the pixel is
+    paint; height (R,): 0 at the foot of the vehicle, 1 at its roof (dirt gathers low); base_lightness (R,): CIE L*
+    of the paint, about which gloss turns contrast. The change is f(colour, code) - f(colour, 0): zero at 0, its
+    slope is not.
     """
     index = ((paint > 0.0) & (opacity > 0.0)).nonzero()[:, 0]
     if index.numel() == 0:
@@ -207,8 +222,9 @@ _GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90),
 def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height: Tensor, sun: Tensor) -> Tensor:
     """Daylight on a vehicle's own colours: RGB (R, 3), the template's look where no photograph helps.
 
-    normal, to_eye (R, 3) unit; albedo (R, 3); sheen (R, 2): paint, glass in [0, 1]; height (R,) 0 at the foot, 1 at the
-    roof; sun (3,) unit. Sky dome and ground bounce, a sun with a highlight, and a Fresnel reflection of a plain sky.
+    normal, to_eye (R, 3) unit; albedo (R, 3); sheen (R, 2): paint, glass in [0, 1]; height (R,) 0 at the foot, 1
+    at the roof; sun (3,) unit. Sky dome and ground bounce, a sun with a highlight, and a Fresnel reflection of a
+    plain sky.
     """
     up = -normal[:, 1]
     dome = 0.5 + 0.5 * up

@@ -13,7 +13,7 @@ import argparse
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from detectors.training import LOG, Sample, TrainingSettings, train
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.data.classes import KITTI
 from drivesem.data.kitti import KittiDataset
+from drivesem.evaluation.coco import Scores, evaluate
 from scene_ir import files
 from scene_ir.types import Labels
 
@@ -115,43 +116,36 @@ class FrameStore(Sequence[Sample]):
 
 @dataclass(frozen=True)
 class Marks:
-    """Average precision at IoU 0.5 and number of objects by class; best F1 over all classes and its score."""
+    """pycocotools' figures, and the best F1 over all classes with its score."""
 
-    ap50: dict[str, float]
-    recall: dict[str, float]
-    objects: dict[str, int]
+    scores: Scores
     f1: float
     t_star: float
 
+    @property
+    def mark(self) -> float:
+        """What checkpoints are chosen by: Car's AP50, and a quarter of the mean over classes."""
+        return (self.scores.headline.ap50 or 0.0) + 0.25 * (self.scores.overall.ap50 or 0.0)
+
     def summary(self) -> str:
-        rows = [f"{n} AP50 {self.ap50[n]:.4f} recall {self.recall[n]:.4f} ({self.objects[n]})" for n in self.ap50]
+        rows = [
+            f"{name} AP50 {s.ap50:.4f} recall {s.recall:.4f} ({s.objects})"
+            for name, s in self.scores.per_class.items()
+            if s.objects
+        ]
         return ", ".join(rows) + f", F1 {self.f1:.4f} at {self.t_star:.3f}"
 
 
 def judge(found: Sequence[Detections], wanted: Sequence[Targets]) -> Marks:
-    """COCO's matching at IoU 0.5 (101 points), with ignored boxes as KITTI has them."""
-    ap50, recall, objects, pooled = {}, {}, {}, []
-    for label, name in enumerate(CLASSES):
-        outcomes = [_outcomes(d, t, label) for d, t in zip(found, wanted, strict=True)]
-        rows = np.concatenate(outcomes)
-        count = sum(int(((t.labels == label) & ~t.ignore).sum()) for t in wanted)
-        order = np.argsort(-rows[:, 0], kind="stable")
-        hits = np.cumsum(rows[order, 1])
-        reached = hits / max(count, 1)
-        precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
-        samples = np.searchsorted(reached, np.linspace(0, 1, 101))
-        ap50[name] = float(np.mean([precision[i] if i < len(precision) else 0.0 for i in samples]))
-        recall[name] = float(reached[-1]) if len(reached) else 0.0
-        objects[name] = count
-        pooled.append(rows)
-    rows = np.concatenate(pooled)
+    """Figures of detections in images, and the score at which F1 over all classes is best."""
+    outcomes = [_outcomes(d, t, k) for d, t in zip(found, wanted, strict=True) for k in range(len(CLASSES))]
+    rows = np.concatenate(outcomes)
     rows = rows[np.argsort(-rows[:, 0], kind="stable")]
     hits = np.cumsum(rows[:, 1])
-    f1 = 2 * hits / (np.arange(1, len(rows) + 1) + sum(objects.values()))
-    best = int(np.argmax(f1)) if len(f1) else 0
-    return Marks(
-        ap50, recall, objects, float(f1[best]) if len(f1) else 0.0, float(rows[best, 0]) if len(f1) else 0.5
-    )
+    f1 = 2 * hits / (np.arange(1, len(rows) + 1) + sum(int((~t.ignore).sum()) for t in wanted))
+    best = int(np.argmax(f1)) if len(f1) else -1
+    f1, t_star = (float(f1[best]), float(rows[best, 0])) if len(f1) else (0.0, 0.5)
+    return Marks(evaluate(wanted, found, CLASSES, t_star), f1, t_star)
 
 
 def _outcomes(found: Detections, wanted: Targets, label: int) -> np.ndarray:
@@ -233,10 +227,9 @@ class Keeper:
         indices = range(0, len(self.store), self.arguments.thin)
         marks = judge(detect(detector, self.store, indices), [self.wanted[i] for i in indices])
         print(f"step {step}: {marks.summary()}", flush=True)
-        mark = marks.ap50["Car"] + 0.25 * float(np.mean(list(marks.ap50.values())))
-        if mark >= self.best:
-            self.best = mark
-            self.best_path.write_text(json.dumps({"mark": mark, "step": step}))
+        if marks.mark >= self.best:
+            self.best = marks.mark
+            self.best_path.write_text(json.dumps({"mark": marks.mark, "step": step}))
             self.export(detector, step)
 
     def export(self, detector: Detector, step: int) -> None:
@@ -244,8 +237,8 @@ class Keeper:
         out: Path = self.arguments.out
         marks = judge(detect(detector, self.store, range(len(self.store))), self.wanted)
         detector.t_star = marks.t_star
-        figures = {name: round(value, 4) for name, value in marks.ap50.items()}
-        save_detector(detector, out, {"step": str(step), "ap50": json.dumps(figures), "f1": f"{marks.f1:.4f}"})
+        figures = json.dumps(asdict(marks.scores.headline))
+        save_detector(detector, out, {"step": str(step), "car": figures, "f1": f"{marks.f1:.4f}"})
         files.write_text(out.with_suffix(".md"), self.card(detector, step, marks))
         print(f"step {step}: exported {out}: {marks.summary()}", flush=True)
 
@@ -253,13 +246,15 @@ class Keeper:
         arguments, also = self.arguments, ""
         if self.also is not None:
             wanted = [judged_targets(labels) for labels in self.also.labels]
-            real = judge(detect(detector, self.also, range(len(self.also))), wanted)
+            real = judge(detect(detector, self.also, range(len(self.also))), wanted).scores.headline
             also = f"\n{len(self.also)} real frames of KITTI, never trained or tuned on, judged in the same way: "
-            also += (
-                f"Car AP50 {real.ap50['Car']:.3f}, recall {real.recall['Car']:.3f} ({real.objects['Car']} cars).\n"
-            )
-        rows = ["| class | objects | AP50 | recall at the lowest score |", "| --- | --- | --- | --- |"]
-        rows += [f"| {n} | {marks.objects[n]} | {marks.ap50[n]:.4f} | {marks.recall[n]:.4f} |" for n in marks.ap50]
+            also += f"Car AP50 {real.ap50:.3f}, recall {real.recall:.3f} ({real.objects} cars).\n"
+        rows = ["| class | objects | AP50 | AP | recall | recall at t* |", "| --- | --- | --- | --- | --- | --- |"]
+        rows += [
+            f"| {name} | {s.objects} | {s.ap50:.4f} | {s.ap:.4f} | {s.recall:.4f} | {s.recall_at_t_star:.4f} |"
+            for name, s in marks.scores.per_class.items()
+            if s.objects
+        ]
         log = (arguments.run / LOG).read_text().splitlines()
         return CARD.format(
             parameters=sum(p.numel() for p in detector.parameters()),
@@ -308,6 +303,7 @@ def main() -> None:
         rate=arguments.rate,
         seed=arguments.seed,
         bfloat16=not arguments.no_bfloat16,
+        warmup_steps=60,
         checkpoint_every=50,
         evaluate_every=arguments.evaluate_every if arguments.held_out else 0,
     )

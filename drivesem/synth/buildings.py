@@ -18,7 +18,8 @@ _PLASTER = np.array(
 )  # fmt: skip
 """Linear albedo of plaster and brick in the colours of Central European streets."""
 _ROOFS = np.array(
-    [[0.17, 0.065, 0.045], [0.11, 0.055, 0.04], [0.07, 0.07, 0.075], [0.20, 0.10, 0.06], [0.05, 0.045, 0.045]], np.float32
+    [[0.17, 0.065, 0.045], [0.11, 0.055, 0.04], [0.07, 0.07, 0.075], [0.20, 0.10, 0.06], [0.05, 0.045, 0.045]],
+    np.float32,
 )
 
 
@@ -91,11 +92,13 @@ def _gable(length_m: float, depth_m: float, height: float, look: BuildingStyle, 
         uv = np.array([[ends[0], 0], [ends[1], 0], [ends[1], short * 0.65], [ends[0], short * 0.65]])
         normal = np.array([0, -short / 2, sign * rise])
         normal /= np.linalg.norm(normal)
-        roofs.append(
-            make(quad(points), Material.ROOF, look.roof, np.broadcast_to(normal, (2, 3, 3)), quad(uv))
-        )
+        roofs.append(make(quad(points), Material.ROOF, look.roof, np.broadcast_to(normal, (2, 3, 3)), quad(uv)))
         gable = np.array(
-            [[sign * long / 2, -height, short / 2], [sign * long / 2, -height, -short / 2], [sign * long / 2, high, 0]]
+            [
+                [sign * long / 2, -height, short / 2],
+                [sign * long / 2, -height, -short / 2],
+                [sign * long / 2, high, 0],
+            ]
         )
         normal = np.array([sign, 0.0, 0.0])
         gables.append(make(gable[None], Material.WALL, look.wall, np.broadcast_to(normal, (1, 3, 3))))

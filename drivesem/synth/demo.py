@@ -15,7 +15,7 @@ from drivesem.synth.frames import (
     SynthFrame,
     SynthSettings,
     Truth,
-    actors_alone,
+    boxes_alone,
     full_boxes,
     plan_frame,
     render_frame,
@@ -28,23 +28,15 @@ from scene_ir.meshes.templates import template
 from scene_ir.sources import solve_sources
 from scene_ir.types import LATTICE_POINTS, TEXTURE_DIM, Category, Crop, Objects, SceneIR
 
-_SETTINGS = SynthSettings(
-    layout=LayoutSettings(
-        variants=VARIANTS["heldout"],
-        people=False,
-        vehicles=(9, 14),
-        max_heavy=1,
-        kinds=("residential", "city", "arterial", "motorway", "country", "junction"),
-    ),
-    sunny=True,
-    tilt_rad=0.004,
-)
+_KINDS = ("residential", "city", "junction", "arterial", "residential", "motorway", "city", "arterial")
+"""Roads of the scenes, in turn."""
+_LAYOUT = LayoutSettings(variants=VARIANTS["heldout"], people=False, vehicles=(10, 18), max_heavy=1)
 _FEWEST, _MOST = 6, 10
 """Vehicles in a scene."""
 _CLEAR_CARS = 4
 _CLEAR_HEIGHT_PX = 30.0
-_LEAST_VISIBLE = 0.35
-_LEAST_HEIGHT_PX = 18.0
+_LEAST_VISIBLE = 0.5
+_LEAST_HEIGHT_PX = 26.0
 _MOST_SCREENED = 0.02
 """Share of a vehicle that poles and plants may hide: its matte would carry their outline along."""
 _ATTEMPTS = 400
@@ -52,12 +44,19 @@ _ATTEMPTS = 400
 
 def _fits(truth: Truth) -> bool:
     height, width = truth.box_xyxy[3] - truth.box_xyxy[1], truth.box_xyxy[2] - truth.box_xyxy[0]
-    return truth.visible >= _LEAST_VISIBLE and height >= _LEAST_HEIGHT_PX and width >= 12 and truth.truncation < 0.7
+    return (
+        truth.visible >= _LEAST_VISIBLE and height >= _LEAST_HEIGHT_PX and width >= 12 and truth.truncation < 0.45
+    )
 
 
 def _clear(truth: Truth) -> bool:
     height = truth.box_xyxy[3] - truth.box_xyxy[1]
-    return truth.actor.label == "Car" and truth.occlusion <= 1 and height >= _CLEAR_HEIGHT_PX and truth.truncation < 0.3
+    return (
+        truth.actor.label == "Car"
+        and truth.occlusion <= 1
+        and height >= _CLEAR_HEIGHT_PX
+        and truth.truncation < 0.3
+    )
 
 
 def _thinned(plan: Plan) -> Plan | None:
@@ -70,7 +69,7 @@ def _thinned(plan: Plan) -> Plan | None:
     for _ in range(4):
         if len(plan.actors) < _FEWEST:
             return None
-        truths = actors_alone(plan)
+        truths = boxes_alone(plan)
         kept = [t for t in truths if _fits(t)]
         kept = sorted(sorted(kept, key=lambda t: (t.translation[2], t.index))[:_MOST], key=lambda t: t.index)
         if len(kept) < _FEWEST or sum(map(_clear, kept)) < _CLEAR_CARS:
@@ -84,7 +83,7 @@ def _thinned(plan: Plan) -> Plan | None:
 def _accepted(truths: Sequence[Truth], count: int) -> bool:
     return (
         len(truths) == count
-        and all(t.screened <= _MOST_SCREENED and t.visible >= 0.3 for t in truths)
+        and all(t.screened <= _MOST_SCREENED and t.visible >= _LEAST_VISIBLE for t in truths)
         and sum(map(_clear, truths)) >= _CLEAR_CARS
     )
 
@@ -97,13 +96,15 @@ def demo_scene(seed: int, index: int) -> SceneIR:
     """
     if index < 0:
         raise RangeError("demo scene", "an index of at least 0", index)
+    layout = replace(_LAYOUT, kinds=(_KINDS[index % len(_KINDS)],))
+    settings = SynthSettings(layout, sunny=True, tilt_rad=0.004)
     for attempt in range(_ATTEMPTS):
-        plan = _thinned(plan_frame(seed, index, "heldout", _SETTINGS, attempt))
+        plan = _thinned(plan_frame(seed, index, "heldout", settings, attempt))
         if plan is None:
             continue
         count = len(plan.actors)
-        frame = render_frame(plan, lambda truths, count=count: _accepted(truths, count))
-        if frame.background is not None:
+        frame = render_frame(plan, True, lambda truths, count=count: _accepted(truths, count))
+        if frame is not None:
             return take_apart(frame, f"demo-{index:03d}")
     raise RangeError(f"demo scene {index} of seed {seed}", f"a street within {_ATTEMPTS} attempts", "none")
 
@@ -231,5 +232,7 @@ def _influence(truth: Truth, point: np.ndarray, sun: np.ndarray) -> np.ndarray:
     one, two = (low - local) / safe, (high - local) / safe
     enters, leaves = np.minimum(one, two).max(axis=1), np.maximum(one, two).min(axis=1)
     blocked = (leaves > np.maximum(enters, 0)).astype(float)
-    outside = np.hypot(np.maximum(np.abs(local[:, 0]) - length / 2, 0), np.maximum(np.abs(local[:, 2]) - width / 2, 0))
+    outside = np.hypot(
+        np.maximum(np.abs(local[:, 0]) - length / 2, 0), np.maximum(np.abs(local[:, 2]) - width / 2, 0)
+    )
     return blocked + 0.6 * np.exp(-outside / (0.25 * height)) * (outside < 2 * height)

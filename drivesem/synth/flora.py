@@ -34,7 +34,9 @@ def leaves(
     one /= np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-6)
     two = np.cross(facing, one)
     reach = size_m * rng.uniform(0.55, 1.35, (n, 1))
-    corners = points[:, None] + np.stack([one, -0.5 * one + 0.87 * two, -0.5 * one - 0.87 * two], 1) * reach[:, None]
+    corners = (
+        points[:, None] + np.stack([one, -0.5 * one + 0.87 * two, -0.5 * one - 0.87 * two], 1) * reach[:, None]
+    )
     shade = outward * 0.75 + facing * 0.45
     shade /= np.linalg.norm(shade, axis=1, keepdims=True)
     soup = make(corners, Material.LEAF, colour, np.repeat(shade[:, None], 3, axis=1))
@@ -61,7 +63,7 @@ def _crown(
     return [*cores, leaves(points[keep], outward[keep], size_m, colour, rng)]
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=96)
 def tree(identifier: int, detail: int) -> Soup:
     """A tree about its trunk's foot, 1 m of height a metre (scale it): total height 1.
 
@@ -100,7 +102,7 @@ def tree(identifier: int, detail: int) -> Soup:
     return join(parts)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def bush(identifier: int, detail: int) -> Soup:
     """A bush standing on the ground, about 1 m wide and high (scale it)."""
     rng = np.random.default_rng([0xB05, identifier])
@@ -123,16 +125,36 @@ def hedge(length_m: float, height_m: float, depth_m: float, detail: int, rng: np
     points, outward = [], []
     for sign in (-1.0, 1.0):
         n = int(area_side * density)
-        points.append(np.stack([rng.uniform(-0.5, 0.5, n) * length_m, -rng.uniform(0, 1, n) * height_m,
-                                np.full(n, sign * depth_m / 2)], axis=1))
+        points.append(
+            np.stack(
+                [
+                    rng.uniform(-0.5, 0.5, n) * length_m,
+                    -rng.uniform(0, 1, n) * height_m,
+                    np.full(n, sign * depth_m / 2),
+                ],
+                axis=1,
+            )
+        )
         outward.append(np.tile([0.0, -0.15, sign], (n, 1)))
         n = int(depth_m * height_m * density)
-        points.append(np.stack([np.full(n, sign * length_m / 2), -rng.uniform(0, 1, n) * height_m,
-                                rng.uniform(-0.5, 0.5, n) * depth_m], axis=1))
+        points.append(
+            np.stack(
+                [
+                    np.full(n, sign * length_m / 2),
+                    -rng.uniform(0, 1, n) * height_m,
+                    rng.uniform(-0.5, 0.5, n) * depth_m,
+                ],
+                axis=1,
+            )
+        )
         outward.append(np.tile([sign, -0.15, 0.0], (n, 1)))
     n = int(area_top * density)
-    points.append(np.stack([rng.uniform(-0.5, 0.5, n) * length_m, np.full(n, -height_m),
-                            rng.uniform(-0.5, 0.5, n) * depth_m], axis=1))
+    points.append(
+        np.stack(
+            [rng.uniform(-0.5, 0.5, n) * length_m, np.full(n, -height_m), rng.uniform(-0.5, 0.5, n) * depth_m],
+            axis=1,
+        )
+    )
     outward.append(np.tile([0.0, -1.0, 0.0], (n, 1)))
     spots = np.concatenate(points)
     spots += rng.normal(0, 0.05, spots.shape)
@@ -174,6 +196,12 @@ def tree_line(start: np.ndarray, end: np.ndarray, height_m: float, rng: np.rando
     where = rng.uniform(0, columns, n)
     cell = np.minimum(where.astype(int), columns - 1)
     height = top[cell] * (1 - rng.random(n) ** 1.4)
-    spots = np.stack([np.interp(where, np.arange(columns + 1), foot[:, 0]), -height,
-                      np.interp(where, np.arange(columns + 1), foot[:, 1])], axis=1)
+    spots = np.stack(
+        [
+            np.interp(where, np.arange(columns + 1), foot[:, 0]),
+            -height,
+            np.interp(where, np.arange(columns + 1), foot[:, 1]),
+        ],
+        axis=1,
+    )
     return join([wall, leaves(spots, normal + rng.normal(0, 0.5, (n, 3)), 1.0, colour, rng)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,16 +20,18 @@ from drivesem.synth.light import draw_light, draw_response
 from drivesem.synth.noise import noise_set
 from drivesem.synth.render import (
     SUPERSAMPLING,
-    Picture,
     Setting,
     Shadow,
+    Sight,
     View,
     blocks,
     fine_matrix,
     rasterise,
     render,
+    render_without_actors,
+    see,
 )
-from drivesem.synth.soup import Material, Soup, join
+from drivesem.synth.soup import Material, Soup, box, join, placed
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
@@ -113,7 +115,9 @@ def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
     pitch, roll = rng.normal(0, settings.tilt_rad), rng.normal(0, settings.tilt_rad * 0.5)
     tilt = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
     lean = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    return View(Camera(k, height, width, projection), lean @ tilt, fitted.camera_height_m + float(rng.normal(0, 0.03)))
+    return View(
+        Camera(k, height, width, projection), lean @ tilt, fitted.camera_height_m + float(rng.normal(0, 0.03))
+    )
 
 
 def _into_camera(soup: Soup, view: View) -> Soup:
@@ -234,7 +238,7 @@ def _share(material: np.ndarray, chosen: tuple[Material, ...]) -> torch.Tensor:
     return torch.from_numpy(sum(table[p] for p in parts) / np.float32(len(parts)))
 
 
-def _environment(picture: Picture, setting: Setting) -> Environment:
+def _environment(sight: Sight, setting: Setting) -> Environment:
     view = setting.view
     up = view.up
     return Environment(
@@ -242,9 +246,9 @@ def _environment(picture: Picture, setting: Setting) -> Environment:
         foliage=torch.zeros(3),
         sun=torch.tensor(setting.light.sun, dtype=torch.float32),
         ground=torch.tensor([*up, view.height_m], dtype=torch.float32),
-        sky=_share(picture.material, (Material.SKY,)),
-        foliage_map=_share(picture.material, (Material.LEAF, Material.GRASS)),
-        road=_share(picture.material, (Material.ROAD, Material.PARKING)),
+        sky=_share(sight.material, (Material.SKY,)),
+        foliage_map=_share(sight.material, (Material.LEAF, Material.GRASS)),
+        road=_share(sight.material, (Material.ROAD, Material.PARKING)),
     )
 
 
@@ -262,7 +266,6 @@ class Plan:
     actors: tuple[Actor, ...]
     setting: Setting
     split: str
-    surroundings_seed: np.random.Generator
 
 
 def plan_frame(
@@ -270,23 +273,23 @@ def plan_frame(
 ) -> Plan:
     """What frame `index` of the stream `seed` will show; see `generate_frame`."""
     settings = settings or SynthSettings()
-    rng = [stream(seed, index, split, 16 * attempt + i) for i in range(5)]
+    rng = [stream(seed, index, split, 16 * attempt + i) for i in (0, 1, 2, 4)]
     layout = settings.layout or LayoutSettings(variants=VARIANTS[split])
     view = _camera(rng[0], settings)
     road = plan_road(rng[1], layout.kinds)
     actors = place_vehicles(rng[1], road, layout)
     if layout.people:
         actors += place_people(rng[2], road, actors)
-    light = draw_light(rng[4], view.up, settings.sunny)
+    light = draw_light(rng[3], view.up, settings.sunny)
     setting = Setting(
         view=view,
         road=road,
         light=light,
-        response=draw_response(rng[4], light.weather),
+        response=draw_response(rng[3], light.weather),
         noise=noise_set(SPLITS.index(split)),
         grain_seed=(seed, index, SPLITS.index(split), attempt),
     )
-    return Plan(tuple(actors), setting, split, rng[3])
+    return Plan(tuple(actors), setting, split)
 
 
 def actor_soups(plan: Plan) -> list[Soup]:
@@ -294,56 +297,76 @@ def actor_soups(plan: Plan) -> list[Soup]:
     return [_place_actor(a, i + 1, plan.setting.view) for i, a in enumerate(plan.actors)]
 
 
-def actors_alone(plan: Plan) -> list[Truth]:
-    """Ground truth as if nothing but the actors stood in the world: what they hide of one another."""
-    view, n = plan.setting.view, SUPERSAMPLING
-    soups = actor_soups(plan)
-    if not soups:
+def boxes_alone(plan: Plan) -> list[Truth]:
+    """Roughly what the actors hide of one another: ground truth as if only their boxes stood in the world."""
+    view = plan.setting.view
+    if not plan.actors:
         return []
-    world = join(soups)
-    size = (n * view.camera.height, n * view.camera.width)
-    rect = np.array([[0, 0, size[1], size[0]]])
-    face, _ = rasterise(world.corners, fine_matrix(view), rect, np.array([[0, len(world)]]))
-    owner = np.where(face >= 0, world.owner[np.maximum(face, 0)], -1).reshape(size)
-    return measure(plan.actors, soups, owner, view)
+    soups = []
+    for i, actor in enumerate(plan.actors):
+        soup = placed(box(actor.size_lhw, Material.FLAT, (0.5, 0.5, 0.5)), (0, 0, 0), actor.yaw, (1, 1, 1))
+        corners = (soup.corners + (_stand(actor, view) - view.centre)).astype(np.float32)
+        soups.append(replace(soup, corners=corners, owner=np.full(len(soup), i + 1, np.int32)))
+    return measure(plan.actors, soups, see(join(soups), view).owner, view)
 
 
-def render_frame(plan: Plan, background_if: Callable[[Sequence[Truth]], bool] | None = None) -> SynthFrame:
-    """Render a plan; also the street without its actors and their shadows if `background_if` says so of the truths."""
+def render_frame(
+    plan: Plan, with_background: bool = False, accept: Callable[[Sequence[Truth]], bool] | None = None
+) -> SynthFrame | None:
+    """Render a plan; with_background: also the street without its actors and their shadows. None where `accept` is given
+    and turns the truths down, which is known before anything is shaded."""
     setting, view = plan.setting, plan.setting.view
-    static, used = surroundings(setting.road, POOLS[plan.split], plan.surroundings_seed)
+    seed, index, _, attempt = setting.grain_seed
+    static, used = surroundings(setting.road, POOLS[plan.split], stream(seed, index, plan.split, 16 * attempt + 3))
     street = _into_camera(static, view)
     soups = actor_soups(plan)
     shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
-    picture = render(join([street, *soups]), shadows, setting)
-    truths = measure(plan.actors, soups, picture.owner, view)
-    empty = render(street, [], setting) if background_if is not None and background_if(truths) else None
+    world = join([street, *soups])
+    sight = see(world, view)
+    truths = measure(plan.actors, soups, sight.owner, view)
+    if accept is not None and not accept(truths):
+        return None
+    picture = render(sight, world, shadows, setting)
+    plain = see(street, view) if with_background else None
+    empty = None if plain is None else render_without_actors(plain, picture, setting)
+    behind = plain or sight
     vehicles = {f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")}
-    seed, index, _, attempt = setting.grain_seed
     return SynthFrame(
         image=picture.image,
         background=None if empty is None else empty.image,
-        background_depth_m=None if empty is None else empty.depth_m,
+        background_depth_m=None if plain is None else plain.depth_m,
         labels=_labels(truths),
         truths=tuple(truths),
-        depth_m=picture.depth_m,
-        owner=picture.owner,
-        ground_material=blocks((empty or picture).material)[0],
+        depth_m=sight.depth_m,
+        owner=sight.owner,
+        ground_material=blocks(behind.material)[0],
         setting=setting,
-        environment=_environment(empty or picture, setting),
+        environment=_environment(behind, setting),
         manifest={
-            "seed": seed, "index": index, "split": plan.split, "attempt": attempt, "road": setting.road.kind,
-            "weather": setting.light.weather, "vehicles": sorted(vehicles), **used,
+            "seed": seed,
+            "index": index,
+            "split": plan.split,
+            "attempt": attempt,
+            "road": setting.road.kind,
+            "weather": setting.light.weather,
+            "vehicles": sorted(vehicles),
+            **used,
         },  # fmt: skip
     )
 
 
 def generate_frame(
-    seed: int, index: int, split: str = "train", settings: SynthSettings | None = None, with_background: bool = False
+    seed: int,
+    index: int,
+    split: str = "train",
+    settings: SynthSettings | None = None,
+    with_background: bool = False,
 ) -> SynthFrame:
     """Frame `index` of the stream `seed` of a split ("train" or "heldout"): same arguments, same bytes.
 
     with_background: also render the street without its actors and their shadows. Raises RangeError for an unknown
     split.
     """
-    return render_frame(plan_frame(seed, index, split, settings), (lambda _: True) if with_background else None)
+    frame = render_frame(plan_frame(seed, index, split, settings), with_background)
+    assert frame is not None
+    return frame

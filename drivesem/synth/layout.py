@@ -125,7 +125,9 @@ class Road:
     def point(self, d: np.ndarray | float, s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """World (x, z) of road coordinates; arrays broadcast."""
         heading = self.curvature * np.asarray(s, float)
-        return self.curvature * np.square(s) / 2 + np.asarray(d) * np.cos(heading), s - np.asarray(d) * np.sin(heading)
+        return self.curvature * np.square(s) / 2 + np.asarray(d) * np.cos(heading), s - np.asarray(d) * np.sin(
+            heading
+        )
 
     def yaw(self, s: float, direction: int) -> float:
         """KITTI yaw of a car driving along (+1) or against (-1) the road at s, or standing across it (0)."""
@@ -217,8 +219,16 @@ def _street(rng: np.random.Generator, kind: str, crossing: tuple[float, float] |
     if not busy and rng.random() < 0.5:
         markings += [Marking(left + 0.1, 0.12, 1.0, 1.0), Marking(right - 0.1, 0.12, 1.0, 1.0)]
     curvature = 0.0 if crossing else float(rng.choice([0.0, 0.0, 0.0, 1.0]) * rng.normal(0, 0.0025))
-    return Road(kind, curvature, tuple(lanes), tuple(strips), tuple(markings), (edges[0], edges[1]),
-                tuple(pavements), crossing)
+    return Road(
+        kind,
+        curvature,
+        tuple(lanes),
+        tuple(strips),
+        tuple(markings),
+        (edges[0], edges[1]),
+        tuple(pavements),
+        crossing,
+    )
 
 
 def _open_road(rng: np.random.Generator, kind: str) -> Road:
@@ -227,7 +237,9 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
     own = {"arterial": 2, "motorway": int(rng.integers(2, 4)), "country": 1}[kind]
     ego = int(rng.integers(own))
     right = (own - ego - 0.5) * lane
-    median = {"arterial": float(rng.uniform(1.5, 7.0)), "motorway": float(rng.uniform(2.5, 4.0)), "country": 0.0}[kind]
+    median = {"arterial": float(rng.uniform(1.5, 7.0)), "motorway": float(rng.uniform(2.5, 4.0)), "country": 0.0}[
+        kind
+    ]
     inner = -(ego + 0.5) * lane
     other = inner - median
     left = other - own * lane
@@ -248,7 +260,9 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
         if kind == "arterial" and rng.random() < 0.6:
             kind_of_bank = Material.PAVEMENT
             bank += side * 1.5
-        strips.append(Strip(*sorted((edge, bank)), kind_of_bank, 0.1 if kind_of_bank == Material.PAVEMENT else 0.0))
+        strips.append(
+            Strip(*sorted((edge, bank)), kind_of_bank, 0.1 if kind_of_bank == Material.PAVEMENT else 0.0)
+        )
         strips.append(Strip(*sorted((bank, bank + side * 60)), Material.GRASS))
         edges.append(bank)
     solid = Marking(right, 0.15, 1.0, 1.0), Marking(left, 0.15, 1.0, 1.0)
@@ -262,8 +276,9 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
     else:
         markings.append(Marking(inner, 0.12, 1.0, 1.0) if rng.random() < 0.3 else Marking(inner, 0.12, *dash))
     bend = 0.0035 if kind == "country" else 0.0012
-    return Road(kind, float(rng.normal(0, bend)), tuple(lanes), tuple(strips), tuple(markings),
-                (edges[0], edges[1]), ())
+    return Road(
+        kind, float(rng.normal(0, bend)), tuple(lanes), tuple(strips), tuple(markings), (edges[0], edges[1]), ()
+    )
 
 
 def footprint(position_xz: tuple[float, float], yaw: float, size_lhw: tuple[float, float, float]) -> np.ndarray:
@@ -374,8 +389,18 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
             paint = _PAINTS[0]
         paint = np.clip(paint * rng.uniform(0.8, 1.15) * rng.uniform(0.93, 1.07, 3), 0.01, 0.85)
         yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
-        actors.append(Actor(kind, variant, (x, z), yaw, tuple(float(v) for v in size), tuple(map(float, paint)),
-                            lane.parked, int(rng.integers(2**31))))
+        actors.append(
+            Actor(
+                kind,
+                variant,
+                (x, z),
+                yaw,
+                tuple(float(v) for v in size),
+                tuple(map(float, paint)),
+                lane.parked,
+                int(rng.integers(2**31)),
+            )
+        )
         outlines.append(outline)
         heavy += kind in ("truck", "bus")
     return actors
@@ -389,8 +414,9 @@ def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor]) ->
         wanted = []
     outlines = [footprint(a.position_xz, a.yaw, a.size_lhw) for a in vehicles]
     outlines.append(footprint((0.0, 1.5), -np.pi / 2, (7.0, 2.0, 2.2)))
-    left, right = min(s.d0 for s in road.strips if s.material == Material.ROAD), max(
-        s.d1 for s in road.strips if s.material == Material.ROAD
+    left, right = (
+        min(s.d0 for s in road.strips if s.material == Material.ROAD),
+        max(s.d1 for s in road.strips if s.material == Material.ROAD),
     )
     actors = []
     for kind in wanted:

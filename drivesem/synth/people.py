@@ -26,7 +26,9 @@ def _limb(points: list[np.ndarray], radii: tuple[float, ...], albedo: np.ndarray
         stick(a, b, (r0, r1), Material.CLOTH, albedo, 6)
         for a, b, r0, r1 in zip(points[:-1], points[1:], radii[:-1], radii[1:], strict=True)
     ]
-    return parts + [ball(p, (r, r, r), Material.CLOTH, albedo, 0) for p, r in zip(points[1:], radii[1:], strict=True)]
+    return parts + [
+        ball(p, (r, r, r), Material.CLOTH, albedo, 0) for p, r in zip(points[1:], radii[1:], strict=True)
+    ]
 
 
 def _swing(top: np.ndarray, angles: tuple[float, float], lengths: tuple[float, float]) -> list[np.ndarray]:
@@ -73,7 +75,9 @@ def pedestrian(rng: np.random.Generator) -> Soup:
         parts += _limb(arm, (0.06, 0.048, 0.04), skin if bare else shirt)
         parts.append(ball(arm[-1], (0.05, 0.06, 0.04), Material.CLOTH, skin, 0))
     if rng.random() < 0.3:
-        parts.append(ball(shoulder + np.array([-0.16, 0.2, 0]), (0.11, 0.22, 0.15), Material.CLOTH, _pick(_CLOTH, rng)))
+        parts.append(
+            ball(shoulder + np.array([-0.16, 0.2, 0]), (0.11, 0.22, 0.15), Material.CLOTH, _pick(_CLOTH, rng))
+        )
     return join(parts)
 
 
@@ -81,7 +85,9 @@ def _wheel(centre: np.ndarray, radius: float) -> list[Soup]:
     rubber, steel = np.full(3, 0.02, np.float32), np.full(3, 0.35, np.float32)
     angle = np.linspace(0, 2 * np.pi, 15)
     rim = centre + np.stack([np.cos(angle) * radius, np.sin(angle) * radius, np.zeros(15)], axis=1)
-    parts = [stick(a, b, (0.022, 0.022), Material.CLOTH, rubber, 5) for a, b in zip(rim[:-1], rim[1:], strict=True)]
+    parts = [
+        stick(a, b, (0.022, 0.022), Material.CLOTH, rubber, 5) for a, b in zip(rim[:-1], rim[1:], strict=True)
+    ]
     spokes = rim[:-1:2]
     return parts + [stick(centre, s, (0.006, 0.006), Material.METAL, steel, 3) for s in spokes]
 
@@ -94,7 +100,9 @@ def bicycle(rng: np.random.Generator) -> Soup:
     bar = head + np.array([0.03, -0.18, 0])
     tubes = ((crank, seat), (crank, head), (seat, head), (seat, back), (crank, back), (bar, front))
     parts = [stick(a, b, (0.02, 0.02), Material.CLOTH, paint, 5) for a, b in tubes]
-    parts.append(stick(bar - [0.05, 0, 0.26], bar + [-0.05, 0, 0.26], (0.015, 0.015), Material.CLOTH, paint * 0.2, 5))
+    parts.append(
+        stick(bar - [0.05, 0, 0.26], bar + [-0.05, 0, 0.26], (0.015, 0.015), Material.CLOTH, paint * 0.2, 5)
+    )
     parts.append(ball(seat - [0, 0.06, 0], (0.13, 0.035, 0.07), Material.CLOTH, np.full(3, 0.02, np.float32), 1))
     return join([*parts, *_wheel(back, 0.33), *_wheel(front, 0.33)])
 
@@ -113,7 +121,9 @@ def cyclist(rng: np.random.Generator) -> Soup:
         bend = np.sqrt(max(0.44**2 - float(((foot - start) ** 2).sum()) / 4, 0.0025))
         knee = middle + bend * np.array([0.9, -0.35, 0.0])
         parts += _limb([start, knee, foot], (0.09, 0.065, 0.045), trousers)
-        parts.append(ball(foot + np.array([0.05, 0.02, 0]), (0.12, 0.045, 0.045), Material.CLOTH, trousers * 0.3, 1))
+        parts.append(
+            ball(foot + np.array([0.05, 0.02, 0]), (0.12, 0.045, 0.045), Material.CLOTH, trousers * 0.3, 1)
+        )
         hand = np.array([0.35, -1.0, side * 0.24])
         start = shoulder + np.array([0, 0, side * 0.19])
         elbow = (start + hand) / 2 + np.array([-0.02, 0.1, side * 0.04])

@@ -78,15 +78,41 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
+class SunMaps:
+    """Depth along the sun's rays: (views, 2, texels, texels); the second axis is surroundings, actors."""
+
+    rows: np.ndarray
+    depth: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
-    """A render. image (H, W, 3) uint8; depth_m (H, W) float32, inf in the sky, of the nearest of a pixel's samples;
-    owner (2H, 2W) int32 of each sample, -1 in the sky; material (2H, 2W) uint8 of each sample.
+    """A render. image (H, W, 3) uint8; developed (H * W, 3) float32, before lens and sensor; touched (H * W,) bool, pixels
+    that actors or their shadows change; sun_maps: shadow maps it used.
     """
 
     image: np.ndarray
-    depth_m: np.ndarray
-    owner: np.ndarray
+    developed: np.ndarray
+    touched: np.ndarray
+    sun_maps: SunMaps | None
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What the camera sees, at twice the resolution. faces: the triangles in view. face (2H, 2W) index into them, -1 in
+    the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32, -1 in the sky.
+    """
+
+    faces: Soup
+    face: np.ndarray
+    depth: np.ndarray
     material: np.ndarray
+    owner: np.ndarray
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        """(H, W) m, of the nearest of a pixel's samples, inf in the sky."""
+        return np.minimum.reduce(blocks(self.depth))
 
 
 def _in_front(points: np.ndarray, view: View) -> np.ndarray:
@@ -139,15 +165,7 @@ def rasterise(corners: np.ndarray, matrix: np.ndarray, rects: np.ndarray, ranges
     return fragments.face.numpy(), fragments.depth.numpy()
 
 
-@dataclass(frozen=True, slots=True)
-class _SunMaps:
-    """Depth along the sun's rays: (views, 2, texels, texels); the second axis is surroundings, actors."""
-
-    rows: np.ndarray
-    depth: np.ndarray
-
-
-def _sun_maps(soup: Soup, setting: Setting) -> _SunMaps | None:
+def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
     """Shadow maps over the ground, or None without sun. soup: camera axes about the centre of projection."""
     light, view = setting.light, setting.view
     if float(light.sun_colour.max()) <= 0.01:
@@ -172,18 +190,23 @@ def _sun_maps(soup: Soup, setting: Setting) -> _SunMaps | None:
             if not len(points):
                 continue
             w = points[..., 2:] + np.float32(_SHADOW_DISTANCE_M)
-            pixels = (points[..., :2] - np.float32([x0, z0])) * np.float32([size / (x1 - x0), size / (z1 - z0)]) - 0.5
+            pixels = (points[..., :2] - np.float32([x0, z0])) * np.float32(
+                [size / (x1 - x0), size / (z1 - z0)]
+            ) - 0.5
             clip = np.concatenate([pixels * w, w], axis=-1)
             _, found = rasterise(clip, np.eye(3), np.array([[0, 0, size, size]]), np.array([[0, len(points)]]))
             depth[i, j] = found.reshape(size, size) - np.float32(_SHADOW_DISTANCE_M)
-    return _SunMaps(np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32), depth)
+    return SunMaps(np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32), depth)
 
 
-def _lit(maps: _SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple) -> np.ndarray:
-    """Share (n,) of the sun that arrives. samples: (material, owner, sun direction)."""
+def _lit(
+    maps: SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share (n,) of the sun that arrives, and where (n,) actors take some of it. samples: (material, owner, sun)."""
     n = len(point)
+    shaded = np.zeros(n, bool)
     if maps is None:
-        return np.zeros(n, np.float32)
+        return np.zeros(n, np.float32), shaded
     material, owner, sun = samples
     lit = np.zeros(n, np.float32)
     facing = normal @ sun.astype(np.float32)
@@ -204,10 +227,14 @@ def _lit(maps: _SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: 
         pending &= ~here
         for j, chosen in ((0, np.flatnonzero(here)), (1, np.flatnonzero(here & by_actor))):
             table = maps.depth[i, j]
-            if len(chosen):
-                share[chosen] *= _soft_compare(table, u[chosen], v[chosen], place[chosen, 2] - np.float32(0.02))
+            if not len(chosen):
+                continue
+            open_share = _soft_compare(table, u[chosen], v[chosen], place[chosen, 2] - np.float32(0.02))
+            share[chosen] *= open_share
+            if j == 1:
+                shaded[towards[chosen]] = open_share < 1
     lit[towards] = share
-    return lit
+    return lit, shaded
 
 
 def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -228,8 +255,12 @@ def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.nda
     return total
 
 
-def _open_sky(world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]) -> np.ndarray:
-    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles."""
+def _open_sky(
+    world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles; and where
+    (n,) vehicles hide some of it."""
+    hemmed = np.zeros(len(world), bool)
     height = -world[:, 1]
     upright = ~np.isin(material, GROUND)
     open_sky = np.ones(len(height), np.float32)
@@ -253,26 +284,61 @@ def _open_sky(world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadow
         outside = np.hypot(np.maximum(along, 0), np.maximum(across, 0))
         inside = np.minimum(np.maximum(along, across), 0)
         dark = 0.62 * np.exp(-outside / (0.32 * reach)) + 0.36 * np.clip(-inside / 0.25, 0, 1)
+        dark[dark < 0.004] = 0
         open_sky[ground[near]] *= (1 - np.minimum(dark, 0.97)).astype(np.float32)
-    return open_sky
+        hemmed[ground[near]] |= dark > 0
+    return open_sky, hemmed
 
 
-def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
-    """Photograph a world. soup: camera axes about the centre of projection; shadows: of the actors in it."""
-    view, n = setting.view, SUPERSAMPLING
-    height, width = view.camera.height, view.camera.width
+def see(soup: Soup, view: View) -> Sight:
+    """Which triangle each sample shows. soup: camera axes about the centre of projection."""
     seen = soup.take(_in_front(soup.corners, view))
-    matrix = fine_matrix(view)
-    rect = np.array([[0, 0, n * width, n * height]])
-    face, depth = rasterise(seen.corners, matrix, rect, np.array([[0, len(seen)]]))
-    face, depth = face.reshape(n * height, n * width), depth.reshape(n * height, n * width)
-    hit = face >= 0
-    safe = np.maximum(face, 0)
+    size = (SUPERSAMPLING * view.camera.height, SUPERSAMPLING * view.camera.width)
+    rect = np.array([[0, 0, size[1], size[0]]])
+    face, depth = rasterise(seen.corners, fine_matrix(view), rect, np.array([[0, len(seen)]]))
+    hit, safe = face >= 0, np.maximum(face, 0)
     material = np.where(hit, seen.material[safe], np.uint8(Material.SKY))
-    owner = np.where(hit, seen.owner[safe], -1)
-    whole, parts = _shading_sites(face, depth, material, owner)
+    owner = np.where(hit, seen.owner[safe], np.int32(-1))
+    return Sight(seen, face.reshape(size), depth.reshape(size), material.reshape(size), owner.reshape(size))
+
+
+def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
+    """Photograph a world. sight: of the soup; shadows: of the actors in it."""
     maps = _sun_maps(soup, setting)
-    image = np.empty((height * width, 3), np.float32)
+    pixels = setting.view.camera.height * setting.view.camera.width
+    blank = np.empty((pixels, 3), np.float32)
+    developed, touched = _develop_pixels(sight, setting, maps, shadows, (blank, np.ones(pixels, bool)))
+    image = _camera(developed.reshape(setting.view.camera.height, -1, 3), setting)
+    return Picture(image, developed, touched, maps)
+
+
+def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
+    """The same photograph with no actors. sight: of the surroundings alone; full: with actors. Shades only what they
+    touched."""
+    maps = full.sun_maps
+    if maps is not None:
+        depth = maps.depth.copy()
+        depth[:, 1] = np.inf
+        maps = SunMaps(maps.rows, depth)
+    developed, _ = _develop_pixels(sight, setting, maps, [], (full.developed.copy(), full.touched))
+    image = _camera(developed.reshape(setting.view.camera.height, -1, 3), setting)
+    return Picture(image, developed, np.zeros_like(full.touched), maps)
+
+
+def _develop_pixels(
+    sight: Sight,
+    setting: Setting,
+    maps: SunMaps | None,
+    shadows: list[Shadow],
+    target: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the image and
+    the pixels that actors touch."""
+    image, wanted = target
+    n, width = SUPERSAMPLING, setting.view.camera.width
+    once, apart = _shading_sites(sight)
+    whole, parts = np.flatnonzero(once & wanted), np.flatnonzero(apart & wanted)
+
     def first_sample(pixels: np.ndarray) -> np.ndarray:
         rows, columns = np.divmod(pixels, width)
         return rows * (n * n * width) + columns * n
@@ -280,38 +346,42 @@ def render(soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
     corner = first_sample(parts)
     spread = np.stack([corner + dy * n * width + dx for dy in range(n) for dx in range(n)], axis=1).reshape(-1)
     sites = np.concatenate([first_sample(whole), spread])
-    shown = _shade_sites(seen, setting, maps, shadows, (sites, face.reshape(-1)[sites], depth.reshape(-1)[sites]))
-    shown = develop(shown, setting.response)
+    radiance, changed = _shade_sites(sight, sites, setting, maps, shadows)
+    shown = develop(radiance, setting.response)
     image[whole] = shown[: len(whole)]
     fine_shown = shown[len(whole) :].reshape(-1, n * n, 3)
     image[parts] = sum(fine_shown[:, i] for i in range(n * n)) / np.float32(n * n)
-    depth_m = np.minimum.reduce(blocks(depth))
-    return Picture(_camera(image.reshape(height, width, 3), setting), depth_m, owner, material)
+    touched = np.zeros(len(image), bool)
+    touched[whole] = changed[: len(whole)]
+    touched[parts] = changed[len(whole) :].reshape(-1, n * n).any(axis=1)
+    for owner in blocks(sight.owner):
+        touched |= owner.reshape(-1) > 0
+    return image, touched
 
 
-def _shading_sites(face: np.ndarray, depth: np.ndarray, material: np.ndarray, owner: np.ndarray) -> tuple:
-    """Pixels (flat indices) shaded once, and those where every sample is shaded: outlines, thin things."""
-    faces, depths = blocks(face), blocks(depth)
-    keys = blocks(material.astype(np.int32) * 4096 + owner)
+def _shading_sites(sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (H * W,) bool shaded once, and those where every sample is shaded: outlines, thin things."""
+    faces, depths = blocks(sight.face), blocks(sight.depth)
+    keys = blocks(sight.material.astype(np.int32) * 4096 + sight.owner)
     same_face, alike = faces[1] == faces[0], keys[1] == keys[0]
     near, far = depths[0], depths[0]
     for i in range(1, len(faces)):
         same_face = same_face & (faces[i] == faces[0])
         alike = alike & (keys[i] == keys[0])
         near, far = np.minimum(near, depths[i]), np.maximum(far, depths[i])
-    leaf = blocks(material)[0] == Material.LEAF
+    leaf = blocks(sight.material)[0] == Material.LEAF
     # Deep foliage is all outline: one sample of its four is enough, as lens blur and grain hide the rest.
-    smooth = alike & ((far < near * np.float32(1.03)) | leaf)
-    once = same_face | smooth
-    return np.flatnonzero(once), np.flatnonzero(~once)
+    once = (same_face | alike & ((far < near * np.float32(1.03)) | leaf)).reshape(-1)
+    return once, ~once
 
 
 def _shade_sites(
-    seen: Soup, setting: Setting, maps: _SunMaps | None, shadows: list[Shadow], sites: tuple
-) -> np.ndarray:
-    """Linear radiance (n, 3) at sites: (flat index into the fine image (n,), face (n,), depth (n,))."""
-    index, face, w = sites
-    view = setting.view
+    sight: Sight, index: np.ndarray, setting: Setting, maps: SunMaps | None, shadows: list[Shadow]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear radiance (n, 3) at samples of the fine image, given by flat index (n,), and whether shadows of actors
+    change it (n,)."""
+    seen, view = sight.faces, setting.view
+    face, w = sight.face.reshape(-1)[index], sight.depth.reshape(-1)[index]
     row, column = np.divmod(index, SUPERSAMPLING * view.camera.width)
     inverse = np.linalg.inv(fine_matrix(view)).astype(np.float32)
     ray = np.empty((len(index), 3), np.float32)
@@ -325,8 +395,9 @@ def _shade_sites(
         if setting.light.weather == "fog":
             out[sky] = setting.light.horizon.astype(np.float32) * 0.8
     land = np.flatnonzero(face >= 0)
+    changed = np.zeros(len(face), bool)
     if not len(land):
-        return out
+        return out, changed
     face = face[land]
     marked = np.zeros(len(seen), bool)
     marked[face] = True
@@ -341,6 +412,9 @@ def _shade_sites(
     normal[away] *= -1
     world = view.to_world(point + view.centre.astype(np.float32))
     material, owner = seen.material[face], seen.owner[face]
+    lit, shaded = _lit(maps, point, normal, (material, owner, setting.light.sun))
+    open_sky, hemmed = _open_sky(world, material, owner, shadows)
+    changed[land] = shaded | hemmed
     samples = Samples(
         point=point,
         world=world,
@@ -350,12 +424,12 @@ def _shade_sites(
         albedo=seen.albedo[face],
         pattern=seen.pattern[face],
         owner=owner,
-        lit=_lit(maps, point, normal, (material, owner, setting.light.sun)),
-        open_sky=_open_sky(world, material, owner, shadows),
+        lit=lit,
+        open_sky=open_sky,
         pixel_m=point[:, 2] / np.float32(view.camera.intrinsics[0, 0]),
     )
     out[land] = shade(samples, setting.road, setting.light, setting.noise, view.height_m)
-    return out
+    return out, changed
 
 
 def _attribute_maps(seen: Soup, used: np.ndarray) -> np.ndarray:

@@ -104,7 +104,9 @@ def _paint_road(s: Samples, road: Road, noise: NoiseSet, along_px: np.ndarray, w
 
 def _paint_slabs(s: Samples, noise: NoiseSet, along_px: np.ndarray, size_m: float, joint_m: float) -> np.ndarray:
     u, v = s.uv[:, 0] + s.pattern[:, 0] % 1, s.uv[:, 1]
-    tone = 1 + 0.10 * _noise(noise.soft, u, v, 0.06) + 0.12 * _noise(noise.grain, u, v, 0.02) * _fade(along_px, 0.08)
+    tone = (
+        1 + 0.10 * _noise(noise.soft, u, v, 0.06) + 0.12 * _noise(noise.grain, u, v, 0.02) * _fade(along_px, 0.08)
+    )
     slab = _noise(noise.grain, np.floor(u / size_m) * 3.7, np.floor(v / size_m) * 5.3, 1.0)
     tone += 0.07 * slab * _fade(along_px, size_m)
     blur = np.maximum(s.pixel_m, 0.008)
@@ -140,7 +142,9 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     pane = _pulse(u, pitch, wide, blur) * _pulse(row, storey, tall, blur) * (row > 0)
     bar = np.abs(np.mod(u / pitch, 1.0) - 0.5) * pitch
     pane *= 1 - np.clip((0.035 - bar) / blur + 0.5, 0, 1) * np.minimum(0.07 / blur, 1)
-    cell = _noise(noise.grain, np.floor(u / pitch) * 7.1 + pitch * 99, np.floor(row / storey) * 9.7 + storey * 55, 1.0)
+    cell = _noise(
+        noise.grain, np.floor(u / pitch) * 7.1 + pitch * 99, np.floor(row / storey) * 9.7 + storey * 55, 1.0
+    )
     curtain = np.clip(cell * 0.5, 0, 1)
     inside = 0.02 + 0.22 * curtain
     sill = np.mod(row / storey, 1.0) - 0.5
@@ -264,7 +268,9 @@ def _surface(
 def _dirty(s: Samples, noise: NoiseSet) -> np.ndarray:
     """Paint with road dust on the sills."""
     height = -s.world[:, 1]
-    dust = np.clip((0.55 - height) * 0.9 + 0.08 * _noise(noise.rough, s.world[:, 0] + s.world[:, 2], height, 0.02), 0, 0.35)
+    dust = np.clip(
+        (0.55 - height) * 0.9 + 0.08 * _noise(noise.rough, s.world[:, 0] + s.world[:, 2], height, 0.02), 0, 0.35
+    )
     return s.albedo + (_F([0.13, 0.115, 0.095]) - s.albedo) * dust[:, None]
 
 

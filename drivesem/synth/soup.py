@@ -96,7 +96,9 @@ def join(soups: list[Soup]) -> Soup:
     return Soup(*(np.concatenate([getattr(s, f.name) for s in soups]) for f in fields(Soup)))
 
 
-def placed(soup: Soup, position: tuple[float, float, float], yaw: float, scale: tuple[float, float, float]) -> Soup:
+def placed(
+    soup: Soup, position: tuple[float, float, float], yaw: float, scale: tuple[float, float, float]
+) -> Soup:
     """A copy scaled along its own axes, turned about y (KITTI's sense) and moved."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
@@ -146,7 +148,9 @@ def _outward(soup: Soup) -> Soup:
     return soup
 
 
-def tube(start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int) -> tuple[np.ndarray, np.ndarray]:
+def tube(
+    start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Corners and normals (F, 3, 3) of a closed, round stick from start to end (3,)."""
     axis = np.asarray(end, float) - np.asarray(start, float)
     axis /= max(float(np.linalg.norm(axis)), 1e-9)

@@ -66,7 +66,9 @@ class _Builder:
         crossing = self.road.crossing
         return crossing is None or s + reach < crossing[0] - 1 or s - reach > crossing[1] + 1
 
-    def put(self, soup: Soup, d: float, s: float, turn: float = 0.0, scale: tuple = (1, 1, 1), y: float = 0.0) -> None:
+    def put(
+        self, soup: Soup, d: float, s: float, turn: float = 0.0, scale: tuple = (1, 1, 1), y: float = 0.0
+    ) -> None:
         """Place a soup whose x runs along the road (turn 0), turned by `turn`."""
         x, z = self.road.point(d, s)
         self.parts.append(placed(soup, (float(x), y, float(z)), self.road.yaw(s, 1) + turn, scale))
@@ -89,8 +91,14 @@ def _ground(b: _Builder) -> None:
         for strip in road.strips:
             if strip.height_m > 0:
                 for at, sign in ((c0, 1.0), (c1, -1.0)):
-                    face = np.array([[strip.d0, 0, at], [strip.d1, 0, at], [strip.d1, -strip.height_m, at],
-                                     [strip.d0, -strip.height_m, at]])
+                    face = np.array(
+                        [
+                            [strip.d0, 0, at],
+                            [strip.d1, 0, at],
+                            [strip.d1, -strip.height_m, at],
+                            [strip.d0, -strip.height_m, at],
+                        ]
+                    )
                     normal = np.broadcast_to([0, 0, sign], (2, 3, 3))
                     colour = _GROUND_ALBEDO[Material.KERB] * tone[Material.KERB]
                     b.parts.append(make(quad(face), Material.KERB, colour, normal, pattern=(seed, 0, 0, 0)))
@@ -99,12 +107,24 @@ def _ground(b: _Builder) -> None:
         for start, end in spans:
             inner = _STATIONS_M[(start < _STATIONS_M) & (end > _STATIONS_M)]
             s = np.concatenate([[start], inner, [end]])
-            b.parts.append(_ribbon(road, (strip.d0, strip.d1), s, (strip.height_m, strip.height_m), strip.material,
-                                   albedo, seed))
+            b.parts.append(
+                _ribbon(
+                    road, (strip.d0, strip.d1), s, (strip.height_m, strip.height_m), strip.material, albedo, seed
+                )
+            )
             if strip.material == Material.KERB or (strip.height_m and strip.material != Material.KERB):
                 for edge in (strip.d0, strip.d1):
-                    b.parts.append(_ribbon(road, (edge, edge), s, (0.0, strip.height_m), Material.KERB,
-                                           _GROUND_ALBEDO[Material.KERB] * tone[Material.KERB], seed))
+                    b.parts.append(
+                        _ribbon(
+                            road,
+                            (edge, edge),
+                            s,
+                            (0.0, strip.height_m),
+                            Material.KERB,
+                            _GROUND_ALBEDO[Material.KERB] * tone[Material.KERB],
+                            seed,
+                        )
+                    )
     far = np.array([[-500, -30], [500, -30], [500, 700], [-500, 700]])
     b.parts.append(_patch(far, -0.12, Material.GRASS, _GROUND_ALBEDO[Material.GRASS] * tone[Material.GRASS], seed))
     del rng
@@ -209,11 +229,15 @@ def _houses(b: _Builder, side: int, edge: float) -> None:
             for _ in range(int(rng.integers(0, 4))):
                 where = s + float(rng.uniform(-gap, length + gap))
                 if rng.random() < 0.45:
-                    _tree(b, edge + side * float(rng.uniform(1.6, 3.2 + back * 0.5)), where, float(rng.uniform(4, 9)))
+                    _tree(
+                        b, edge + side * float(rng.uniform(1.6, 3.2 + back * 0.5)), where, float(rng.uniform(4, 9))
+                    )
                 else:
                     _bush(b, edge + side * float(rng.uniform(1.2, 2.5)), where, float(rng.uniform(0.8, 2.2)))
             if rng.random() < 0.5:
-                _tree(b, edge + side * (back + depth + float(rng.uniform(2, 8))), middle, float(rng.uniform(8, 14)))
+                _tree(
+                    b, edge + side * (back + depth + float(rng.uniform(2, 8))), middle, float(rng.uniform(8, 14))
+                )
         s += length + gap
 
 
@@ -265,7 +289,9 @@ def _street_furniture(b: _Builder) -> None:
     while s < 120:
         if b.free(s, 0.3):
             pole = stick((0, 0, 0), (0, -height, 0), (0.09, 0.05), Material.METAL, grey, 8)
-            arm = stick((0, -height, 0), (0, -height - 0.35, -lamp_side * 1.8), (0.04, 0.03), Material.METAL, grey, 5)
+            arm = stick(
+                (0, -height, 0), (0, -height - 0.35, -lamp_side * 1.8), (0.04, 0.03), Material.METAL, grey, 5
+            )
             head = ball((0, -height - 0.38, -lamp_side * 2.0), (0.14, 0.07, 0.35), Material.METAL, grey * 1.3, 1)
             b.put(join([pole, arm, head]), edge - lamp_side * 0.3, s)
         s += float(rng.uniform(22, 38))
@@ -294,8 +320,14 @@ def _sign(rng: np.random.Generator) -> Soup:
     sides = int(rng.choice([3, 4, 24]))
     angle = np.arange(sides + 1) * 2 * np.pi / sides + {3: np.pi / 2, 4: np.pi / 4, 24: 0.0}[sides]
     for scale, colour, out in ((1.0, colours[pick[0]], -0.05), (0.72, colours[pick[1]], -0.055)):
-        rim = np.stack([np.full_like(angle, out), -height + size - np.sin(angle) * size * scale,
-                        np.cos(angle) * size * scale], axis=1)
+        rim = np.stack(
+            [
+                np.full_like(angle, out),
+                -height + size - np.sin(angle) * size * scale,
+                np.cos(angle) * size * scale,
+            ],
+            axis=1,
+        )
         middle = np.broadcast_to([out, -height + size, 0.0], rim[:-1].shape)
         corners = np.stack([middle, rim[:-1], rim[1:]], axis=1)
         parts.append(make(corners, Material.FLAT, colour, np.broadcast_to([-1.0, 0, 0], corners.shape)))
@@ -309,8 +341,15 @@ def _clutter(rng: np.random.Generator) -> Soup:
     colour = pool[rng.integers(len(pool))] * rng.uniform(0.7, 1.3)
     shape = int(rng.integers(5))
     if shape == 0:
-        bins = [placed(box((0.55, 1.05, 0.6), Material.FLAT, colour * rng.uniform(0.7, 1.2)), (0.68 * i, 0, 0),
-                       float(rng.normal(0, 0.1)), (1, 1, 1)) for i in range(int(rng.integers(1, 4)))]
+        bins = [
+            placed(
+                box((0.55, 1.05, 0.6), Material.FLAT, colour * rng.uniform(0.7, 1.2)),
+                (0.68 * i, 0, 0),
+                float(rng.normal(0, 0.1)),
+                (1, 1, 1),
+            )
+            for i in range(int(rng.integers(1, 4)))
+        ]
         return join(bins)
     if shape == 1:
         return box((float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.9, 1.5)), 0.45), Material.FLAT, colour)
@@ -403,13 +442,15 @@ def _hill(b: _Builder) -> None:
                         np.broadcast_to(normal, (118, 3, 3))))  # fmt: skip
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=96)
 def _vehicle_soup(kind: str, variant: int) -> Soup:
     """A template in its unit box with its parts' materials; painted faces keep their own tint (light grey)."""
     mesh = template(kind, variant)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     corners = vertices[faces]
-    colours = mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
+    colours = (
+        mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
+    )
     part = mesh.part.numpy()
     material = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)[part]
     soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5))

@@ -27,6 +27,7 @@ class _Job:
     seed: int
     split: str
     settings: SynthSettings
+    keep: bool
 
 
 def _paths(out: Path, index: int) -> tuple[Path, Path, Path, Path]:
@@ -54,7 +55,7 @@ def write_frame(out: Path, index: int, frame: SynthFrame) -> None:
 
 def _work(job: _Job) -> int:
     image = _paths(job.out, job.index)[0]
-    if not image.exists():
+    if not (job.keep and image.exists()):
         write_frame(job.out, job.index, generate_frame(job.seed, job.index, job.split, job.settings))
     return job.index
 
@@ -74,10 +75,11 @@ def synthesise(
     split: str = "train",
     workers: int = 1,
     settings: SynthSettings | None = None,
+    resume: bool = True,
 ) -> Iterator[int]:
-    """Write `frames` frames under `out`/training, yielding each index as it is done; existing frames are kept.
+    """Write `frames` frames under `out`/training, yielding each index as it is done.
 
-    split: "train" or "heldout". workers: processes. At the end `manifest.json` lists every frame's seed and shapes.
+    split: "train" or "heldout". workers: processes. resume: whether frames that exist are kept. At the end `manifest.json` lists every frame's seed and shapes.
     Raises RangeError for bad counts or an unknown split, FormatError where `out` holds frames of other settings.
     """
     for name, value in (("frames", frames), ("workers", workers)):
@@ -89,10 +91,10 @@ def synthesise(
     origin = {"version": MANIFEST_VERSION, "seed": seed, "split": split, "settings": repr(settings)}
     out.mkdir(parents=True, exist_ok=True)
     stamp = out / "origin.json"
-    if stamp.exists() and (found := files.read_json(stamp)) != origin:
+    if resume and stamp.exists() and (found := files.read_json(stamp)) != origin:
         raise FormatError(str(stamp), f"seed {seed}, split {split}, the same settings", found)
     files.write_json(stamp, origin)
-    jobs = [_Job(out, index, seed, split, settings) for index in range(frames)]
+    jobs = [_Job(out, index, seed, split, settings, resume) for index in range(frames)]
     if workers == 1:
         yield from map(_work, jobs)
     else:

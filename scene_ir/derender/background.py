@@ -30,7 +30,7 @@ class FillSettings:
     """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds at
     the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far away
     costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's border; search_px: how far from
-    the best source so far others are tried.
+    the best source so far others are tried; ground_weight: cost of showing no ground where ground must be.
     """
 
     coarsest_radius: float = 4.0
@@ -39,7 +39,23 @@ class FillSettings:
     row_weight: float = 0.05
     column_weight: float = 0.004
     search_px: float = 160.0
+    ground_weight: float = 0.02
     confidence_px: float = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """wanted (H, W): pixels that see the ground once the cars are gone; like (H, W) in [0, 1]: how much each pixel of
+    the photograph looks like ground.
+    """
+
+    wanted: Mask
+    like: NDArray[np.float32]
+
+    def halved(self, size: tuple[int, int]) -> Ground:
+        """At the next coarser level, of `size` (width, height)."""
+        wanted = cv2.resize(self.wanted.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
+        return Ground(wanted, cv2.resize(self.like.astype(np.float32), size, interpolation=cv2.INTER_AREA))
 
 
 def push_pull(image: Image, known: NDArray[np.float32]) -> Image:
@@ -65,38 +81,41 @@ def fill(
     hole: Mask,
     forbidden: Mask,
     horizon: float,
+    ground: Ground,
     seed: int = 0,
     settings: FillSettings | None = None,
 ) -> Image:
     """The image with `hole` filled from pixels that are not `forbidden`.
 
-    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row, px
-    -> (H, W, 3) in [0, 1], equal to the image outside the hole.
+    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row, px;
+    ground: where ground is to be seen, and where it can be copied from -> (H, W, 3) in [0, 1], equal to the image outside the hole.
     """
     settings = settings or FillSettings()
     if not hole.any():
         return image.copy()
     forbidden = forbidden | hole
     pyramid = [(image.astype(np.float32), hole, forbidden)]
+    grounds = [ground]
     while len(pyramid) < settings.max_levels and min(pyramid[-1][1].shape) >= 48:
         level_image, level_hole, level_forbidden = pyramid[-1]
         if float(_distance(level_hole).max()) <= settings.coarsest_radius:
             break
         pyramid.append(_halve(level_image, level_hole, level_forbidden))
+        grounds.append(grounds[-1].halved(pyramid[-1][1].shape[::-1]))
     rng = np.random.default_rng(seed)
     source: NDArray[np.int64] | None = None
     current = pyramid[-1][0]
     for index in reversed(range(len(pyramid))):
         level_image, level_hole, level_forbidden = pyramid[index]
         if source is None:
-            start = level_image[mirrored(level_forbidden)]
+            start = level_image[first_guess(level_forbidden, grounds[index])]
         else:
             size = (level_image.shape[1], level_image.shape[0])
             start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
         start = np.where(level_hole[..., None], start, level_image)
         share = index / max(len(pyramid) - 1, 1)
         rounds = round(settings.iterations[1] + (settings.iterations[0] - settings.iterations[1]) * share)
-        level = _Level(start, level_hole, level_forbidden, horizon / 2**index, 2**index, settings)
+        level = _Level(start, level_hole, level_forbidden, grounds[index], (horizon, 2**index), settings)
         current, source = level.run(source, rounds, rng)
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
 
@@ -114,6 +133,17 @@ def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     rows, columns = np.where(inside, rows, nearest[0]), np.where(inside, columns, nearest[1])
     known = ~unknown[rows, columns]
     return np.where(known, rows, nearest[0]), np.where(known, columns, nearest[1])
+
+
+def first_guess(unknown: Mask, ground: Ground) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`mirrored`, with ground from the nearest ground where ground must be."""
+    rows, columns = mirrored(unknown)
+    other = unknown | (ground.like < 0.5)
+    if other.all():
+        return rows, columns
+    ground_rows, ground_columns = mirrored(other)
+    take = ground.wanted & unknown
+    return np.where(take, ground_rows, rows), np.where(take, ground_columns, columns)
 
 
 def _distance(mask: Mask) -> NDArray[np.float32]:
@@ -137,9 +167,16 @@ class _Level:
     """One pyramid level of the completion: the current image, its target pixels, and their search for sources."""
 
     def __init__(
-        self, image: Image, hole: Mask, forbidden: Mask, horizon: float, scale: int, settings: FillSettings
+        self,
+        image: Image,
+        hole: Mask,
+        forbidden: Mask,
+        ground: Ground,
+        horizon_and_scale: tuple[float, int],
+        settings: FillSettings,
     ) -> None:
         self.settings = settings
+        horizon, scale = horizon_and_scale[0] / horizon_and_scale[1], horizon_and_scale[1]
         pad = _RADIUS
         self.pad = pad
         self.padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REFLECT)
@@ -156,7 +193,8 @@ class _Level:
         self.index = np.full(hole.shape, -1, np.int64)
         self.index[target] = np.arange(self.rows.size)
         self.offsets = _PATTERN[:, 0] * self.stride + _PATTERN[:, 1]
-        self.horizon = horizon
+        self.ground = ground
+        self.wanted = ground.wanted[self.rows, self.columns] * np.float32(settings.ground_weight)
         self.reach = np.maximum(np.abs(self.rows - horizon), 24 / scale).astype(np.float32)
         self.column_unit = 200.0 / scale
         self.search = max(settings.search_px / scale, 4.0)
@@ -178,6 +216,7 @@ class _Level:
         dy = (rows - self.rows[which]) / self.reach[which]
         dx = (columns - self.columns[which]) / self.column_unit
         cost = colour + self.settings.row_weight * dy * dy + self.settings.column_weight * dx * dx
+        cost = cost + self.wanted[which] * (1 - self.ground.like[rows, columns])
         return np.where(self.allowed[rows, columns], cost, np.inf).astype(np.float32)
 
     def _try(self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
@@ -193,7 +232,7 @@ class _Level:
     def _start(self, coarse: NDArray[np.int64] | None) -> None:
         """First sources: mirrored ones, or the coarser level's where these are better."""
         everything = np.arange(self.rows.size)
-        rows, columns = mirrored(~self.allowed)
+        rows, columns = first_guess(~self.allowed, self.ground)
         self.source = np.stack([rows[self.rows, self.columns], columns[self.rows, self.columns]], 1)
         self.best = self._cost(everything, self.source[:, 0], self.source[:, 1])
         if coarse is not None:

@@ -42,6 +42,8 @@ VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 
 _FADE = 0.35
 """Opacity from which on what is behind a car is all filled."""
+_TRUSTED = 0.85
+"""Agreement of mask and fitted outline from which on the outline may add to the mask."""
 _UNDERBODY = 0.3
 """Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
@@ -182,7 +184,9 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
         masks.append(mask)
         hidden.append(mine)
     if settings.fit:
-        chosen = silhouette.fit(chosen, masks, hidden, camera, settings.fitting, settings.backend)
+        chosen = silhouette.fit(
+            chosen, masks, hidden, _boxes(labels, kept, camera), camera, settings.fitting, settings.backend
+        )
     outlines = silhouette.silhouettes(chosen, camera, settings.backend)
     cuts: list[_Cut] = []
     for index, row in enumerate(kept):
@@ -195,6 +199,9 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
             closer &= _label_box(labels, row, mask.shape)
             if silhouette.iou(closer, outline, mine) >= settings.min_iou:
                 mask = closer
+            # Bright edges of roofs and pillars look like sky to GrabCut; the fitted mesh knows better.
+            if silhouette.iou(mask, outline, mine) >= _TRUSTED:
+                mask = mask | (silhouette.grow(outline, -1) & ~mine)
         if mask.any():
             agreement = silhouette.iou(mask, outline, mine)
             cuts.append(_Cut(row, chosen[index], mask, mine, outline, agreement))
@@ -236,6 +243,17 @@ def _label_box(labels: Labels, row: int, shape: tuple[int, int]) -> Mask:
     return inside
 
 
+def _boxes(labels: Labels, rows: list[int], camera: Camera) -> silhouette.Boxes:
+    """The labels' boxes; only sides that neither the image's border nor, as far as labelled, anything else cuts."""
+    xyxy = labels.boxes_xyxy[rows].float()
+    limit = xyxy.new_tensor([camera.width - 1, camera.height - 1]).repeat(2)
+    inside = (xyxy > 2) & (xyxy < limit - 2)
+    # Mirrors and bumpers of others make the sides less sure than roof and wheels.
+    sure = xyxy.new_tensor([0.2, 1.0, 0.2, 1.0]) * (labels.occlusion[rows] == 0)[:, None]
+    top_only = xyxy.new_tensor([0.0, 1.0, 0.0, 0.0]) * (labels.occlusion[rows] == 1)[:, None]
+    return silhouette.Boxes(xyxy, (sure + top_only) * inside)
+
+
 def _union(masks: Sequence[Mask], shape: tuple[int, ...]) -> Mask:
     """Pixels of any of the masks."""
     return np.logical_or.reduce(masks) if masks else np.zeros(shape, bool)
@@ -262,17 +280,17 @@ def _layers(
         return image, [], [], maps.sun_direction()
     views = [shadow.ground_view(cut.placement, ground, camera) for cut in cuts]
     placements = [cut.placement for cut in cuts]
+    tight = _union([cut.mask for cut in cuts], vehicles.shape)
     lighting = shadow.light(image, road, vehicles, views)
     sun = shadow.estimate_sun(lighting, vehicles, placements, views, maps.sun_direction())
-    shaded = [
-        region & shadow.reachable(placement, view, sun)
-        for region, placement, view in zip(shadow.find(lighting, vehicles, views), placements, views, strict=True)
-    ]
+    allowed = [shadow.reachable(placement, view, sun) for placement, view in zip(placements, views, strict=True)]
+    shaded = shadow.find(lighting, tight, views, allowed)
     hole = vehicles.copy()
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4) | (view.distance < 0.2)
-    filled = fills.fill(image, hole, silhouette.grow(hole, 2), horizon, seed)
     near = np.stack([view.distance for view in views])
+    known_ground = fills.Ground(near.min(0) < 0.3, np.where(hole, 0, road))
+    filled = fills.fill(image, hole, silhouette.grow(hole, 2), horizon, known_ground, seed)
     mattes = [matte(image, cut.mask, cut.unknown, near.min(0) < 0.6) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
@@ -288,7 +306,7 @@ def _layers(
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
     owner = near.argmin(0)
     factors = [
-        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque == 0)) for i in range(len(cuts))
+        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5)) for i in range(len(cuts))
     ]
     return background, mattes, factors, sun
 

@@ -63,10 +63,10 @@ def matte(
     else:
         across = inside - outside
         length = (across * across).sum(-1)
-        share = ((colours - outside) * across).sum(-1) / np.maximum(length, 1e-6)
+        share = np.clip(((colours - outside) * across).sum(-1) / np.maximum(length, 1e-6), 0, 1)
         trust = length / (length + settings.contrast**2)
-        mixed = trust * np.clip(share, 0, 1) + (1 - trust) * prior
-        odd = _oddness(colours, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window])
+        mixed = trust * share + (1 - trust) * prior
+        odd = _oddness(colours, share[..., None] * across, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window])
         low, high = settings.odd
         piece = np.clip((odd - low) / (high - low), 0, 1) * ~ground[window]
         mixed = np.maximum(mixed, piece)
@@ -86,15 +86,16 @@ def _signed_distance(mask: Mask) -> Array:
     return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
 
 
-def _oddness(image: Array, sure: Mask) -> Array:
-    """How far (H, W) each pixel is from the colours of the `sure` surroundings near it, in standard deviations."""
+def _oddness(image: Array, explained: Array, sure: Mask) -> Array:
+    """How far (H, W) each pixel, less what a mixture with the car explains (H, W, 3), is from the colours of the `sure`
+    surroundings near it, in standard deviations."""
     weight = cv2.GaussianBlur(sure.astype(np.float32), (0, 0), 4.0)
     scale = np.maximum(weight, 1e-4)[..., None]
     known = image * sure[..., None]
     mean = cv2.GaussianBlur(known, (0, 0), 4.0) / scale
     square = cv2.GaussianBlur(known * image, (0, 0), 4.0) / scale
     spread = np.sqrt(np.maximum(square - mean * mean, 0).sum(-1)) + 0.05
-    odd = np.sqrt(((image - mean) ** 2).sum(-1)) / spread
+    odd = np.sqrt(((image - explained - mean) ** 2).sum(-1)) / spread
     return np.where(weight > 0.01, odd, 0).astype(np.float32)
 
 

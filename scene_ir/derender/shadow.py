@@ -30,13 +30,16 @@ _SAMPLES = 6000
 class ShadowSettings:
     """reach_m: how far from the footprint a shadow is looked for; contact_m: width of the strip around the footprint
     that counts as touching; dark: share of the lit ground's brightness below which ground is shaded; gain: by how much
-    an estimated sun must explain the darkness better than the assumed one.
+    an estimated sun must explain the darkness better than the assumed one; rim_m: how far beyond the reach shade
+    is followed; open_share: a shadow of which more than this lies out of reach is not a car's.
     """
 
     reach_m: float = 2.6
     contact_m: float = 0.25
     dark: float = 0.72
     gain: float = 0.03
+    rim_m: float = 0.8
+    open_share: float = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,8 @@ def light(
     image (H, W, 3); road (H, W) in [0, 1]; vehicles (H, W): all cars' pixels.
     """
     settings = settings or ShadowSettings()
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+    # The brightest channel: in a shadow all three fall, on a red or blue thing one stays.
+    grey = cv2.GaussianBlur(image.max(-1), (0, 0), 1.0)
     zone = np.logical_or.reduce([view.distance < settings.reach_m for view in views]) | grow(vehicles, 3)
     known = (road > 0.5) & ~zone
     if not known.any():
@@ -99,25 +103,43 @@ def light(
 
 
 def find(
-    lighting: Light, vehicles: Mask, views: Sequence[GroundView], settings: ShadowSettings | None = None
+    lighting: Light,
+    vehicles: Mask,
+    views: Sequence[GroundView],
+    allowed: Sequence[Mask],
+    settings: ShadowSettings | None = None,
 ) -> list[Mask]:
-    """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot."""
+    """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot.
+
+    allowed: ground that each car's shadow can reach. Shade that goes on beyond it is a house's or a tree's: then only
+    what is darker than that shade counts.
+    """
     settings = settings or ShadowSettings()
     if not views:
         return []
     near = np.stack([view.distance for view in views])
-    owner = near.argmin(0)
-    dark = (near.min(0) < settings.reach_m) & ~vehicles & (lighting.grey < settings.dark * lighting.lit)
+    owner, nearest = near.argmin(0), near.min(0)
+    around = (nearest < settings.reach_m + settings.rim_m) & ~vehicles
+    dark = around & (lighting.grey < settings.dark * lighting.lit)
+    within = np.logical_or.reduce(allowed) & (nearest < settings.reach_m)
     found = []
     for index, view in enumerate(views):
         touching = (view.distance < settings.contact_m) & ~vehicles & (owner == index)
-        own = dark & (owner == index)
-        _, parts = cv2.connectedComponents((own | touching).astype(np.uint8), connectivity=4)
-        joined = np.isin(parts, np.unique(parts[touching])) & (own | touching)
+        own = _joined(dark, touching)
+        beyond = own & ~within
+        if np.count_nonzero(beyond) > settings.open_share * max(np.count_nonzero(own), 1):
+            shade = float(np.median(lighting.grey[beyond]))
+            own = _joined(dark & (lighting.grey < settings.dark * shade), touching)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-        closed = cv2.morphologyEx(joined.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-        found.append(closed & ~vehicles)
+        closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+        found.append(closed & ~vehicles & allowed[index] & (owner == index) & (nearest < settings.reach_m))
     return found
+
+
+def _joined(candidates: Mask, seeds: Mask) -> Mask:
+    """The candidates that hang together with the seeds."""
+    _, parts = cv2.connectedComponents((candidates | seeds).astype(np.uint8), connectivity=4)
+    return np.isin(parts, np.unique(parts[seeds])) & candidates
 
 
 def estimate_sun(

@@ -28,6 +28,10 @@ _WORK_PX = 160
 _BAND = 0.12
 """Width of the band in which mask and outline pull at each other, as a fraction of the window."""
 
+_FREE = 0.5
+"""How far single points of the lattice move where the shaped modes move by 1."""
+_COVER = 2.0
+"""How much more a pixel of the mask that the mesh leaves out weighs than one that it covers in vain."""
 _LOW_PART = 0.3
 """Lower part of a car, as a fraction of its height, beside which its shadow lies."""
 
@@ -51,7 +55,9 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """steps of Adam at `rate` (in units of the standard deviations below); the rest are bounds around the label."""
+    """steps of Adam at `rate` (in units of the standard deviations below); then bounds around the label, and the
+    weights of staying there (prior) and of filling the label's 2D box (box).
+    """
 
     steps: int = 40
     rate: float = 0.25
@@ -60,6 +66,15 @@ class FitSettings:
     max_stretch: float = 0.08
     max_offset: float = 0.08
     prior: float = 0.004
+    box: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes:
+    """Labels' boxes xyxy (N, 4) px, and how much to trust each side, (N, 4) in [0, 1]: 0 where something cuts it."""
+
+    xyxy: Tensor
+    trust: Tensor
 
 
 def candidates(kind: str, size_lhw: Sequence[float]) -> tuple[str, ...]:
@@ -189,11 +204,14 @@ def fit(
     placements: Sequence[Placement],
     masks: Sequence[Mask],
     unknown: Sequence[Mask],
+    boxes: Boxes,
     camera: Camera,
     settings: FitSettings,
     backend: verbs.Backend = "warp",
 ) -> list[Placement]:
     """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at nothing.
+
+    boxes: what the labels' boxes say of the outlines' extent, which no reflection can mislead.
 
     Minimises the signed distance to the mask, cut at +-band, summed over what the mesh covers: its gradient moves
     each piece of outline towards the mask's border from as far as the band reaches (Chan and Vese 2001).
@@ -224,7 +242,9 @@ def fit(
         fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
         covered = verbs.antialias(fragments, clip, faces, backend) * pull
         energy = torch.stack([covered[span].sum() for span, _ in layout.spans()])
-        loss = energy + settings.prior * code.square().sum(1)
+        apart = [_apart(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
+        filling = (torch.stack(apart) * boxes.trust).sum(1)
+        loss = energy + settings.prior * code.square().sum(1) + settings.box * filling
         better = loss.detach() < best
         best = torch.where(better, loss.detach(), best)
         best_code = torch.where(better[:, None], code.detach(), best_code)
@@ -238,6 +258,17 @@ def fit(
         with torch.no_grad():
             code.clamp_(-bound / spread, bound / spread)
     return [_apply(p, c * spread, modes) for p, c in zip(placements, best_code, strict=True)]
+
+
+def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
+    """How far (4,) the extent of a mesh is from a label's box on each side, squared, in units of the band."""
+    # What is nearer than half a metre projects anywhere; such boxes are cut by the image's border anyway.
+    pixels = clip[:, :2] / clip[:, 2:].clamp(min=0.5)
+    extremes = torch.cat([pixels.amin(0), pixels.amax(0)])
+    scale = window.zoom.diagonal()[:2].repeat(2)
+    offset = window.zoom[:2, 2].repeat(2)
+    band = _BAND * max(window.pull.shape)
+    return (((extremes - (box_xyxy * scale + offset)) / band).clamp(-3, 3)) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,6 +300,8 @@ def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
     signed = np.where(inner, 0.5 - to_rest, to_car - 0.5) * scale
     band = _BAND * max(size)
     pull = np.clip(signed / band, -1, 1) * shown
+    # A piece of car outside the mesh tears off when the car turns; a piece of road inside it only travels along.
+    pull = np.where(pull < 0, _COVER * pull, pull)
     zoom = torch.tensor(
         [
             [size[0] / (x1 - x0), 0.0, (0.5 - x0) * size[0] / (x1 - x0) - 0.5],
@@ -312,7 +345,10 @@ def _modes() -> Tensor:
     for station in (0, 3):
         grid()[station, :, :, 2] = across  # rear and front broader
         grid()[station, 2, :, 0] = 1.0  # bumpers out
-    return torch.stack(modes).reshape(-1, LATTICE_POINTS, 3)
+    shaped = torch.stack(modes).reshape(-1, LATTICE_POINTS, 3)
+    free = lattice.from_symmetric(torch.eye(lattice.SYMMETRIC_DIM)).reshape(-1, *LATTICE, 3)
+    lifts = free[:, :, -1, :, 1].abs().sum((1, 2)) > 0
+    return torch.cat([shaped, _FREE * free[~lifts].reshape(-1, LATTICE_POINTS, 3)])
 
 
 def _units(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:

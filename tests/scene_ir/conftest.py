@@ -12,6 +12,7 @@ import trimesh
 
 from scene_ir import blend, surfaces
 from scene_ir.compositor import Compositor, RenderSettings
+from scene_ir.raster.verbs import Backend
 from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
 from scene_ir.types import Camera, Crop, Environment, Mesh, Objects, Part, SceneIR
 
@@ -38,7 +39,9 @@ def _car(colour: tuple[float, float, float], dtype: torch.dtype) -> Mesh:
 
 def _noise(count: int, scale: float, seed: int, dtype: torch.dtype) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(1, count, int(HEIGHT / scale) + 2, int(WIDTH / scale) + 2, generator=generator, dtype=dtype)
+    coarse = torch.rand(
+        1, count, int(HEIGHT / scale) + 2, int(WIDTH / scale) + 2, generator=generator, dtype=dtype
+    )
     return torch.nn.functional.interpolate(coarse, (HEIGHT, WIDTH), mode="bicubic", align_corners=True)[0]
 
 
@@ -76,9 +79,9 @@ def bare_scene(dtype: torch.dtype = torch.float64) -> SceneIR:
     return SceneIR(camera, meshes, objects, environment, picture, picture, depth, torch.zeros(0, 4, dtype=dtype))
 
 
-def photographed_scene(scene: SceneIR, backend: str) -> SceneIR:
+def photographed_scene(scene: SceneIR, backend: Backend) -> SceneIR:
     """`scene` after a photograph of it, 8 bit, was taken and taken apart."""
-    settings = RenderSettings(backend=backend)  # type: ignore[arg-type]
+    settings = RenderSettings(backend=backend)
     shot = Compositor(scene, settings).render(scene)
     objects = scene.objects
     order = blend.paint_order(
@@ -93,7 +96,8 @@ def photographed_scene(scene: SceneIR, backend: str) -> SceneIR:
         mattes[i] = Crop(crop.values * window, crop.x0, crop.y0)
         window *= 1 - crop.values[0]
     taken = replace(scene, photograph=(shot.image * 255).round() / 255)
-    return solve_sources(taken, mattes, analytic_shadows(scene, settings), SolveSettings(backend=backend))  # type: ignore[arg-type]
+    shadows = analytic_shadows(scene, settings)
+    return solve_sources(taken, mattes, shadows, SolveSettings(backend=backend))
 
 
 @pytest.fixture(scope="session")

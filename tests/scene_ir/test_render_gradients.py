@@ -20,7 +20,8 @@ COSINE, RELATIVE = 0.99, 0.05
 
 @dataclass(frozen=True)
 class Parameter:
-    """dim: how many numbers; apply: (scene, numbers) -> scene; step: of the central difference; scale: of random theta."""
+    """dim: how many numbers; apply: (scene, numbers) -> scene; step: of the central difference; scale: of random
+    theta."""
 
     dim: int
     apply: Callable[[SceneIR, Tensor], SceneIR]

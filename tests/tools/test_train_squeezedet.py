@@ -116,8 +116,9 @@ def test_judge_by_hand() -> None:
     # hit at 0.9; double at 0.8 is false; inside the ignored region at 0.7 counts nowhere; hit at 0.6
     detections = found([car, [0.0, 0.0, 10.0, 11.0], [82.0, 2.0, 90.0, 9.0], far], [0.9, 0.8, 0.7, 0.6])
     marks = training.judge([detections], [wanted])
-    assert marks.objects["Car"] == 2
-    assert marks.recall["Car"] == 1.0
-    assert marks.ap50["Car"] == pytest.approx((51 * 1.0 + 50 * 2 / 3) / 101)
+    assert marks.scores.headline.objects == 2
+    assert marks.scores.headline.recall == 1.0
+    assert marks.scores.headline.ap50 == pytest.approx((51 * 1.0 + 50 * 2 / 3) / 101)
+    assert marks.mark == pytest.approx(1.25 * (51 * 1.0 + 50 * 2 / 3) / 101)
     assert marks.f1 == pytest.approx(2 * 2 / (3 + 2))
     assert marks.t_star == pytest.approx(0.6)

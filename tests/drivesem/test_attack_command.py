@@ -1,0 +1,139 @@
+"""`drivesem attack` as a user types it: figures, files, going on where it stopped, bad frames."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivesem.cli import main
+from drivesem.feasibility_check import check_scene
+from drivesem.results import load_frame
+from drivesem.synth.write import synthesise
+from scene_ir.io import load_scene
+
+WORDS = ["attack", "--combo", "2", "--steps", "2", "--json"]
+PARTS = ("benign.png", "rerender.png", "counterexample.png", "overlay.png", "difference.png", "theta.json")
+
+
+def attack(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """Run a command that must succeed and print one JSON object on standard output, and nothing else."""
+    capsys.readouterr()
+    assert main(words) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: without_times(v) for k, v in value.items() if k not in ("seconds", "out")}
+    return [without_times(v) for v in value] if isinstance(value, list) else value
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Every file of a run: bytes of pictures and scenes, JSON without times; the page apart, which shows times."""
+    found: dict[str, Any] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "report.html"):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".json":
+            found[name] = without_times(json.loads(path.read_text()))
+        elif path.suffix == ".yaml":
+            found[name] = [ln for ln in path.read_text().splitlines() if not ln.startswith(("out:", "limit:"))]
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "whole"
+    assert main([*WORDS, "--limit", "2", "--out", str(out)]) == 0
+    return out
+
+
+def test_figures(finished: Path) -> None:
+    figures = json.loads((finished / "metrics.json").read_text())
+    for key in ("benign", "rerendered"):
+        assert {"ap50", "ap70", "ap", "recall"} <= set(figures[key])
+    assert set(figures["attacked"]) == {"paper", "moved"}
+    assert figures["out"] == str(finished)
+    assert figures["frames"] == 2
+    assert figures["frames_without_vehicles"] == 0
+    assert figures["objects"] >= 8
+    assert figures["queries"] == 4
+    assert figures["feasible_fraction"] == 1.0
+    assert figures["rerendered"]["ap50"] == pytest.approx(figures["benign"]["ap50"], abs=0.01)
+
+
+def test_folder(finished: Path) -> None:
+    for name in ("demo-000", "demo-001"):
+        folder = finished / "frames" / name
+        assert all((folder / part).is_file() for part in PARTS)
+        result = load_frame(folder / "result.json")
+        assert len(result.loss_trace) == 3
+        assert any(c.value != 0 for c in result.theta)
+        saved = load_scene(folder / "scene")
+        assert check_scene(saved.as_photographed(), saved) == list(result.violations) == []
+        assert (folder / "benign.png").read_bytes() == (folder / "rerender.png").read_bytes()
+        paper, moved = ((folder / f"labels_{mode}.txt").read_text().splitlines() for mode in ("paper", "moved"))
+        assert len(paper) == len(moved) >= result.objects
+    page = (finished / "report.html").read_text()
+    assert "demo-000" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "https://" not in page
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "stopped"
+    shutil.copytree(finished, out)
+    shutil.rmtree(out / "frames" / "demo-001")
+    for name in ("metrics.json", "manifest.json", "report.html"):
+        (out / name).unlink()
+    kept = (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
+    attack([*WORDS, "--limit", "2", "--out", str(out)], capsys)
+    assert (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == kept
+    assert contents(out) == contents(finished)
+
+
+def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(finished)
+    assert main([*WORDS, "--limit", "2", "--out", str(finished), "--seed", "5"]) == 2
+    assert "seed" in capsys.readouterr().err
+    assert contents(finished) == before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert main([*WORDS, "--limit", "1", "--out", str(tmp_path)]) == 2
+    assert "--out" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.fixture(scope="module")
+def kitti_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames in KITTI's layout: one with vehicles, one without, one with a broken label."""
+    root = tmp_path_factory.mktemp("kitti")
+    for _ in synthesise(root, 3, seed=11, split="heldout"):
+        pass
+    labels = root / "training" / "label_2"
+    lines = [ln for ln in (labels / "000001.txt").read_text().splitlines() if ln.split()[0] == "Pedestrian"]
+    (labels / "000001.txt").write_text("".join(f"{ln}\n" for ln in lines))
+    (labels / "000002.txt").write_text("Car 0.00 0 nan 1 2 30 40 1.5 1.6 3.9 0 1.6 20 0\n")
+    return root
+
+
+def test_kitti_folder(kitti_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [*WORDS, "--dataset", "kitti", "--root", str(kitti_folder), "--no-fit", "--out", str(tmp_path / "run")]
+    assert main(words) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "000002.txt" in error
+    figures = attack([*words, "--keep-going"], capsys)
+    assert figures["frames"] == 1
+    assert figures["frames_without_vehicles"] == 1
+    assert list(figures["frames_failed"]) == ["000002"]
+    assert figures["feasible_fraction"] == 1.0
+    assert "000002" in (tmp_path / "run" / "report.html").read_text()

@@ -1,0 +1,92 @@
+"""Ground plane, depth, sky, foliage and road by rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import maps
+from scene_ir.types import Camera, Labels
+
+CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+LEVEL = torch.tensor([0.0, -1.0, 0.0, 1.65])
+
+
+def labels_at(points: list[list[float]]) -> Labels:
+    n = len(points)
+    return Labels(
+        ("Car",) * n, torch.zeros(n, 4), torch.zeros(n), torch.zeros(n, dtype=torch.int64),
+        torch.tensor(points).reshape(n, 3), torch.zeros(n), torch.ones(n, 3), torch.zeros(0, 4),
+    )  # fmt: skip
+
+
+def street() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    image = np.zeros((200, 480, 3), np.float32)
+    image[:50] = (0.7, 0.82, 0.98)
+    image[50:95] = (0.2, 0.42, 0.15)
+    image[95:] = 0.5
+    image[50:] += rng.normal(0, 0.03, (150, 480, 1)).astype(np.float32)
+    return np.clip(image, 0, 1)
+
+
+def test_without_labels_the_ground_is_level_at_camera_height():
+    assert maps.fit_ground(None, []) == pytest.approx(LEVEL, abs=1e-6)
+
+
+def test_ground_follows_the_labels_and_not_the_one_that_is_wrong():
+    slope = [[x, 1.7 + 0.01 * z, z] for z in (6.0, 9.0, 14.0, 20.0, 28.0) for x in (-4.0, 3.0)]
+    plane = maps.fit_ground(labels_at([*slope, [2.0, 0.2, 12.0]]), list(range(11)))
+    residual = torch.tensor(slope) @ plane[:3] + plane[3]
+    assert float(residual.abs().max()) < 0.12
+    assert float(plane[:3].norm()) == pytest.approx(1.0)
+    assert plane[1] < 0
+
+
+def test_horizon_and_plane_depth_of_a_level_camera():
+    assert maps.horizon_row(LEVEL, CAMERA) == pytest.approx(88.0, abs=1e-4)
+    depth = maps.plane_depth(LEVEL, CAMERA)
+    assert np.isinf(depth[:88]).all()
+    assert depth[188, 100] == pytest.approx(380 * 1.65 / 100, rel=1e-4)
+
+
+def test_sky_foliage_and_road_are_where_they_are():
+    image = street()
+    nothing = np.zeros(image.shape[:2], bool)
+    sky = maps.sky_map(image, 88.0, nothing)
+    road = maps.road_map(image, 88.0, nothing)
+    foliage = maps.foliage_map(image, sky, road, nothing)
+    assert sky[:44].mean() > 0.95
+    assert sky[56:].max() < 0.05
+    assert foliage[60:85].mean() > 0.8
+    assert foliage[110:].mean() < 0.1
+    assert road[110:].mean() > 0.9
+    assert road[:88].max() == 0
+
+
+def test_vehicles_are_neither_sky_nor_foliage():
+    image = street()
+    car = np.zeros(image.shape[:2], bool)
+    car[20:90, 100:200] = True
+    assert maps.sky_map(image, 88.0, car)[car].max() == 0
+    assert maps.foliage_map(image, np.zeros_like(image[..., 0]), np.zeros_like(image[..., 0]), car)[car].max() == 0
+
+
+def test_depth_is_ground_below_a_wall_above_and_infinite_in_the_sky():
+    ground = maps.plane_depth(LEVEL, CAMERA)
+    road = np.zeros((200, 480), np.float32)
+    road[120:] = 1
+    sky = np.zeros_like(road)
+    sky[:40] = 1
+    depth = maps.depth_map(ground, road, sky, 88.0)
+    assert depth[150] == pytest.approx(ground[150])
+    assert depth[60, 200] == pytest.approx(ground[120, 200], rel=0.05)
+    assert np.isinf(depth[:40]).all()
+    assert depth[np.isfinite(depth)].max() <= maps.FAR
+
+
+def test_sun_is_a_unit_vector_that_points_up():
+    sun = maps.sun_direction()
+    assert float(sun.norm()) == pytest.approx(1)
+    assert sun[1] < -0.5

@@ -1,0 +1,341 @@
+"""Re-rendering: identity, moved vehicles against the truth, order, shadows, backends, borders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from scene_ir import blend, surfaces
+from scene_ir.compositor import Compositor, RenderSettings, render, scene_to
+from scene_ir.errors import ShapeError
+from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
+from scene_ir.types import Crop, Objects, Render, SceneIR
+
+REFERENCE = RenderSettings(backend="reference")
+IDENTITY = 1e-5
+Street = Callable[[torch.dtype], SceneIR]
+
+
+def _regions(scene: SceneIR, margin: int = 0) -> Tensor:
+    """(H, W) bool: the crops of vehicles and shadows."""
+    compositor = Compositor(scene, REFERENCE)
+    layers = compositor.layers(compositor.scene.objects)
+    inside = torch.zeros_like(scene.depth, dtype=torch.bool)
+    for rects in (layers.layout.rects, layers.shadow_layout.rects):
+        for x0, y0, x1, y1 in rects.tolist():
+            inside[max(y0 - margin, 0) : y1 + margin, max(x0 - margin, 0) : x1 + margin] = True
+    return inside
+
+
+def _moved(scene: SceneIR, dx: float = 0.0, dz: float = 0.0, dyaw: float = 0.0) -> SceneIR:
+    step = scene.objects.translation.new_tensor([dx, 0.0, dz])
+    return scene.with_objects(translation=scene.objects.translation + step, yaw=scene.objects.yaw + dyaw)
+
+
+def _only(objects: Objects, index: list[int]) -> Objects:
+    names = ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d")
+    names += ("truncation", "occlusion")
+    source = tuple(objects.source[i] for i in index) if objects.source else ()
+    return replace(objects, source=source, **{n: getattr(objects, n)[index] for n in names})
+
+
+@pytest.mark.parametrize(("backend", "dtype"), [("reference", torch.float64), ("warp", torch.float32)])
+def test_nothing_perturbed_gives_the_photograph(photographed: SceneIR, backend, dtype: torch.dtype) -> None:
+    scene = scene_to(photographed, dtype)
+    image = Compositor(scene, RenderSettings(backend=backend)).render(scene).image
+    assert float((image - scene.photograph).abs().max()) < IDENTITY
+    assert torch.equal((image * 255).round(), (scene.photograph * 255).round())
+    outside = ~_regions(scene)
+    assert torch.equal(image[:, outside], scene.photograph[:, outside])
+
+
+@pytest.mark.parametrize("matte", ["eroded", "binary", "noisy", "empty"])
+def test_identity_holds_for_any_matte(street: Street, photographed: SceneIR, matte: str) -> None:
+    bare = replace(street(torch.float64), photograph=photographed.photograph)
+    generator = torch.Generator().manual_seed(4)
+
+    def spoil(values: Tensor) -> Tensor:
+        if matte == "eroded":
+            return (-torch.nn.functional.max_pool2d(-values[None], 5, 1, 2))[0]
+        if matte == "binary":
+            return (values > 0.5).to(values)
+        if matte == "empty":
+            return torch.zeros_like(values)
+        return values * torch.rand(values.shape, generator=generator, dtype=values.dtype)
+
+    crops = [replace(s.foreground, values=spoil(s.foreground.values[3:])) for s in photographed.objects.source]
+    solved = solve_sources(bare, crops, analytic_shadows(bare, REFERENCE), SolveSettings(backend="reference"))
+    image = Compositor(solved, REFERENCE).render(solved).image
+    assert float((image - photographed.photograph).abs().max()) < IDENTITY
+    for source in solved.objects.source:
+        values = source.foreground.values
+        assert float(values.min() if values.numel() else 0.0) > -1e-9
+        assert bool((values[:3] <= values[3:] + 1e-9).all())
+
+
+def test_background_loses_vehicles_and_shadows(street: Street, photographed: SceneIR) -> None:
+    truth = street(torch.float64).background
+    free = torch.ones_like(photographed.depth, dtype=torch.bool)
+    for source in photographed.objects.source:
+        crop = source.foreground
+        h, w = crop.values.shape[1:]
+        free[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] &= crop.values[3] == 0
+    before = (photographed.photograph - truth).abs().amax(dim=0)
+    after = (photographed.background - truth).abs().amax(dim=0)
+    assert float(before[free].max()) > 0.1
+    assert float(after[free].max()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("move", "worst"), [((0.5, 0.0, 0.0), 0.02), ((0.0, 1.0, 0.0), 0.02), ((0.0, 0.0, 0.15), 0.03), ((0.3, -0.5,
+    -0.15), 0.035)]
+)  # fmt: skip
+def test_moved_vehicles_look_like_the_truth(
+    street: Street, photographed: SceneIR, move: tuple[float, float, float], worst: float
+) -> None:
+    """Against the same street drawn with its vehicles, and their shadows, at the new places."""
+    truth = Compositor(street(torch.float64), REFERENCE).render(_moved(street(torch.float64), *move))
+    seen = Compositor(photographed, REFERENCE).render(_moved(photographed, *move))
+    vehicles = (truth.object_id > 0) | (seen.object_id > 0)
+    error = (truth.image - seen.image).abs().mean(dim=0)
+    assert float(error[vehicles].mean()) < worst
+    assert float(error.mean()) < 0.6 * float((truth.image - photographed.photograph).abs().mean())
+    assert float((truth.object_id == seen.object_id).to(torch.float64).mean()) > 0.98
+    both = (truth.object_id == seen.object_id) & (truth.object_id > 0)
+    assert float((truth.depth - seen.depth)[both].abs().median()) < 0.1
+
+
+def test_turned_vehicles_have_no_cracks(street: Street, photographed: SceneIR) -> None:
+    """Well inside the mesh a turned vehicle is opaque, also along what used to be its outline."""
+    turned = _moved(photographed, dyaw=0.3)
+    truth = Compositor(street(torch.float64), REFERENCE).render(_moved(street(torch.float64), dyaw=0.3))
+    seen = Compositor(photographed, REFERENCE).render(turned)
+    for full, crop in zip(truth.opacity, seen.opacity, strict=True):
+        whole = torch.zeros_like(photographed.depth)
+        whole[full.y0 : full.y0 + full.values.shape[1], full.x0 : full.x0 + full.values.shape[2]] = full.values[0]
+        solid = -torch.nn.functional.max_pool2d(-whole[None, None], 5, 1, 2)[0, 0] > 0.999
+        h, w = crop.values.shape[1:]
+        window = solid[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
+        assert int(window.sum()) > 30
+        assert float(crop.values[0][window].min()) > 0.9
+
+
+def test_shadow_moves_with_its_vehicle(photographed: SceneIR) -> None:
+    lone = replace(photographed, objects=_only(photographed.objects, [0]))
+    dark = Compositor(lone, REFERENCE).render(_moved(lone, dz=3.0))
+    none = replace(lone.objects.source[0], shadow=None)
+    bright_scene = replace(lone, objects=replace(lone.objects, source=(none,)))
+    bright = Compositor(bright_scene, REFERENCE).render(_moved(bright_scene, dz=3.0))
+    darker = (bright.image - dark.image).amax(dim=0) > 0.02
+    rows = darker.any(dim=1).nonzero()[:, 0]
+    fy, eye, centre = 110.0, 1.65, 80 * 0.4
+    near, far = 9.0 + 3.0 - 3.5, 9.0 + 3.0 + 4.0
+    assert int(darker.sum()) > 10
+    assert centre + fy * eye / far - 1 <= int(rows.min())
+    assert int(rows.max()) <= centre + fy * eye / near + 1
+
+
+def test_order_of_objects_does_not_matter(photographed: SceneIR) -> None:
+    turned = _moved(photographed, dyaw=0.1)
+    image = Compositor(photographed, REFERENCE).render(turned).image
+    order = [2, 0, 1]
+    mixed = replace(photographed, objects=_only(photographed.objects, order))
+    again = Compositor(mixed, REFERENCE).render(replace(turned, objects=_only(turned.objects, order)))
+    torch.testing.assert_close(image, again.image, rtol=0, atol=1e-9)
+
+
+def test_backends_agree_in_values_and_gradients(photographed: SceneIR) -> None:
+    scene = scene_to(photographed, torch.float32)
+    weights = torch.randn(scene.photograph.shape, generator=torch.Generator().manual_seed(1))
+    weights = torch.nn.functional.avg_pool2d(weights[None], 7, 1, 3)[0]
+    results = []
+    for backend in ("warp", "reference"):
+        yaw = (scene.objects.yaw + 0.07).requires_grad_()
+        place = (scene.objects.translation + 0.11).requires_grad_()
+        compositor = Compositor(scene, RenderSettings(backend=backend))
+        out = compositor.render(scene.with_objects(yaw=yaw, translation=place))
+        (out.image * weights).sum().backward()
+        results.append((out, torch.cat([yaw.grad, place.grad.flatten()])))
+    (fast, fast_grad), (slow, slow_grad) = results
+    difference = (fast.image - slow.image).abs().amax(dim=0)
+    assert float((difference > 1e-3).to(torch.float32).mean()) < 1e-3
+    assert float((fast.object_id != slow.object_id).to(torch.float32).mean()) < 1e-3
+    assert float(torch.nn.functional.cosine_similarity(fast_grad, slow_grad, dim=0)) > 0.999
+
+
+def test_texture_code_changes_only_one_vehicle(photographed: SceneIR) -> None:
+    code = torch.zeros(3, 5, dtype=torch.float64)
+    code[1, 1] = 0.8
+    compositor = Compositor(photographed, REFERENCE)
+    plain, painted = (compositor.render(s) for s in (photographed, photographed.with_objects(texture_code=code)))
+    changed = (plain.image != painted.image).any(dim=0)
+    crop = plain.opacity[1]
+    h, w = crop.values.shape[1:]
+    allowed = torch.zeros_like(changed)
+    allowed[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] = crop.values[0] > 0
+    assert int(changed.sum()) > 50
+    assert not bool((changed & ~allowed).any())
+    assert float((painted.image - plain.image)[0][changed].mean()) > 0.02
+
+
+def test_weather_reaches_vehicles_and_foliage_does_not(photographed: SceneIR) -> None:
+    compositor = Compositor(photographed, REFERENCE)
+    plain = compositor.render(photographed)
+    solid = torch.zeros_like(photographed.depth)
+    for crop in plain.opacity:
+        h, w = crop.values.shape[1:]
+        window = solid[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
+        window.copy_(torch.maximum(window, crop.values[0]))
+    fog = compositor.render(
+        photographed.with_environment(weather=torch.tensor([0.8, 0, 0, 0], dtype=torch.float64))
+    )
+    leaves = compositor.render(
+        photographed.with_environment(foliage=torch.tensor([0.8, 0.2, 0], dtype=torch.float64))
+    )
+    inside = solid > 0.999
+    assert float((fog.image - plain.image)[:, inside].abs().mean()) > 0.03
+    assert torch.equal(leaves.image[:, inside], plain.image[:, inside])
+    assert float((leaves.image - plain.image).abs().mean()) > 0.005
+
+
+def _finite(result: Render) -> bool:
+    low, high = float(result.image.detach().min()), float(result.image.detach().max())
+    return bool(torch.isfinite(result.image).all()) and 0.0 <= low <= high <= 1.0
+
+
+@pytest.mark.parametrize(
+    "place", [[0.0, 1.65, -10.0], [60.0, 1.65, 10.0], [-1.9, 1.65, 1.5], [0.0, 1.65, 0.2]],
+    ids=["behind", "beside", "through the near plane", "around the camera"],
+)  # fmt: skip
+def test_vehicles_out_of_view_and_across_the_near_plane(photographed: SceneIR, place: list[float]) -> None:
+    lone = replace(photographed, objects=_only(photographed.objects, [0]))
+    translation = torch.tensor([place], dtype=torch.float64, requires_grad=True)
+    out = Compositor(lone, REFERENCE).render(lone.with_objects(translation=translation))
+    assert _finite(out)
+    out.image.sum().backward()
+    assert translation.grad is None or bool(torch.isfinite(translation.grad).all())
+    if place[2] < 0 or place[0] > 50:
+        assert out.opacity[0].values.numel() == 0
+        assert torch.equal(out.image, lone.background)
+
+
+def test_truncated_vehicle_is_the_photograph_and_can_be_pulled_into_view(street: Street) -> None:
+    bare = street(torch.float64)
+    at = bare.objects.translation.clone()
+    at[0] = at.new_tensor([-4.6, 1.65, 6.5])
+    bare = bare.with_objects(translation=at)
+    shot = Compositor(bare, REFERENCE).render(bare)
+    assert shot.opacity[0].x0 == 0
+    taken = replace(bare, photograph=(shot.image * 255).round() / 255, objects=_only(bare.objects, [0, 2]))
+    alphas = [shot.opacity[0], shot.opacity[2]]
+    solved = solve_sources(taken, alphas, analytic_shadows(taken, REFERENCE), SolveSettings(backend="reference"))
+    image = Compositor(solved, REFERENCE).render(solved).image
+    assert float((image - taken.photograph).abs().max()) < IDENTITY
+    pulled = Compositor(solved, REFERENCE).render(_moved(solved, dx=1.5))
+    truth = Compositor(bare, REFERENCE).render(_moved(bare, dx=1.5))
+    mask = truth.object_id == 1
+    assert float((pulled.object_id == 1)[mask].to(torch.float64).mean()) > 0.97
+    assert float((pulled.image - truth.image).abs().mean(dim=0)[mask].mean()) < 0.08
+
+
+def test_no_objects(photographed: SceneIR) -> None:
+    empty = replace(photographed, objects=_only(photographed.objects, []))
+    (out,) = render([empty], REFERENCE)
+    assert torch.equal(out.image, empty.background)
+    assert out.opacity == ()
+
+
+def test_wrong_number_of_objects_is_rejected(photographed: SceneIR) -> None:
+    fewer = replace(photographed, objects=_only(photographed.objects, [0]))
+    with pytest.raises(ShapeError, match="the 3 of the base scene"):
+        Compositor(photographed, REFERENCE).render(fewer)
+    with pytest.raises(ShapeError, match="one an object, 3"):
+        solve_sources(photographed, [])
+
+
+def test_blend_is_the_plain_formula_and_has_its_gradients() -> None:
+    generator = torch.Generator().manual_seed(1)
+    layers = torch.tensor([[0, 0, 4, 3], [2, 1, 6, 5]])
+    shadows = torch.tensor([[1, 1, 5, 4]])
+
+    def offsets(rects: Tensor) -> Tensor:
+        return torch.nn.functional.pad((rects[:, 2:] - rects[:, :2]).prod(dim=1).cumsum(0), (1, 0))
+
+    plan = blend.Plan(
+        tuple(blend.spans(shadows, offsets(shadows))), tuple(reversed(blend.spans(layers, offsets(layers))))
+    )
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
+
+    canvas, shadow, colour, opacity = rand(4, 5, 6), rand(12, 3), rand(28, 4), rand(28)
+    out = blend.blend(canvas, shadow, colour, opacity, plan)
+    expected = canvas.detach().clone()
+    expected[:3, 1:4, 1:5] *= shadow.detach().T.reshape(3, 3, 4)
+    for part, (rows, columns), size in ((slice(12, 28), (slice(1, 5), slice(2, 6)), (4, 4)),
+                                        (slice(0, 12), (slice(0, 3), slice(0, 4)), (3, 4))):  # fmt: skip
+        under = expected[:, rows, columns]
+        clear = 1 - opacity.detach()[part].reshape(size)
+        expected[:, rows, columns] = colour.detach()[part].T.reshape(4, *size) + clear * under
+    torch.testing.assert_close(out.detach(), expected)
+    assert torch.autograd.gradcheck(lambda *inputs: blend.blend(*inputs, plan), (canvas, shadow, colour, opacity))
+
+
+def _order(cars: list[tuple[float, float, float, float]]) -> list[int]:
+    """From (x, z, yaw, length) of cars 2 m wide."""
+    table = torch.tensor(cars, dtype=torch.float64)
+    count = len(cars)
+    translation = torch.stack([table[:, 0], torch.full((count,), 1.6, dtype=torch.float64), table[:, 1]], dim=1)
+    size = torch.stack([table[:, 3], torch.full_like(table[:, 3], 1.5), torch.full_like(table[:, 3], 2.0)], dim=1)
+    return blend.paint_order(size, table[:, 2], translation, torch.zeros(3, dtype=torch.float64))
+
+
+def test_paint_order_of_a_car_beside_a_long_truck() -> None:
+    half = math.pi / 2
+    ahead, truck_right = (0.0, 14.0, half, 4.0), (3.5, 16.0, half, 16.0)
+    assert _order([ahead, truck_right]) == [1, 0]
+    assert _order([truck_right, ahead]) == [0, 1]
+    # The truck's middle and nearest point are nearer, yet the car stands before its side.
+    beyond = (0.5, 22.0, half, 4.0)
+    assert _order([beyond, truck_right]) == [1, 0]
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20)
+def test_paint_order_never_lays_a_hidden_car_over_its_hider(seed: int) -> None:
+    """Cars one behind the other on a ray from the camera."""
+    generator = torch.Generator().manual_seed(seed)
+    far = torch.randperm(5, generator=generator).tolist()
+    yaw = (6.0 * torch.rand(5, generator=generator)).tolist()
+    slope = float(torch.rand(1, generator=generator)) - 0.5
+    cars = [(slope * (8.0 + 7.0 * k), 8.0 + 7.0 * k, yaw[i], 4.0) for i, k in enumerate(far)]
+    assert [far[i] for i in _order(cars)] == [4, 3, 2, 1, 0]
+
+
+def test_inflated_proxy_does_not_crack(street: Street) -> None:
+    """Vertices at one place move together, though the mesh does not share them between faces."""
+    fleet = surfaces.Fleet.of(
+        [surfaces.Surface.of(street(torch.float64).meshes[0], torch.float64)], torch.zeros(1)
+    )
+    local = fleet.surfaces[0].unit
+    _, smooth = fleet.normals(local)
+    weld = fleet.surfaces[0].weld
+    for place in range(int(weld.max()) + 1):
+        here = smooth[weld == place]
+        torch.testing.assert_close(here, here[:1].expand_as(here))
+
+
+def test_scene_to_changes_every_floating_tensor(photographed: SceneIR) -> None:
+    single = scene_to(photographed, torch.float32)
+    assert single.objects.source[0].foreground.values.dtype == torch.float32
+    assert single.camera.projection is not None
+    assert single.camera.projection.dtype == torch.float32
+    assert single.meshes[0].faces.dtype == torch.int64
+    assert isinstance(single.objects.source[0].shadow, Crop)
