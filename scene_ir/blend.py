@@ -64,9 +64,9 @@ class _Blend(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
         shadow, opacity = ctx.saved_tensors
-        grad = grad.clone(memory_format=torch.contiguous_format)
+        grad = grad_outputs[0].clone(memory_format=torch.contiguous_format)
         to_shadow = torch.zeros_like(shadow)
         to_colour = opacity.new_zeros(opacity.shape[0], ctx.channels)
         to_opacity = torch.zeros_like(opacity)

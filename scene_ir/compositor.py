@@ -82,14 +82,12 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """Placed vertices. points (V, 3) m; normals (V, 3); clip (V, 3); cos (V,) towards the camera; the same of the
-    proxy (`shell_clip`, `shell_cos`); ground_clip (4N, 3), the shadows' patches."""
+    """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the camera;
+    shell_clip (V, 3) of the proxies; ground_clip (4N, 3) of the shadows' patches."""
 
-    points: Tensor
     clip: Tensor
     cos: Tensor
     shell_clip: Tensor
-    shell_cos: Tensor
     ground_clip: Tensor
 
 
@@ -120,6 +118,17 @@ class _Rows:
     counts: Tensor
     mesh_rows: int
     fringe: _Fringe
+
+
+@dataclass(frozen=True, slots=True)
+class _Shaded:
+    """Rows with their looks: premultiplied colour (R, 3), opacity (R,), depth (R,) m, paint and height (R,)."""
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    paint: Tensor
+    height: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +218,9 @@ class Compositor:
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
         self._texels, self._shadows = None, None
+        ones = torch.ones_like(base.translation)
+        self._paint = torch.stack([s.paint for s in objects.source]).to(ones) if objects.source else ones
+        self._paint_lightness = self._base_lightness()
         if objects.source:
             self._prepare_sources(objects, base, hidden)
 
@@ -236,9 +248,15 @@ class Compositor:
             depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self._frame_hw))
         self._texels = Texels.pack(crops + crops, self._like)
-        self._paint = torch.stack([s.paint for s in objects.source]).to(self._like)
-        self._paint_lightness = texture.lab(self._paint.clamp(0.0, 1.0))[:, 0]
         self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
+
+    def _base_lightness(self) -> Tensor:
+        """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
+        fleet = self._fleet
+        total = torch.zeros_like(self._paint).index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
+        count = self._paint.new_zeros(len(self._paint)).index_add(0, fleet.owner, fleet.paint)
+        mean = total / count.clamp(min=1e-3)[:, None]
+        return texture.lab((mean * self._paint).clamp(0.0, 1.0))[:, 0]
 
     def _place(self, objects: Objects) -> _Geometry:
         fleet, camera = self._fleet, self.scene.camera
@@ -250,11 +268,9 @@ class Compositor:
             self._corners, objects.yaw, objects.translation, self.scene.environment.ground
         )
         return _Geometry(
-            points,
             surfaces.project_vertices(points, camera),
             surfaces.facing(points, normals, self._centre),
             surfaces.project_vertices(shell, camera),
-            surfaces.facing(shell, normals, self._centre),
             surfaces.project_vertices(ground, camera),
         )
 
@@ -289,20 +305,18 @@ class Compositor:
         rows = self._rows(drawn, bool(objects.source))
         size = drawn.mesh.layout.size
         if objects.source:
-            colour, opacity, depth, paint, height = self._photographed_rows(objects, drawn, rows)
-            lightness = self._paint_lightness
+            shaded = self._photographed_rows(objects, drawn, rows)
         else:
             own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
-            colour, depth, paint = self._own_colour(rows, own, None), own[:, 8], own[:, 6]
-            opacity, height = torch.ones_like(depth), own[:, 9]
-            lightness = torch.full_like(objects.yaw, 60.0)
+            colour = self._own_colour(rows, own, None)
+            shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
+        colour, depth = shaded.colour, shaded.depth
         if _active(objects.texture_code):
-            code = objects.texture_code.to(self._like)[rows.owner]
-            colour = texture.apply_texture_code(colour, opacity, code, paint, height, lightness[rows.owner])
-        opacity = opacity * rows.share
-        packed = torch.cat(
-            [colour * rows.share[:, None], (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]], dim=1
-        )
+            code, base = objects.texture_code.index_select(0, rows.owner), self._paint_lightness[rows.owner]
+            colour = texture.apply_texture_code(colour, shaded.opacity, code, shaded.paint, shaded.height, base)
+        opacity = shaded.opacity * rows.share
+        inverse = (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]
+        packed = torch.cat([colour * rows.share[:, None], inverse], dim=1)
         z = torch.full_like(drawn.mesh.depth, torch.inf).scatter_reduce(
             0, rows.pixel, depth.detach(), "amin", include_self=True
         )
@@ -343,58 +357,42 @@ class Compositor:
         )
         return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
-    def _photographed_rows(
-        self, objects: Objects, drawn: Drawn, rows: _Rows
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Premultiplied colour (R, 3), opacity, depth m, paint and height (R,) of all rows."""
-        geometry, base, fleet = drawn.geometry, self._base, self._fleet
-        height, width = self._frame_hw
-        fixed = torch.stack([fleet.paint, self._height], dim=1)
+    def _photographed_rows(self, objects: Objects, drawn: Drawn, rows: _Rows) -> _Shaded:
+        """All rows, coloured by the photograph, and completed where it did not see the mesh."""
+        geometry, base, fleet, m = drawn.geometry, self._base, self._fleet, rows.mesh_rows
+        turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, self._height], dim=1)
 
-        def attributes(clip: Tensor, base_clip: Tensor, cos: Tensor, base_cos: Tensor) -> Tensor:
-            return torch.cat(
-                [base_clip - clip, base_clip[:, 2:], (cos - base_cos)[:, None], base_cos[:, None], fixed], dim=1
-            )
+        def lookup(fragments: verbs.Fragments, clip: Tensor, base_clip: Tensor, part: slice) -> Tensor:
+            attributes = torch.cat([base_clip - clip, base_clip[:, 2:], turn], dim=1)
+            dense = verbs.interpolate(fragments, clip, fleet.faces, attributes, self.settings.backend)
+            return _lookup(dense.index_select(0, rows.pixel[part]), rows.xy[part])
 
-        m = rows.mesh_rows
-        dense = verbs.interpolate(
-            drawn.mesh, geometry.clip, fleet.faces,
-            attributes(geometry.clip, base.clip, geometry.cos, base.cos), self.settings.backend,
-        )  # fmt: skip
-        mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
-        dense = verbs.interpolate(
-            drawn.shell, geometry.shell_clip, fleet.faces,
-            attributes(geometry.shell_clip, base.shell_clip, geometry.shell_cos, base.shell_cos),
-            self.settings.backend,
-        )  # fmt: skip
-        shell = _lookup(dense.index_select(0, rows.pixel[m:]), rows.xy[m:])
-        move, z_then, z_now, turned, cos_then, paint, up = torch.cat([mesh, shell]).split(
-            [2, 1, 1, 1, 1, 1, 1], dim=1
-        )
-        z_then, z_now, turned, cos_then, paint, up = (
-            t[:, 0] for t in (z_then, z_now, turned, cos_then, paint, up)
-        )
+        mesh = rows.fringe.fill(lookup(drawn.mesh, geometry.clip, base.clip, slice(0, m)))
+        shell = lookup(drawn.shell, geometry.shell_clip, base.shell_clip, slice(m, None))
+        move, rest = torch.cat([mesh, shell]).split([2, 6], dim=1)
+        z_then, z_now, turned, cos_then, paint, up = rest.unbind(1)
 
         assert self._texels is not None
         uv = rows.xy + move
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
-        alpha = seen[:, 3]
-        known = 1.0 - smoothstep(seen[:, 4], 0.0, 1.0)
-        weight = texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, height, width) * known
-        near = 1.0 - smoothstep(z_then[:m] - seen[:m, 6], *texture.DEPTH_TOLERANCE_M)
-        outline = smoothstep(seen[m:, 5], 0.0, 1.0) * texture.outline_weight(turned[m:])
-        weight = weight * torch.cat([near, outline])
-        rim = 1.0 - smoothstep(cos_then[:m], 0.3, 0.5)
+        rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
+        alpha, hidden, outline, z_seen = rest.unbind(1)
+        weight = texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, *self._frame_hw)
+        weight = weight * (1.0 - smoothstep(hidden, 0.0, 1.0))
+        reached = 1.0 - smoothstep(z_then[:m] - z_seen[:m], *texture.DEPTH_TOLERANCE_M)
+        kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
+        weight = weight * torch.cat([reached, kept])
+        rim = 1.0 - smoothstep(cos_then[:m], *texture.RIM)
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
         fill = 1.0 - weight[:m] + weight[:m] * opened
-        colour = weight[:, None] * seen[:, :3]
-        opacity = weight * alpha
+        colour, opacity = weight[:, None] * rgb, weight * alpha
         need = (fill != 0.0).nonzero()[:, 0]
         if need.numel():
+            filled = fill.index_select(0, need)
             completed = self._completion(objects, drawn, rows, need, cos_then[:m] + turned[:m])
-            colour = colour.index_add(0, need, fill.index_select(0, need)[:, None] * completed)
-            opacity = opacity.index_add(0, need, fill[need])
-        return colour, opacity, z_now, paint, up
+            colour = colour.index_add(0, need, filled[:, None] * completed)
+            opacity = opacity.index_add(0, need, filled)
+        return _Shaded(colour, opacity, z_now, paint, up)
 
     def _own_attributes(self, objects: Objects, geometry: _Geometry) -> Tensor:
         """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
@@ -499,7 +497,8 @@ class Compositor:
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
-        objects = scene_to(objects, self._like.dtype, self._like.device)
+        moving = {n: getattr(objects, n).to(self._like) for n in ("translation", "yaw", "ffd", "texture_code")}
+        objects = replace(self.scene.objects, **moving)
         environment = perturbed.environment
         weather, foliage = _active(environment.weather), _active(environment.foliage)
         canvas = self._canvas

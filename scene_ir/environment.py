@@ -25,7 +25,7 @@ _SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
 _LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
-_DARKENING = (3.0, 2.5, 1.7)
+_DARKENING = (2.0, 1.75, 1.25)
 """Optical depth of red, green and blue at time code 1: night is blue and dark, not black."""
 _WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
@@ -70,10 +70,11 @@ def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
     hue, shift, density = code.unbind(-1)
     lightness, a, b = lab(rgb.clamp(0.0, 1.0)).unbind(-1)
     level = (lightness / 100.0).clamp(0.01, 0.99)
-    level = torch.sigmoid(torch.logit(level) + 1.5 * shift)
-    angle = -1.05 * hue
+    lifted = torch.sigmoid(torch.logit(level) + 1.5 * shift)
+    chroma = (1.0 + 0.3 * hue) * (lifted / level).sqrt()
+    level = lifted
+    angle = -(0.70 + 0.35 * torch.tanh(2.0 * hue)) * hue  # green is nearer to blue than to orange
     cos, sin = torch.cos(angle), torch.sin(angle)
-    chroma = 1.0 + 0.3 * hue
     room = 4.0 * level * (1.0 - level)
     red = chroma * (cos * a - sin * b) + 10.0 * hue * room
     yellow = chroma * (sin * a + cos * b) + 8.0 * hue * room
@@ -158,5 +159,5 @@ def _leaf_gaps(height: int, width: int) -> Tensor:
     noise = torch.rand(1, 1, height, width, generator=generator)
     fine = kornia.filters.gaussian_blur2d(noise, (5, 5), (1.0, 1.0), border_type="replicate")
     coarse = kornia.filters.gaussian_blur2d(noise, (21, 21), (4.0, 4.0), border_type="replicate")
-    mixed = (fine - 0.5) / fine.std().clamp(min=1e-6) + (coarse - 0.5) / coarse.std().clamp(min=1e-6)
-    return torch.sigmoid(1.5 * mixed)[0, 0]
+    mixed = (fine - 0.5) / fine.std().clamp(min=1e-6) + 0.5 * (coarse - 0.5) / coarse.std().clamp(min=1e-6)
+    return torch.sigmoid(2.0 * mixed - 1.0)[0, 0]

@@ -24,6 +24,8 @@ TURN_TOLERANCE = (0.08, 0.25)
 """Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
 OPEN_TURN = (0.02, 0.1)
 """Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
+RIM = (0.3, 0.5)
+"""That cosine, in the photograph, up to and beyond which a point is near the outline, and not."""
 OUTLINE_TURN = (0.1, 0.25)
 """Change of that cosine at which a point begins to leave, and has left, the outline."""
 OUTLINE_PX = (1.0, 2.2)

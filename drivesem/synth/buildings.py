@@ -26,13 +26,13 @@ _ROOFS = np.array(
 @dataclass(frozen=True, slots=True)
 class BuildingStyle:
     """Look of one building. wall, roof: linear albedo. pattern: window pitch and storey height in metres, and the
-    window's share of both. shop: whether the ground floor is glazed. pitched: roof form.
+    window's share of both. offset_m: by which windows are shifted along the wall. pitched: roof form.
     """
 
     wall: np.ndarray
     roof: np.ndarray
     pattern: tuple[float, float, float, float]
-    shop: bool
+    offset_m: float
     pitched: bool
 
 
@@ -51,7 +51,7 @@ def style(identifier: int) -> BuildingStyle:
             float(rng.uniform(0.34, 0.6)),
             float(rng.uniform(0.42, 0.6)),
         ),
-        shop=bool(rng.random() < 0.35),
+        offset_m=0.37 if rng.random() < 0.35 else 0.0,
         pitched=bool(rng.random() < 0.75),
     )
 
@@ -64,7 +64,7 @@ def building(identifier: int, length_m: float, depth_m: float, storeys: int, alo
     look = style(identifier)
     height = storeys * look.pattern[1] + 0.5
     body = box((length_m, height, depth_m), Material.FACADE, look.wall, look.pattern)
-    body.uv[..., 0] += 0.37 if look.shop else 0.0
+    body.uv[..., 0] += look.offset_m
     parts = [body]
     if look.pitched:
         parts += _gable(length_m, depth_m, height, look, along)

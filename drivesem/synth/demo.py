@@ -21,7 +21,7 @@ from drivesem.synth.frames import (
     render_frame,
 )
 from drivesem.synth.layout import LayoutSettings
-from drivesem.synth.render import SUPERSAMPLING, blocks
+from drivesem.synth.render import blocks
 from drivesem.synth.soup import GROUND
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
@@ -117,8 +117,9 @@ def demo_scenes(count: int = 10, seed: int = 0) -> list[SceneIR]:
 
 
 def take_apart(frame: SynthFrame, name: str) -> SceneIR:
-    """The scene of a frame rendered with its background: exact objects, mattes, shadows and maps; all its actors must
-    be vehicles that appear in the image."""
+    """The scene of a frame rendered with its background: exact objects, mattes, shadows and maps; all its actors
+    must be vehicles that appear in the image.
+    """
     assert frame.background is not None
     assert frame.background_depth_m is not None
     truths = frame.truths
@@ -175,16 +176,17 @@ def _mattes(frame: SynthFrame) -> list[Crop]:
         own = truth.opacity.values.shape
         x0, y0 = max(truth.opacity.x0 - 3, 0), max(truth.opacity.y0 - 3, 0)
         x1, y1 = min(truth.opacity.x0 + own[2] + 3, width), min(truth.opacity.y0 + own[1] + 3, height)
-        share = sum((p[y0:y1, x0:x1] == truth.index + 1).astype(np.float32) for p in parts) / SUPERSAMPLING**2
-        share = cv2.GaussianBlur(share, (5, 5), frame.setting.response.blur_px)
+        shown = np.stack([p[y0:y1, x0:x1] == truth.index + 1 for p in parts]).mean(axis=0, dtype=np.float32)
+        share = cv2.GaussianBlur(shown, (5, 5), frame.setting.response.blur_px)
         share[share < 1e-3] = 0
         out.append(Crop(torch.from_numpy(np.minimum(share, 1.0))[None], x0, y0))
     return out
 
 
 def _shadows(frame: SynthFrame, alphas: list[Crop]) -> list[Crop | None]:
-    """For each vehicle the factor (3, h, w) by which it darkens the ground, split where several do by who stands between
-    the ground and the sun, and who stands near."""
+    """For each vehicle the factor (3, h, w) by which it darkens the ground, split where several do by who stands
+    between the ground and the sun, and who stands near.
+    """
     setting, camera = frame.setting, frame.camera
     covered = np.zeros((camera.height, camera.width), bool)
     for alpha in alphas:

@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: solid dark cores under a coat of single leaf triangles. Each shape has an id in a pool."""
+"""Trees, bushes and hedges: dark cores under a coat of leaf triangles. Each shape has an id in a pool."""
 
 from __future__ import annotations
 

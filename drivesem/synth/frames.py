@@ -50,7 +50,8 @@ _LEAST_WIDTH_PX = 3.0
 @dataclass(frozen=True, slots=True)
 class SynthSettings:
     """What varies between uses of the generator. layout: vehicles and roads. sunny: clear weather only.
-    tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None: any.
+    tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None:
+    any.
     """
 
     layout: LayoutSettings | None = None
@@ -63,7 +64,8 @@ class SynthSettings:
 class Truth:
     """Exact ground truth of one actor. translation (3,) m, yaw rad: camera axes, KITTI's convention. index: of
     the actor in its plan. box_xyxy (4,) px; visible: share of its own silhouette in the image that nothing hides;
-    screened: share that the surroundings hide; truncation in [0, 1]; opacity: its own silhouette (1, h, w), in [0, 1].
+    screened: share that the surroundings hide; truncation in [0, 1]; opacity: its own silhouette (1, h, w), in [0,
+    1].
     """
 
     actor: Actor
@@ -80,10 +82,11 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class SynthFrame:
-    """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels: KITTI's
-    classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; owner (2H, 2W): what each sample
-    shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background where there is one, of each
-    pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed and shapes used.
+    """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels:
+    KITTI's classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; owner (2H, 2W): what
+    each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background where there
+    is one, of each pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed and shapes
+    used.
     """
 
     image: np.ndarray
@@ -138,8 +141,15 @@ def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
     soup = actor_soup(actor, owner)
     turn = yaw_matrix(torch.tensor(actor.yaw, dtype=torch.float64)).numpy().T
     corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
-    return Soup(corners, (soup.normals @ turn).astype(np.float32), soup.uv, soup.material, soup.albedo, soup.pattern,
-                soup.owner)  # fmt: skip
+    return Soup(
+        corners,
+        (soup.normals @ turn).astype(np.float32),
+        soup.uv,
+        soup.material,
+        soup.albedo,
+        soup.pattern,
+        soup.owner,
+    )
 
 
 def full_boxes(actors: Sequence[Actor], view: View) -> np.ndarray:
@@ -158,10 +168,10 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
     height, width = view.camera.height, view.camera.width
     full = full_boxes(actors, view)
     rects = np.zeros((len(actors), 4), np.int64)
-    for i, box in enumerate(full):
-        if np.isfinite(box).all():
-            low = np.floor(np.clip(box[:2] - 2, 0, [width, height]))
-            high = np.ceil(np.clip(box[2:] + 3, 0, [width, height]))
+    for i, extent in enumerate(full):
+        if np.isfinite(extent).all():
+            low = np.floor(np.clip(extent[:2] - 2, 0, [width, height]))
+            high = np.ceil(np.clip(extent[2:] + 3, 0, [width, height]))
             rects[i] = n * np.concatenate([low, np.maximum(high, low)])
     ends = np.cumsum([len(s) for s in soups])
     ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1) if soups else np.zeros((0, 2))
@@ -180,8 +190,8 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
         shown = (seen == i + 1) & own
         rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
         # Sample k of an axis covers [k / n - 1/2, (k + 1) / n - 1/2] px, as pixel j covers [j - 1/2, j + 1/2].
-        box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1]) / n - 0.5
-        box = np.clip(box, 0, [width - 1, height - 1, width - 1, height - 1])
+        outline = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1]) / n - 0.5
+        outline = np.clip(outline, 0, [width - 1, height - 1, width - 1, height - 1])
         visible = float(shown.sum() / own.sum())
         screened = float(((seen == 0) & own).sum() / own.sum())
         cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
@@ -193,7 +203,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
                 actor=actor,
                 translation=_stand(actor, view),
                 yaw=actor.yaw,
-                box_xyxy=box,
+                box_xyxy=outline,
                 index=i,
                 visible=visible,
                 screened=screened,
@@ -313,8 +323,9 @@ def boxes_alone(plan: Plan) -> list[Truth]:
 def render_frame(
     plan: Plan, with_background: bool = False, accept: Callable[[Sequence[Truth]], bool] | None = None
 ) -> SynthFrame | None:
-    """Render a plan; with_background: also the street without its actors and their shadows. None where `accept` is given
-    and turns the truths down, which is known before anything is shaded."""
+    """Render a plan; with_background: also the street without its actors and their shadows. None where
+    `accept` is given and turns the truths down, which is known before anything is shaded.
+    """
     setting, view = plan.setting, plan.setting.view
     seed, index, _, attempt = setting.grain_seed
     static, used = surroundings(setting.road, POOLS[plan.split], stream(seed, index, plan.split, 16 * attempt + 3))
@@ -351,7 +362,7 @@ def render_frame(
             "weather": setting.light.weather,
             "vehicles": sorted(vehicles),
             **used,
-        },  # fmt: skip
+        },
     )
 
 

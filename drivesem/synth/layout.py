@@ -34,8 +34,9 @@ _PAINTS = np.array(
     np.float32,
 )  # fmt: skip
 _PAINT_SHARE = np.array([0.18, 0.19, 0.16, 0.15, 0.07, 0.08, 0.02, 0.025, 0.02, 0.015, 0.04, 0.04, 0.01])
-"""Linear albedo of car paints and how often they are seen (new registrations 2005 to 2012: black, grey, silver, white
-lead)."""
+"""Linear albedo of car paints and how often they are seen (new registrations 2005 to 2012: black, grey, silver,
+white lead).
+"""
 MARGIN_M = 0.3
 """Least clearance between two footprints."""
 
@@ -76,8 +77,9 @@ def statistics() -> Statistics:
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """Where vehicles may be. middle_m: d. direction: +1 as the ego car, -1 oncoming, 0 across the road (parked nose
-    in). parked: standing. weight: how much more often than average it is chosen. spacing_m: between candidates.
+    """Where vehicles may be. middle_m: d. direction: +1 as the ego car, -1 oncoming, 0 across the road (parked
+    nose in). parked: standing. weight: how much more often than average it is chosen. spacing_m: between
+    candidates.
     """
 
     middle_m: float
@@ -97,6 +99,11 @@ class Strip:
     height_m: float = 0.0
 
 
+def _strip(edge: float, other: float, material: Material, height_m: float = 0.0) -> Strip:
+    """A strip between two edges in any order."""
+    return Strip(min(edge, other), max(edge, other), material, height_m)
+
+
 @dataclass(frozen=True, slots=True)
 class Marking:
     """A painted line along the road at `middle_m`: dashes of `dash_m` every `period_m` (equal: solid)."""
@@ -109,8 +116,8 @@ class Marking:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """One road. curvature in 1/m; crossing: (s0, s1) of a road across, or None; flank_m: (left, right) d from which
-    on buildings and plants may stand.
+    """One road. curvature in 1/m; crossing: (s0, s1) of a road across, or None; flank_m: (left, right) d from
+    which on buildings and plants may stand.
     """
 
     kind: str
@@ -156,8 +163,8 @@ class Actor:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSettings:
-    """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists appear.
-    vehicles: (fewest, most) a frame, or None for KITTI's distribution. max_heavy: most trucks and buses.
+    """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists
+    appear. vehicles: (fewest, most) a frame, or None for KITTI's distribution. max_heavy: most trucks and buses.
     """
 
     variants: tuple[int, int] = (0, 100)
@@ -196,18 +203,18 @@ def _street(rng: np.random.Generator, kind: str, crossing: tuple[float, float] |
         width = float(rng.uniform(4.6, 5.2) if nose_in else rng.uniform(1.95, 2.3)) if parked else 0.0
         if parked:
             material = Material.PARKING if rng.random() < 0.6 else Material.ROAD
-            strips.append(Strip(*sorted((edge, edge + side * width)), material))
+            strips.append(_strip(edge, edge + side * width, material))
             direction = 0 if nose_in else side if rng.random() < 0.85 or side < 0 else -side
             spacing = 2.75 if nose_in else 5.6
             lanes.append(Lane(edge + side * width / 2, direction, True, 1.9 if busy else 1.5, spacing))
         outer = edge + side * width
         walk = outer + side * float(rng.uniform(1.5, 2.6) if busy else rng.uniform(2.0, 4.5))
         height = float(rng.uniform(0.08, 0.14))
-        strips.append(Strip(*sorted((outer, outer + side * 0.14)), Material.KERB, height))
-        strips.append(Strip(*sorted((outer + side * 0.14, walk)), Material.PAVEMENT, height))
+        strips.append(_strip(outer, outer + side * 0.14, Material.KERB, height))
+        strips.append(_strip(outer + side * 0.14, walk, Material.PAVEMENT, height))
         pavements.append(tuple(sorted((outer + side * 0.4, walk - side * 0.3))))
         garden = Material.GRASS if busy or rng.random() < 0.4 else Material.PAVEMENT
-        strips.append(Strip(*sorted((walk, walk + side * 60)), garden, height))
+        strips.append(_strip(walk, walk + side * 60, garden, height))
         edges.append(walk)
     markings = []
     middle = -lane / 2
@@ -253,17 +260,15 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
     edges = []
     for side, edge in ((-1, left - 0.3), (1, right + 0.3)):
         if shoulder:
-            strips.append(Strip(*sorted((edge, edge + side * shoulder)), Material.ROAD))
+            strips.append(_strip(edge, edge + side * shoulder, Material.ROAD))
             edge += side * shoulder
         bank = edge + side * float(rng.uniform(0.8, 1.6))
         kind_of_bank = Material.GRAVEL if rng.random() < 0.5 else Material.GRASS
         if kind == "arterial" and rng.random() < 0.6:
             kind_of_bank = Material.PAVEMENT
             bank += side * 1.5
-        strips.append(
-            Strip(*sorted((edge, bank)), kind_of_bank, 0.1 if kind_of_bank == Material.PAVEMENT else 0.0)
-        )
-        strips.append(Strip(*sorted((bank, bank + side * 60)), Material.GRASS))
+        strips.append(_strip(edge, bank, kind_of_bank, 0.1 if kind_of_bank == Material.PAVEMENT else 0.0))
+        strips.append(_strip(bank, bank + side * 60, Material.GRASS))
         edges.append(bank)
     solid = Marking(right, 0.15, 1.0, 1.0), Marking(left, 0.15, 1.0, 1.0)
     markings = list(solid)
@@ -368,7 +373,8 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
             break
         d, s, lane, _ = candidates[index]
         kind, variant = _vehicle(rng, settings, lane.parked, heavy < settings.max_heavy)
-        size = np.array(typical_size_lhw(kind, variant)) * rng.normal(1.0, (0.025, 0.02, 0.015))
+        usual, stretch = typical_size_lhw(kind, variant), rng.normal(1.0, (0.025, 0.02, 0.015)).tolist()
+        size = (usual[0] * stretch[0], usual[1] * stretch[1], usual[2] * stretch[2])
         if abs(lane.direction) == 2:
             yaw = 0.0 if lane.direction > 0 else np.pi
             yaw += float(rng.normal(0, 0.05) if rng.random() < 0.7 else rng.uniform(-0.9, 0.9))
@@ -380,7 +386,7 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
             yaw = road.yaw(s, -lane.direction if flipped else lane.direction)
             yaw += float(rng.normal(0, fitted.yaw_spread_rad))
         x, z = (float(v) for v in road.point(d, s))
-        outline = footprint((x, z), yaw, tuple(size))
+        outline = footprint((x, z), yaw, size)
         in_view = abs(x) < 0.95 * z + 3.0 and z > 1.5
         if not in_view or any(clearance(outline, o) < MARGIN_M for o in outlines):
             continue
@@ -395,8 +401,8 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
                 variant,
                 (x, z),
                 yaw,
-                tuple(float(v) for v in size),
-                tuple(map(float, paint)),
+                size,
+                (float(paint[0]), float(paint[1]), float(paint[2])),
                 lane.parked,
                 int(rng.integers(2**31)),
             )

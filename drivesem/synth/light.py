@@ -15,8 +15,8 @@ _WEATHER_SHARE = (0.72, 0.15, 0.05, 0.08)
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are linear
-    radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
+    """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are
+    linear radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
     """
 
     weather: str
@@ -33,8 +33,8 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The camera. exposure: factor; white_balance (3,); contrast: exponent of the toe; vignette: loss in the corners;
-    blur_px: standard deviation; noise: standard deviation of a mid-grey pixel, of 1.
+    """The camera. exposure: factor; white_balance (3,); contrast: exponent of the toe; vignette: loss in the
+    corners; blur_px: standard deviation; noise: standard deviation of a mid-grey pixel, of 1.
     """
 
     exposure: float

@@ -1,4 +1,4 @@
-"""Tiling noise that surfaces are painted with: made once per pool, sampled by position, no aliasing by choice of scale."""
+"""Tiling noise that surfaces are painted with: made once per pool, sampled by position."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ _ROW = 4096
 
 @dataclass(frozen=True, slots=True)
 class NoiseSet:
-    """Three textures (SIZE + 1, SIZE + 1) float32, zero mean, unit deviation, last row and column repeat the first.
+    """Three textures (SIZE + 1, SIZE + 1) float32, zero mean, unit deviation, last row and column repeat the
+    first.
 
     soft: clouds and patches (amplitude ~ 1/f^1.7); rough: leaves and plaster (~ 1/f^0.9); grain: nearly white.
     """

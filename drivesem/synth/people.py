@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from drivesem.synth.soup import Material, Soup, ball, join, stick
@@ -85,9 +87,7 @@ def _wheel(centre: np.ndarray, radius: float) -> list[Soup]:
     rubber, steel = np.full(3, 0.02, np.float32), np.full(3, 0.35, np.float32)
     angle = np.linspace(0, 2 * np.pi, 15)
     rim = centre + np.stack([np.cos(angle) * radius, np.sin(angle) * radius, np.zeros(15)], axis=1)
-    parts = [
-        stick(a, b, (0.022, 0.022), Material.CLOTH, rubber, 5) for a, b in zip(rim[:-1], rim[1:], strict=True)
-    ]
+    parts = [stick(a, b, (0.022, 0.022), Material.CLOTH, rubber, 5) for a, b in pairwise(rim)]
     spokes = rim[:-1:2]
     return parts + [stick(centre, s, (0.006, 0.006), Material.METAL, steel, 3) for s in spokes]
 
@@ -101,9 +101,18 @@ def bicycle(rng: np.random.Generator) -> Soup:
     tubes = ((crank, seat), (crank, head), (seat, head), (seat, back), (crank, back), (bar, front))
     parts = [stick(a, b, (0.02, 0.02), Material.CLOTH, paint, 5) for a, b in tubes]
     parts.append(
-        stick(bar - [0.05, 0, 0.26], bar + [-0.05, 0, 0.26], (0.015, 0.015), Material.CLOTH, paint * 0.2, 5)
+        stick(
+            bar - np.array([0.05, 0, 0.26]),
+            bar + np.array([-0.05, 0, 0.26]),
+            (0.015, 0.015),
+            Material.CLOTH,
+            paint * 0.2,
+            5,
+        )
     )
-    parts.append(ball(seat - [0, 0.06, 0], (0.13, 0.035, 0.07), Material.CLOTH, np.full(3, 0.02, np.float32), 1))
+    parts.append(
+        ball(seat - np.array([0, 0.06, 0]), (0.13, 0.035, 0.07), Material.CLOTH, np.full(3, 0.02, np.float32), 1)
+    )
     return join([*parts, *_wheel(back, 0.33), *_wheel(front, 0.33)])
 
 

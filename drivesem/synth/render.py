@@ -28,8 +28,8 @@ _SHADOW_DISTANCE_M = 3000.0
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of projection in
-    camera axes (KITTI's camera 2 sits beside the origin). height_m: of the origin above the ground.
+    """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of
+    projection in camera axes (KITTI's camera 2 sits beside the origin). height_m: of the origin above the ground.
     """
 
     camera: Camera
@@ -87,8 +87,8 @@ class SunMaps:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A render. image (H, W, 3) uint8; developed (H * W, 3) float32, before lens and sensor; touched (H * W,) bool, pixels
-    that actors or their shadows change; sun_maps: shadow maps it used.
+    """A render. image (H, W, 3) uint8; developed (H * W, 3) float32, before lens and sensor; touched (H * W,)
+    bool, pixels that actors or their shadows change; sun_maps: shadow maps it used.
     """
 
     image: np.ndarray
@@ -99,8 +99,8 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What the camera sees, at twice the resolution. faces: the triangles in view. face (2H, 2W) index into them, -1 in
-    the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32, -1 in the sky.
+    """What the camera sees, at twice the resolution. faces: the triangles in view. face (2H, 2W) index into them,
+    -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32, -1 in the sky.
     """
 
     faces: Soup
@@ -190,9 +190,8 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
             if not len(points):
                 continue
             w = points[..., 2:] + np.float32(_SHADOW_DISTANCE_M)
-            pixels = (points[..., :2] - np.float32([x0, z0])) * np.float32(
-                [size / (x1 - x0), size / (z1 - z0)]
-            ) - 0.5
+            texels = np.array([size / (x1 - x0), size / (z1 - z0)], np.float32)
+            pixels = (points[..., :2] - np.array([x0, z0], np.float32)) * texels - 0.5
             clip = np.concatenate([pixels * w, w], axis=-1)
             _, found = rasterise(clip, np.eye(3), np.array([[0, 0, size, size]]), np.array([[0, len(points)]]))
             depth[i, j] = found.reshape(size, size) - np.float32(_SHADOW_DISTANCE_M)
@@ -202,7 +201,7 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
 def _lit(
     maps: SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Share (n,) of the sun that arrives, and where (n,) actors take some of it. samples: (material, owner, sun)."""
+    """Share (n,) of the sun that arrives, and where (n,) actors take some. samples: (material, owner, sun)."""
     n = len(point)
     shaded = np.zeros(n, bool)
     if maps is None:
@@ -258,8 +257,9 @@ def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.nda
 def _open_sky(
     world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles; and where
-    (n,) vehicles hide some of it."""
+    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles; and
+    where (n,) vehicles hide some of it.
+    """
     hemmed = np.zeros(len(world), bool)
     height = -world[:, 1]
     upright = ~np.isin(material, GROUND)
@@ -313,8 +313,9 @@ def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) ->
 
 
 def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
-    """The same photograph with no actors. sight: of the surroundings alone; full: with actors. Shades only what they
-    touched."""
+    """The same photograph with no actors. sight: of the surroundings alone; full: with actors. Shades only
+    what they touched.
+    """
     maps = full.sun_maps
     if maps is not None:
         depth = maps.depth.copy()
@@ -332,8 +333,9 @@ def _develop_pixels(
     shadows: list[Shadow],
     target: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the image and
-    the pixels that actors touch."""
+    """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the
+    image and the pixels that actors touch.
+    """
     image, wanted = target
     n, width = SUPERSAMPLING, setting.view.camera.width
     once, apart = _shading_sites(sight)
@@ -433,7 +435,8 @@ def _shade_sites(
 
 
 def _attribute_maps(seen: Soup, used: np.ndarray) -> np.ndarray:
-    """(m, 5, 3) linear maps from a point on each used face (centre-relative) to its normal and surface coordinates.
+    """(m, 5, 3) linear maps from a point on each used face (centre-relative) to its normal and surface
+    coordinates.
 
     Barycentric coordinates are linear in the point, as the point is the same combination of the three corners.
     """

@@ -18,8 +18,8 @@ _F = np.float32
 class Samples:
     """n surface samples. point (n, 3): camera axes, from the camera's centre, m; world (n, 3): m, ground at y = 0;
     normal (n, 3) unit, towards the viewer; uv (n, 2) m; material (n,); albedo (n, 3); pattern (n, 4); owner (n,);
-    lit (n,): share of the sun that arrives, in [0, 1]; open_sky (n,): share of the sky, in [0, 1]; pixel_m (n,): size of
-    a pixel at the sample.
+    lit (n,): share of the sun that arrives, in [0, 1]; open_sky (n,): share of the sky, in [0, 1]; pixel_m (n,):
+    size of a pixel at the sample.
     """
 
     point: np.ndarray
@@ -37,6 +37,10 @@ class Samples:
     def take(self, index: np.ndarray) -> Samples:
         """Some of the samples."""
         return Samples(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+def _rgb(red: float, green: float, blue: float) -> np.ndarray:
+    return np.array([red, green, blue], np.float32)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -64,7 +68,7 @@ def _pulse(x: np.ndarray, period: np.ndarray | float, share: np.ndarray | float,
     return sharp * (1 - melt) + mean * melt
 
 
-def _paint_road(s: Samples, road: Road, noise: NoiseSet, along_px: np.ndarray, wet: float) -> np.ndarray:
+def _paint_road(s: Samples, road: Road, noise: NoiseSet, along_px: np.ndarray) -> np.ndarray:
     d, q, seed = s.uv[:, 0], s.uv[:, 1], s.pattern[:, 0]
     x = d + seed
     tone = 1 + 0.09 * _noise(noise.soft, x, q * _F(0.4), 0.08)
@@ -75,9 +79,9 @@ def _paint_road(s: Samples, road: Road, noise: NoiseSet, along_px: np.ndarray, w
     tone *= 1 - 0.22 * np.clip((patch - 1.35) * 6, 0, 1)
     crack = np.abs(_noise(noise.soft, x + 13, q * _F(0.8) + 7, 0.035))
     tone *= 1 - 0.35 * np.clip(1 - crack * 26, 0, 1) * _fade(along_px, 0.12)
-    track = np.cos((d - 0.0) * _F(2 * np.pi / 1.7))
+    track = np.cos(d * _F(2 * np.pi / 1.7))
     tone *= 1 + 0.035 * track
-    albedo = s.albedo * np.maximum(tone, 0.2)[:, None] * (1 - wet)
+    albedo = s.albedo * np.maximum(tone, 0.2)[:, None]
     cover = np.zeros(len(d), _F)
     for line in road.markings:
         near = np.abs(d - line.middle_m) < line.width_m + 0.3
@@ -98,7 +102,7 @@ def _paint_road(s: Samples, road: Road, noise: NoiseSet, along_px: np.ndarray, w
     if cover.any():
         worn = np.clip(0.75 + 0.28 * _noise(noise.rough, x, q, 0.02), 0.25, 1.0)
         cover *= worn
-        albedo += (_F([0.62, 0.62, 0.60]) - albedo) * cover[:, None]
+        albedo += (_rgb(0.62, 0.62, 0.60) - albedo) * cover[:, None]
     return albedo
 
 
@@ -121,7 +125,7 @@ def _paint_grass(s: Samples, noise: NoiseSet, along_px: np.ndarray) -> np.ndarra
     tone = 1 + 0.16 * broad + 0.30 * _noise(noise.rough, u, v * _F(0.6), 0.035) * _fade(along_px, 0.3)
     tone += 0.30 * _noise(noise.grain, u, v * _F(0.5), 0.02) * _fade(along_px, 0.08)
     dry = np.clip(0.25 + 0.3 * _noise(noise.soft, u + 50, v, 0.05), 0, 0.8)[:, None]
-    albedo = s.albedo * (1 - dry) + _F([0.16, 0.135, 0.07]) * dry
+    albedo = s.albedo * (1 - dry) + _rgb(0.16, 0.135, 0.07) * dry
     return albedo * np.maximum(tone, 0.25)[:, None]
 
 
@@ -138,7 +142,7 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     frame_u = _pulse(u, pitch, np.minimum(wide + 0.20 / pitch, 0.9), blur)
     frame_v = _pulse(row, storey, np.minimum(tall + 0.20 / storey, 0.92), blur)
     frame = frame_u * frame_v * (row > 0)
-    albedo += (_F([0.62, 0.61, 0.58]) - albedo) * (frame * _F(0.85))[:, None]
+    albedo += (_rgb(0.62, 0.61, 0.58) - albedo) * (frame * _F(0.85))[:, None]
     pane = _pulse(u, pitch, wide, blur) * _pulse(row, storey, tall, blur) * (row > 0)
     bar = np.abs(np.mod(u / pitch, 1.0) - 0.5) * pitch
     pane *= 1 - np.clip((0.035 - bar) / blur + 0.5, 0, 1) * np.minimum(0.07 / blur, 1)
@@ -149,7 +153,7 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     inside = 0.02 + 0.22 * curtain
     sill = np.mod(row / storey, 1.0) - 0.5
     inside = inside * np.clip(1.0 - 1.4 * sill / np.maximum(tall, 0.1), 0.3, 1.0)
-    albedo += (inside[:, None] * _F([1.0, 0.97, 0.92]) - albedo) * pane[:, None]
+    albedo += (inside[:, None] * _rgb(1.0, 0.97, 0.92) - albedo) * pane[:, None]
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = view + 2 * cosine[:, None] * s.normal
@@ -213,7 +217,7 @@ def _surface(
     along_px = s.pixel_m * np.maximum(s.point[:, 2] / camera_height_m, 1.0) if material in GROUND else s.pixel_m
     u, v = s.uv[:, 0], s.uv[:, 1]
     if material == Material.ROAD:
-        return _paint_road(s, road, noise, along_px, 0.0) * incoming
+        return _paint_road(s, road, noise, along_px) * incoming
     if material == Material.PARKING:
         return _paint_slabs(s, noise, along_px, 0.2, 0.02) * incoming
     if material == Material.PAVEMENT:
@@ -252,7 +256,7 @@ def _surface(
     if material == Material.PAINT:
         return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05, 1.0, 600.0))
     if material == Material.GLASS:
-        return _polish(s, light, noise, _F([0.022, 0.025, 0.026]) * incoming, (0.07, 1.0, 900.0))
+        return _polish(s, light, noise, _rgb(0.022, 0.025, 0.026) * incoming, (0.07, 1.0, 900.0))
     if material == Material.LIGHT:
         return _polish(s, light, noise, s.albedo * 0.8 * incoming, (0.08, 0.9, 500.0))
     if material == Material.METAL:
@@ -271,7 +275,7 @@ def _dirty(s: Samples, noise: NoiseSet) -> np.ndarray:
     dust = np.clip(
         (0.55 - height) * 0.9 + 0.08 * _noise(noise.rough, s.world[:, 0] + s.world[:, 2], height, 0.02), 0, 0.35
     )
-    return s.albedo + (_F([0.13, 0.115, 0.095]) - s.albedo) * dust[:, None]
+    return s.albedo + (_rgb(0.13, 0.115, 0.095) - s.albedo) * dust[:, None]
 
 
 def _leaf(s: Samples, light: Light, noise: NoiseSet, incoming: np.ndarray) -> np.ndarray:
@@ -281,5 +285,5 @@ def _leaf(s: Samples, light: Light, noise: NoiseSet, incoming: np.ndarray) -> np
     clump = _noise(noise.soft, p[:, 0] + _F(0.5) * p[:, 2], p[:, 1] - _F(0.3) * p[:, 0], 0.06)
     tone = np.exp(0.32 * speckle * _fade(s.pixel_m, 0.09) + 0.22 * clump)
     through = np.clip(-(s.normal @ light.sun.astype(_F)), 0, 1) * s.lit * 0.35
-    total = incoming + through[:, None] * light.sun_colour.astype(_F) * _F([1.0, 1.15, 0.5])
+    total = incoming + through[:, None] * light.sun_colour.astype(_F) * _rgb(1.0, 1.15, 0.5)
     return s.albedo * tone[:, None] * total

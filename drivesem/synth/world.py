@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -75,7 +76,7 @@ class _Builder:
 
 
 def _ground(b: _Builder) -> None:
-    road, rng = b.road, b.rng
+    road = b.road
     look = np.random.default_rng([0x5F, b.draw("surface", b.pool.surfaces)])
     tone = {m: look.uniform(0.75, 1.3) * look.uniform(0.96, 1.04, 3) for m in _GROUND_ALBEDO}
     tone[Material.GRASS] = look.uniform(0.8, 1.4) * np.array([look.uniform(0.8, 1.6), 1.0, look.uniform(0.8, 1.2)])
@@ -127,7 +128,6 @@ def _ground(b: _Builder) -> None:
                     )
     far = np.array([[-500, -30], [500, -30], [500, 700], [-500, 700]])
     b.parts.append(_patch(far, -0.12, Material.GRASS, _GROUND_ALBEDO[Material.GRASS] * tone[Material.GRASS], seed))
-    del rng
 
 
 def _patch(outline: np.ndarray, height_m: float, material: Material, albedo: np.ndarray, seed: float) -> Soup:
@@ -136,8 +136,8 @@ def _patch(outline: np.ndarray, height_m: float, material: Material, albedo: np.
     zs = np.linspace(outline[0, 1], outline[2, 1], 9)
     cells = [
         np.array([[x0, -height_m, z0], [x1, -height_m, z0], [x1, -height_m, z1], [x0, -height_m, z1]])
-        for x0, x1 in zip(xs[:-1], xs[1:], strict=True)
-        for z0, z1 in zip(zs[:-1], zs[1:], strict=True)
+        for x0, x1 in pairwise(xs)
+        for z0, z1 in pairwise(zs)
     ]
     corners = np.concatenate([quad(c) for c in cells])
     normals = np.broadcast_to([0.0, -1.0, 0.0], corners.shape)
@@ -160,14 +160,14 @@ def _ribbon(
         sides.append(np.stack([x, np.full_like(s, -height), z], axis=1))
     low, high = sides
     points = np.stack([low[:-1], high[:-1], high[1:], low[1:]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
-    uv = np.stack(
-        [np.stack(np.broadcast_arrays(np.float64(d[i]), s[j]), axis=-1) for i, j in ((0, slice(None, -1)), (1, slice(None, -1)), (1, slice(1, None)), (0, slice(1, None)))],
-        axis=1,
-    )[:, np.array([[0, 1, 2], [0, 2, 3]])]  # fmt: skip
-    if d[0] == d[1]:
-        normal = np.array([1.0 if d[0] < 0 else -1.0, -0.05, 0.0])
-    else:
-        normal = np.array([0.0, -1.0, 0.0])
+    start, end = slice(None, -1), slice(1, None)
+    outline = [
+        np.stack(np.broadcast_arrays(np.float64(d[i]), s[j]), axis=-1)
+        for i, j in zip((0, 1, 1, 0), (start, start, end, end), strict=True)
+    ]
+    uv = np.stack(outline, axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+    upright = np.array([1.0 if d[0] < 0 else -1.0, -0.05, 0.0])
+    normal = upright if d[0] == d[1] else np.array([0.0, -1.0, 0.0])
     normals = np.broadcast_to(normal / np.linalg.norm(normal), (2 * (len(s) - 1), 3, 3))
     return make(points.reshape(-1, 3, 3), material, albedo, normals, uv.reshape(-1, 3, 2), (seed, 0, 0, 0))
 
@@ -191,8 +191,13 @@ def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
         return
     identifier = b.draw("bush", b.pool.trees)
     wide = size_m * float(b.rng.uniform(0.9, 1.5))
-    b.put(flora.bush(identifier, _detail(float(np.hypot(d, s)) * 1.4 / size_m)), d, s, float(b.rng.uniform(0, 6.28)),
-          (wide, size_m, wide))  # fmt: skip
+    b.put(
+        flora.bush(identifier, _detail(float(np.hypot(d, s)) * 1.4 / size_m)),
+        d,
+        s,
+        float(b.rng.uniform(0, 6.28)),
+        (wide, size_m, wide),
+    )
 
 
 def _city_row(b: _Builder, side: int, edge: float) -> None:
@@ -247,8 +252,11 @@ def _boundary(b: _Builder, side: int, d: float, middle: float, length: float) ->
     draw = rng.random()
     height = float(rng.uniform(0.7, 1.7))
     if draw < 0.4:
-        b.put(flora.hedge(length, height, 0.7, _detail(float(np.hypot(d, middle - length / 4))), rng), d + side * 0.35,
-              middle)  # fmt: skip
+        b.put(
+            flora.hedge(length, height, 0.7, _detail(float(np.hypot(d, middle - length / 4))), rng),
+            d + side * 0.35,
+            middle,
+        )
     elif draw < 0.6:
         colour = np.array([0.35, 0.33, 0.30]) * rng.uniform(0.5, 1.3)
         b.put(buildings.garden_wall(length, height * 0.8, Material.WALL, colour), d, middle)
@@ -336,8 +344,17 @@ def _sign(rng: np.random.Generator) -> Soup:
 
 def _clutter(rng: np.random.Generator) -> Soup:
     """Bins, cabinets, containers, billboards: what a detector might take for a car."""
-    pool = np.array([[0.05, 0.05, 0.055], [0.12, 0.16, 0.1], [0.3, 0.3, 0.29], [0.35, 0.2, 0.05], [0.03, 0.06, 0.15],
-                     [0.3, 0.04, 0.04], [0.02, 0.02, 0.02]])  # fmt: skip
+    pool = np.array(
+        [
+            [0.05, 0.05, 0.055],
+            [0.12, 0.16, 0.1],
+            [0.3, 0.3, 0.29],
+            [0.35, 0.2, 0.05],
+            [0.03, 0.06, 0.15],
+            [0.3, 0.04, 0.04],
+            [0.02, 0.02, 0.02],
+        ]
+    )
     colour = pool[rng.integers(len(pool))] * rng.uniform(0.7, 1.3)
     shape = int(rng.integers(5))
     if shape == 0:
@@ -354,14 +371,19 @@ def _clutter(rng: np.random.Generator) -> Soup:
     if shape == 1:
         return box((float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.9, 1.5)), 0.45), Material.FLAT, colour)
     if shape == 2:
-        return box((float(rng.uniform(2.5, 5.0)), float(rng.uniform(1.4, 2.4)), float(rng.uniform(1.4, 2.2))),
-                   Material.FLAT, colour)  # fmt: skip
+        return box(
+            (float(rng.uniform(2.5, 5.0)), float(rng.uniform(1.4, 2.4)), float(rng.uniform(1.4, 2.2))),
+            Material.FLAT,
+            colour,
+        )
     if shape == 3:
         legs = [stick((x, 0, 0), (x, -1.0, 0), (0.05, 0.05), Material.METAL, np.full(3, 0.2)) for x in (-1.2, 1.2)]
         board = placed(box((3.0, 1.6, 0.12), Material.FLAT, colour * 2.0), (0, -0.9, 0), 0.0, (1, 1, 1))
         return placed(join([*legs, board]), (0, 0, 0), float(rng.uniform(0, 1.57)), (1, 1, 1))
-    posts = [placed(box((0.15, 0.9, 0.15), Material.FLAT, np.full(3, 0.35)), (1.5 * i, 0, 0), 0.0, (1, 1, 1))
-             for i in range(4)]  # fmt: skip
+    posts = [
+        placed(box((0.15, 0.9, 0.15), Material.FLAT, np.full(3, 0.35)), (1.5 * i, 0, 0), 0.0, (1, 1, 1))
+        for i in range(4)
+    ]
     return join(posts)
 
 
@@ -438,8 +460,14 @@ def _hill(b: _Builder) -> None:
     low, high = np.stack([x, np.zeros(60), z], 1), np.stack([x, -crest, z + 120], 1)
     strip = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
     normal = np.array([0.0, -0.7, -0.7])
-    b.parts.append(make(strip.reshape(-1, 3, 3), Material.LEAF, np.array([0.06, 0.08, 0.035]),
-                        np.broadcast_to(normal, (118, 3, 3))))  # fmt: skip
+    b.parts.append(
+        make(
+            strip.reshape(-1, 3, 3),
+            Material.LEAF,
+            np.array([0.06, 0.08, 0.035]),
+            np.broadcast_to(normal, (118, 3, 3)),
+        )
+    )
 
 
 @lru_cache(maxsize=96)
@@ -496,5 +524,12 @@ def actor_soup(actor: Actor, owner: int) -> Soup:
         tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
         albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
         soup = Soup(soup.corners, soup.normals, soup.uv, soup.material, albedo, soup.pattern, soup.owner)
-    return Soup(soup.corners, soup.normals, soup.uv, soup.material, soup.albedo, soup.pattern,
-                np.full(len(soup), owner, np.int32))  # fmt: skip
+    return Soup(
+        soup.corners,
+        soup.normals,
+        soup.uv,
+        soup.material,
+        soup.albedo,
+        soup.pattern,
+        np.full(len(soup), owner, np.int32),
+    )

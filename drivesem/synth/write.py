@@ -42,7 +42,7 @@ def _paths(out: Path, index: int) -> tuple[Path, Path, Path, Path]:
 
 
 def write_frame(out: Path, index: int, frame: SynthFrame) -> None:
-    """Write one frame into a KITTI folder, each file atomically, the image last: where it is, the frame is whole."""
+    """Write one frame into a KITTI folder, each file atomically; where the image is, the frame is whole."""
     image, labels, calib, entry = _paths(out, index)
     for path in (image, labels, calib, entry):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -79,7 +79,8 @@ def synthesise(
 ) -> Iterator[int]:
     """Write `frames` frames under `out`/training, yielding each index as it is done.
 
-    split: "train" or "heldout". workers: processes. resume: whether frames that exist are kept. At the end `manifest.json` lists every frame's seed and shapes.
+    split: "train" or "heldout". workers: processes. resume: whether frames that exist are kept. At the end
+    `manifest.json` lists every frame's seed and shapes.
     Raises RangeError for bad counts or an unknown split, FormatError where `out` holds frames of other settings.
     """
     for name, value in (("frames", frames), ("workers", workers)):

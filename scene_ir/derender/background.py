@@ -27,10 +27,12 @@ _SIDEWAYS = 0.4
 
 @dataclass(frozen=True, slots=True)
 class FillSettings:
-    """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds at
-    the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far away
-    costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's border; search_px: how far from
-    the best source so far others are tried; ground_weight: cost of showing no ground where ground must be.
+    """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds
+    at the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far
+    away costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's
+    border; search_px: how far from the best source so far others are tried, at the coarsest level in px of the
+    full image, then in px of each level; ground_weight: cost of showing no ground where ground must be; guessed:
+    weight of a pixel in the hole against one outside, when patches are compared.
     """
 
     coarsest_radius: float = 4.0
@@ -38,15 +40,16 @@ class FillSettings:
     iterations: tuple[int, int] = (10, 2)
     row_weight: float = 0.05
     column_weight: float = 0.004
-    search_px: float = 160.0
+    search_px: tuple[float, float] = (160.0, 24.0)
     ground_weight: float = 0.02
+    guessed: float = 0.3
     confidence_px: float = 12.0
 
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """wanted (H, W): pixels that see the ground once the cars are gone; like (H, W) in [0, 1]: how much each pixel of
-    the photograph looks like ground.
+    """wanted (H, W): pixels that see the ground once the cars are gone; like (H, W) in [0, 1]: how much each pixel
+    of the photograph looks like ground.
     """
 
     wanted: Mask
@@ -61,7 +64,8 @@ class Ground:
 def push_pull(image: Image, known: NDArray[np.float32]) -> Image:
     """Smooth interpolation into unknown pixels. image (H, W, C), known (H, W) in [0, 1] -> (H, W, C).
 
-    The pyramid of Gortler's lumigraph (SIGGRAPH 1996): weighted averages go up, fill what is missing on the way down.
+    The pyramid of Gortler's lumigraph (SIGGRAPH 1996): weighted averages go up, fill what is missing on the way
+    down.
     """
     height, width = known.shape
     if min(height, width) <= 2 or bool((known > 0.999).all()):
@@ -87,8 +91,9 @@ def fill(
 ) -> Image:
     """The image with `hole` filled from pixels that are not `forbidden`.
 
-    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row, px;
-    ground: where ground is to be seen, and where it can be copied from -> (H, W, 3) in [0, 1], equal to the image outside the hole.
+    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row,
+    px; ground: where ground is to be seen, and where it can be copied from -> (H, W, 3) in [0, 1], equal to the
+    image outside the hole.
     """
     settings = settings or FillSettings()
     if not hole.any():
@@ -121,13 +126,16 @@ def fill(
 
 
 def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns (H, W) of a first guess: each unknown pixel copies what lies mirrored at the hole's nearest end.
+    """Rows and columns (H, W) of a first guess: each unknown pixel copies what lies mirrored at the hole's nearest
+    end.
 
-    unknown (H, W), not everywhere. Sideways counts as nearer than up and down, since streets run on sideways behind a
-    car: hedge, wall, kerb, road. Known pixels point to themselves.
+    unknown (H, W), not everywhere. Sideways counts as nearer than up and down, since streets run on sideways
+    behind a car: hedge, wall, kerb, road. Known pixels point to themselves.
     """
     height, width = unknown.shape
-    nearest = distance_transform_edt(unknown, sampling=(1.0, _SIDEWAYS), return_distances=False, return_indices=True)
+    nearest = np.asarray(
+        distance_transform_edt(unknown, sampling=(1.0, _SIDEWAYS), return_distances=False, return_indices=True)
+    )
     rows, columns = 2 * nearest - np.mgrid[0:height, 0:width]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     rows, columns = np.where(inside, rows, nearest[0]), np.where(inside, columns, nearest[1])
@@ -177,6 +185,7 @@ class _Level:
     ) -> None:
         self.settings = settings
         horizon, scale = horizon_and_scale[0] / horizon_and_scale[1], horizon_and_scale[1]
+        self.scale = scale
         pad = _RADIUS
         self.pad = pad
         self.padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REFLECT)
@@ -197,9 +206,13 @@ class _Level:
         self.wanted = ground.wanted[self.rows, self.columns] * np.float32(settings.ground_weight)
         self.reach = np.maximum(np.abs(self.rows - horizon), 24 / scale).astype(np.float32)
         self.column_unit = 200.0 / scale
-        self.search = max(settings.search_px / scale, 4.0)
         self.confidence = np.exp(-_distance(hole)[target] * scale / settings.confidence_px).astype(np.float32)
         self.confidence = np.maximum(self.confidence, 1e-4)
+        # What the photograph shows at the hole's border weighs more than what is only guessed inside.
+        certain = np.where(hole, settings.guessed, 1).astype(np.float32)
+        certain = cv2.copyMakeBorder(certain, pad, pad, pad, pad, cv2.BORDER_REFLECT).reshape(-1)
+        trust = certain[self._flat(self.rows, self.columns)[:, None] + self.offsets]
+        self.trust = np.repeat(trust / trust.sum(1, keepdims=True), 3, axis=1)
 
     def _flat(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
         return (rows + self.pad) * self.stride + columns + self.pad
@@ -212,7 +225,7 @@ class _Level:
     ) -> NDArray[np.float32]:
         """Cost of source positions for the targets `which`; infinite where copying is not allowed."""
         difference = self._patches(rows, columns) - self.target_patches[which]
-        colour = np.einsum("pk,pk->p", difference, difference) / len(_PATTERN)
+        colour = np.einsum("pk,pk,pk->p", difference, difference, self.trust[which])
         dy = (rows - self.rows[which]) / self.reach[which]
         dx = (columns - self.columns[which]) / self.column_unit
         cost = colour + self.settings.row_weight * dy * dy + self.settings.column_weight * dx * dx
@@ -236,23 +249,26 @@ class _Level:
         self.source = np.stack([rows[self.rows, self.columns], columns[self.rows, self.columns]], 1)
         self.best = self._cost(everything, self.source[:, 0], self.source[:, 1])
         if coarse is not None:
-            up = coarse[np.minimum(self.rows // 2, coarse.shape[0] - 1), np.minimum(self.columns // 2, coarse.shape[1] - 1)]
+            up = coarse[
+                np.minimum(self.rows // 2, coarse.shape[0] - 1), np.minimum(self.columns // 2, coarse.shape[1] - 1)
+            ]
             parity = np.stack([self.rows % 2, self.columns % 2], 1)
             proposed = np.where(up >= 0, 2 * up + parity, self.source)
             self._try(everything, proposed[:, 0], proposed[:, 1])
 
-    def _search(self, rng: np.random.Generator, step: int) -> None:
+    def _search(self, rng: np.random.Generator, step: int, radius: float) -> None:
         """One round: neighbours' offsets, then random positions in shrinking windows."""
         everything = np.arange(self.rows.size)
         for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
             dy, dx = dy * step, dx * step
             rows, columns = self.rows + dy, self.columns + dx
             inside = (rows >= 0) & (rows < self.height) & (columns >= 0) & (columns < self.width)
-            neighbour = np.where(inside, self.index[rows.clip(0, self.height - 1), columns.clip(0, self.width - 1)], -1)
+            neighbour = np.where(
+                inside, self.index[rows.clip(0, self.height - 1), columns.clip(0, self.width - 1)], -1
+            )
             which = everything[neighbour >= 0]
             near = neighbour[which]
             self._try(which, self.source[near, 0] - dy, self.source[near, 1] - dx)
-        radius = self.search
         while radius >= 1:
             spread_y = np.minimum(radius, 0.5 * self.reach + 2)
             rows = self.source[:, 0] + rng.uniform(-1, 1, self.rows.size) * spread_y
@@ -282,12 +298,16 @@ class _Level:
     def run(
         self, coarse: NDArray[np.int64] | None, rounds: int, rng: np.random.Generator
     ) -> tuple[Image, NDArray[np.int64]]:
-        """Alternate search and vote. -> the image (H, W, 3) and the sources (H, W, 2), -1 where nothing is filled."""
+        """Alternate search and vote. -> the image (H, W, 3) and the sources (H, W, 2), -1 where nothing is
+        filled."""
         everything = (self.rows, self.columns)
         self.target_patches = self._patches(*everything)
         self._start(coarse)
+        radius = (
+            max(self.settings.search_px[0] / self.scale, 4.0) if coarse is None else self.settings.search_px[1]
+        )
         for round_index in range(rounds):
-            self._search(rng, 1 if round_index % 2 == 0 else 2)
+            self._search(rng, 1 if round_index % 2 == 0 else 2, radius)
             self._vote()
             self.target_patches = self._patches(*everything)
             self.best = self._cost(np.arange(self.rows.size), self.source[:, 0], self.source[:, 1])

@@ -82,8 +82,8 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     """Take a photograph apart into vehicles, their shadows, and what stood behind them.
 
     frame: with labels; Car, Van and Truck with a 3D pose become objects, in the labels' order. Masks and depth of
-    the frame, where given, are used instead of estimates. Raises ShapeError without labels, RangeError for a labelled
-    box behind the camera. The unperturbed render of the result is the photograph.
+    the frame, where given, are used instead of estimates. Raises ShapeError without labels, RangeError for a
+    labelled box behind the camera. The unperturbed render of the result is the photograph.
     """
     settings = settings or DerenderSettings()
     if frame.labels is None:
@@ -98,9 +98,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         vehicles |= silhouette.grow(cut.mask, 2)
     horizon = maps.horizon_row(ground, camera)
     road = maps.road_map(image, horizon, vehicles)
-    background, mattes, shadows, sun = _layers(
-        image, cuts, vehicles, road, ground, horizon, camera, settings.seed
-    )
+    background, mattes, shadows, sun = _layers(image, cuts, vehicles, road, ground, horizon, camera, settings.seed)
     environment, depth = _environment(background, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
         depth = frame.depth.float()
@@ -109,10 +107,18 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     for index, cut in enumerate(cuts):
         provenance[f"objects[{index}].label"] = str(cut.row)
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
+    picture = torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1)))
     scene = SceneIR(
-        camera, meshes, objects, environment, frame.photograph.float(),
-        torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1))), depth, labels.ignore_xyxy, provenance,
-    )  # fmt: skip
+        camera,
+        meshes,
+        objects,
+        environment,
+        frame.photograph.float(),
+        picture,
+        depth,
+        labels.ignore_xyxy,
+        provenance,
+    )
     if not cuts:
         return scene
     margins = [_reach_px(cut, opacity, settings) for cut, opacity in zip(cuts, mattes, strict=True)]
@@ -218,7 +224,8 @@ def _without_underbody(cut: _Cut, ground: torch.Tensor, camera: Camera) -> _Cut:
 
 
 def _hidden_by_others(labels: Labels, rows: list[int], camera: Camera) -> dict[int, Mask]:
-    """For each vehicle the pixels of nearer people and the like, ellipses in their boxes: the car cannot own them."""
+    """For each vehicle the pixels of nearer people and the like, ellipses in their boxes: the car cannot own
+    them."""
     shape = (camera.height, camera.width)
     people = [i for i in _posed_rows(labels) if labels.kind[i] not in VEHICLES]
     hidden = {}
@@ -244,7 +251,8 @@ def _label_box(labels: Labels, row: int, shape: tuple[int, int]) -> Mask:
 
 
 def _boxes(labels: Labels, rows: list[int], camera: Camera) -> silhouette.Boxes:
-    """The labels' boxes; only sides that neither the image's border nor, as far as labelled, anything else cuts."""
+    """The labels' boxes; only sides that neither the image's border nor, as far as labelled, anything else
+    cuts."""
     xyxy = labels.boxes_xyxy[rows].float()
     limit = xyxy.new_tensor([camera.width - 1, camera.height - 1]).repeat(2)
     inside = (xyxy > 2) & (xyxy < limit - 2)
@@ -306,7 +314,8 @@ def _layers(
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
     owner = near.argmin(0)
     factors = [
-        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5)) for i in range(len(cuts))
+        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5))
+        for i in range(len(cuts))
     ]
     return background, mattes, factors, sun
 
@@ -368,12 +377,14 @@ def _reach_px(cut: _Cut, opacity: Array, settings: DerenderSettings) -> float:
     """How far the matte reaches beyond the mesh's outline, px, and a little more; bounded by the car's height."""
     beyond = cv2.distanceTransform((~cut.outline).astype(np.uint8), cv2.DIST_L2, 5)
     limit = settings.max_inflation * _height(cut.outline)
-    return float(np.clip(beyond[opacity > 0].max(initial=0) + 1.5, settings.min_reach_px, max(limit, settings.min_reach_px)))
+    return float(
+        np.clip(beyond[opacity > 0].max(initial=0) + 1.5, settings.min_reach_px, max(limit, settings.min_reach_px))
+    )
 
 
 def _crop(values: Array, inverted: bool = False) -> Crop:
     """The part (C, h, w) of a frame (C, H, W) that is not zero; of `inverted` values, one minus it."""
-    used = (values > 0).any(0)
+    used = np.asarray((values > 0).any(0))
     x0, y0, x1, y1 = silhouette.extent(used) if used.any() else (0, 0, 0, 0)
     part = np.ascontiguousarray(values[:, y0:y1, x0:x1], dtype=np.float32)
     return Crop(torch.from_numpy(1 - part if inverted else part), x0, y0)

@@ -1,7 +1,7 @@
 """Maps of the surroundings by simple, documented rules: ground plane, depth, sky, foliage, road, sun.
 
-A first method without any learned part: colour, texture, position against the horizon, and a guided filter that lays
-the soft borders along the photograph's edges.
+A first method without any learned part: colour, texture, position against the horizon, and a guided filter that
+lays the soft borders along the photograph's edges.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ DEFAULT_SUN = (-0.35, -0.85, -0.39)
 def fit_ground(labels: Labels | None, rows: list[int]) -> torch.Tensor:
     """Plane (4,) n.x + d = 0 with n up, from the bottom centres of the labels `rows` and a prior of a level road.
 
-    y = a x + b z + c by iterated least squares with Huber weights; a point's error is 0.1 m and grows with distance.
+    y = a x + b z + c by iterated least squares with Huber weights; a point's error is 0.1 m and grows with
+    distance.
     """
     points = labels.translation[rows].double().numpy() if labels is not None and rows else np.zeros((0, 3))
     prior = np.diag([1 / 0.03, 1 / 0.015, 1 / 0.15])
@@ -76,7 +77,8 @@ def _soft(mask: NDArray[np.bool_] | Array, guide: Array, radius: int) -> Array:
 
 
 def sky_map(image: Array, horizon: float, vehicles: NDArray[np.bool_]) -> Array:
-    """(H, W) in [0, 1]. Sky is bright, not warmer than neutral, smooth, above the horizon and joined to the top."""
+    """(H, W) in [0, 1]. Sky is bright, not warmer than neutral, smooth, above the horizon and joined to the
+    top."""
     blurred = cv2.GaussianBlur(image, (5, 5), 0)
     red, blue = blurred[..., 0], blurred[..., 2]
     value = blurred.max(-1)
@@ -99,7 +101,8 @@ def sky_map(image: Array, horizon: float, vehicles: NDArray[np.bool_]) -> Array:
 
 
 def foliage_map(image: Array, sky: Array, road: Array, vehicles: NDArray[np.bool_]) -> Array:
-    """(H, W) in [0, 1]. Foliage has more green than red and blue (excess green, Woebbecke 1995) or is dark and ragged."""
+    """(H, W) in [0, 1]. Foliage has more green than red and blue (excess green, Woebbecke 1995) or is dark and
+    ragged."""
     blurred = cv2.GaussianBlur(image, (0, 0), 2.0)
     total = blurred.sum(-1) + 0.03
     excess = (2 * blurred[..., 1] - blurred[..., 0] - blurred[..., 2]) / total
@@ -137,7 +140,8 @@ def road_map(image: Array, horizon: float, vehicles: NDArray[np.bool_]) -> Array
 
 
 def depth_map(ground_depth: Array, road: Array, sky: Array, horizon: float) -> Array:
-    """(H, W) m of the background: the ground plane where it is road, upright walls on its upper end, inf in the sky.
+    """(H, W) m of the background: the ground plane where it is road, upright walls on its upper end, inf in the
+    sky.
 
     Each column's wall stands where its lowest stretch of ground ends, at most `FAR` away.
     """

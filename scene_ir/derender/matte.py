@@ -1,8 +1,8 @@
 """From a hard mask to opacity: how much of each pixel along the border is car.
 
-Along the outline a pixel is a mixture of the car's colour just inside and the surroundings' just outside; where the
-two differ, the mixing share is read off the photograph (the colour line of Bayesian matting, Chuang 2001), and where
-they do not, the distance to the mask's border decides.
+Along the outline a pixel is a mixture of the car's colour just inside and the surroundings' just outside; where
+the two differ, the mixing share is read off the photograph (the colour line of Bayesian matting, Chuang 2001), and
+where they do not, the distance to the mask's border decides.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class MatteSettings:
-    """band_px: mixed pixels are looked for this far on both sides of the mask; generous_px: how far the prior border
-    lies outside the mask (some road that travels with a car shows less than an edge of car left behind);
+    """band_px: mixed pixels are looked for this far on both sides of the mask; generous_px: how far the prior
+    border lies outside the mask (some road that travels with a car shows less than an edge of car left behind);
     softness_px: width of the prior ramp; contrast: difference of colours at which the photograph counts as much as
-    the prior; odd: deviations from the surroundings (in their standard deviations) between which a pixel just outside
-    begins to be, and is, taken for a piece of the car.
+    the prior; odd: deviations from the surroundings (in their standard deviations) between which a pixel just
+    outside begins to be, and is, taken for a piece of the car.
     """
 
     band_px: float = 2.5
@@ -35,9 +35,7 @@ class MatteSettings:
     odd: tuple[float, float] = (1.8, 3.2)
 
 
-def matte(
-    image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None
-) -> Array:
+def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None) -> Array:
     """Opacity (H, W) in [0, 1] of the car in `mask`.
 
     image (H, W, 3) RGB in [0, 1]. unknown (H, W): pixels of nearer things. The car runs on behind their border, so
@@ -66,7 +64,9 @@ def matte(
         share = np.clip(((colours - outside) * across).sum(-1) / np.maximum(length, 1e-6), 0, 1)
         trust = length / (length + settings.contrast**2)
         mixed = trust * share + (1 - trust) * prior
-        odd = _oddness(colours, share[..., None] * across, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window])
+        odd = _oddness(
+            colours, share[..., None] * across, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window]
+        )
         low, high = settings.odd
         piece = np.clip((odd - low) / (high - low), 0, 1) * ~ground[window]
         mixed = np.maximum(mixed, piece)
@@ -87,8 +87,8 @@ def _signed_distance(mask: Mask) -> Array:
 
 
 def _oddness(image: Array, explained: Array, sure: Mask) -> Array:
-    """How far (H, W) each pixel, less what a mixture with the car explains (H, W, 3), is from the colours of the `sure`
-    surroundings near it, in standard deviations."""
+    """How far (H, W) each pixel, less what a mixture with the car explains (H, W, 3), is from the colours of the
+    `sure` surroundings near it, in standard deviations."""
     weight = cv2.GaussianBlur(sure.astype(np.float32), (0, 0), 4.0)
     scale = np.maximum(weight, 1e-4)[..., None]
     known = image * sure[..., None]

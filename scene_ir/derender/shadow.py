@@ -28,10 +28,10 @@ _SAMPLES = 6000
 
 @dataclass(frozen=True, slots=True)
 class ShadowSettings:
-    """reach_m: how far from the footprint a shadow is looked for; contact_m: width of the strip around the footprint
-    that counts as touching; dark: share of the lit ground's brightness below which ground is shaded; gain: by how much
-    an estimated sun must explain the darkness better than the assumed one; rim_m: how far beyond the reach shade
-    is followed; open_share: a shadow of which more than this lies out of reach is not a car's.
+    """reach_m: how far from the footprint a shadow is looked for; contact_m: width of the strip around the
+    footprint that counts as touching; dark: share of the lit ground's brightness below which ground is shaded;
+    gain: by how much an estimated sun must explain the darkness better than the assumed one; rim_m: how far beyond
+    the reach shade is followed; open_share: a shadow of which more than this lies out of reach is not a car's.
     """
 
     reach_m: float = 2.6
@@ -55,7 +55,8 @@ class GroundView:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """grey (H, W): the photograph's brightness; lit (H, W): how bright the ground would be without cars' shadows."""
+    """grey (H, W): the photograph's brightness; lit (H, W): how bright the ground would be without cars'
+    shadows."""
 
     grey: Array
     lit: Array
@@ -80,7 +81,8 @@ def ground_view(placement: Placement, ground: torch.Tensor, camera: Camera) -> G
     beyond = np.abs(local) - placement.size_lhw[[0, 2]].double().numpy() / 2
     distance = np.hypot(*np.maximum(beyond, 0).transpose(2, 0, 1)) + np.minimum(beyond.max(-1), 0)
     return GroundView(
-        np.where(seen[..., None], local, np.inf).astype(np.float32), np.where(seen, distance, np.inf).astype(np.float32)
+        np.where(seen[..., None], local, np.inf).astype(np.float32),
+        np.where(seen, distance, np.inf).astype(np.float32),
     )
 
 
@@ -111,8 +113,8 @@ def find(
 ) -> list[Mask]:
     """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot.
 
-    allowed: ground that each car's shadow can reach. Shade that goes on beyond it is a house's or a tree's: then only
-    what is darker than that shade counts.
+    allowed: ground that each car's shadow can reach. Shade that goes on beyond it is a house's or a tree's: then
+    only what is darker than that shade counts.
     """
     settings = settings or ShadowSettings()
     if not views:
@@ -201,6 +203,7 @@ def reachable(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask
 
 
 def factors(image: Array, background: Array, region: Mask) -> Array:
-    """The factor (H, W, 3) in [0, 1] by which one car darkens the ground: photograph / background in its `region`."""
+    """The factor (H, W, 3) in [0, 1] by which one car darkens the ground: photograph / background in its
+    `region`."""
     seen = np.clip(image / np.maximum(background, 1 / 255), 0, 1)
     return np.where(region[..., None], seen, 1).astype(np.float32)

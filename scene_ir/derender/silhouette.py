@@ -1,4 +1,5 @@
-"""Where a car is in the photograph: its template placed by the label, GrabCut around it, and the fit of one to the other.
+"""Where a car is in the photograph: its template placed by the label, GrabCut around it, and the fit of one to the
+other.
 
 The fit moves pose, size and a few symmetric modes of the free-form deformation through the project's own renderer
 until the outline of the mesh runs along the border of the mask; it never leaves the label's neighbourhood.
@@ -24,7 +25,8 @@ from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
 Mask = NDArray[np.bool_]
 
 _WORK_PX = 160
-"""Larger side of the windows in which outlines are fitted: more changes nothing that shows, less loses the wheels."""
+"""Larger side of the windows in which outlines are fitted: more changes nothing that shows, less loses the
+wheels."""
 _BAND = 0.12
 """Width of the band in which mask and outline pull at each other, as a fraction of the window."""
 
@@ -71,7 +73,8 @@ class FitSettings:
 
 @dataclass(frozen=True, slots=True)
 class Boxes:
-    """Labels' boxes xyxy (N, 4) px, and how much to trust each side, (N, 4) in [0, 1]: 0 where something cuts it."""
+    """Labels' boxes xyxy (N, 4) px, and how much to trust each side, (N, 4) in [0, 1]: 0 where something cuts
+    it."""
 
     xyxy: Tensor
     trust: Tensor
@@ -133,13 +136,13 @@ def grow(mask: Mask, radius: float) -> Mask:
 
 
 def instance_mask(
-    image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float, float], rounds: int = 4
+    image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float, float], rounds: int = 3
 ) -> Mask:
     """The car's pixels by GrabCut (Rother 2004) in a band around the template's outline.
 
     image (H, W, 3) RGB; outline: the placed template; unknown: pixels of nearer things, which are nobody's;
-    band_px: how far the border is searched inside of the outline, outside of it near the ground (where shadows look
-    like cars), and outside of it higher up -> mask (H, W), without `unknown`.
+    band_px: how far the border is searched inside of the outline, outside of it near the ground (where shadows
+    look like cars), and outside of it higher up -> mask (H, W), without `unknown`.
     """
     visible = outline & ~unknown
     if not visible.any():
@@ -209,7 +212,8 @@ def fit(
     settings: FitSettings,
     backend: verbs.Backend = "warp",
 ) -> list[Placement]:
-    """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at nothing.
+    """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at
+    nothing.
 
     boxes: what the labels' boxes say of the outlines' extent, which no reflection can mislead.
 
@@ -223,7 +227,7 @@ def fit(
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
     layout = verbs.Layout.of(rects)
     pull = torch.from_numpy(np.concatenate([w.pull.reshape(-1) / w.length for w in windows]))
-    faces, vertex_ranges, face_ranges = _pack(placements, camera.matrix)[1:]
+    faces, _, face_ranges = _pack(placements, camera.matrix)[1:]
     matrices = [w.zoom @ camera.matrix for w in windows]
     weights = [lattice.lattice_weights(p.mesh.vertices) for p in placements]
     modes = _modes()
@@ -309,7 +313,9 @@ def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
             [0.0, 0.0, 1.0],
         ]
     )
-    resized = cv2.resize(pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    resized = cv2.resize(
+        pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    )
     return _Window(resized.reshape(size[::-1]), 2.0 * (size[0] + size[1]), zoom)
 
 
@@ -328,7 +334,8 @@ def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tens
 
 
 def _modes() -> Tensor:
-    """Symmetric deformations (K, 64, 3) that turn one car's outline into another's; the lowest layer stays down."""
+    """Symmetric deformations (K, 64, 3) that turn one car's outline into another's; the lowest layer stays
+    down."""
     modes = []
 
     def grid() -> Tensor:

@@ -14,7 +14,7 @@ from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.ffd import from_symmetric
 from scene_ir.types import FOLIAGE_DIM, LATTICE, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
-FUNCTIONALS = 4
+FUNCTIONALS = 3
 COSINE, RELATIVE = 0.99, 0.05
 
 
@@ -43,7 +43,7 @@ def _translate(scene: SceneIR, theta: Tensor) -> SceneIR:
 
 
 def _ffd(scene: SceneIR, theta: Tensor) -> SceneIR:
-    """Offsets of the upper three lattice layers; 24 random symmetric directions of the three cars together."""
+    """Offsets of the upper three lattice layers; some random symmetric directions of the three cars together."""
     generator = torch.Generator().manual_seed(5)
     codes = torch.randn(theta.shape[0], 3, 96, generator=generator, dtype=theta.dtype)
     offsets = from_symmetric(torch.einsum("k,kno->no", theta, codes)).reshape(3, *LATTICE, 3)
@@ -57,7 +57,7 @@ PARAMETERS = {
     "foliage": Parameter(FOLIAGE_DIM, lambda s, t: s.with_environment(foliage=t), 1e-4, 0.5),
     "translate": Parameter(6, _translate, 1e-4, 0.3),
     "rotate": Parameter(3, lambda s, t: s.with_objects(yaw=s.objects.yaw + t), 1e-4, 0.12),
-    "mesh": Parameter(24, _ffd, 1e-4, 0.01),
+    "mesh": Parameter(15, _ffd, 1e-4, 0.01),
 }
 
 

@@ -33,8 +33,8 @@ def test_placed_agrees_with_the_projects_placing():
     rng = np.random.default_rng(0)
     soup = make(rng.uniform(-0.5, 0.5, (7, 3, 3)), Material.FLAT, (0.5, 0.5, 0.5))
     found = placed(soup, (1.0, 1.6, 9.0), 0.8, (4.0, 1.5, 1.8)).corners
-    expected = place(torch.from_numpy(soup.corners.reshape(-1, 3)), torch.tensor([4.0, 1.5, 1.8]), torch.tensor(0.8),
-                     torch.tensor([1.0, 1.6, 9.0]))  # fmt: skip
+    points = torch.from_numpy(soup.corners.reshape(-1, 3))
+    expected = place(points, torch.tensor([4.0, 1.5, 1.8]), torch.tensor(0.8), torch.tensor([1.0, 1.6, 9.0]))
     assert np.abs(found.reshape(-1, 3) - expected.numpy()).max() < 1e-5
 
 

@@ -1,4 +1,5 @@
-"""A street made by code, of which everything is known: its photograph, its background, its car and the car's mask."""
+"""A street made by code, of which everything is known: its photograph, its background, its car and the car's
+mask."""
 
 from __future__ import annotations
 
@@ -31,9 +32,15 @@ def camera() -> Camera:
 
 def labels_of(kind: str, translation: list[float], yaw: float, size_lhw: list[float], box: list[float]) -> Labels:
     return Labels(
-        (kind,), torch.tensor([box]), torch.zeros(1), torch.zeros(1, dtype=torch.int64), torch.tensor([translation]),
-        torch.tensor([yaw]), torch.tensor([size_lhw]), torch.zeros(0, 4),
-    )  # fmt: skip
+        (kind,),
+        torch.tensor([box]),
+        torch.zeros(1),
+        torch.zeros(1, dtype=torch.int64),
+        torch.tensor([translation]),
+        torch.tensor([yaw]),
+        torch.tensor([size_lhw]),
+        torch.zeros(0, 4),
+    )
 
 
 def empty_street() -> np.ndarray:
@@ -68,10 +75,17 @@ def street() -> Street:
     size, place, yaw = [4.0, 1.5, 1.7], [0.6, 1.65, 11.0], 0.6
     code = torch.tensor([[0.0, 0.8, 0.5, 0.0, 0.0]])
     objects = Objects(
-        torch.zeros(1, dtype=torch.int64), torch.tensor([place]), torch.tensor([yaw]), torch.tensor([size]),
-        torch.zeros(1, LATTICE_POINTS, 3), code, torch.zeros(1, dtype=torch.int64), torch.zeros(1, 4), torch.zeros(1),
         torch.zeros(1, dtype=torch.int64),
-    )  # fmt: skip
+        torch.tensor([place]),
+        torch.tensor([yaw]),
+        torch.tensor([size]),
+        torch.zeros(1, LATTICE_POINTS, 3),
+        code,
+        torch.zeros(1, dtype=torch.int64),
+        torch.zeros(1, 4),
+        torch.zeros(1),
+        torch.zeros(1, dtype=torch.int64),
+    )
     scene = _scene(background, objects, sun)
     render = Compositor(scene).render(scene)
     photograph = (render.image * 255).round() / 255

@@ -34,7 +34,8 @@ def test_outside_the_hole_nothing_changes_and_inside_everything_is_in_range():
     image = textured()
     result = filled(image)
     assert np.array_equal(result[~hole()], image[~hole()])
-    assert 0 <= result.min() and result.max() <= 1
+    assert result.min() >= 0
+    assert result.max() <= 1
 
 
 def test_what_was_in_the_hole_does_not_matter():

@@ -13,7 +13,9 @@ NONE = np.zeros((60, 80), bool)
 def disc(radius: float) -> np.ndarray:
     """Exact coverage of a disc by four by four samples a pixel."""
     v, u = np.mgrid[0:240, 0:320] / 4.0 - 0.375
-    return cv2.resize((np.hypot(u - 40, v - 30) < radius).astype(np.float32), (80, 60), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        (np.hypot(u - 40, v - 30) < radius).astype(np.float32), (80, 60), interpolation=cv2.INTER_AREA
+    )
 
 
 def blended(radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +47,8 @@ def test_range_and_support():
     mask = truth >= 0.5
     found = matte(image, mask, NONE, NONE)
     assert found.dtype == np.float32
-    assert 0 <= found.min() and found.max() <= 1
+    assert found.min() >= 0
+    assert found.max() <= 1
     far = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) > 5
     assert (found[far] == 0).all()
 

@@ -1,0 +1,177 @@
+"""From a photograph to a scene and back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.compositor import Compositor
+from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.types import Category, Frame, Labels, SceneIR
+
+KITTI = Path(__file__).parents[4] / "shared" / "data" / "kitti" / "training"
+
+
+def render(scene: SceneIR) -> torch.Tensor:
+    return Compositor(scene).render(scene).image
+
+
+def psnr(first: torch.Tensor, second: torch.Tensor) -> float:
+    return -10 * math.log10(max(float((first - second).square().mean()), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def scene(street) -> SceneIR:
+    return derender(street.frame)
+
+
+def test_the_render_is_the_photograph(street, scene):
+    assert psnr(render(scene), street.frame.photograph) > 60
+
+
+def test_outside_of_car_and_shadow_not_a_bit_changes(street, scene):
+    matte = scene.objects.source[0].foreground
+    touched = np.zeros(street.mask.shape, bool)
+    touched[matte.y0 : matte.y0 + matte.values.shape[1], matte.x0 : matte.x0 + matte.values.shape[2]] = True
+    touched |= (scene.background != street.frame.photograph).any(0).numpy()
+    assert torch.equal(
+        render(scene)[:, ~torch.from_numpy(touched)], street.frame.photograph[:, ~torch.from_numpy(touched)]
+    )
+    assert (~touched).mean() > 0.6
+
+
+def test_mask_and_place_come_out_right(street, scene):
+    matte = scene.objects.source[0].foreground
+    opaque = np.zeros(street.mask.shape, bool)
+    h, w = matte.values.shape[1:]
+    opaque[matte.y0 : matte.y0 + h, matte.x0 : matte.x0 + w] = matte.values[3].numpy() > 0.5
+    union = (opaque | street.mask).sum()
+    assert (opaque & street.mask).sum() / union > 0.9
+    assert float(scene.provenance["objects[0].mask_iou"]) > 0.9
+    assert scene.objects.translation[0].tolist() == pytest.approx([0.6, 1.65, 11.0], abs=0.35)
+
+
+def test_the_car_and_its_shadow_are_gone_from_the_background(street, scene):
+    truth = torch.from_numpy(street.background.transpose(2, 0, 1))
+    box = [int(v) for v in street.frame.labels.boxes_xyxy[0]]
+    part = (slice(None), slice(box[1] - 4, box[3] + 5), slice(box[0] - 4, box[2] + 5))
+    with_car = psnr(street.frame.photograph[part], truth[part])
+    without = psnr(scene.background[part], truth[part])
+    assert without > 17
+    assert without > with_car + 3
+    red = (scene.background[0] - scene.background[1])[part[1:]]
+    assert float((red > 0.25).float().mean()) < 0.005
+
+
+def test_a_moved_car_takes_all_of_itself_along(scene):
+    objects = scene.objects
+    away = render(scene.with_objects(translation=objects.translation + torch.tensor([3.5, 0.0, 0.0])))
+    matte = scene.objects.source[0].foreground
+    left = away[:, matte.y0 : matte.y0 + matte.values.shape[1], matte.x0 : matte.x0 + matte.values.shape[2] // 2]
+    assert float(((left[0] - left[1]) > 0.25).float().mean()) < 0.01
+
+
+def test_same_input_same_scene(street, scene):
+    again = derender(street.frame)
+    assert torch.equal(again.background, scene.background)
+    assert torch.equal(again.objects.translation, scene.objects.translation)
+    assert torch.equal(again.objects.source[0].foreground.values, scene.objects.source[0].foreground.values)
+
+
+def test_a_given_mask_is_used(street):
+    masks = torch.from_numpy(street.mask)[None].float()
+    scene = derender(replace(street.frame, masks=masks), DerenderSettings(fit=False))
+    assert psnr(render(scene), street.frame.photograph) > 60
+
+
+def with_labels(frame: Frame, **changes) -> Frame:
+    return replace(frame, labels=replace(frame.labels, **changes))
+
+
+def test_no_labels_is_an_error(street):
+    with pytest.raises(ShapeError, match="labels"):
+        derender(replace(street.frame, labels=None))
+
+
+def test_a_box_behind_the_camera_is_an_error_that_names_it(street):
+    behind = with_labels(street.frame, translation=torch.tensor([[0.0, 1.6, -8.0]]))
+    with pytest.raises(RangeError, match=r"label 0 \(Car\).*in front of the camera"):
+        derender(behind)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": ("Pedestrian",)},
+        {"translation": torch.full((1, 3), -1000.0), "size_lhw": -torch.ones(1, 3)},
+        {"translation": torch.tensor([[0.0, 1.6, 300.0]])},
+        {"translation": torch.tensor([[40.0, 1.6, 10.0]])},
+    ],
+    ids=["a person", "no pose", "too small", "beside the image"],
+)
+def test_a_frame_without_vehicles_is_a_scene_without_objects(street, change):
+    scene = derender(with_labels(street.frame, **change))
+    assert len(scene.objects) == 0
+    assert torch.equal(scene.background, street.frame.photograph)
+    assert torch.equal(render(scene), street.frame.photograph)
+
+
+def test_vans_are_cars_and_trucks_are_trucks(street):
+    for kind, category in (("Van", Category.CAR), ("Truck", Category.TRUCK)):
+        scene = derender(with_labels(street.frame, kind=(kind,)), DerenderSettings(fit=False))
+        assert scene.objects.category.tolist() == [int(category)]
+
+
+def test_cars_behind_each_other_at_the_border_and_through_the_near_plane(street):
+    place = torch.tensor([[0.6, 1.65, 11.0], [1.2, 1.65, 15.0], [-4.6, 1.65, 9.0], [1.5, 1.65, 1.2]])
+    n = len(place)
+    labels = Labels(
+        ("Car",) * n, torch.tensor([[0.0, 60.0, 470.0, 199.0]]).expand(n, 4), torch.zeros(n),
+        torch.full((n,), 2), place, torch.full((n,), 0.6), torch.tensor([[4.0, 1.5, 1.7]]).expand(n, 3),
+        torch.zeros(0, 4),
+    )  # fmt: skip
+    scene = derender(replace(street.frame, labels=labels), DerenderSettings(fit=True))
+    assert 2 <= len(scene.objects) <= n
+    assert psnr(render(scene), street.frame.photograph) > 60
+    assert bool(torch.isfinite(scene.background).all())
+
+
+def kitti_frame(identifier: str) -> Frame:
+    if not KITTI.is_dir():
+        pytest.skip(f"{KITTI} is missing")
+    from drivesem.data.kitti import KittiDataset
+
+    return KittiDataset(KITTI.parent).frame(identifier)
+
+
+@pytest.mark.parametrize("identifier", ["000003", "000012"])
+def test_a_real_frame_comes_back_exactly(identifier):
+    frame = kitti_frame(identifier)
+    scene = derender(frame)
+    image = render(scene)
+    inside = torch.zeros(image.shape[1:], dtype=torch.bool)
+    for x0, y0, x1, y1 in scene.objects.box2d.round().long().tolist():
+        inside[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1] = True
+    assert len(scene.objects) > 0
+    assert psnr(image[:, inside], frame.photograph[:, inside]) > 40
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "identifier",
+    ["000000", "000001", "000002", "000004", "000005", "000006", "000008", "000010", "000015", "000021", "000031",
+     "000060"],
+)  # fmt: skip
+def test_all_real_frames_come_back(identifier):
+    frame = kitti_frame(identifier)
+    scene = derender(frame)
+    image = render(scene)
+    assert psnr(image, frame.photograph) > 50
+    for index in range(len(scene.objects)):
+        assert float(scene.provenance[f"objects[{index}].mask_iou"]) > 0.45

@@ -1,0 +1,110 @@
+"""Shadows on the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import shadow, silhouette
+from scene_ir.geometry import project
+from scene_ir.surfaces import shadow_density, sun_offset
+from scene_ir.types import Camera
+
+CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+LEVEL = torch.tensor([0.0, -1.0, 0.0, 1.65])
+CAR = silhouette.placed(
+    "hatchback", torch.tensor([0.5, 1.65, 9.0]), torch.tensor(0.4), torch.tensor([4.0, 1.5, 1.7])
+)
+ROAD = np.concatenate([np.zeros((92, 480)), np.ones((108, 480))]).astype(np.float32)
+
+
+def view() -> shadow.GroundView:
+    return shadow.ground_view(CAR, LEVEL, CAMERA)
+
+
+def vehicle() -> np.ndarray:
+    return silhouette.silhouettes([CAR], CAMERA)[0]
+
+
+def toward(x: float, z: float) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.tensor([x, -1.0, z]), dim=0)
+
+
+def shaded(sun: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """A lit street on which the car's box shadow lies, and that shadow's factor."""
+    ground = view()
+    flat = torch.from_numpy(np.where(np.isfinite(ground.local), ground.local, 99.0)).reshape(-1, 2)
+    size = CAR.size_lhw.expand(len(flat), 3)
+    offset = sun_offset(sun, CAR.yaw.expand(len(flat)), size[:, 1])
+    factor = 1 - 0.8 * shadow_density(flat, size, offset).reshape(200, 480).numpy()
+    image = np.full((200, 480, 3), 0.6, np.float32) * factor[..., None]
+    image[vehicle()] = (0.5, 0.1, 0.1)
+    return image.astype(np.float32), factor
+
+
+def test_ground_view_knows_the_footprints_corners_and_middle():
+    ground = view()
+    front = CAR.translation + torch.tensor([np.cos(0.4), 0, -np.sin(0.4)]).float() * 2.0
+    u, v = project(front, CAMERA.matrix).round().long().tolist()
+    assert ground.local[v, u] == pytest.approx([2.0, 0.0], abs=0.12)
+    assert ground.distance[v, u] == pytest.approx(0.0, abs=0.12)
+    u, v = project(CAR.translation, CAMERA.matrix).round().long().tolist()
+    assert ground.distance[v, u] == pytest.approx(-0.85, abs=0.12)
+    assert np.isinf(ground.distance[:88]).all()
+
+
+def test_a_shadow_is_found_and_the_lit_road_is_not():
+    image, factor = shaded(toward(0.6, 0.0))
+    light = shadow.light(image, ROAD, vehicle(), [view()])
+    found = shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0]
+    visible = ~vehicle() & (view().distance < 2.4)
+    assert found[visible & (factor < 0.5)].mean() > 0.95
+    assert found[visible & (factor > 0.95)].mean() < 0.02
+    assert not (found & vehicle()).any()
+
+
+def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
+    image, _ = shaded(toward(0.0, 0.0))
+    image[:, :260] *= 0.4
+    image[92:110] *= 2.5
+    light = shadow.light(np.clip(image, 0, 1), ROAD, vehicle(), [view()])
+    found = shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0]
+    shade = (view().distance > 1.2) & (view().distance < 2.0) & ~vehicle()
+    shade[:, 250:] = False
+    assert found[shade].mean() < 0.1
+
+
+@pytest.mark.parametrize("direction", [(0.8, 0.0), (-0.8, 0.1)])
+def test_the_sun_is_on_the_other_side_of_the_shadow(direction):
+    image, _ = shaded(toward(*direction))
+    light = shadow.light(image, ROAD, vehicle(), [view()])
+    sun = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
+    assert float(sun[0]) * direction[0] > 0.2
+    assert float(sun.norm()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_without_shadows_the_assumed_sun_stays():
+    image = np.full((200, 480, 3), 0.6, np.float32)
+    assumed = toward(0.1, -0.3)
+    light = shadow.light(image, ROAD, vehicle(), [view()])
+    assert torch.equal(shadow.estimate_sun(light, vehicle(), [CAR], [view()], assumed), assumed)
+
+
+def test_reach_of_the_renderers_patch():
+    ground = view()
+    reach = shadow.reachable(CAR, ground, toward(0.0, 0.0))
+    assert reach[ground.distance < 0.5].all()
+    assert not reach[ground.distance > 3.5].any()
+
+
+def test_factors_darken_only_in_their_region():
+    image = np.full((4, 5, 3), 0.2, np.float32)
+    background = np.full((4, 5, 3), 0.5, np.float32)
+    background[0, 0] = 0.1
+    region = np.zeros((4, 5), bool)
+    region[:2] = True
+    factor = shadow.factors(image, background, region)
+    assert factor[1, 1] == pytest.approx([0.4] * 3)
+    assert factor[0, 0] == pytest.approx([1.0] * 3)
+    assert (factor[2:] == 1).all()
