@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 import shlex
 import shutil
 import sys
@@ -25,7 +26,7 @@ from rich.table import Table
 from detectors.base import Detector
 from detectors.registry import load_detector
 from drivesem.attacks.si_fgsm import SiFGSM
-from drivesem.config import DEFAULT_COMBO, Attack, UsageError, to_yaml
+from drivesem.config import DEFAULT_COMBO, Attack, UsageError, processes, to_yaml
 from drivesem.evaluation import coco
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
 from drivesem.report.html import render_report
@@ -137,14 +138,18 @@ def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[st
 
 def _outcomes(worker: _Worker, todo: Sequence[str], out: Path) -> Iterator[tuple[str, Callable[[], object]]]:
     config = worker.config
-    processes = min(config.workers, len(todo))
-    if processes <= 1:
+    # The number of threads follows from the settings, not from the frames left: a resumed run adds up alike.
+    threads = max((os.cpu_count() or 1) // processes(config), 1)
+    torch.set_num_threads(threads)
+    if min(processes(config), len(todo)) <= 1:
         for identifier in todo:
             yield identifier, lambda identifier=identifier: worker.attack(identifier, out)
         return
-    threads = max(torch.get_num_threads() // processes, 1)
     pool = ProcessPoolExecutor(
-        processes, get_context("spawn"), initializer=_start_process, initargs=(config, worker.params, threads)
+        min(processes(config), len(todo)),
+        get_context("spawn"),
+        initializer=_start_process,
+        initargs=(config, worker.params, threads),
     )
     with pool:
         pending = {pool.submit(_attack_in_process, identifier, out): identifier for identifier in todo}

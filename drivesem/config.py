@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +19,8 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 COMBO_NUMBERS = (1, 2, 3, 4)
 DEFAULT_COMBO = 2
+_MOST_PROCESSES = 4
+"""Each process takes about 1 GB."""
 
 
 class UsageError(ValueError):
@@ -37,8 +40,8 @@ class Common:
     """Take the first N frames (those with vehicles, where a command needs vehicles)."""
     seed: int = 0
     """Seed of everything random."""
-    workers: int = 1
-    """Processes that share the frames."""
+    workers: int | None = None
+    """Processes that share the frames; by default one a core, at most 4."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, ..."""
     keep_going: Flag = False
@@ -90,9 +93,14 @@ class Synth(Common):
 COMMANDS: dict[str, type[Common]] = {"attack": Attack, "synth": Synth}
 
 
+def processes(config: Common) -> int:
+    """How many processes share the frames."""
+    return config.workers or min(os.cpu_count() or 1, _MOST_PROCESSES)
+
+
 def validate(config: Common) -> None:
     """Raise UsageError for values that no command accepts."""
-    if config.workers < 1:
+    if config.workers is not None and config.workers < 1:
         raise UsageError("--workers", "at least 1", config.workers)
     if config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)

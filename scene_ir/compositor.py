@@ -376,15 +376,17 @@ class Compositor:
         uv = rows.xy + move
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
         rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
-        alpha, hidden, outline, z_seen = rest.unbind(1)
-        weight = texture.facing_weight(turned, cos_then) * texture.inside_weight(uv, *self._frame_hw)
-        weight = weight * (1.0 - smoothstep(hidden, 0.0, 1.0))
+        alpha, hidden, outline, z_seen, support = rest.unbind(1)
+        visible = texture.inside_weight(uv, *self._frame_hw) * (1.0 - smoothstep(hidden, 0.0, 1.0))
+        weight = texture.facing_weight(turned, cos_then) * visible
         reached = 1.0 - smoothstep(z_then[:m] - z_seen[:m], *texture.DEPTH_TOLERANCE_M)
         kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
         weight = weight * torch.cat([reached, kept])
         rim = 1.0 - smoothstep(cos_then[:m], *texture.RIM)
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
-        fill = 1.0 - weight[:m] + weight[:m] * opened
+        # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
+        empty = visible[:m] * (1.0 - smoothstep(support[:m], 0.1, 0.9))
+        fill = (1.0 - weight[:m] + weight[:m] * opened) * (1.0 - empty)
         colour, opacity = weight[:, None] * rgb, weight * alpha
         need = (fill != 0.0).nonzero()[:, 0]
         if need.numel():

@@ -33,8 +33,10 @@ OUTLINE_PX = (1.0, 2.2)
 inside."""
 HIDDEN_PX = (1.0, 3.0)
 """Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
-CHANNELS = 7
-"""Of a texel: premultiplied RGB, opacity, hidden, outline, depth m."""
+SUPPORT_PX = 2
+"""Beyond the matte by more than this, the photograph shows that there is no vehicle."""
+CHANNELS = 8
+"""Of a texel: premultiplied RGB, opacity, hidden, outline, depth m, support."""
 _PAD = 2
 """Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
 _LIGHTNESS_GAIN, _CHROMA_GAIN, _GLOSS_GAIN, _DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
@@ -120,7 +122,9 @@ def source_texels(
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     outline = 1.0 - smoothstep(torch.from_numpy(np.ascontiguousarray(distance)).to(rgba), *OUTLINE_PX)
-    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth])
+    pool = 2 * SUPPORT_PX + 1
+    support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=SUPPORT_PX)[0]
+    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth, support])
     return Crop(values, x0, y0)
 
 

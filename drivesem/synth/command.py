@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from drivesem.config import Synth, UsageError
+from drivesem.config import Synth, UsageError, processes
 from drivesem.synth.write import synthesise
 
 
@@ -23,7 +23,7 @@ def run(config: Synth) -> int:
     frames = config.frames if config.limit is None else min(config.frames, config.limit)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        done = synthesise(out, frames, config.seed, config.split, config.workers)
+        done = synthesise(out, frames, config.seed, config.split, processes(config), resume=config.resume)
         for _ in progress.track(done, total=frames, description="making frames"):
             pass
     seconds = round(time.perf_counter() - start, 3)

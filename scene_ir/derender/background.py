@@ -58,7 +58,8 @@ class Ground:
     def halved(self, size: tuple[int, int]) -> Ground:
         """At the next coarser level, of `size` (width, height)."""
         wanted = cv2.resize(self.wanted.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
-        return Ground(wanted, cv2.resize(self.like.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+        like = cv2.resize(self.like.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        return Ground(wanted, np.asarray(like, np.float32))
 
 
 def push_pull(image: Image, known: NDArray[np.float32]) -> Image:
@@ -156,7 +157,7 @@ def first_guess(unknown: Mask, ground: Ground) -> tuple[NDArray[np.int64], NDArr
 
 def _distance(mask: Mask) -> NDArray[np.float32]:
     """Distance (H, W) px of each pixel in the mask to the nearest one outside."""
-    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
 def _halve(image: Image, hole: Mask, forbidden: Mask) -> tuple[Image, Mask, Mask]:
@@ -188,7 +189,7 @@ class _Level:
         self.scale = scale
         pad = _RADIUS
         self.pad = pad
-        self.padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REFLECT)
+        self.padded = np.asarray(cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_REFLECT), np.float32)
         self.height, self.width = hole.shape
         self.stride = self.width + 2 * pad
         kernel = np.ones((2 * _RADIUS + 1, 2 * _RADIUS + 1), np.uint8)

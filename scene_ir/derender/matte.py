@@ -109,6 +109,7 @@ def _carried(image: Array, sure: Mask, allowed: Mask) -> Array | None:
     _, labels = cv2.distanceTransformWithLabels(
         (~sure).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    labels = np.asarray(labels, np.int64)
     lookup = np.zeros((int(labels.max()) + 1, 3), np.float32)
     lookup[labels[sure]] = blurred[sure]
     return lookup[labels]

@@ -174,7 +174,7 @@ def instance_mask(
     models = np.zeros((1, 65)), np.zeros((1, 65))
     # OpenCV seeds its clusters from one process-wide generator.
     cv2.setRNGSeed(0)
-    cv2.grabCut(crop, labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(crop, labels, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
     found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)) & ~hidden
     found = _tidy(found, enlarge(outline), scale)
     result = np.zeros_like(outline)
@@ -195,7 +195,7 @@ def _tidy(found: Mask, outline: Mask, scale: float) -> Mask:
     for part in range(1, count):
         area = stats[part, cv2.CC_STAT_AREA]
         keep[part] = area >= 0.05 * largest and np.count_nonzero(outline & (parts == part)) >= 0.6 * area
-    kept = keep[parts]
+    kept = keep[np.asarray(parts, np.int64)]
     # Holes are windows or reflections, never background: fill what the outside cannot reach.
     padded = np.pad(~kept, 1, constant_values=True).astype(np.uint8)
     _, regions = cv2.connectedComponents(padded, connectivity=4)
@@ -257,6 +257,7 @@ def fit(
         optimiser.zero_grad()
         loss.sum().backward()
         # Vertices at the near plane can give infinite slopes; one car's must not spoil the others.
+        assert code.grad is not None
         torch.nan_to_num_(code.grad, nan=0.0, posinf=0.0, neginf=0.0)
         optimiser.step()
         with torch.no_grad():
@@ -316,7 +317,7 @@ def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
     resized = cv2.resize(
         pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
-    return _Window(resized.reshape(size[::-1]), 2.0 * (size[0] + size[1]), zoom)
+    return _Window(np.asarray(resized, np.float32).reshape(size[::-1]), 2.0 * (size[0] + size[1]), zoom)
 
 
 def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

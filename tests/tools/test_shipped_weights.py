@@ -1,0 +1,33 @@
+"""The shipped detector on pictures of the generator that it was trained with, from the held-out split."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from detectors.boxes import iou_matrix
+from detectors.registry import SHIPPED, load_detector
+from detectors.types import CLASSES
+from drivesem.data.classes import KITTI
+from drivesem.synth.frames import generate_frame
+
+SEED, INDEX = 2026, 1
+"""A held-out street; no frame that the detector was trained, chosen or judged on."""
+
+
+@pytest.mark.skipif(
+    not SHIPPED["squeezedet"].is_file(), reason="detectors/weights/squeezedet.safetensors is not there"
+)
+def test_near_cars_are_found() -> None:
+    frame = generate_frame(SEED, INDEX, "heldout")
+    targets = KITTI.targets(frame.labels)
+    boxes_xyxy = targets.boxes_xyxy
+    near = (targets.labels == CLASSES.index("Car")) & (boxes_xyxy[:, 3] - boxes_xyxy[:, 1] >= 40)
+    near &= (frame.labels.occlusion == 0) & (frame.labels.truncation < 0.1)
+    assert int(near.sum()) >= 1
+    detector = load_detector("squeezedet")
+    image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].float() / 255
+    found = detector.decode(detector(image))[0]
+    sure = (found.scores >= detector.t_star) & (found.labels == CLASSES.index("Car"))
+    overlap = iou_matrix(boxes_xyxy[near], found.boxes_xyxy[sure])
+    assert float((overlap.max(1).values > 0.5).float().mean()) == 1.0
