@@ -40,7 +40,9 @@ class Targets:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """What a detector found in one image, best first. boxes_xyxy (M, 4) px; labels (M,) int64; scores (M,) in [0, 1]."""
+    """What a detector found in one image, best first. boxes_xyxy (M, 4) px; labels (M,) int64;
+    scores (M,) in [0, 1].
+    """
 
     boxes_xyxy: Tensor
     labels: Tensor

@@ -32,7 +32,7 @@ def lattice_weights(unit: Tensor) -> Tensor:
 
 
 def deform(unit: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
-    """Deformed vertices. unit (V, 3), weights (V, 64) of `lattice_weights`, offsets (..., 64, 3) -> (..., V, 3)."""
+    """Deformed vertices (..., V, 3): unit (V, 3), weights (V, 64) of `lattice_weights`, offsets (..., 64, 3)."""
     return unit + weights @ offsets
 
 

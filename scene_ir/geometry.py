@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def yaw_matrix(yaw: Tensor) -> Tensor:
-    """Rotation about the camera's y axis. yaw: (...,) rad -> (..., 3, 3). At yaw 0 a car's front looks along +x."""
+    """Rotation (..., 3, 3) about the camera's y axis by yaw (...,) rad. At yaw 0 a car's front looks along +x."""
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     zero, one = torch.zeros_like(cos), torch.ones_like(cos)
     rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
@@ -35,8 +35,11 @@ def project(points: Tensor, matrix: Tensor) -> Tensor:
     return clip[..., :2] / clip[..., 2:]
 
 
-_BOX_CORNERS = ((0.5, 0.5, -0.5, -0.5, 0.5, 0.5, -0.5, -0.5), (0, 0, 0, 0, -1, -1, -1, -1),
-                (0.5, -0.5, -0.5, 0.5, 0.5, -0.5, -0.5, 0.5))
+_BOX_CORNERS = (
+    (0.5, 0.5, -0.5, -0.5, 0.5, 0.5, -0.5, -0.5),
+    (0, 0, 0, 0, -1, -1, -1, -1),
+    (0.5, -0.5, -0.5, 0.5, 0.5, -0.5, -0.5, 0.5),
+)
 _BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
@@ -51,9 +54,7 @@ def ground_footprint(size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tens
     return box_corners(size_lhw, yaw, translation)[..., :4, [0, 2]]
 
 
-def project_boxes(
-    size_lhw: Tensor, yaw: Tensor, translation: Tensor, matrix: Tensor, near: float = 0.1
-) -> Tensor:
+def project_boxes(size_lhw: Tensor, yaw: Tensor, translation: Tensor, matrix: Tensor, near: float = 0.1) -> Tensor:
     """Tight image boxes of 3D boxes, cut at the near plane but not at the image border.
 
     size_lhw (N, 3), yaw (N,), translation (N, 3), matrix (3, 4) -> (N, 4) px, xyxy, differentiable. A box wholly
@@ -77,7 +78,7 @@ def project_boxes(
 
 
 def clip_boxes(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
-    """Boxes (N, 4) cut at the image border, in KITTI's convention: coordinates in [0, width - 1], [0, height - 1]."""
+    """Boxes (N, 4) cut at the image border; in KITTI's convention that is [0, width - 1] x [0, height - 1]."""
     limit = boxes_xyxy.new_tensor([width - 1, height - 1, width - 1, height - 1])
     return torch.minimum(boxes_xyxy.clamp(min=0), limit)
 

@@ -63,6 +63,13 @@ def check_finite(name: str, tensor: Tensor) -> None:
         raise RangeError(f"{name}{list(index)}", "a finite value", float(tensor[index]))
 
 
+def check_indices(name: str, indices: Tensor, count: int) -> None:
+    """Raise RangeError naming the first of `indices` that is not in [0, count)."""
+    bad = indices[(indices < 0) | (indices >= count)]
+    if bad.numel():
+        raise RangeError(name, f"indices in [0, {count})", int(bad[0]))
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole camera.
@@ -117,10 +124,7 @@ class Mesh:
         check_finite("mesh.vertices", self.vertices)
         check_shape("mesh.faces", self.faces, None, 3, floating=False)
         check_shape("mesh.part", self.part, self.faces.shape[0], floating=False)
-        if self.faces.numel() and not (
-            0 <= int(self.faces.min()) and int(self.faces.max()) < self.vertices.shape[0]
-        ):
-            raise RangeError("mesh.faces", f"indices in [0, {self.vertices.shape[0]})", int(self.faces.max()))
+        check_indices("mesh.faces", self.faces, self.vertices.shape[0])
         if self.colours is not None:
             check_shape("mesh.colours", self.colours, self.vertices.shape[0], 3)
         if self.uv is not None:
@@ -146,7 +150,7 @@ class Source:
     translation (3,) m, yaw () rad, size_lhw (3,) m, ffd (P, 3): the geometry at which the photograph was taken.
     foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity (the matte), in [0, 1].
     shadow: Crop of (3, h, w): the factor in [0, 1] by which the object darkens the ground at each pixel, or None.
-    inflation: m by which the proxy that carries the matte is larger than the mesh (it must reach beyond the matte).
+    inflation: m by which the proxy that carries the matte is larger than the mesh: it must reach beyond the matte.
     paint: (3,) RGB, the base colour of the paint.
     """
 
@@ -175,7 +179,7 @@ class Objects:
     """N vehicles. mesh_index (N,) into `SceneIR.meshes`; translation (N, 3) m, the bottom-face centre;
     yaw (N,) rad about the camera's y axis (KITTI's rotation_y); size_lhw (N, 3) m; ffd (N, P, 3), lattice offsets
     as fractions of the unit box; texture_code (N, 5); category (N,) a `Category`.
-    box2d (N, 4) px, xyxy: the label's box as given with the data set (`paper` labels, and the base of `moved` ones);
+    box2d (N, 4) px, xyxy: the label's box as the data set gives it (`paper` labels, and the base of `moved` ones);
     truncation (N,) in [0, 1]; occlusion (N,) int64, 0 to 3: as labelled.
     source: one `Source` an object, or an empty tuple where nothing was photographed (pure mesh rendering).
     """
@@ -266,12 +270,7 @@ class SceneIR:
         check_shape("scene.depth", self.depth, h, w)
         check_shape("scene.environment.sky", self.environment.sky, h, w)
         check_shape("scene.ignore", self.ignore, None, 4)
-        if len(self.objects) and not (
-            0 <= int(self.objects.mesh_index.min()) and int(self.objects.mesh_index.max()) < len(self.meshes)
-        ):
-            raise RangeError(
-                "objects.mesh_index", f"indices in [0, {len(self.meshes)})", self.objects.mesh_index.tolist()
-            )
+        check_indices("objects.mesh_index", self.objects.mesh_index, len(self.meshes))
 
     def with_objects(self, **changes: Tensor) -> SceneIR:
         """The same scene with some fields of `objects` replaced."""
