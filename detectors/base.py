@@ -11,6 +11,10 @@ from torch import Tensor, nn
 from detectors.types import Detections, Targets
 
 
+class DetectorError(ValueError):
+    """A detector that cannot be had: no such name or file, or weights that belong to another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class RawPredictions:
     """What the network says about each of its A anchors, before any choice is made; differentiable.

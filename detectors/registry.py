@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from detectors.base import Detector
+from detectors.base import Detector, DetectorError
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES
 
@@ -24,25 +24,25 @@ SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safeten
 def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") -> Detector:
     """The shipped detector of that name, or the one in a `.safetensors` file; frozen, eval mode, channels-last.
 
-    Raises ValueError for a name that is not known, a file that is missing or damaged, and weights that belong to
+    Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong to
     another architecture; the message names the file, what was expected and what was found.
     """
     path = SHIPPED.get(str(name_or_path), Path(name_or_path))
     if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
         known = ", ".join(sorted(SHIPPED))
-        raise ValueError(f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}")
+        raise DetectorError(f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}")
     if not path.is_file():
-        raise ValueError(f"{path}: expected a weights file, found none")
+        raise DetectorError(f"{path}: expected a weights file, found none")
     metadata, tensors = read_weights(path)
     architecture = metadata.get("architecture", "squeezedet")
     if architecture not in ARCHITECTURES:
         known = ", ".join(sorted(ARCHITECTURES))
-        raise ValueError(f"{path}: expected architecture {known}, found {architecture!r}")
+        raise DetectorError(f"{path}: expected architecture {known}, found {architecture!r}")
     try:
         classes = tuple(json.loads(metadata.get("classes", json.dumps(CLASSES))))
         t_star = float(metadata.get("t_star", "0.5"))
     except ValueError as error:
-        raise ValueError(f"{path}: expected metadata classes (list) and t_star (number): {error}") from None
+        raise DetectorError(f"{path}: expected metadata classes (list) and t_star (number): {error}") from None
     detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
     _load_into(detector, tensors, path)
     detector.requires_grad_(False)
@@ -65,30 +65,30 @@ def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None =
 
 
 def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    """Metadata and tensors of a safetensors file; ValueError where it is none."""
+    """Metadata and tensors of a safetensors file; DetectorError where it is none."""
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: expected a safetensors file, found {error}") from None
+        raise DetectorError(f"{path}: expected a safetensors file, found {error}") from None
 
 
 def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:
     expected = detector.state_dict()
     missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or unexpected:
-        raise ValueError(
+        raise DetectorError(
             f"{path}: expected the {len(expected)} tensors of {detector.name}, found "
             f"{len(missing)} missing{_first(missing)} and {len(unexpected)} unexpected{_first(unexpected)}"
         )
     for key, tensor in tensors.items():
         if tensor.shape != expected[key].shape:
-            raise ValueError(
+            raise DetectorError(
                 f"{path}: {key}: expected shape {tuple(expected[key].shape)} of {detector.name} with "
                 f"{len(detector.classes)} classes, found {tuple(tensor.shape)}"
             )
         if not bool(torch.isfinite(tensor).all()):
-            raise ValueError(f"{path}: {key}: expected finite numbers, found NaN or infinity")
+            raise DetectorError(f"{path}: {key}: expected finite numbers, found NaN or infinity")
     detector.load_state_dict(tensors)
 
 

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors.torch import save
 from torch import Tensor
 
@@ -39,6 +37,9 @@ Sample = tuple[np.ndarray, Targets]
 
 Evaluate = Callable[[Detector, int], None]
 """Called with the averaged detector (eval mode) and the number of steps done."""
+
+Progress = Callable[[int, int, float], None]
+"""Called after each step with the steps done, the steps in all, and the loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,7 @@ def train(
     folder: Path,
     evaluate: Evaluate | None = None,
     stop_after: int | None = None,
+    progress: Progress | None = None,
 ) -> Detector:
     """Train in place, from the checkpoint in `folder` where there is one; the detector returned holds the averaged
     weights, in eval mode.
@@ -97,21 +99,17 @@ def train(
     run = _Run(detector, settings)
     step = run.load(folder / CHECKPOINT) if (folder / CHECKPOINT).is_file() else 0
     started, before = time.monotonic(), run.seconds
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        Progress(*columns, transient=True, console=Console(stderr=True)) as progress,
-        _Log(folder / LOG, step) as log,
-    ):
-        bar = progress.add_task("training", total=settings.steps, completed=step)
+    with _Log(folder / LOG, step) as log:
         while step < settings.steps and (stop_after is None or step < stop_after):
             run.seconds = before + time.monotonic() - started
-            done = _progress(step, run.seconds, settings)
+            done = _done(step, run.seconds, settings)
             if done >= 1:
                 break
             terms = run.step(step, dataset, schedule(done, step, settings))
             step += 1
             log.add(step, run.seconds, terms)
-            progress.update(bar, completed=step, description=f"loss {terms['total']:.3f}")
+            if progress is not None:
+                progress(step, settings.steps, terms["total"])
             if step % settings.checkpoint_every == 0:
                 run.save(folder / CHECKPOINT, step)
                 log.flush()
@@ -277,7 +275,7 @@ class _Log:
         self._file.flush()
 
 
-def _progress(step: int, seconds: float, settings: TrainingSettings) -> float:
+def _done(step: int, seconds: float, settings: TrainingSettings) -> float:
     by_time = seconds / (60 * settings.minutes) if settings.minutes > 0 else 0.0
     return max(step / settings.steps, by_time)
 

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from detectors.base import Detector
+from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.attacks.si_fgsm import SiFGSM
 from drivesem.config import DEFAULT_COMBO, Attack, UsageError, processes, to_yaml
@@ -90,7 +90,7 @@ class _Worker:
         self.source: SceneSource = open_source(self.config)
         try:
             self.detector: Detector = load_detector(self.config.detector, self.config.device)
-        except ValueError as error:
+        except DetectorError as error:
             raise UsageError("--detector", "a detector", error) from error
 
     def attack(self, identifier: str, out: Path) -> FrameResult:
@@ -300,7 +300,7 @@ def _command(config: Attack) -> str:
     words = ["drivesem", "attack"]
     default = Attack()
     for key, value in asdict(config).items():
-        if value == getattr(default, key) or key in ("out", "json"):
+        if value == getattr(default, key) or key in ("out", "json", "resume", "workers"):
             continue
         flag = key.replace("_", "-")
         words += (

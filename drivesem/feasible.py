@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,8 @@ from scene_ir.errors import RangeError
 from scene_ir.types import LATTICE, LATTICE_POINTS, Mesh, SceneIR
 
 Array = NDArray[np.float64]
+Values = NDArray[np.floating[Any]]
+"""Of theta's own dtype, float32 or float64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +142,7 @@ class FeasibleSet:
             found += [f"objects[{i}]: strain" for i in np.flatnonzero(~self._strain.holds(_offsets(mesh)))]
         return tuple(found + self._named(self._violated(self._state(values))))
 
-    def _project(self, values: NDArray) -> tuple[NDArray, list[str]]:
+    def _project(self, values: Values) -> tuple[Values, list[str]]:
         active: list[str] = []
         boxed = self._box(values)
         active += [f"{self.space.name(int(i))}: bounds" for i in np.flatnonzero(boxed != values)]
@@ -156,18 +159,18 @@ class FeasibleSet:
         active += self._named(violated)
         return self._back_off(boxed, _cars(violated)), active
 
-    def _box(self, values: NDArray) -> NDArray:
+    def _box(self, values: Values) -> Values:
         return np.clip(values, self._lower, self._upper).astype(values.dtype)
 
-    def _block(self, values: NDArray, parameter: Parameter) -> NDArray | None:
+    def _block(self, values: Values, parameter: Parameter) -> Values | None:
         """theta's block of one parameter of cars, (N, size), a view; None where it is held."""
         where = self.space.slice_of(parameter)
         return None if where is None else values[where].reshape(self.space.count, -1)
 
-    def _mesh(self, values: NDArray) -> NDArray | None:
+    def _mesh(self, values: Values) -> Values | None:
         return self._block(values, Parameter.MESH)
 
-    def _bound_strain(self, mesh: NDArray) -> NDArray[np.bool_]:
+    def _bound_strain(self, mesh: Values) -> NDArray[np.bool_]:
         """Scale each car's mesh offsets (N, 96) back, in place, until its strain holds; returns who was scaled."""
         wrong = ~self._strain.holds(_offsets(mesh))
         if not wrong.any():
@@ -182,7 +185,7 @@ class FeasibleSet:
         mesh[wrong] = (full * low[:, None]).astype(mesh.dtype)[wrong]
         return wrong
 
-    def _back_off(self, wanted: NDArray, offenders: NDArray[np.bool_]) -> NDArray:
+    def _back_off(self, wanted: Values, offenders: NDArray[np.bool_]) -> Values:
         """Feasible values: offenders go back to 0 and take each block up again as far as everything allows.
 
         Where an offender at 0 is still hit by a car that moved, that car is an offender too.
@@ -205,7 +208,7 @@ class FeasibleSet:
         return current
 
     def _take_up(
-        self, current: NDArray, wanted: NDArray, parameter: Parameter, offenders: NDArray[np.bool_]
+        self, current: Values, wanted: Values, parameter: Parameter, offenders: NDArray[np.bool_]
     ) -> None:
         """Bring the offenders' block of `parameter` from 0 towards `wanted`, in place, feasible throughout."""
         block, goal = self._block(current, parameter), self._block(wanted, parameter)
@@ -227,7 +230,7 @@ class FeasibleSet:
 
             _largest_scales(wrong_at, len(offenders))
 
-    def _state(self, values: NDArray, extents: tuple[Array, Array] | None = None) -> _State:
+    def _state(self, values: Values, extents: tuple[Array, Array] | None = None) -> _State:
         """What the constraints look at; `extents` where they are known already."""
         translate = self._block(values, Parameter.TRANSLATE)
         rotate = self._block(values, Parameter.ROTATE)
@@ -242,7 +245,7 @@ class FeasibleSet:
         low, high = extents or self._extents(values)
         return self._measure(low, high, yaw, translation)
 
-    def _extents(self, values: NDArray) -> tuple[Array, Array]:
+    def _extents(self, values: Values) -> tuple[Array, Array]:
         """Bounds (N, 3), (N, 3) m of the deformed cars in their own frames."""
         mesh = self._mesh(values)
         offsets = self._ffd if mesh is None else self._ffd + _offsets(mesh)
@@ -590,12 +593,12 @@ def _surface(mesh: Mesh) -> tuple[Array, Array]:
     return unit, ffd.lattice_weights(torch.from_numpy(unit)).numpy()
 
 
-def _offsets(mesh: NDArray) -> Array:
+def _offsets(mesh: Values) -> Array:
     """Lattice offsets (N, 64, 3) of symmetric codes (N, 96)."""
     return ffd.from_symmetric(torch.from_numpy(np.ascontiguousarray(mesh)).double()).numpy()
 
 
-def _lowest(mesh: NDArray) -> NDArray:
+def _lowest(mesh: Values) -> Values:
     """The vertical offsets (N, 4, 2) of the lowest lattice layer: a view into symmetric codes (N, 96)."""
     return mesh.reshape(len(mesh), LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)[:, :, -1, :, 1]
 

@@ -1,12 +1,12 @@
 """Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all six kinds of parameter.
 
-A vehicle is drawn on two surfaces. Its *mesh* shows the photograph where the photograph saw that point, and
-completes what it did not see. Its *proxy*, the mesh inflated, carries what of the matte lies beyond the mesh. A
-pixel's lookup is `pixel + displacement`, the displacement interpolated from the difference of the clip coordinates
-then and now: with nothing perturbed it is exactly zero, every lookup falls on a pixel centre, and the picture is
-the photograph.
+A vehicle's *mesh* shows the photograph where the photograph saw that point, and completes what it did not see. Its
+*halo*, the pixels around the mesh, carries what of the matte lies beyond the mesh, and moves as the nearest piece
+of outline does. A pixel's lookup is `pixel + displacement`, the displacement interpolated from the difference of
+the clip coordinates then and now: with nothing perturbed it is exactly zero, every lookup falls on a pixel centre,
+and the picture is the photograph.
 
-Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its proxy.
+Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its halo.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ from scene_ir.texture import Texels, smoothstep
 from scene_ir.types import Crop, Objects, Render, SceneIR
 
 T = TypeVar("T")
+
+HALO_MAX_PX = 64.0
+"""However near a vehicle is, its halo reaches no farther: of a car that fills the picture's height this is a
+sixth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,23 +87,23 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 @dataclass(frozen=True, slots=True)
 class _Geometry:
     """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the camera;
-    shell_clip (V, 3) of the proxies; ground_clip (4N, 3) of the shadows' patches."""
+    ground_clip (4N, 3) of the shadows' patches."""
 
     clip: Tensor
     cos: Tensor
-    shell_clip: Tensor
     ground_clip: Tensor
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); shell, ground: fragments of proxies and
-    patches."""
+    """What the z-buffers found for one perturbation. coverage (T,); nearest (T,) int64: the packed pixel of the same
+    object nearest to each that the mesh hits, -1 where the halo does not reach; ground: fragments of the patches.
+    """
 
     geometry: _Geometry
     mesh: verbs.Fragments
     coverage: Tensor
-    shell: verbs.Fragments
+    nearest: Tensor
     ground: verbs.Fragments
 
 
@@ -108,7 +112,8 @@ class _Rows:
     """Pixels to be coloured, mesh rows first, each part grouped by object.
 
     pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this
-    row fills; counts (2N,) int64 rows of each mesh, then of each proxy; fringe: see `_Fringe`.
+    row fills; counts (2N,) int64 rows of each mesh, then of each halo; fringe: see `_Fringe`; anchor (R - Rm,)
+    int64: the mesh row that each row of a halo moves with.
     """
 
     pixel: Tensor
@@ -118,6 +123,7 @@ class _Rows:
     counts: Tensor
     mesh_rows: int
     fringe: _Fringe
+    anchor: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,14 +210,14 @@ class Compositor:
             self._prepare(scene.objects, hidden)
 
     def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
-        """Everything that hangs on the unperturbed objects: normals, proxies, and what the photograph knows."""
+        """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
         picked = [Surface.of(self.scene.meshes[int(i)], self._like.dtype) for i in objects.mesh_index]
         self._fleet = Fleet.of(picked, self._like)
         base = _photographed(objects)
         local = self._fleet.local(base.ffd, base.size_lhw)
         self._sharp, self._smooth = self._fleet.normals(local)
         inflation = self._like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
-        self._offset = inflation[self._fleet.owner][:, None] * self._smooth
+        self._halo = inflation * self.scene.camera.matrix[0, 0].to(self._like)
         self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
         self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
         self._size = base.size_lhw
@@ -262,7 +268,6 @@ class Compositor:
         fleet, camera = self._fleet, self.scene.camera
         local = fleet.local(objects.ffd, objects.size_lhw)
         points = fleet.place(local, objects.yaw, objects.translation)
-        shell = fleet.place(local + self._offset, objects.yaw, objects.translation)
         normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
         ground = surfaces.place_on_ground(
             self._corners, objects.yaw, objects.translation, self.scene.environment.ground
@@ -270,7 +275,6 @@ class Compositor:
         return _Geometry(
             surfaces.project_vertices(points, camera),
             surfaces.facing(points, normals, self._centre),
-            surfaces.project_vertices(shell, camera),
             surfaces.project_vertices(ground, camera),
         )
 
@@ -278,26 +282,29 @@ class Compositor:
         """Find which surfaces the pixels see."""
         fleet, camera, backend = self._fleet, self.scene.camera, self.settings.backend
         geometry = self._place(objects)
+        reach = self._reach_px(objects) if objects.source else [0.0] * len(objects)
         rects = surfaces.crop_rects(
-            geometry.shell_clip, fleet.faces, fleet.vertex_ranges, fleet.face_ranges, camera
+            geometry.clip, fleet.faces, fleet.vertex_ranges, fleet.face_ranges, camera, [2.0 + r for r in reach]
         )
         layout = verbs.Layout.of(rects)
         mesh = verbs.rasterize(geometry.clip, fleet.faces, fleet.face_ranges, layout, backend)
         coverage = verbs.antialias(mesh, geometry.clip, fleet.faces, backend=backend)
-        if objects.source:
-            shell = verbs.rasterize(geometry.shell_clip, fleet.faces, fleet.face_ranges, layout, backend)
-        else:
-            shell = mesh
+        nearest = surfaces.nearest_hits(mesh, reach)
         faces, vertex_ranges, face_ranges = _patches(len(objects), self._like.device)
         patch_rects = surfaces.crop_rects(
-            geometry.ground_clip, faces, vertex_ranges, face_ranges, camera, margin=0
+            geometry.ground_clip, faces, vertex_ranges, face_ranges, camera, [0.0] * len(objects)
         )
         shadowless = [not self.settings.shadows or (bool(objects.source) and objects.source[i].shadow is None)
                       for i in range(len(objects))]  # fmt: skip
         patch_rects[torch.tensor(shadowless, dtype=torch.bool)] = 0
         ground_layout = verbs.Layout.of(patch_rects)
         ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return Drawn(geometry, mesh, coverage, shell, ground)
+        return Drawn(geometry, mesh, coverage, nearest, ground)
+
+    def _reach_px(self, objects: Objects) -> list[float]:
+        """How far the halo of each object reaches beyond its mesh."""
+        distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
+        return (self._halo / distance).clamp(max=HALO_MAX_PX).tolist()
 
     def layers(self, objects: Objects) -> Layers:
         """The objects drawn one by one, not yet blended."""
@@ -329,7 +336,7 @@ class Compositor:
             self._shadow_factors(objects, drawn),
         )
 
-    def _rows(self, drawn: Drawn, with_shell: bool) -> _Rows:
+    def _rows(self, drawn: Drawn, with_halo: bool) -> _Rows:
         layout = drawn.mesh.layout
         count = layout.rects.shape[0]
         covered = drawn.coverage.detach()
@@ -338,17 +345,21 @@ class Compositor:
         owner = layout.draw()
         pixel, share = mesh_pixel, drawn.coverage.index_select(0, mesh_pixel)
         counts = torch.bincount(owner[mesh_pixel], minlength=count)
-        if with_shell:
-            shell_pixel = ((drawn.shell.face >= 0) & (covered < 1)).nonzero()[:, 0]
-            pixel = torch.cat([mesh_pixel, shell_pixel])
-            share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, shell_pixel)])
-            counts = torch.cat([counts, torch.bincount(owner[shell_pixel], minlength=count)])
+        anchor = mesh_pixel[:0]
+        if with_halo:
+            halo_pixel = ((drawn.nearest >= 0) & (covered < 1)).nonzero()[:, 0]
+            pixel = torch.cat([mesh_pixel, halo_pixel])
+            share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, halo_pixel)])
+            counts = torch.cat([counts, torch.bincount(owner[halo_pixel], minlength=count)])
+            rank = torch.zeros_like(owner)
+            rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=rank.device)
+            anchor = rank[drawn.nearest[halo_pixel]]
         rows_owner = owner[pixel]
         x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
         within, width = pixel - layout.offsets[rows_owner], x1 - x0
         xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
         fringe = _Fringe.of(layout, hit, drawn.coverage, mesh_pixel, owner)
-        return _Rows(pixel, rows_owner, xy.to(self._like), share, counts, mesh_pixel.shape[0], fringe)
+        return _Rows(pixel, rows_owner, xy.to(self._like), share, counts, mesh_pixel.shape[0], fringe, anchor)
 
     def _mesh_attributes(self, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
         """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
@@ -362,14 +373,10 @@ class Compositor:
         geometry, base, fleet, m = drawn.geometry, self._base, self._fleet, rows.mesh_rows
         turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, self._height], dim=1)
 
-        def lookup(fragments: verbs.Fragments, clip: Tensor, base_clip: Tensor, part: slice) -> Tensor:
-            attributes = torch.cat([base_clip - clip, base_clip[:, 2:], turn], dim=1)
-            dense = verbs.interpolate(fragments, clip, fleet.faces, attributes, self.settings.backend)
-            return _lookup(dense.index_select(0, rows.pixel[part]), rows.xy[part])
-
-        mesh = rows.fringe.fill(lookup(drawn.mesh, geometry.clip, base.clip, slice(0, m)))
-        shell = lookup(drawn.shell, geometry.shell_clip, base.shell_clip, slice(m, None))
-        move, rest = torch.cat([mesh, shell]).split([2, 6], dim=1)
+        attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
+        dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, self.settings.backend)
+        mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
+        move, rest = torch.cat([mesh, mesh.index_select(0, rows.anchor)]).split([2, 6], dim=1)
         z_then, z_now, turned, cos_then, paint, up = rest.unbind(1)
 
         assert self._texels is not None
@@ -377,11 +384,14 @@ class Compositor:
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
         rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
         alpha, hidden, outline, z_seen, support = rest.unbind(1)
-        visible = texture.inside_weight(uv, *self._frame_hw) * (1.0 - smoothstep(hidden, 0.0, 1.0))
-        weight = texture.facing_weight(turned, cos_then) * visible
-        reached = 1.0 - smoothstep(z_then[:m] - z_seen[:m], *texture.DEPTH_TOLERANCE_M)
+        clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
+        inside = texture.inside_weight(uv, *self._frame_hw)
+        visible = inside * clear
+        near = texture.inside_weight(uv, *self._frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
+        weight = texture.facing_weight(turned, cos_then) * (inside + (1.0 - inside) * near) * clear
+        weight = weight * (1.0 - smoothstep(z_then - z_seen, *texture.DEPTH_TOLERANCE_M))
         kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
-        weight = weight * torch.cat([reached, kept])
+        weight = torch.cat([weight[:m], weight[m:] * kept])
         rim = 1.0 - smoothstep(cos_then[:m], *texture.RIM)
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
         # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
@@ -472,16 +482,18 @@ class Compositor:
         dense = verbs.interpolate(drawn.ground, clip, faces, fixed, self.settings.backend)
         hit = (drawn.ground.face >= 0).nonzero()[:, 0]
         xy = layout.pixels()[hit].to(self._like)
-        uv = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
+        wanted = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
+        height, width = self._frame_hw
+        # Constant from the border on, where `_darkness` repeats it: clamping two pixels beyond leaves no kink.
+        uv = wanted.clamp(min=-2.0).minimum(wanted.new_tensor([width + 1.0, height + 1.0]))
         assert self._shadows is not None
         owner = layout.draw()[hit]
         rect = self._shadows.rects[owner]
         reached = ((uv > rect[:, :2] - 2) & (uv < rect[:, 2:] + 1)).all(dim=1).nonzero()[:, 0]
-        hit, uv = hit[reached], uv.index_select(0, reached)
+        hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)
         counts = torch.bincount(owner[reached], minlength=len(objects))
         dark = self._shadows.sample(uv, counts, self.settings.backend, "zero")
-        height, width = self._frame_hw
-        dark = dark * texture.inside_weight(uv, height, width)[:, None]
+        dark = dark * texture.inside_weight(wanted, height, width, texture.EXTENDED_PX)[:, None]
         return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 
     def ground_density(self, drawn: Drawn) -> Tensor:
@@ -553,7 +565,7 @@ def _darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
         return Crop(torch.zeros(3, 0, 0), 0, 0)
     h, w = shadow.values.shape[1:]
     dark = replace(shadow, values=1.0 - shadow.values)
-    rect = (shadow.x0 - 2, shadow.y0 - 2, shadow.x0 + w + 2, shadow.y0 + h + 2)
+    rect = (shadow.x0 - 4, shadow.y0 - 4, shadow.x0 + w + 4, shadow.y0 + h + 4)
     return Crop(texture.crop_of(dark, rect, frame_hw), rect[0], rect[1])
 
 

@@ -32,7 +32,7 @@ _LEVELS = 255.0
 
 @dataclass(frozen=True, slots=True)
 class SolveSettings:
-    """margin_px: how far the proxy reaches beyond the mesh; min_inflation_m: but at least so far;
+    """margin_px: how far the halo reaches beyond the mesh; min_inflation_m: but at least so far;
     complete_shadows: whether shadows are continued under the vehicles, where the photograph could not show them;
     backend: see `RenderSettings`.
     """
@@ -159,20 +159,13 @@ def _window(frame: Tensor, crop: Crop) -> Tensor:
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
 
 
-def _hits(fragments: verbs.Fragments, index: int) -> Crop:
-    """Where draw `index` hit something: Crop (1, h, w) of 0 and 1."""
-    packed, size = fragments.layout.spans()[index]
-    x0, y0 = fragments.layout.rects[index, :2].tolist()
-    return Crop((fragments.face[packed] >= 0).reshape(1, *size).float(), x0, y0)
-
-
 def _cut(alpha: Crop, drawn: Drawn, index: int, like: Tensor) -> Crop:
-    """The matte where the proxy can carry it, trimmed to where it is above 0 and what it may be continued to."""
-    shell = _hits(drawn.shell, index)
-    x0, y0 = shell.x0, shell.y0
-    rect = (x0, y0, x0 + shell.values.shape[2], y0 + shell.values.shape[1])
+    """The matte where mesh and halo can carry it, trimmed to where it is above 0 and what it may be continued to."""
+    packed, size = drawn.mesh.layout.spans()[index]
+    x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
     height, width = like.shape[1:]
-    values = texture.crop_of(alpha, rect, (height, width)).to(like).clamp(0.0, 1.0) * shell.values.to(like)
+    carried = (drawn.nearest[packed] >= 0).reshape(1, *size).to(like)
+    values = texture.crop_of(alpha, (x0, y0, x1, y1), (height, width)).to(like).clamp(0.0, 1.0) * carried
     return _trimmed(Crop(values, x0, y0), values[0] > 0, grow=int(np.ceil(_EXTENSION_PX)))
 
 

@@ -1,4 +1,4 @@
-"""What the compositor draws: a vehicle's mesh, its inflated proxy and the patch of ground that carries its shadow.
+"""What the compositor draws: a vehicle's mesh, its halo and the patch of ground that carries its shadow.
 
 Shapes: N objects; V vertices and F triangles of all objects together, object after object.
 """
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -161,8 +162,7 @@ class Fleet:
         return torch.cat(parts) if parts else ffd.new_zeros(0, 3)
 
     def normals(self, local: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones, along which a proxy cannot
-        crack."""
+        """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones."""
         sharp, smooth = [], []
         for surface, (start, end) in zip(self.surfaces, self.vertex_ranges.tolist(), strict=True):
             points = local[start:end]
@@ -256,12 +256,17 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
 
 
 def crop_rects(
-    clip: Tensor, faces: Tensor, vertex_ranges: Tensor, face_ranges: Tensor, camera: Camera, margin: int = 2
+    clip: Tensor,
+    faces: Tensor,
+    vertex_ranges: Tensor,
+    face_ranges: Tensor,
+    camera: Camera,
+    margins_px: Sequence[float],
 ) -> Tensor:
     """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near
     plane.
 
-    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2). A draw wholly behind the camera or beside the
+    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2); margins_px: of each draw. A draw wholly behind the camera or beside the
     image has an empty rectangle.
     """
     points = clip.detach().to("cpu", torch.float64)
@@ -277,11 +282,32 @@ def crop_rects(
         if not bool(front.all()):
             inside = torch.cat([inside[front], _near_crossings(points, triangles[face_start:face_end])])
         px = inside[:, :2] / inside[:, 2:]
+        margin = margins_px[i]
         low = (px.amin(dim=0) - margin).ceil().clamp(min=0).minimum(limit)
         high = ((px.amax(dim=0) + margin).floor() + 1).clamp(min=0).minimum(limit)
         if bool((high > low).all()):
             rects[i] = torch.cat([low, high]).to(torch.int64)
     return rects.to(clip.device)
+
+
+def nearest_hits(fragments: verbs.Fragments, reach_px: Sequence[float]) -> Tensor:
+    """For each packed pixel (T,) int64 the nearest one of its draw that is hit, itself where it is; -1 where none is
+    within `reach_px`, one a draw."""
+    hit = (fragments.face >= 0).cpu().numpy()
+    nearest = np.full(hit.shape[0], -1, dtype=np.int64)
+    for i, (packed, size) in enumerate(fragments.layout.spans()):
+        inside = hit[packed]
+        if not inside.any():
+            continue
+        distance, labels = cv2.distanceTransformWithLabels(
+            (~inside).astype(np.uint8).reshape(size), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        numbers = np.asarray(labels).reshape(-1)
+        pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
+        pixel_of[numbers[inside]] = packed.start + np.nonzero(inside)[0]
+        within = np.asarray(distance).reshape(-1) <= reach_px[i]
+        nearest[packed] = np.where(within, pixel_of[numbers], -1)
+    return torch.from_numpy(nearest).to(fragments.face.device)
 
 
 def _near_crossings(points: Tensor, faces: Tensor) -> Tensor:

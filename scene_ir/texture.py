@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import kornia
 import numpy as np
+import scipy.ndimage
 import torch
 from torch import Tensor
 
@@ -33,6 +34,11 @@ OUTLINE_PX = (1.0, 2.2)
 inside."""
 HIDDEN_PX = (1.0, 3.0)
 """Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
+BORDER_PX = (0.5, 1.5)
+"""Distance beyond the photograph's border over which what it shows ends."""
+EXTENDED_PX = (4.0, 60.0)
+"""Distance beyond it over which a vehicle's looks at the border still stand for what goes on there: panels and
+windows run on, and a soft change to the template's colours shows less than a seam."""
 SUPPORT_PX = 2
 """Beyond the matte by more than this, the photograph shows that there is no vehicle."""
 CHANNELS = 8
@@ -106,7 +112,7 @@ def source_texels(
     """The `CHANNELS` texels of one object inside `rect`, padded.
 
     mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
-    object stands before this one. Beyond the mesh, texels belong to the outline; its depth lies behind everything.
+    object stands before this one. Beyond the mesh, texels belong to the outline and lie as deep as its nearest piece.
     """
     x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
     window = (x0, y0, x1, y1)
@@ -115,9 +121,7 @@ def source_texels(
     covered = torch.isfinite(mesh_depth.values)
     padded = crop_of(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
     finite = torch.where(covered, mesh_depth.values, torch.zeros_like(mesh_depth.values)).to(rgba)
-    depth = crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw)
-    beyond = float(finite.max()) + 2.0 * DEPTH_TOLERANCE_M[1]
-    depth = torch.where(padded, depth, torch.full_like(depth, beyond))
+    depth = _continued(crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
     depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -126,6 +130,16 @@ def source_texels(
     support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=SUPPORT_PX)[0]
     values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth, support])
     return Crop(values, x0, y0)
+
+
+def _continued(values: Tensor, known: Tensor) -> Tensor:
+    """Values (C, h, w) where `known` (h, w), elsewhere those of the nearest known pixel; unchanged if none is."""
+    mask = known.cpu().numpy()
+    if not mask.any():
+        return values
+    nearest = scipy.ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    rows, columns = (torch.from_numpy(np.ascontiguousarray(index)).to(values.device) for index in nearest)
+    return values[:, rows.long(), columns.long()]
 
 
 def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
@@ -163,11 +177,11 @@ def outline_weight(turned: Tensor) -> Tensor:
     return 1.0 - smoothstep(turned.square(), low * low, high * high)
 
 
-def inside_weight(uv: Tensor, height: int, width: int) -> Tensor:
-    """1 for pixels uv (R, 2) in the photograph, fading to 0 within one pixel beyond it."""
+def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, float] = BORDER_PX) -> Tensor:
+    """1 for pixels uv (R, 2) in the photograph and up to fade_px[0] beyond it, fading to 0 at fade_px[1]."""
     limit = uv.new_tensor([width - 1.0, height - 1.0])
     beyond = torch.maximum(-uv, uv - limit)
-    return (1.0 - smoothstep(beyond, 0.5, 1.5)).prod(dim=-1)
+    return (1.0 - smoothstep(beyond, *fade_px)).prod(dim=-1)
 
 
 def apply_texture_code(

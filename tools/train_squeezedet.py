@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from detectors import boxes
 from detectors.base import Detector
@@ -318,7 +320,14 @@ def main() -> None:
         held_out = FrameStore(arguments.held_out, arguments.run / "cache_held_out")
         print(f"{len(held_out)} frames held out", flush=True)
         keeper = Keeper(arguments, len(frames), held_out)
-    train(detector, frames, settings, arguments.run, keeper)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, console=Console(stderr=True)) as bar:
+        task = bar.add_task("training", total=settings.steps)
+
+        def progress(done: int, steps: int, loss: float) -> None:
+            bar.update(task, completed=done, total=steps, description=f"loss {loss:.3f}")
+
+        train(detector, frames, settings, arguments.run, keeper, progress=progress)
 
 
 if __name__ == "__main__":

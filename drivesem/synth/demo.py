@@ -19,6 +19,7 @@ from drivesem.synth.frames import (
     full_boxes,
     plan_frame,
     render_frame,
+    table,
 )
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.render import blocks
@@ -133,19 +134,16 @@ def take_apart(frame: SynthFrame, name: str) -> SceneIR:
             meshes.append(mesh)
     count = len(truths)
 
-    def table(rows: list) -> torch.Tensor:
-        return torch.tensor(np.array(rows), dtype=torch.float32)
-
     objects = Objects(
         mesh_index=torch.tensor(index, dtype=torch.int64),
-        translation=table([t.translation for t in truths]),
-        yaw=table([t.yaw for t in truths]),
-        size_lhw=table([a.size_lhw for a in vehicles]),
+        translation=table([t.translation for t in truths], 3),
+        yaw=torch.tensor([t.yaw for t in truths], dtype=torch.float32),
+        size_lhw=table([a.size_lhw for a in vehicles], 3),
         ffd=torch.zeros(count, LATTICE_POINTS, 3),
         texture_code=torch.zeros(count, TEXTURE_DIM),
         category=torch.tensor([int(Category.TRUCK if a.label == "Truck" else Category.CAR) for a in vehicles]),
-        box2d=table([t.box_xyxy for t in truths]),
-        truncation=table([t.truncation for t in truths]),
+        box2d=table([t.box_xyxy for t in truths], 4),
+        truncation=torch.tensor([t.truncation for t in truths], dtype=torch.float32),
         occlusion=torch.tensor([t.occlusion for t in truths], dtype=torch.int64),
     )
     scene = SceneIR(

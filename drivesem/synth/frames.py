@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from drivesem.synth.layout import (
     Actor,
@@ -110,11 +111,11 @@ class SynthFrame:
 def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
     fitted = statistics()
     choice = int(rng.integers(len(fitted.cameras))) if settings.camera is None else settings.camera
-    raw = fitted.cameras[choice]
-    f, (cx, cy) = raw["focal_px"], raw["centre_px"]
+    fit = fitted.cameras[choice]
+    f, (cx, cy) = fit.focal_px, fit.centre_px
     k = torch.tensor([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
-    projection = torch.cat([k, torch.tensor(raw["offset_px_m"])[:, None]], dim=1)
-    width, height = raw["size_wh_px"]
+    projection = torch.cat([k, torch.tensor(fit.offset_px_m)[:, None]], dim=1)
+    width, height = fit.size_wh_px
     pitch, roll = rng.normal(0, settings.tilt_rad), rng.normal(0, settings.tilt_rad * 0.5)
     tilt = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
     lean = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
@@ -226,9 +227,6 @@ def _labels(truths: list[Truth]) -> Labels:
         elif truth.visible > 0 and (truth.box_xyxy[2:] > truth.box_xyxy[:2] + 0.5).all():
             ignored.append(truth.box_xyxy)
 
-    def table(rows: list, width: int) -> torch.Tensor:
-        return torch.tensor(np.array(rows), dtype=torch.float32).reshape(-1, width)
-
     return Labels(
         kind=tuple(t.actor.label for t in kept),
         boxes_xyxy=table([t.box_xyxy for t in kept], 4),
@@ -239,6 +237,11 @@ def _labels(truths: list[Truth]) -> Labels:
         size_lhw=table([t.actor.size_lhw for t in kept], 3),
         ignore_xyxy=table(ignored, 4),
     )
+
+
+def table(rows: Sequence[ArrayLike], width: int) -> torch.Tensor:
+    """Rows of `width` numbers, also none at all, as a tensor (N, width) float32."""
+    return torch.tensor(np.array(rows), dtype=torch.float32).reshape(-1, width)
 
 
 def _share(material: np.ndarray, chosen: tuple[Material, ...]) -> torch.Tensor:

@@ -42,6 +42,16 @@ MARGIN_M = 0.3
 
 
 @dataclass(frozen=True, slots=True)
+class FittedCamera:
+    """One of KITTI's rectified cameras. offset_px_m: fourth column of its projection, f times the baseline first."""
+
+    focal_px: float
+    centre_px: tuple[float, float]
+    offset_px_m: tuple[float, float, float]
+    size_wh_px: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
 class Statistics:
     """Summary of KITTI's labels (`kitti_statistics.json`). edges in metres; shares sum to one."""
 
@@ -53,7 +63,7 @@ class Statistics:
     yaw_spread_rad: float
     type_share: dict[str, float]
     size_hwl_mean_m: dict[str, list[float]]
-    cameras: tuple[dict, ...]
+    cameras: tuple[FittedCamera, ...]
     camera_height_m: float
 
 
@@ -70,7 +80,10 @@ def statistics() -> Statistics:
         yaw_spread_rad=raw["yaw_spread_rad"],
         type_share=raw["type_share"],
         size_hwl_mean_m=raw["size_hwl_mean_m"],
-        cameras=tuple(raw["cameras"]),
+        cameras=tuple(
+            FittedCamera(c["focal_px"], tuple(c["centre_px"]), tuple(c["offset_px_m"]), tuple(c["size_wh_px"]))
+            for c in raw["cameras"]
+        ),
         camera_height_m=raw["camera_height_m"],
     )
 

@@ -152,7 +152,9 @@ def fine_matrix(view: View) -> np.ndarray:
     return to_fine @ view.camera.matrix.double().numpy()[:, :3]
 
 
-def rasterise(corners: np.ndarray, matrix: np.ndarray, rects: np.ndarray, ranges: np.ndarray) -> tuple:
+def rasterise(
+    corners: np.ndarray, matrix: np.ndarray, rects: np.ndarray, ranges: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Face (T,) int32 (-1: none) and depth (T,) float32 of each draw's pixels, packed.
 
     corners (F, 3, 3) m; matrix (3, 3); rects (N, 4) px; ranges (N, 2) faces.
@@ -199,7 +201,7 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
 
 
 def _lit(
-    maps: SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple
+    maps: SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Share (n,) of the sun that arrives, and where (n,) actors take some. samples: (material, owner, sun)."""
     n = len(point)

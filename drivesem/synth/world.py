@@ -68,7 +68,13 @@ class _Builder:
         return crossing is None or s + reach < crossing[0] - 1 or s - reach > crossing[1] + 1
 
     def put(
-        self, soup: Soup, d: float, s: float, turn: float = 0.0, scale: tuple = (1, 1, 1), y: float = 0.0
+        self,
+        soup: Soup,
+        d: float,
+        s: float,
+        turn: float = 0.0,
+        scale: tuple[float, float, float] = (1, 1, 1),
+        y: float = 0.0,
     ) -> None:
         """Place a soup whose x runs along the road (turn 0), turned by `turn`."""
         x, z = self.road.point(d, s)
@@ -113,7 +119,7 @@ def _ground(b: _Builder) -> None:
                     road, (strip.d0, strip.d1), s, (strip.height_m, strip.height_m), strip.material, albedo, seed
                 )
             )
-            if strip.material == Material.KERB or (strip.height_m and strip.material != Material.KERB):
+            if strip.material == Material.KERB or strip.height_m:
                 for edge in (strip.d0, strip.d1):
                     b.parts.append(
                         _ribbon(

@@ -52,7 +52,7 @@ _UNDERBODY = 0.3
 class DerenderSettings:
     """fit: move templates until their outlines meet the masks. min_height_px: smaller vehicles stay background.
     min_iou: below this agreement of mask and template the template's outline is the mask. max_inflation: of the
-    proxy that carries the matte, as a fraction of the car's height. min_reach_px: how far it reaches at least.
+    halo that carries the matte, as a fraction of the car's height. min_reach_px: how far it reaches at least.
     seed: of the fill's random search. backend: of the renderer.
     """
 

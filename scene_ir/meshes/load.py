@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Mesh, Part
 
@@ -131,12 +131,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     scene.add_geometry(shape, geom_name="mesh", node_name="vehicle", transform=_FLIP)
     content = scene.export(file_type="glb", include_normals=False)
     assert isinstance(content, bytes)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    files.write_bytes(file, content)
 
 
 def _read(file: Path) -> trimesh.Scene:
@@ -290,7 +285,9 @@ def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np
     return np.stack([forward, down, np.cross(forward, down)])
 
 
-def _bonnet_side(vertices: NDArray, faces: NDArray, forward: NDArray, up: NDArray) -> float:
+def _bonnet_side(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], forward: NDArray[np.float64], up: NDArray[np.float64]
+) -> float:
     """Positive where the upper third's surface lies behind the middle, seen along `forward`."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, save_detector
 from detectors.squeezedet import SqueezeDet
 
@@ -38,20 +39,20 @@ def test_round_trip(weights: Path) -> None:
 
 def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
-        ValueError, match=r"detector: expected one of squeezedet or a path\.safetensors, found 'yolo9'"
+        DetectorError, match=r"detector: expected one of squeezedet or a path\.safetensors, found 'yolo9'"
     ):
         load_detector("yolo9")
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"gone\.safetensors: expected a weights file, found none"):
+    with pytest.raises(DetectorError, match=r"gone\.safetensors: expected a weights file, found none"):
         load_detector(tmp_path / "gone.safetensors")
 
 
 def test_damaged_file(tmp_path: Path) -> None:
     path = tmp_path / "noise.safetensors"
     path.write_bytes(b"this is no safetensors file, whatever its name says")
-    with pytest.raises(ValueError, match=r"noise\.safetensors: expected a safetensors file, found"):
+    with pytest.raises(DetectorError, match=r"noise\.safetensors: expected a safetensors file, found"):
         load_detector(path)
 
 
@@ -65,28 +66,28 @@ def state() -> dict[str, torch.Tensor]:
 
 def test_other_architecture(weights: Path) -> None:
     rewrite(weights, {"backbone.0.weight": torch.zeros(2), "head.bias": torch.zeros(1)}, {})
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(DetectorError) as caught:
         load_detector(weights)
     message = str(caught.value)
     assert "\n" not in message
     assert "own.safetensors: expected the 64 tensors of squeezedet, found 64 missing (conv1.bias, ...)" in message
     assert "2 unexpected (backbone.0.weight, ...)" in message
     rewrite(weights, state(), {"architecture": "resnet"})
-    with pytest.raises(ValueError, match="expected architecture squeezedet, found 'resnet'"):
+    with pytest.raises(DetectorError, match="expected architecture squeezedet, found 'resnet'"):
         load_detector(weights)
 
 
 def test_other_shapes_and_values(weights: Path) -> None:
     rewrite(weights, state(), {"classes": '["Car"]'})
-    with pytest.raises(ValueError, match=r"convdet\.\w+: expected shape \(54,.* of squeezedet with 1 classes"):
+    with pytest.raises(DetectorError, match=r"convdet\.\w+: expected shape \(54,.* of squeezedet with 1 classes"):
         load_detector(weights)
     broken = state()
     broken["conv1.bias"][3] = float("nan")
     rewrite(weights, broken, {})
-    with pytest.raises(ValueError, match=r"conv1\.bias: expected finite numbers"):
+    with pytest.raises(DetectorError, match=r"conv1\.bias: expected finite numbers"):
         load_detector(weights)
     rewrite(weights, state(), {"t_star": "high"})
-    with pytest.raises(ValueError, match="expected metadata classes"):
+    with pytest.raises(DetectorError, match="expected metadata classes"):
         load_detector(weights)
 
 
