@@ -41,7 +41,7 @@ def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") 
     try:
         classes = tuple(json.loads(metadata.get("classes", json.dumps(CLASSES))))
         t_star = float(metadata.get("t_star", "0.5"))
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise DetectorError(f"{path}: expected metadata classes (list) and t_star (number): {error}") from None
     detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
     _load_into(detector, tensors, path)
@@ -58,10 +58,7 @@ def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None =
         **(facts or {}),
     }
     tensors = {k: v.detach().cpu().contiguous().to(torch.float16) for k, v in detector.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(save(tensors, metadata))
-    os.replace(temporary, path)
+    write_weights(path, metadata, tensors)
 
 
 def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
@@ -71,6 +68,14 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
             return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise DetectorError(f"{path}: expected a safetensors file, found {error}") from None
+
+
+def write_weights(path: Path, metadata: dict[str, str], tensors: dict[str, torch.Tensor]) -> None:
+    """Write a safetensors file so that a reader sees the old one or the new one, never a part. Makes the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_bytes(save(tensors, metadata))
+    os.replace(temporary, path)
 
 
 def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,12 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from detectors.augment import AugmentSettings, view
 from detectors.base import Detector
-from detectors.registry import read_weights
+from detectors.registry import read_weights, write_weights
 from detectors.squeezedet import SeededDropout
 from detectors.types import Targets
 
@@ -210,15 +208,12 @@ class _Run:
         self.detector.eval()
 
     def save(self, path: Path, step: int) -> None:
-        """One safetensors file, replaced as a whole."""
         tensors = {f"weights.{n}": p.detach().contiguous() for n, p in self.detector.named_parameters()}
         tensors |= {f"average.{n}": p.contiguous() for n, p in self.average.items()}
         for index, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{key}": value.contiguous() for key, value in state.items()}
         facts = {"step": str(step), "seconds": repr(self.seconds), "settings": _fingerprint(self.settings)}
-        temporary = path.with_name(path.name + ".partial")
-        temporary.write_bytes(save(tensors, facts))
-        os.replace(temporary, path)
+        write_weights(path, facts, tensors)
 
     def load(self, path: Path) -> int:
         """The step that a checkpoint was written after. ValueError where it belongs to other settings."""

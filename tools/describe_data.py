@@ -2,8 +2,8 @@
 
     python tools/describe_data.py data/synth-train-seed1 detectors/weights/squeezedet_data.json
 
-The result goes beside the weights that were trained on the folder, so that it can be shown that no demo scene shares
-anything with them.
+The result goes beside the weights that were trained on the folder, so that a test can show that no demo scene
+shares anything with them.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import Any
 
 from scene_ir import files
 
+
 def describe(folder: Path, frames: int | None = None) -> dict[str, Any]:
     """Splits, seeds and the union of shapes over the first `frames` frames of a folder of `drivesem synth`."""
     entries = [json.loads(files.read_text(path)) for path in sorted((folder / "entries").glob("*.json"))[:frames]]
-    other = sorted({key for entry in entries for key in entry if key not in ("index", "attempt", "road", "weather")})
+    other = sorted({key for entry in entries for key in entry} - {"index", "attempt", "road", "weather"})
     union: dict[str, Any] = {"frames": len(entries)}
     for key in other:
         values = [entry[key] for entry in entries]

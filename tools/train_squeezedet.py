@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -92,9 +91,7 @@ class FrameStore(Sequence[Sample]):
                 file.write(np.ascontiguousarray(image).tobytes())
                 self._index.append((identifier, end, image.shape[0], image.shape[1]))
                 end += image.size
-        temporary = index_path.with_name("index.json.partial")
-        temporary.write_text(json.dumps(self._index))
-        os.replace(temporary, index_path)
+        files.write_text(index_path, json.dumps(self._index))
         self._pixels = np.memmap(pixels_path, np.uint8, "r", shape=(end,))
         self.labels = []
         for identifier, *_ in self._index:

@@ -1,0 +1,1 @@
+"""Attacks: how theta is searched; the objective arrives as a callable."""

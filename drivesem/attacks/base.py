@@ -86,8 +86,8 @@ class Attack(ABC):
 
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
-        """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one with most lost
-        objects under `moved` labels wins; then a success, then the highest loss.
+        """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one with most
+        lost objects under `moved` labels wins; then a success, then the highest loss.
 
         All are scored because a detector's loss says only roughly what is lost: on the embedded scenes the iterate
         of highest loss loses fewer objects than the best one. A score takes no gradient and counts as no query.

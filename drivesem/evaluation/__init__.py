@@ -1,0 +1,1 @@
+"""Figures of detections against labels: average precision, recall, failures."""

@@ -1,0 +1,1 @@
+"""Vehicle meshes: generated templates, import from files, levels of detail."""

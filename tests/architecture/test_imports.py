@@ -150,6 +150,7 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
         ("scene_ir/types.py", "import open3d"),
         ("detectors/boxes.py", "from scene_ir.types import Labels"),
         ("detectors/boxes.py", "import onnxruntime"),
+        ("detectors/training.py", "from rich.progress import Progress"),
         ("drivesem/attacks/base.py", "from drivesem import objective"),
         ("drivesem/attacks/base.py", "from detectors import types"),
         ("drivesem/feasible.py", "from scene_ir import compositor"),

@@ -69,6 +69,15 @@ def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
     assert not torch.equal(trained.convdet.weight, before)
 
 
+def test_progress_is_told_after_each_step(tmp_path: Path) -> None:
+    told: list[tuple[int, int, float]] = []
+    settings = replace(SMALL, steps=4)
+    train(fresh(), painted(2), settings, tmp_path, stop_after=3, progress=lambda *told_now: told.append(told_now))
+    assert [told_now[:2] for told_now in told] == [(1, 4), (2, 4), (3, 4)]
+    log = list(csv.DictReader((tmp_path / LOG).read_text().splitlines()))
+    assert [loss for *_, loss in told] == pytest.approx([float(row["total"]) for row in log], rel=1e-5)
+
+
 @pytest.mark.slow
 def test_learns_a_few_frames_by_heart(tmp_path: Path) -> None:
     augment = AugmentSettings(
