@@ -24,13 +24,15 @@ SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safeten
 def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") -> Detector:
     """The shipped detector of that name, or the one in a `.safetensors` file; frozen, eval mode, channels-last.
 
-    Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong to
-    another architecture; the message names the file, what was expected and what was found.
+    Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
+    to another architecture; the message names the file, what was expected and what was found.
     """
     path = SHIPPED.get(str(name_or_path), Path(name_or_path))
     if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
         known = ", ".join(sorted(SHIPPED))
-        raise DetectorError(f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}")
+        raise DetectorError(
+            f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}"
+        )
     if not path.is_file():
         raise DetectorError(f"{path}: expected a weights file, found none")
     metadata, tensors = read_weights(path)
@@ -71,7 +73,7 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 
 
 def write_weights(path: Path, metadata: dict[str, str], tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file so that a reader sees the old one or the new one, never a part. Makes the folder."""
+    """Write a safetensors file, so that a reader sees the old or the new one, never a part. Makes the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".partial")
     temporary.write_bytes(save(tensors, metadata))

@@ -96,8 +96,8 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); nearest (T,) int64: the packed pixel of the same
-    object nearest to each that the mesh hits, -1 where the halo does not reach; ground: fragments of the patches.
+    """What the z-buffers found for one perturbation. coverage (T,); nearest (T,) int64: the packed pixel that the
+    same object's mesh hits nearest to each, -1 where the halo does not reach; ground: fragments of the patches.
     """
 
     geometry: _Geometry
@@ -225,8 +225,7 @@ class Compositor:
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
         self._texels, self._shadows = None, None
         ones = torch.ones_like(base.translation)
-        self._paint = torch.stack([s.paint for s in objects.source]).to(ones) if objects.source else ones
-        self._paint_lightness = self._base_lightness()
+        self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
 
@@ -255,6 +254,11 @@ class Compositor:
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self._frame_hw))
         self._texels = Texels.pack(crops + crops, self._like)
         self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
+
+    def repaint(self, paint: Tensor) -> None:
+        """Give the templates, which complete what the photograph did not see, the paint (N, 3)."""
+        self._paint = paint.to(self._like)
+        self._paint_lightness = self._base_lightness()
 
     def _base_lightness(self) -> Tensor:
         """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
@@ -396,8 +400,11 @@ class Compositor:
         opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
         # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
         empty = visible[:m] * (1.0 - smoothstep(support[:m], 0.1, 0.9))
-        fill = (1.0 - weight[:m] + weight[:m] * opened) * (1.0 - empty)
-        colour, opacity = weight[:, None] * rgb, weight * alpha
+        # What opens up is as opaque as the inside, in its own colour, where there is enough of it to tell.
+        closed = weight[:m] * opened * (1.0 - empty) * smoothstep(alpha[:m], *texture.OPEN_ALPHA)
+        gain = torch.cat([closed / alpha[:m].clamp(min=texture.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
+        fill = (1.0 - weight[:m]) * (1.0 - empty)
+        colour, opacity = (weight + gain)[:, None] * rgb, (weight + gain) * alpha
         need = (fill != 0.0).nonzero()[:, 0]
         if need.numel():
             filled = fill.index_select(0, need)

@@ -20,12 +20,18 @@ from scene_ir.compositor import Compositor, Drawn, RenderSettings
 from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
+from scene_ir.surfaces import nearest_true
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _EXTENSION_PX = 4.5
 """How far colours are continued under a nearer object: beyond `texture.HIDDEN_PX`, plus the lookups' kernel."""
 _KEEP = 0.02
 """A given background is kept under a shadow where background times shadow is this near to the photograph."""
+_SOLID = 0.95
+"""Opacity from which on a pixel is taken to show nothing but the vehicle."""
+_COLOUR_SLACK = 0.1
+"""How far a foreground colour may leave the range between photograph and vehicle: thin trims do; what a wrong
+matte or background asks for goes farther, and would travel with the vehicle as dark or bright specks."""
 _LEVELS = 255.0
 """Backgrounds are stored with 8 bit."""
 
@@ -122,8 +128,8 @@ def _solve(
         one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)))
         alone = Compositor(one, RenderSettings(settings.backend), hidden=[hidden])
         source = replace(source, paint=_paint_of(alone))
-        one = replace(one, objects=replace(one.objects, source=(source,)))
-        canvas = _with_layer(Compositor(one, RenderSettings(settings.backend), hidden=[hidden]))
+        alone.repaint(source.paint[None])
+        canvas = _with_layer(alone)
         solved[i] = source
     sources = tuple(solved[i] for i in range(len(objects)))
     return replace(scene, background=background, objects=replace(objects, source=sources))
@@ -160,7 +166,7 @@ def _window(frame: Tensor, crop: Crop) -> Tensor:
 
 
 def _cut(alpha: Crop, drawn: Drawn, index: int, like: Tensor) -> Crop:
-    """The matte where mesh and halo can carry it, trimmed to where it is above 0 and what it may be continued to."""
+    """The matte where mesh and halo carry it, trimmed to where it is above 0 and what it may be continued to."""
     packed, size = drawn.mesh.layout.spans()[index]
     x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
     height, width = like.shape[1:]
@@ -274,25 +280,37 @@ def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, cove
         return Crop(image.new_zeros(4, 0, 0), matte.x0, matte.y0)
     goal, behind = _window(image, matte), _window(canvas, matte)
     opacity = matte.values[0]
-    need = torch.where(
-        goal < behind, (behind - goal) / behind.clamp(min=1e-6), (goal - behind) / (1.0 - behind).clamp(min=1e-6)
-    )
-    raised = torch.maximum(opacity, need.amax(dim=0)).clamp(max=1.0)
     seen = (opacity > 0) & ~_window(nearer[None], matte)[0]
-    raised = raised * seen
+    low, high = _plausible(goal, seen & (opacity > _SOLID))
+    need = torch.where(
+        goal < behind,
+        (behind - goal) / (behind - low).clamp(min=1e-6),
+        (goal - behind) / (high - behind).clamp(min=1e-6),
+    )
+    raised = torch.maximum(opacity, need.amax(dim=0)).clamp(max=1.0) * seen
     colour = torch.where(seen, goal - (1.0 - raised) * behind, torch.zeros_like(goal))
     values = torch.cat([colour, raised[None]])
-    solid = seen & (raised > 0.5)
-    if bool(seen.all()) or not bool(solid.any()):
+    solid = (seen & (raised > 0.5)).numpy()
+    if bool(seen.all()) or not solid.any():
         return replace(matte, values=values)
-    found = scipy.ndimage.distance_transform_edt(~solid.numpy(), return_indices=True)
-    distance, index = (torch.from_numpy(np.ascontiguousarray(part)) for part in found)  # type: ignore[union-attr]
-    straight = (colour / raised.clamp(min=0.5))[:, index[0], index[1]]
+    distance, index = (torch.from_numpy(part) for part in nearest_true(solid))
+    straight = (colour / raised.clamp(min=0.5)).flatten(1)[:, index]
     rect = (matte.x0, matte.y0, matte.x0 + w, matte.y0 + h)
     filled = texture.crop_of(coverage, rect, (image.shape[1], image.shape[2])).to(values)
     continued = torch.cat([straight * filled, filled])
     use = (distance <= _EXTENSION_PX) & _window(nearer[None], matte)[0] & ~seen
     return replace(matte, values=torch.where(use, continued, values))
+
+
+def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest foreground (3, h, w) to believe in: between the photograph's colour and that of the
+    nearest pixel that is all vehicle, `solid` (h, w), and a little beyond."""
+    if not bool(solid.any()):
+        return torch.zeros_like(goal), torch.ones_like(goal)
+    index = torch.from_numpy(nearest_true(solid.numpy())[1])
+    inside = goal.flatten(1)[:, index]
+    low = (torch.minimum(goal, inside) - _COLOUR_SLACK).clamp(min=0.0)
+    return low, (torch.maximum(goal, inside) + _COLOUR_SLACK).clamp(max=1.0)
 
 
 def _paint_of(alone: Compositor) -> Tensor:

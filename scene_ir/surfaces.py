@@ -266,7 +266,8 @@ def crop_rects(
     """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near
     plane.
 
-    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2); margins_px: of each draw. A draw wholly behind the camera or beside the
+    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2); margins_px: of each draw. A draw
+    wholly behind the camera or beside the
     image has an empty rectangle.
     """
     points = clip.detach().to("cpu", torch.float64)
@@ -291,23 +292,26 @@ def crop_rects(
 
 
 def nearest_hits(fragments: verbs.Fragments, reach_px: Sequence[float]) -> Tensor:
-    """For each packed pixel (T,) int64 the nearest one of its draw that is hit, itself where it is; -1 where none is
-    within `reach_px`, one a draw."""
+    """For each packed pixel (T,) int64 the nearest one of its draw that is hit, itself where it is; -1 where none
+    is within `reach_px`, one a draw."""
     hit = (fragments.face >= 0).cpu().numpy()
     nearest = np.full(hit.shape[0], -1, dtype=np.int64)
     for i, (packed, size) in enumerate(fragments.layout.spans()):
-        inside = hit[packed]
-        if not inside.any():
-            continue
-        distance, labels = cv2.distanceTransformWithLabels(
-            (~inside).astype(np.uint8).reshape(size), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        numbers = np.asarray(labels).reshape(-1)
-        pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
-        pixel_of[numbers[inside]] = packed.start + np.nonzero(inside)[0]
-        within = np.asarray(distance).reshape(-1) <= reach_px[i]
-        nearest[packed] = np.where(within, pixel_of[numbers], -1)
+        if hit[packed].any():
+            distance, index = nearest_true(hit[packed].reshape(size))
+            nearest[packed] = np.where(distance <= reach_px[i], packed.start + index, -1).reshape(-1)
     return torch.from_numpy(nearest).to(fragments.face.device)
+
+
+def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (h, w) px to the nearest true pixel of a mask (h, w) that has one, and that pixel's flat index."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    numbers = np.asarray(labels)
+    pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
+    pixel_of[numbers[mask]] = np.flatnonzero(mask)
+    return np.asarray(distance), pixel_of[numbers]
 
 
 def _near_crossings(points: Tensor, faces: Tensor) -> Tensor:

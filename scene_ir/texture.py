@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import cv2
 import kornia
 import numpy as np
-import scipy.ndimage
 import torch
 from torch import Tensor
 
 from scene_ir.raster import verbs
+from scene_ir.surfaces import nearest_true
 from scene_ir.types import Crop, Source
 
 DEPTH_TOLERANCE_M = (0.25, 0.6)
@@ -25,6 +25,8 @@ TURN_TOLERANCE = (0.08, 0.25)
 """Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
 OPEN_TURN = (0.02, 0.1)
 """Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
+OPEN_ALPHA = (0.2, 0.5)
+"""Opacity of those texels up to which they show the background, and from which on the vehicle, for certain."""
 RIM = (0.3, 0.5)
 """That cosine, in the photograph, up to and beyond which a point is near the outline, and not."""
 OUTLINE_TURN = (0.1, 0.25)
@@ -112,7 +114,7 @@ def source_texels(
     """The `CHANNELS` texels of one object inside `rect`, padded.
 
     mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
-    object stands before this one. Beyond the mesh, texels belong to the outline and lie as deep as its nearest piece.
+    object stands before this one. Beyond the mesh, texels are of the outline and as deep as its nearest piece.
     """
     x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
     window = (x0, y0, x1, y1)
@@ -137,9 +139,8 @@ def _continued(values: Tensor, known: Tensor) -> Tensor:
     mask = known.cpu().numpy()
     if not mask.any():
         return values
-    nearest = scipy.ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    rows, columns = (torch.from_numpy(np.ascontiguousarray(index)).to(values.device) for index in nearest)
-    return values[:, rows.long(), columns.long()]
+    index = torch.from_numpy(nearest_true(mask)[1]).to(values.device)
+    return values.flatten(1)[:, index]
 
 
 def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:

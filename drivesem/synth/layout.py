@@ -43,7 +43,7 @@ MARGIN_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class FittedCamera:
-    """One of KITTI's rectified cameras. offset_px_m: fourth column of its projection, f times the baseline first."""
+    """One of KITTI's rectified cameras. offset_px_m: fourth column of its projection."""
 
     focal_px: float
     centre_px: tuple[float, float]

@@ -219,7 +219,8 @@ class _Level:
         return (rows + self.pad) * self.stride + columns + self.pad
 
     def _patches(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
-        return self.padded.reshape(-1, 3)[self._flat(rows, columns)[:, None] + self.offsets].reshape(rows.size, -1)
+        index = self._flat(rows, columns)[:, None] + self.offsets
+        return self.padded.reshape(-1, 3).take(index, axis=0, mode="clip").reshape(rows.size, -1)
 
     def _cost(
         self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
@@ -237,6 +238,9 @@ class _Level:
         """Take the proposed sources where they are better."""
         rows = np.clip(rows, 0, self.height - 1)
         columns = np.clip(columns, 0, self.width - 1)
+        current = self.source[which]
+        new = self.allowed[rows, columns] & ((rows != current[:, 0]) | (columns != current[:, 1]))
+        which, rows, columns = which[new], rows[new], columns[new]
         cost = self._cost(which, rows, columns)
         better = cost < self.best[which]
         chosen = which[better]

@@ -44,6 +44,8 @@ _FADE = 0.35
 """Opacity from which on what is behind a car is all filled."""
 _TRUSTED = 0.85
 """Agreement of mask and fitted outline from which on the outline may add to the mask."""
+_EDGE = 0.03
+"""How far the outline may add to the mask, as a fraction of the car's height: more is a mesh that is too large."""
 _UNDERBODY = 0.3
 """Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
@@ -92,13 +94,15 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     rows = _vehicle_rows(frame.identifier, labels, camera, settings)
     image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     ground = maps.fit_ground(labels, _posed_rows(labels))
-    cuts = [_without_underbody(cut, ground, camera) for cut in _cut_out(image, frame, rows, settings)]
+    cuts = _cut_out(image, frame, rows, settings)
+    views = [shadow.ground_view(cut.placement, ground, camera) for cut in cuts]
+    cuts = [_without_underbody(cut, view) for cut, view in zip(cuts, views, strict=True)]
     vehicles = np.zeros(image.shape[:2], bool)
     for cut in cuts:
         vehicles |= silhouette.grow(cut.mask, 2)
     horizon = maps.horizon_row(ground, camera)
     road = maps.road_map(image, horizon, vehicles)
-    background, mattes, shadows, sun = _layers(image, cuts, vehicles, road, ground, horizon, camera, settings.seed)
+    background, mattes, shadows, sun = _layers(image, cuts, views, vehicles, road, horizon, settings.seed)
     environment, depth = _environment(background, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
         depth = frame.depth.float()
@@ -205,21 +209,21 @@ def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSett
             closer &= _label_box(labels, row, mask.shape)
             if silhouette.iou(closer, outline, mine) >= settings.min_iou:
                 mask = closer
-            # Bright edges of roofs and pillars look like sky to GrabCut; the fitted mesh knows better.
+            # Bright edges of roofs and pillars look like sky to GrabCut; the fitted mesh knows better, nearby.
             if silhouette.iou(mask, outline, mine) >= _TRUSTED:
-                mask = mask | (silhouette.grow(outline, -1) & ~mine)
+                near = silhouette.grow(mask, _EDGE * height + 1)
+                mask = mask | (silhouette.grow(outline, -1) & near & ~mine)
         if mask.any():
             agreement = silhouette.iou(mask, outline, mine)
             cuts.append(_Cut(row, chosen[index], mask, mine, outline, agreement))
     return sorted(cuts, key=lambda cut: cut.row)
 
 
-def _without_underbody(cut: _Cut, ground: torch.Tensor, camera: Camera) -> _Cut:
+def _without_underbody(cut: _Cut, view: shadow.GroundView) -> _Cut:
     """The mask without the dark ground between and beside the wheels: that is shadow, and lies on the ground."""
-    distance = shadow.ground_view(cut.placement, ground, camera).distance
     _, top, _, bottom = silhouette.extent(cut.outline)
-    low = np.arange(camera.height)[:, None] > bottom - _UNDERBODY * (bottom - top)
-    beneath = low & (distance < 0.4) & ~silhouette.grow(cut.outline, 1.5)
+    low = np.arange(cut.outline.shape[0])[:, None] > bottom - _UNDERBODY * (bottom - top)
+    beneath = low & (view.distance < 0.4) & ~silhouette.grow(cut.outline, 1.5)
     return replace(cut, mask=cut.mask & ~beneath) if (cut.mask & ~beneath).any() else cut
 
 
@@ -276,17 +280,15 @@ def _height(mask: Mask) -> int:
 def _layers(
     image: Array,
     cuts: list[_Cut],
+    views: list[shadow.GroundView],
     vehicles: Mask,
     road: Array,
-    ground: torch.Tensor,
     horizon: float,
-    camera: Camera,
     seed: int,
 ) -> tuple[Array, list[Array], list[Array], torch.Tensor]:
     """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (H, W, 3), sun."""
     if not cuts:
         return image, [], [], maps.sun_direction()
-    views = [shadow.ground_view(cut.placement, ground, camera) for cut in cuts]
     placements = [cut.placement for cut in cuts]
     tight = _union([cut.mask for cut in cuts], vehicles.shape)
     lighting = shadow.light(image, road, vehicles, views)

@@ -25,7 +25,8 @@ class MatteSettings:
     border lies outside the mask (some road that travels with a car shows less than an edge of car left behind);
     softness_px: width of the prior ramp; contrast: difference of colours at which the photograph counts as much as
     the prior; odd: deviations from the surroundings (in their standard deviations) between which a pixel just
-    outside begins to be, and is, taken for a piece of the car.
+    outside begins to be, and is, taken for a piece of the car; unlike: how far its colour must at least be from
+    mixtures of the nearest car's and surroundings' colours to be one.
     """
 
     band_px: float = 2.5
@@ -33,6 +34,7 @@ class MatteSettings:
     softness_px: float = 1.6
     contrast: float = 0.06
     odd: tuple[float, float] = (1.8, 3.2)
+    unlike: float = 0.1
 
 
 def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None) -> Array:
@@ -68,7 +70,10 @@ def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: Matte
             colours, share[..., None] * across, (depth < -settings.band_px - 1.5) & ~hidden & ~ground[window]
         )
         low, high = settings.odd
-        piece = np.clip((odd - low) / (high - low), 0, 1) * ~ground[window]
+        # What goes on just outside, a window frame or a branch, is no piece of the car.
+        unlike = np.linalg.norm(colours - outside - share[..., None] * across, axis=-1)
+        unlike = np.clip(unlike / settings.unlike - 1, 0, 1)
+        piece = np.clip((odd - low) / (high - low), 0, 1) * unlike * ~ground[window]
         mixed = np.maximum(mixed, piece)
         mixed = cv2.GaussianBlur(mixed.astype(np.float32), (3, 3), 0.6)
     low = np.clip(depth + 0.5, 0, 1)

@@ -34,6 +34,8 @@ _FREE = 0.5
 """How far single points of the lattice move where the shaped modes move by 1."""
 _COVER = 2.0
 """How much more a pixel of the mask that the mesh leaves out weighs than one that it covers in vain."""
+_ADAM = (0.9, 0.999)
+"""Decay of the means of gradients and of their squares, as its authors recommend."""
 _LOW_PART = 0.3
 """Lower part of a car, as a fraction of its height, beside which its shadow lies."""
 
@@ -233,7 +235,7 @@ def fit(
     modes = _modes()
     spread, bound = _units(settings, len(modes))
     code = torch.zeros(len(placements), spread.numel(), requires_grad=True)
-    optimiser = torch.optim.Adam([code], lr=settings.rate)
+    mean, square = torch.zeros_like(code), torch.zeros_like(code)
     best = torch.full((len(placements),), torch.inf)
     best_code = code.detach().clone()
     for step in range(settings.steps + 1):
@@ -254,13 +256,15 @@ def fit(
         best_code = torch.where(better[:, None], code.detach(), best_code)
         if step == settings.steps:
             break
-        optimiser.zero_grad()
-        loss.sum().backward()
-        # Vertices at the near plane can give infinite slopes; one car's must not spoil the others.
-        assert code.grad is not None
-        torch.nan_to_num_(code.grad, nan=0.0, posinf=0.0, neginf=0.0)
-        optimiser.step()
+        gradient = torch.autograd.grad(loss.sum(), code)[0]
         with torch.no_grad():
+            # Vertices at the near plane can give infinite slopes; one car's must not spoil the others.
+            torch.nan_to_num_(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+            # Adam (Kingma and Ba 2015) by hand: importing torch's optimisers takes longer than this whole fit.
+            mean.lerp_(gradient, 1 - _ADAM[0])
+            square.lerp_(gradient.square(), 1 - _ADAM[1])
+            scale = (square / (1 - _ADAM[1] ** (step + 1))).sqrt() + 1e-8
+            code -= settings.rate * mean / (1 - _ADAM[0] ** (step + 1)) / scale
             code.clamp_(-bound / spread, bound / spread)
     return [_apply(p, c * spread, modes) for p, c in zip(placements, best_code, strict=True)]
 

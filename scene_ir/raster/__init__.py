@@ -1,1 +1,1 @@
-"""The rasteriser: four differentiable verbs, each as plain torch and as Warp kernels; see `scene_ir.raster.verbs`."""
+"""The rasteriser: four differentiable verbs, each in plain torch and as Warp kernels: `scene_ir.raster.verbs`."""

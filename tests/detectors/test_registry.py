@@ -86,9 +86,10 @@ def test_other_shapes_and_values(weights: Path) -> None:
     rewrite(weights, broken, {})
     with pytest.raises(DetectorError, match=r"conv1\.bias: expected finite numbers"):
         load_detector(weights)
-    rewrite(weights, state(), {"t_star": "high"})
-    with pytest.raises(DetectorError, match="expected metadata classes"):
-        load_detector(weights)
+    for wrong in ({"t_star": "high"}, {"classes": "3"}, {"classes": "Car"}):
+        rewrite(weights, state(), wrong)
+        with pytest.raises(DetectorError, match="expected metadata classes"):
+            load_detector(weights)
 
 
 @pytest.mark.skipif(

@@ -15,7 +15,9 @@ SHAPES = ("vehicles", "building", "tree", "bush", "surface")
 
 
 @pytest.mark.parametrize(
-    "index", [0, 1, *(pytest.param(i, marks=pytest.mark.slow) for i in range(2, 10))], ids=lambda i: f"demo-{i:03d}"
+    "index",
+    [0, 1, *(pytest.param(i, marks=pytest.mark.slow) for i in range(2, 10))],
+    ids=lambda i: f"demo-{i:03d}",
 )
 def test_manifests_are_disjoint(index: int) -> None:
     trained_on = json.loads((WEIGHTS / "squeezedet_data.json").read_text())
