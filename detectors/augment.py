@@ -143,6 +143,9 @@ def _place(
     chosen = torch.nonzero(~targets.ignore)[:, 0]
     focus = generator.uniform(0, 1, 2) * (image_hw[1], image_hw[0])
     if len(chosen) and generator.random() < settings.object_probability:
+        # A class first, then one of its objects: the rare classes are seen more often than they occur.
+        present = torch.unique(targets.labels[chosen])
+        chosen = chosen[targets.labels[chosen] == present[generator.integers(len(present))]]
         left, top, right, bottom = targets.boxes_xyxy[chosen[generator.integers(len(chosen))]].tolist()
         focus = np.array([(left + right) / 2, (top + bottom) / 2])
     corner = focus - generator.uniform(0.1, 0.9, 2) * (size_hw[1], size_hw[0])

@@ -231,17 +231,23 @@ class SqueezeDet(Detector):
         )
 
     def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
-        """The three terms over the whole batch, each weighted as published, and their sum."""
+        """The three terms over the whole batch, each weighted as published, and their sum.
+
+        Box and class: a mean over the batch's objects. Confidence: each image's sum over anchors, weighted by
+        75 / objects of the batch where an object is and by 100 / the other anchors of one image elsewhere; then a
+        mean over images. So false alarms weigh the more, against misses, the larger the batch.
+        """
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(image), 1)
         confidence = torch.sigmoid(raw.confidence_logits)
         missed = (confidence[image, anchor] - assignment.confidence).square().sum() / objects
-        silent = max(confidence.numel() - len(image), 1)
+        batch, anchors = confidence.shape
+        silent = max(anchors - len(image), 1)
         alarms = torch.where(assignment.negative, confidence, 0.0).square().sum() / silent
         box = (raw.deltas[image, anchor] - assignment.deltas).square().sum() / objects
         classes = F.cross_entropy(raw.class_logits[image, anchor], assignment.labels, reduction="sum") / objects
         terms = {
-            "confidence": WEIGHT_CONFIDENCE_POSITIVE * missed + WEIGHT_CONFIDENCE_NEGATIVE * alarms,
+            "confidence": (WEIGHT_CONFIDENCE_POSITIVE * missed + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
             "box": WEIGHT_BOX * box,
             "class": WEIGHT_CLASS * classes,
         }

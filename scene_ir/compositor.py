@@ -221,6 +221,7 @@ class Compositor:
         self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
         self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
         self._size = base.size_lhw
+        self._base_ffd, self._base_local = base.ffd, local
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
         self._texels, self._shadows = None, None
@@ -270,7 +271,8 @@ class Compositor:
 
     def _place(self, objects: Objects) -> _Geometry:
         fleet, camera = self._fleet, self.scene.camera
-        local = fleet.local(objects.ffd, objects.size_lhw)
+        bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
+        local = fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
         points = fleet.place(local, objects.yaw, objects.translation)
         normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
         ground = surfaces.place_on_ground(
@@ -391,8 +393,10 @@ class Compositor:
         clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
         inside = texture.inside_weight(uv, *self._frame_hw)
         visible = inside * clear
-        near = texture.inside_weight(uv, *self._frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
-        weight = texture.facing_weight(turned, cos_then) * (inside + (1.0 - inside) * near) * clear
+        weight = texture.facing_weight(turned, cos_then) * visible
+        if bool((inside.detach() < 1.0).any()):
+            near = texture.inside_weight(uv, *self._frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
+            weight = weight + texture.facing_weight(turned, cos_then) * (1.0 - inside) * near * clear
         weight = weight * (1.0 - smoothstep(z_then - z_seen, *texture.DEPTH_TOLERANCE_M))
         kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
         weight = torch.cat([weight[:m], weight[m:] * kept])

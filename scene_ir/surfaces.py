@@ -267,8 +267,7 @@ def crop_rects(
     plane.
 
     clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2); margins_px: of each draw. A draw
-    wholly behind the camera or beside the
-    image has an empty rectangle.
+    wholly behind the camera or beside the image has an empty rectangle.
     """
     points = clip.detach().to("cpu", torch.float64)
     triangles = faces.cpu()

@@ -186,7 +186,7 @@ CARD = """# SqueezeDet, trained on generated streets
   licence (`python tools/fetch_backbone.py`). Everything else was drawn anew.
 - Data: {frames:,} frames of the project's own generator (`{data}`), no photographs. Vans count as Car, buses as
   Truck. Objects lower than {minimum:g} px or of unknown occlusion were ignored.
-- Training: {step:,} steps of {batch} windows, {minutes:.0f} minutes on {threads} CPU threads, seed {seed}.
+- Training: {step:,} steps of {batch} windows, {minutes:.0f} minutes on {threads} CPU threads, seed {seed}.{note}
 
 ## Figures
 
@@ -267,6 +267,7 @@ class Keeper:
             minutes=float(log[-1].split(",")[1]) / 60 if len(log) > 1 else 0.0,
             threads=torch.get_num_threads(),
             seed=arguments.seed,
+            note=f"\n  {arguments.note}" if arguments.note else "",
             held_out=len(self.store),
             table="\n".join(rows),
             t_star=marks.t_star,
@@ -293,6 +294,7 @@ def main() -> None:
     parser.add_argument("--evaluate-every", type=int, default=500)
     parser.add_argument("--thin", type=int, default=2, help="judge by every n-th held-out frame until the end")
     parser.add_argument("--no-bfloat16", action="store_true")
+    parser.add_argument("--note", default="", help="a remark on this run for the model card")
     parser.add_argument("--dropout", type=float, default=0.5)
     arguments = parser.parse_args()
     settings = TrainingSettings(

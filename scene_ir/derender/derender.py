@@ -40,8 +40,8 @@ Mask = NDArray[np.bool_]
 VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 """Labels that become objects; all others stay in the background. Vans count as cars, as in the paper."""
 
-_FADE = 0.35
-"""Opacity from which on what is behind a car is all filled."""
+_FADE = (0.08, 0.45)
+"""Opacity up to which the photograph is taken for what is behind a car, and from which on that is all filled."""
 _TRUSTED = 0.85
 """Agreement of mask and fitted outline from which on the outline may add to the mask."""
 _EDGE = 0.03
@@ -308,7 +308,7 @@ def _layers(
         beyond = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
         shadow_share = np.maximum(shadow_share, np.clip(1.25 - beyond / 2.5, 0, 1))
     # Where a matte is thin, most of the pixel is background already: the fill fades into it.
-    replaced = np.clip(np.maximum(shadow_share, opaque / _FADE), 0, 1)[..., None]
+    replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)[..., None]
     mixed = image + (filled - image) * replaced
     # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
     only_shadow = (opaque == 0)[..., None]

@@ -168,6 +168,20 @@ def test_confidence_term_by_hand() -> None:
     assert terms["confidence"].item() == pytest.approx(expected, rel=1e-4)
 
 
+def test_confidence_term_of_a_batch_by_hand() -> None:
+    parts = silent(4, 64, 160)
+    at, other = anchor_at(2, 5, 8, 10), anchor_at(0, 0, 0, 10)
+    truth = parts["boxes_xyxy"][0, at].tolist()  # met exactly: IoU 1
+    parts["confidence_logits"][0, at] = 0.0  # 0.5
+    parts["confidence_logits"][1, at] = 40.0  # 1.0
+    parts["confidence_logits"][3, other] = math.log(0.2 / 0.8)
+    wanted = [targets([truth], [0]), targets([truth], [0]), targets([], []), targets([], [])]
+    terms = fresh().loss(raw_of(parts, 64, 160), wanted)
+    # Two objects in the batch, 360 anchors an image, four images.
+    expected = (75 * (0.5 - 1.0) ** 2 / 2 + 100 * 0.2**2 / (360 - 2)) / 4
+    assert terms["confidence"].item() == pytest.approx(expected, rel=1e-4)
+
+
 def test_box_and_class_terms_by_hand() -> None:
     parts = silent(1, 64, 160)
     at = anchor_at(2, 5, 8, 10)

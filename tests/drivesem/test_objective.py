@@ -19,11 +19,11 @@ EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1)
 
 
 class StubCompositor:
-    """An image whose mean is the sum of the cars' z, and opacities without a meaning."""
+    """An image whose mean is a hundredth of the sum of the cars' z, and opacities without a meaning."""
 
     def render(self, scene) -> Render:
         h, w = scene.camera.height, scene.camera.width
-        value = scene.objects.translation[:, 2].sum()
+        value = scene.objects.translation[:, 2].sum() / 100
         crops = tuple(Crop(torch.ones(1, 2, 2), 4 * i, 0) for i in range(len(scene.objects)))
         ids = torch.zeros(h, w, dtype=torch.int64)
         for i, crop in enumerate(crops):
@@ -131,7 +131,7 @@ def test_a_theta_is_rendered_once(street):
 def test_both_label_modes_are_judged(street):
     scene = street(positions_xz=NEAR)
     # A detector that sees nothing any more fails both; one that stays where the cars were fails `moved` only.
-    blind = _objective(scene, StubDetector(scene.objects.box2d, blind_above=22.2))
+    blind = _objective(scene, StubDetector(scene.objects.box2d, blind_above=0.222))
     gone = blind.score(torch.tensor([0.1, 0.0, 0.0, 0.0]))
     assert (gone.lost, gone.phantoms, gone.success, gone.success_paper) == (2, 0, True, True)
     still = _objective(scene, StubDetector(scene.objects.box2d))
@@ -172,6 +172,7 @@ def test_the_whole_chain_is_deterministic_and_feasible(street):
     assert torch.equal(result.theta, again.theta)
     assert result.loss_trace == again.loss_trace
     assert result.queries == 2
-    assert result.loss_trace[0] == pytest.approx(objective.benign.loss)
+    # What is judged is rounded to 8 bits, what is differentiated is not.
+    assert result.loss_trace[0] == pytest.approx(objective.benign.loss, rel=0.05)
     assert not objective.score(space.theta0).success
     assert check_scene(scene, space.apply(scene, result.theta)) == []

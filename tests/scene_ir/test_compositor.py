@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import pytest
 import torch
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from torch import Tensor
 from scene_ir import blend, surfaces
 from scene_ir.compositor import Compositor, RenderSettings, render, scene_to
 from scene_ir.errors import ShapeError
+from scene_ir.raster import verbs
 from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
 from scene_ir.types import Crop, Objects, Render, SceneIR
 
@@ -319,8 +321,8 @@ def test_paint_order_never_lays_a_hidden_car_over_its_hider(seed: int) -> None:
     assert [far[i] for i in _order(cars)] == [4, 3, 2, 1, 0]
 
 
-def test_inflated_proxy_does_not_crack(street: Street) -> None:
-    """Vertices at one place move together, though the mesh does not share them between faces."""
+def test_welded_normals_are_one_a_place(street: Street) -> None:
+    """Vertices at one place face one way, though the mesh does not share them between faces."""
     fleet = surfaces.Fleet.of(
         [surfaces.Surface.of(street(torch.float64).meshes[0], torch.float64)], torch.zeros(1)
     )
@@ -339,3 +341,33 @@ def test_scene_to_changes_every_floating_tensor(photographed: SceneIR) -> None:
     assert single.camera.projection.dtype == torch.float32
     assert single.meshes[0].faces.dtype == torch.int64
     assert isinstance(single.objects.source[0].shadow, Crop)
+
+
+def test_nearest_hits_stay_within_their_draw_and_reach() -> None:
+    layout = verbs.Layout.of(torch.tensor([[0, 0, 5, 1], [2, 3, 5, 5], [0, 0, 2, 1]]))
+    face = torch.full((13,), -1, dtype=torch.int32)
+    face[1], face[5] = 7, 2
+    fragments = verbs.Fragments(layout, face, torch.ones(13), torch.zeros(3, 2, dtype=torch.int64), 0.05)
+    nearest = surfaces.nearest_hits(fragments, [2.0, 9.0, 9.0])
+    assert nearest.tolist() == [1, 1, 1, 1, -1] + [5] * 6 + [-1, -1]
+
+
+def test_halo_moves_with_the_outline(street: Street) -> None:
+    """A matte that is larger than the mesh stays joined to the vehicle when that turns."""
+    scene = street(torch.float64)
+    scene = replace(scene, objects=_only(scene.objects, [0]))
+    shot = Compositor(scene, REFERENCE).render(scene).opacity[0]
+    wide = torch.nn.functional.max_pool2d(torch.nn.functional.pad(shot.values, (3, 3, 3, 3))[None], 7, 1, 3)[0]
+    inside = (slice(None), slice(max(-(shot.y0 - 3), 0), None), slice(max(-(shot.x0 - 3), 0), None))
+    matte = Crop(wide[inside], max(shot.x0 - 3, 0), max(shot.y0 - 3, 0))
+    taken = solve_sources(scene, [matte], None, SolveSettings(margin_px=6.0, backend="reference"))
+    still = Compositor(taken, REFERENCE).render(taken).opacity[0].values.sum()
+    turned = Compositor(taken, REFERENCE).render(_moved(taken, dyaw=0.08)).opacity[0]
+    solid = (turned.values[0] > 0.5).numpy().astype("uint8")
+    parts, _, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    assert parts == 2 or stats[1:, cv2.CC_STAT_AREA].max() > 0.995 * stats[1:, cv2.CC_STAT_AREA].sum()
+    gaps, *_ = cv2.connectedComponents(
+        1 - cv2.copyMakeBorder(solid, 1, 1, 1, 1, cv2.BORDER_CONSTANT), connectivity=4
+    )
+    assert gaps == 2
+    assert float(turned.values.sum()) == pytest.approx(float(still), rel=0.15)

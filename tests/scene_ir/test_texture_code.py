@@ -149,3 +149,19 @@ def test_shade_is_brighter_towards_the_sun_and_in_range() -> None:
     assert 0.0 <= float(lit.min()) <= float(lit.max()) <= 1.0
     towards = (normal * sun).sum(-1)
     assert float(lit[towards > 0.5].mean()) > 1.3 * float(lit[towards < -0.3].mean())
+
+
+def test_smoothstep_is_flat_outside_and_has_its_gradient() -> None:
+    x = torch.tensor([-1.0, 0.3, 0.45, 0.7, 0.7 + 1e-9, 4.0], dtype=torch.float64, requires_grad=True)
+    values = texture.smoothstep(x, 0.3, 0.7)
+    assert values[[0, 1, 3, 4, 5]].tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]
+    assert float(values[2].detach()) == pytest.approx(0.31640625)
+    assert torch.autograd.gradcheck(lambda t: texture.smoothstep(t, 0.3, 0.7), (x,))
+
+
+def test_looks_at_the_border_fade_beyond_it() -> None:
+    uv = torch.tensor([[5.0, 5.0], [-3.0, 5.0], [-30.0, 5.0], [-61.0, 5.0], [5.0, 99.0]])
+    weight = texture.inside_weight(uv, 20, 30, (4.0, 60.0))
+    assert weight[[0, 1, 3, 4]].tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert 0.4 < float(weight[2]) < 0.6
+    assert texture.inside_weight(uv, 20, 30).tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
