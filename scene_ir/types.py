@@ -150,7 +150,7 @@ class Source:
     translation (3,) m, yaw () rad, size_lhw (3,) m, ffd (P, 3): the geometry at which the photograph was taken.
     foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity (the matte), in [0, 1].
     shadow: Crop of (3, h, w): the factor in [0, 1] by which the object darkens the ground at each pixel, or None.
-    inflation: m by which the proxy that carries the matte is larger than the mesh: it must reach beyond the matte.
+    inflation: m beyond the mesh within which the matte may reach: its halo, which moves with the outline.
     paint: (3,) RGB, the base colour of the paint.
     """
 
