@@ -307,7 +307,7 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distance, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    numbers = np.asarray(labels)
+    numbers = np.asarray(labels, dtype=np.int64)
     pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
     pixel_of[numbers[mask]] = np.flatnonzero(mask)
     return np.asarray(distance), pixel_of[numbers]
