@@ -56,7 +56,10 @@ class Detector(nn.Module, ABC):
 
     @abstractmethod
     def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """Scalars "confidence", "box", "class" and their sum "total"; one Targets for each image."""
+        """Scalars "confidence", "box", "class", their sum "total", and "objectness"; one Targets for each image.
+
+        "objectness" falls as the objects' confidences rise to 1 and those elsewhere fall to 0: attacks raise it.
+        """
 
     @abstractmethod
     def decode(self, raw: RawPredictions) -> list[Detections]:

@@ -231,16 +231,21 @@ class SqueezeDet(Detector):
         )
 
     def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
-        """The three terms over the whole batch, each weighted as published, and their sum.
+        """The three terms over the whole batch, each weighted as published, their sum, and what attacks raise.
 
         Box and class: a mean over the batch's objects. Confidence: each image's sum over anchors, weighted by
         75 / objects of the batch where an object is and by 100 / the other anchors of one image elsewhere; then a
         mean over images. So false alarms weigh the more, against misses, the larger the batch.
+
+        "objectness" is the confidence term with 1 as its target where an object is, in place of the IoU of the
+        predicted box. A trained detector meets the published target, so that term starts at its minimum, and
+        raising it makes an object more certain as readily as less; raising this one lowers its confidence.
         """
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(image), 1)
         confidence = torch.sigmoid(raw.confidence_logits)
         missed = (confidence[image, anchor] - assignment.confidence).square().sum() / objects
+        unseen = (1 - confidence[image, anchor]).square().sum() / objects
         batch, anchors = confidence.shape
         silent = max(anchors - len(image), 1)
         alarms = torch.where(assignment.negative, confidence, 0.0).square().sum() / silent
@@ -251,7 +256,10 @@ class SqueezeDet(Detector):
             "box": WEIGHT_BOX * box,
             "class": WEIGHT_CLASS * classes,
         }
-        return terms | {"total": terms["confidence"] + terms["box"] + terms["class"]}
+        return terms | {
+            "total": terms["confidence"] + terms["box"] + terms["class"],
+            "objectness": (WEIGHT_CONFIDENCE_POSITIVE * unseen + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
+        }
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:

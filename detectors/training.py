@@ -181,7 +181,7 @@ class _Run:
         self.optimiser.zero_grad(set_to_none=True)
         terms["total"].backward()
         norm = torch.nn.utils.clip_grad_norm_(self.detector.parameters(), self.settings.clip_norm)
-        values = {name: float(value.detach()) for name, value in terms.items()}
+        values = {name: float(terms[name].detach()) for name in ("confidence", "box", "class", "total")}
         if not (math.isfinite(values["total"]) and bool(torch.isfinite(norm))):
             raise FloatingPointError(f"step {step}: expected a finite loss and gradient, found {values}, {norm}")
         self.optimiser.step()

@@ -100,6 +100,7 @@ class _Worker:
             attack=SiFGSM(steps=config.steps, early_stop=config.early_stop),
             params=self.params,
             label_mode=config.objective_labels,
+            term=config.objective,
             render=RenderSettings(backend=config.backend),
             seed=config.seed,
         )

@@ -48,7 +48,7 @@ class Objective:
         space: ParameterSpace,
         detector: Detector,
         label_mode: LabelMode = "moved",
-        term: str = "confidence",
+        term: str = "objectness",
         difficulty: Difficulty | None = None,
     ) -> None:
         self.compositor = compositor

@@ -34,11 +34,14 @@ RESULT = "result.json"
 
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
-    """What is done to every frame. attack: the algorithm; params: what it may move; seed: of its randomness."""
+    """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss, to
+    be raised; seed: of its randomness.
+    """
 
     attack: AttackMethod
     params: tuple[Parameter, ...]
     label_mode: LabelMode
+    term: str
     render: RenderSettings
     seed: int
 
@@ -52,7 +55,8 @@ def attack_frame(
     """
     start = time.perf_counter()
     space = ParameterSpace(scene, settings.params)
-    objective = Objective(Compositor(scene, settings.render), space, detector, settings.label_mode)
+    compositor = Compositor(scene, settings.render)
+    objective = Objective(compositor, space, detector, settings.label_mode, settings.term)
     attacked = settings.attack(objective.problem(FeasibleSet(space)), space.theta0, settings.seed)
     rendered = objective.evaluate(attacked.theta)
     with torch.no_grad():

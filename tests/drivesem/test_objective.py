@@ -58,7 +58,8 @@ class StubDetector(Detector):
 
 def _objective(scene, detector, mode="moved", **settings):
     space = ParameterSpace(scene, ("translate",))
-    return Objective(StubCompositor(), space, detector, mode, difficulty=EVERYTHING, **settings)
+    settings = {"term": "confidence", "difficulty": EVERYTHING, **settings}
+    return Objective(StubCompositor(), space, detector, mode, **settings)
 
 
 def test_loss_and_gradient_are_those_of_the_whole_chain(street):
