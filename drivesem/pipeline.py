@@ -34,8 +34,8 @@ RESULT = "result.json"
 
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
-    """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss, to
-    be raised; seed: of its randomness.
+    """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
+    to be raised; seed: of its randomness.
     """
 
     attack: AttackMethod
