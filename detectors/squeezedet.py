@@ -47,6 +47,9 @@ WEIGHT_CONFIDENCE_NEGATIVE = 100.0
 WEIGHT_CLASS = 1.0
 """Weights of the loss terms (published code, LOSS_COEF_*)."""
 
+MEETING_IOU = 0.5
+"""Overlap from which a predicted box meets an object, as in the evaluation."""
+
 TOP_DETECTIONS = 64
 NMS_IOU = 0.4
 SCORE_MINIMUM = 0.005
@@ -108,7 +111,8 @@ class Assignment:
     """Which anchors answer for which objects; holds no gradient. K objects of the batch that are not ignored.
 
     image, anchor (K,) int64; confidence (K,), the IoU of predicted and true box; deltas (K, 4); labels (K,) int64;
-    negative (B, A) bool, the anchors that must stay silent.
+    negative (B, A) bool, the anchors that must stay silent. found_by (K,) int64: the most confident of the anchors
+    whose predicted boxes meet the object (IoU of at least 0.5); found (K,) bool: whether there is any.
     """
 
     image: Tensor
@@ -117,6 +121,8 @@ class Assignment:
     deltas: Tensor
     labels: Tensor
     negative: Tensor
+    found_by: Tensor
+    found: Tensor
 
 
 class SqueezeDet(Detector):
@@ -195,7 +201,7 @@ class SqueezeDet(Detector):
         anchors_cxcywh = _anchors(-(-height // STRIDE), -(-width // STRIDE), like.dtype, like.device)
         anchors_xyxy = _corners(anchors_cxcywh)
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
-        image, anchor, true_boxes, labels = [], [], [], []
+        image, anchor, true_boxes, labels, meeting = [], [], [], [], []
         for b, target in enumerate(targets):
             ignore = target.ignore.to(like.device)
             ignored_xyxy, wanted_xyxy = target.boxes_xyxy.to(like)[ignore], target.boxes_xyxy.to(like)[~ignore]
@@ -212,6 +218,8 @@ class SqueezeDet(Detector):
                 image.append(b)
                 anchor.append(best)
             true_boxes.append(wanted_xyxy)
+            meets = boxes.iou_matrix(wanted_xyxy, raw.boxes_xyxy[b]) >= MEETING_IOU
+            meeting.append(raw.confidence_logits[b].expand_as(meets).masked_fill(~meets, -torch.inf).max(1))
             labels.append(target.labels.to(like.device)[~ignore])
         image = torch.tensor(image, dtype=torch.int64, device=like.device)
         anchor = torch.tensor(anchor, dtype=torch.int64, device=like.device)
@@ -228,6 +236,8 @@ class SqueezeDet(Detector):
             deltas=torch.cat((shift, _safe_log(scale)), 1),
             labels=label,
             negative=negative,
+            found_by=torch.cat([m.indices for m in meeting]),
+            found=torch.cat([m.values for m in meeting]) > -torch.inf,
         )
 
     def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
@@ -237,15 +247,16 @@ class SqueezeDet(Detector):
         75 / objects of the batch where an object is and by 100 / the other anchors of one image elsewhere; then a
         mean over images. So false alarms weigh the more, against misses, the larger the batch.
 
-        "objectness" is the confidence term with 1 as its target where an object is, in place of the IoU of the
-        predicted box. A trained detector meets the published target, so that term starts at its minimum, and
-        raising it makes an object more certain as readily as less; raising this one lowers its confidence.
+        "objectness" is the confidence term as attacks want it: an object counts by the most confident of the
+        anchors whose boxes meet it, and the target is 1. A trained detector meets the published target, so that
+        term starts at its minimum, and raising it makes an object more certain as readily as less.
         """
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(image), 1)
         confidence = torch.sigmoid(raw.confidence_logits)
         missed = (confidence[image, anchor] - assignment.confidence).square().sum() / objects
-        unseen = (1 - confidence[image, anchor]).square().sum() / objects
+        found = torch.where(assignment.found, confidence[image, assignment.found_by], 0.0)
+        unseen = (1 - found).square().sum() / objects
         batch, anchors = confidence.shape
         silent = max(anchors - len(image), 1)
         alarms = torch.where(assignment.negative, confidence, 0.0).square().sum() / silent

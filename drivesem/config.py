@@ -73,8 +73,8 @@ class Attack(Common):
     objective_labels: Literal["moved", "paper"] = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence"] = "objectness"
-    """What the attack raises: SqueezeDet's confidence term with 1 as the true objects' target, or as published,
-    with the IoU of the predicted box, which a trained detector meets already."""
+    """What the attack raises: SqueezeDet's confidence term with 1 as the target of what finds the true objects, or
+    as published, with the IoU of the predicted box, which a trained detector meets already."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     backend: Literal["warp", "reference"] = "warp"

@@ -183,16 +183,20 @@ def test_confidence_term_of_a_batch_by_hand() -> None:
 
 
 def test_objectness_by_hand() -> None:
-    # One object, whose predicted box is 18 px off (IoU 0.6), at confidence 0.4; one false alarm at 0.2.
+    # One object, whose responsible box is 18 px off (IoU 0.6), at confidence 0.4; another anchor's box meets it at
+    # confidence 0.7, and counts as a false alarm besides; one false alarm elsewhere, at 0.2.
     parts = silent(1, 64, 160)
     at, other = anchor_at(2, 5, 8, 10), anchor_at(0, 0, 0, 10)
     truth = parts["boxes_xyxy"][0, at].tolist()
     parts["boxes_xyxy"][0, at] += torch.tensor([18.0, 0, 18.0, 0])
     parts["confidence_logits"][0, at] = math.log(0.4 / 0.6)
     parts["confidence_logits"][0, other] = math.log(0.2 / 0.8)
+    second = anchor_at(2, 5, 0, 10)
+    parts["boxes_xyxy"][0, second] = torch.tensor(truth)
+    parts["confidence_logits"][0, second] = math.log(0.7 / 0.3)
     terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [0])])
-    alarms = 100 * 0.2**2 / (360 - 1)
-    assert terms["objectness"].item() == pytest.approx(75 * (1 - 0.4) ** 2 + alarms, rel=1e-4)
+    alarms = 100 * (0.2**2 + 0.7**2) / (360 - 1)
+    assert terms["objectness"].item() == pytest.approx(75 * (1 - 0.7) ** 2 + alarms, rel=1e-4)
     assert terms["confidence"].item() == pytest.approx(75 * (0.6 - 0.4) ** 2 + alarms, rel=1e-4)
 
 
