@@ -87,7 +87,7 @@ class Attack(ABC):
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
         """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one with most
-        lost objects under `moved` labels wins; then most phantoms, then the highest loss.
+        failures (lost objects and phantoms) under `moved` labels wins; then the highest loss.
 
         All are scored because a detector's loss says only roughly what is lost: on the embedded scenes the iterate
         of highest loss loses fewer objects than the best one. A score takes no gradient and counts as no query.
@@ -100,7 +100,7 @@ class Attack(ABC):
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)
         scores = [problem.score(p.theta) for p in projected]
-        best = max(range(len(scores)), key=lambda i: (scores[i].lost, scores[i].phantoms, scores[i].loss, -i))
+        best = max(range(len(scores)), key=lambda i: (scores[i].lost + scores[i].phantoms, scores[i].loss, -i))
         score = scores[best]
         trace = [loss for loss in proposals.losses if loss is not None]
         return AttackResult(
