@@ -1,0 +1,114 @@
+"""Running Warp kernels: on a GPU at once, on a CPU by several threads, each with ranges of its own.
+
+A kernel that is launched here takes the first index of its range as its first argument and adds `wp.tid()` to it.
+Warp's kernels release the interpreter's lock, but its atomic operations are not atomic on a CPU: ranges that may
+write to one place belong to one thread. So gradients that many pixels add to a vertex are split between objects.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from typing import Any
+
+import torch
+import warp as wp
+
+_WORTH = 2048
+"""Fewer indices than this are not worth a second thread: handing over costs some 50 microseconds."""
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Drops what native code writes to the standard error stream meanwhile."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@cache
+def start_warp() -> None:
+    """Initialise Warp, silently; every module of kernels calls this first."""
+    wp.config.quiet = True
+    wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
+    # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
+    with nullcontext() if torch.cuda.is_available() else _without_stderr():
+        wp.init()
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:  # a forked process has none of its parent's threads
+    return ThreadPoolExecutor(max_workers=15, thread_name_prefix="warp")
+
+
+def threads() -> int:
+    """How many threads share a launch on the CPU: as many as torch uses."""
+    return min(torch.get_num_threads(), 16)
+
+
+def halves(count: int) -> list[int]:
+    """Edges of about equal ranges of [0, count), one a thread."""
+    parts = threads() if count >= _WORTH else 1
+    return [count * i // parts for i in range(parts + 1)]
+
+
+def between(edges: Sequence[int], weights: Sequence[float] | None = None) -> list[int]:
+    """Of ascending edges those that split their ranges between the threads most evenly.
+
+    weights: the work of each range, by default its length.
+    """
+    work = [float(b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)] if weights is None else list(weights)
+    parts, total = threads(), sum(work)
+    if parts < 2 or edges[-1] - edges[0] < _WORTH or len(work) < 2 or total <= 0:
+        return [edges[0], edges[-1]]
+    cuts, done, wanted = [edges[0]], 0.0, total / parts
+    for i, share in enumerate(work):
+        if len(cuts) < parts and done + share / 2 > wanted * len(cuts) and edges[i] > cuts[-1]:
+            cuts.append(edges[i])
+        done += share
+    return [*cuts, edges[-1]] if edges[-1] > cuts[-1] else cuts
+
+
+def launch(kernel: Any, edges: Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
+    """Run a kernel over the ranges between ascending `edges`, in torch's stream on a GPU, else a thread a range.
+
+    inputs, outputs: the kernel's arguments after the first index.
+    """
+    if len(edges) < 2 or edges[-1] <= edges[0]:
+        return
+    device = next(i.device for i in inputs if isinstance(i, wp.array))
+    if device.is_cuda:
+        _run(
+            kernel,
+            edges[0],
+            edges[-1] - edges[0],
+            inputs,
+            outputs,
+            device,
+            wp.stream_from_torch(wp.device_to_torch(device)),
+        )
+        return
+    ranges = [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    if len(ranges) > 1:
+        wp.load_module(kernel.module, device)  # once, before several threads ask for it
+    pool = _pool(os.getpid())
+    rest: list[Future[None]] = [
+        pool.submit(_run, kernel, start, count, inputs, outputs, device, None) for start, count in ranges[1:]
+    ]
+    _run(kernel, *ranges[0], inputs, outputs, device, None)
+    for future in rest:
+        future.result()
+
+
+def _run(
+    kernel: Any, start: int, count: int, inputs: Sequence[Any], outputs: Sequence[Any], device: Any, stream: Any
+) -> None:
+    wp.launch(kernel, dim=count, inputs=[start, *inputs, *outputs], device=device, stream=stream)
