@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from scene_ir import blend, surfaces, texture
+from scene_ir import blend, fused, surfaces, texture
 from scene_ir.environment import apply_foliage, apply_weather, shadow_softening, sky_colour
 from scene_ir.errors import ShapeError
 from scene_ir.raster import verbs
@@ -216,6 +216,7 @@ class Compositor:
         base = _photographed(objects)
         local = self._fleet.local(base.ffd, base.size_lhw)
         self._sharp, self._smooth = self._fleet.normals(local)
+        self._rig = fused.Rig.of(self._fleet, self._smooth, self.scene.camera.matrix, self._centre)
         inflation = self._like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
         self._halo = inflation * self.scene.camera.matrix[0, 0].to(self._like)
         self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
@@ -224,7 +225,7 @@ class Compositor:
         self._base_ffd, self._base_local = base.ffd, local
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
-        self._texels, self._shadows = None, None
+        self._texels, self._shadows, self._fixed = None, None, None
         ones = torch.ones_like(base.translation)
         self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
         if objects.source:
@@ -255,6 +256,30 @@ class Compositor:
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self._frame_hw))
         self._texels = Texels.pack(crops + crops, self._like)
         self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
+        if self.settings.backend == "warp":
+            self._fixed = self._fuse()
+
+    def _fuse(self) -> fused.Fixed:
+        """What the fast kernels read, gathered."""
+        fleet, base, count = self._fleet, self._base, len(self.scene.objects)
+        assert self._texels is not None
+        assert self._shadows is not None
+        own = (fleet.colours, self._sharp, fleet.paint[:, None], fleet.glass[:, None], self._height[:, None])
+        faces, _, _ = _patches(count, self._like.device)
+        height, width = self._frame_hw
+        return fused.Fixed(
+            faces=fleet.faces.to(torch.int32).contiguous(),
+            base_clip=base.clip,
+            base=torch.stack([base.cos, fleet.paint, self._height], dim=1),
+            own=torch.cat([*own, self._mirror_clip, self._mirror_cos[:, None]], dim=1),
+            texels=(self._texels.values, self._texels.rects, self._texels.offsets),
+            ground_clip=base.ground_clip,
+            ground_faces=faces.to(torch.int32).contiguous(),
+            dark=(self._shadows.values, self._shadows.rects, self._shadows.offsets),
+            frame_wh=self._like.new_tensor([width, height]).expand(count, 2).contiguous(),
+            sun=self.scene.environment.sun.to(self._like).expand(count, 3).contiguous(),
+            unproject=self._unproject.expand(count, 3, 3).contiguous(),
+        )
 
     def repaint(self, paint: Tensor) -> None:
         """Give the templates, which complete what the photograph did not see, the paint (N, 3)."""
@@ -273,16 +298,17 @@ class Compositor:
         fleet, camera = self._fleet, self.scene.camera
         bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
         local = fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
-        points = fleet.place(local, objects.yaw, objects.translation)
-        normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
         ground = surfaces.place_on_ground(
             self._corners, objects.yaw, objects.translation, self.scene.environment.ground
         )
-        return _Geometry(
-            surfaces.project_vertices(points, camera),
-            surfaces.facing(points, normals, self._centre),
-            surfaces.project_vertices(ground, camera),
-        )
+        ground_clip = surfaces.project_vertices(ground, camera)
+        if self.settings.backend == "warp" and len(objects):
+            clip, cos = fused.place(self._rig, local, objects.yaw, objects.translation)
+            return _Geometry(clip, cos, ground_clip)
+        points = fleet.place(local, objects.yaw, objects.translation)
+        normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
+        cos = surfaces.facing(points, normals, self._centre)
+        return _Geometry(surfaces.project_vertices(points, camera), cos, ground_clip)
 
     def draw(self, objects: Objects) -> Drawn:
         """Find which surfaces the pixels see."""
@@ -315,6 +341,8 @@ class Compositor:
     def layers(self, objects: Objects) -> Layers:
         """The objects drawn one by one, not yet blended."""
         drawn = self.draw(objects)
+        if self._fixed is not None:
+            return self._fused_layers(objects, drawn, self._fixed)
         rows = self._rows(drawn, bool(objects.source))
         size = drawn.mesh.layout.size
         if objects.source:
@@ -341,6 +369,15 @@ class Compositor:
             drawn.ground.layout,
             self._shadow_factors(objects, drawn),
         )
+
+    def _fused_layers(self, objects: Objects, drawn: Drawn, fixed: fused.Fixed) -> Layers:
+        """`layers` of photographed objects by the fast kernels."""
+        code = None
+        if _active(objects.texture_code):
+            code = (objects.texture_code, self._paint_lightness)
+        colour, opacity, depth = fused.photographed(fixed, drawn, objects.yaw, self._paint, code)
+        shadow = fused.shadows(fixed, drawn)
+        return Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)
 
     def _rows(self, drawn: Drawn, with_halo: bool) -> _Rows:
         layout = drawn.mesh.layout

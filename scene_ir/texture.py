@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import cv2
@@ -48,10 +49,10 @@ CHANNELS = 8
 """Of a texel: premultiplied RGB, opacity, hidden, outline, depth m, support."""
 _PAD = 2
 """Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
-_LIGHTNESS_GAIN, _CHROMA_GAIN, _GLOSS_GAIN, _DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
-_GAMUT_SHARPNESS = 20.0
+LIGHTNESS_GAIN, CHROMA_GAIN, GLOSS_GAIN, DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
+GAMUT_SHARPNESS = 20.0
 """Colours bend within about 1/20 of black and white."""
-_DUST_RGB = (0.47, 0.42, 0.35)
+DUST_RGB = (0.47, 0.42, 0.35)
 """Dry road dust."""
 
 
@@ -203,7 +204,13 @@ def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, flo
 
 
 def apply_texture_code(
-    colour: Tensor, opacity: Tensor, code: Tensor, paint: Tensor, height: Tensor, base_lightness: Tensor
+    colour: Tensor,
+    opacity: Tensor,
+    code: Tensor,
+    paint: Tensor,
+    height: Tensor,
+    base_lightness: Tensor,
+    backend: verbs.Backend = "reference",
 ) -> Tensor:
     """Premultiplied colours (R, 3) with the paint changed; untouched bits where the code is 0.
 
@@ -212,6 +219,9 @@ def apply_texture_code(
     of the paint, about which gloss turns contrast. The change is f(colour, code) - f(colour, 0): zero at 0, its
     slope is not.
     """
+    if backend == "warp":
+        fast = import_module("scene_ir.raster.colour").paint
+        return fast(colour, opacity, code, paint, height, base_lightness)
     index = ((paint > 0.0) & (opacity > 0.0)).nonzero()[:, 0]
     if index.numel() == 0:
         return colour
@@ -229,13 +239,13 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
     lightness, a, b = lab(rgb).unbind(-1)
     shift, red, yellow, gloss, dirt = code.unbind(-1)
     level = (lightness / 100.0).clamp(0.01, 0.99)
-    glossy = gloss * _GLOSS_GAIN * (lightness - base_lightness) / 30.0
-    level = torch.sigmoid(torch.logit(level) + _LIGHTNESS_GAIN * shift + glossy)
+    glossy = gloss * GLOSS_GAIN * (lightness - base_lightness) / 30.0
+    level = torch.sigmoid(torch.logit(level) + LIGHTNESS_GAIN * shift + glossy)
     room = 4.0 * level * (1.0 - level)
-    changed = torch.stack([100.0 * level, a + _CHROMA_GAIN * red * room, b + _CHROMA_GAIN * yellow * room], dim=-1)
+    changed = torch.stack([100.0 * level, a + CHROMA_GAIN * red * room, b + CHROMA_GAIN * yellow * room], dim=-1)
     out = rgb_of(changed)
-    veil = (dirt * _DIRT_GAIN * (1.0 - 0.75 * height.clamp(0.0, 1.0)))[:, None]
-    return out + veil * (out.new_tensor(_DUST_RGB) - out)
+    veil = (dirt * DIRT_GAIN * (1.0 - 0.75 * height.clamp(0.0, 1.0)))[:, None]
+    return out + veil * (out.new_tensor(DUST_RGB) - out)
 
 
 def lab(rgb: Tensor) -> Tensor:
@@ -251,10 +261,10 @@ def rgb_of(lab_rows: Tensor) -> Tensor:
     """
     rgb = kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
     softplus = torch.nn.functional.softplus
-    return softplus(rgb, beta=_GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=_GAMUT_SHARPNESS)
+    return softplus(rgb, beta=GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=GAMUT_SHARPNESS)
 
 
-_GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90), (0.52, 0.66, 0.86)
+GROUND_RGB, HORIZON_RGB, ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90), (0.52, 0.66, 0.86)
 
 
 def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height: Tensor, sun: Tensor) -> Tensor:
@@ -273,7 +283,7 @@ def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height:
     cos = (normal * to_eye).sum(-1).clamp(0.0, 1.0)
     mirror = 2.0 * cos[:, None] * normal - to_eye
     sky_up = -mirror[:, 1]
-    ground, horizon, zenith = (albedo.new_tensor(c) for c in (_GROUND_RGB, _HORIZON_RGB, _ZENITH_RGB))
+    ground, horizon, zenith = (albedo.new_tensor(c) for c in (GROUND_RGB, HORIZON_RGB, ZENITH_RGB))
     above = horizon + (zenith - horizon) * smoothstep(sky_up, 0.0, 0.9)[:, None]
     surround = ground + (above - ground) * smoothstep(sky_up, -0.08, 0.12)[:, None]
     fresnel = 0.04 + 0.96 * (1.0 - cos).pow(5)

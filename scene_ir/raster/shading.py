@@ -1,0 +1,1541 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
+# ruff: noqa: E501, UP018, SIM102 - the line above; Warp needs int(0) to declare what a loop changes.
+"""The compositor's per-pixel work as Warp kernels: one pass a stage, forward and backward, float32.
+
+What each stage computes is defined by the plain torch of `compositor` and `texture`, which the backend `reference`
+runs; the constants are theirs. A stage is a `torch.autograd.Function`; gradients of the per-pixel functions come
+from `wp.grad`, those that gather at vertices are written by hand. Shapes: N objects, V vertices, T packed pixels.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from scene_ir import texture
+from scene_ir.raster.launch import between, halves, launch, start_warp
+from scene_ir.raster.layout import Fragments, Layout
+
+start_warp()
+wp.set_module_options({"fuse_fp": True, "fast_math": False})
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec5 = wp.types.vector(length=5, dtype=wp.float32)
+vec13 = wp.types.vector(length=13, dtype=wp.float32)
+
+NEAR = wp.constant(wp.float32(0.05))
+FAR_AWAY = wp.constant(wp.float32(1e5))
+ZERO = wp.constant(wp.float64(0.0))
+ONE = wp.constant(wp.float64(1.0))
+DEPTH_LOW, DEPTH_HIGH = (wp.constant(wp.float32(v)) for v in texture.DEPTH_TOLERANCE_M)
+TURN_LOW, TURN_HIGH = (wp.constant(wp.float32(v)) for v in texture.TURN_TOLERANCE)
+OPEN_TURN_LOW, OPEN_TURN_HIGH = (wp.constant(wp.float32(v)) for v in texture.OPEN_TURN)
+OPEN_ALPHA_LOW, OPEN_ALPHA_HIGH = (wp.constant(wp.float32(v)) for v in texture.OPEN_ALPHA)
+RIM_LOW, RIM_HIGH = (wp.constant(wp.float32(v)) for v in texture.RIM)
+OUTLINE_LOW, OUTLINE_HIGH = (wp.constant(wp.float32(v * v)) for v in texture.OUTLINE_TURN)
+BORDER_LOW, BORDER_HIGH = (wp.constant(wp.float32(v)) for v in texture.BORDER_PX)
+EXTENDED_LOW, EXTENDED_HIGH = (wp.constant(wp.float32(v)) for v in texture.EXTENDED_PX)
+GROUND_RGB = wp.constant(wp.vec3f(*texture.GROUND_RGB))
+HORIZON_RGB = wp.constant(wp.vec3f(*texture.HORIZON_RGB))
+ZENITH_RGB = wp.constant(wp.vec3f(*texture.ZENITH_RGB))
+
+
+@wp.func
+def step(x: float, low: float, high: float):
+    """`texture.smoothstep`."""
+    t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@wp.func
+def step_slope(x: float, low: float, high: float):
+    """The derivative of `step`."""
+    t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
+    return 6.0 * (t - t * t) / (high - low)
+
+
+# ---------------------------------------------------------------------------------------------- pixels of a layout
+
+
+@wp.kernel(enable_backward=False)
+def table_kernel(
+    start: int,
+    rects: wp.array2d(dtype=wp.int64),
+    offsets: wp.array(dtype=wp.int64),
+    table: wp.array(dtype=wp.vec4i),
+):
+    draw = start + wp.tid()
+    x0 = wp.int32(rects[draw, 0])
+    y0 = wp.int32(rects[draw, 1])
+    width = wp.int32(rects[draw, 2]) - x0
+    at = wp.int32(offsets[draw])
+    if width > 0:
+        for y in range(wp.int32(rects[draw, 3]) - y0):
+            for x in range(width):
+                table[at] = wp.vec4i(draw, x0 + x, y0 + y, width)
+                at += 1
+
+
+def pixel_table(layout: Layout) -> Tensor:
+    """For each packed pixel (T, 4) int32: its draw, x, y px, and the width of its draw's rectangle."""
+    table = torch.empty(layout.size, 4, dtype=torch.int32, device=layout.rects.device)
+    inputs = [_array(layout.rects), _array(layout.offsets), _array(table, wp.vec4i)]
+    launch(table_kernel, [0, layout.rects.shape[0]], inputs)
+    return table
+
+
+# ------------------------------------------------------------------------------------------------------- placement
+
+
+@wp.kernel(enable_backward=False)
+def place_kernel(
+    start: int,
+    local: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    owner: wp.array(dtype=wp.int32),
+    turn: wp.array(dtype=wp.vec2f),
+    translation: wp.array(dtype=wp.vec3f),
+    matrix: wp.array2d(dtype=wp.vec4f),
+    centre: wp.array(dtype=wp.vec3f),
+    clip: wp.array(dtype=wp.vec3f),
+    facing: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    o = owner[i]
+    c = turn[o][0]
+    s = turn[o][1]
+    v = local[i]
+    p = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0]) + translation[o]
+    n = normal[i]
+    n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
+    q = wp.vec4f(p[0], p[1], p[2], 1.0)
+    clip[i] = wp.vec3f(wp.dot(matrix[o, 0], q), wp.dot(matrix[o, 1], q), wp.dot(matrix[o, 2], q))
+    way = centre[o] - p
+    facing[i] = wp.dot(way, n) / wp.max(wp.length(way), 1e-6)
+
+
+@wp.kernel(enable_backward=False)
+def place_backward_kernel(
+    start: int,
+    local: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    owner: wp.array(dtype=wp.int32),
+    turn: wp.array(dtype=wp.vec2f),
+    translation: wp.array(dtype=wp.vec3f),
+    matrix: wp.array2d(dtype=wp.vec4f),
+    centre: wp.array(dtype=wp.vec3f),
+    grad_clip: wp.array(dtype=wp.vec3f),
+    grad_facing: wp.array(dtype=wp.float32),
+    grad_local: wp.array(dtype=wp.vec3f),
+    grad_pose: wp.array(dtype=wp.vec4d),
+):
+    i = start + wp.tid()
+    g = grad_clip[i]
+    gf = grad_facing[i]
+    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or gf != 0.0:
+        o = owner[i]
+        c = turn[o][0]
+        s = turn[o][1]
+        v = local[i]
+        r = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
+        p = r + translation[o]
+        n = normal[i]
+        n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
+        way = centre[o] - p
+        length = wp.max(wp.length(way), 1e-6)
+        m = matrix[o, 0] * g[0] + matrix[o, 1] * g[1] + matrix[o, 2] * g[2]
+        to_way = (n - way * (wp.dot(way, n) / (length * length))) * (gf / length)
+        to_p = wp.vec3f(m[0], m[1], m[2]) - to_way
+        to_n = way * (gf / length)
+        grad_local[i] = wp.vec3f(c * to_p[0] - s * to_p[2], to_p[1], s * to_p[0] + c * to_p[2])
+        # d (turned vector) / d yaw is (z, 0, -x) of the turned vector
+        angle = to_p[0] * r[2] - to_p[2] * r[0] + to_n[0] * n[2] - to_n[2] * n[0]
+        wp.atomic_add(
+            grad_pose, o, wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle))
+        )
+
+
+class Place(torch.autograd.Function):
+    """Local vertices (V, 3) m, yaw (N,), translation (N, 3) -> clip (V, 3), cosine towards the camera (V,).
+
+    normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4), centre (N, 3) of each object's camera; edges: the
+    objects' first vertices, and V.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, local, yaw, translation, normal, owner, matrix, centre, edges) -> tuple[Tensor, Tensor]:
+        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
+        clip, facing = torch.empty_like(local), local.new_empty(local.shape[0])
+        fixed = (local.contiguous(), normal, owner, turn, translation.contiguous(), matrix, centre)
+        launch(place_kernel, halves(local.shape[0]), [*_place_inputs(fixed), _vec3(clip), _array(facing)])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return clip, facing
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_clip: Tensor, grad_facing: Tensor):
+        fixed = ctx.saved_tensors
+        local, turn = fixed[0], fixed[3]
+        grad_local = torch.zeros_like(local)
+        grad_pose = torch.zeros(turn.shape[0], 4, dtype=torch.float64, device=local.device)
+        inputs = [
+            *(*_place_inputs(fixed), _vec3(grad_clip.contiguous()), _array(grad_facing.contiguous())),
+            *(_vec3(grad_local), _array(grad_pose, wp.vec4d)),
+        ]
+        launch(place_backward_kernel, between(ctx.edges), inputs)
+        pose = grad_pose.to(local.dtype)
+        return grad_local, pose[:, 3], pose[:, :3], None, None, None, None, None
+
+
+def _place_inputs(fixed) -> list:
+    local, normal, owner, turn, translation, matrix, centre = fixed
+    return [
+        *(_vec3(local), _vec3(normal), _array(owner), _array(turn, wp.vec2f)),
+        *(_vec3(translation), _array(matrix, wp.vec4f), _vec3(centre)),
+    ]
+
+
+# ------------------------------------------------------------------------------------------- what a mesh pixel shows
+
+
+@wp.struct
+class Hit:
+    """A triangle at a pixel: its corners, and their perspective-correct weights."""
+
+    i0: int
+    i1: int
+    i2: int
+    c0: wp.vec3d
+    c1: wp.vec3d
+    c2: wp.vec3d
+    b: wp.vec3d
+    scale: wp.float64
+
+
+@wp.func
+def edge_at(a: wp.vec3d, b: wp.vec3d, x: wp.float64, y: wp.float64):
+    n = wp.cross(a, b)
+    return (n[0] * x + n[1] * y) + n[2]
+
+
+@wp.func
+def find_hit(f: int, x: int, y: int, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)):
+    hit = Hit()
+    corners = faces[f]
+    hit.i0 = corners[0]
+    hit.i1 = corners[1]
+    hit.i2 = corners[2]
+    hit.c0 = wp.vec3d(clip[hit.i0])
+    hit.c1 = wp.vec3d(clip[hit.i1])
+    hit.c2 = wp.vec3d(clip[hit.i2])
+    px = wp.float64(x)
+    py = wp.float64(y)
+    e0 = edge_at(hit.c1, hit.c2, px, py)
+    e1 = edge_at(hit.c2, hit.c0, px, py)
+    e2 = edge_at(hit.c0, hit.c1, px, py)
+    hit.scale = ONE / ((e0 + e1) + e2)
+    hit.b = wp.vec3d(e0, e1, e2) * hit.scale
+    return hit
+
+
+@wp.func
+def add_to_corners(
+    hit: Hit, x: int, y: int, g0: wp.float64, g1: wp.float64, g2: wp.float64, grad_clip: wp.array(dtype=wp.vec3d)
+):
+    """Add what gradients g to the (unnormalised, times scale) edge functions mean for the corners."""
+    p = wp.vec3d(wp.float64(x), wp.float64(y), ONE) * hit.scale
+    q0 = p * g0
+    q1 = p * g1
+    q2 = p * g2
+    wp.atomic_add(grad_clip, hit.i0, wp.cross(q1, hit.c2) + wp.cross(hit.c1, q2))
+    wp.atomic_add(grad_clip, hit.i1, wp.cross(q2, hit.c0) + wp.cross(hit.c2, q0))
+    wp.atomic_add(grad_clip, hit.i2, wp.cross(q0, hit.c1) + wp.cross(hit.c0, q1))
+
+
+@wp.func
+def corner_values(
+    i: int,
+    clip: wp.array(dtype=wp.vec3f),
+    facing: wp.array(dtype=wp.float32),
+    base_clip: wp.array(dtype=wp.vec3f),
+    base: wp.array(dtype=wp.vec3f),
+):
+    """Clip then minus now (3), w then, cosine now minus then, and then, paint, height."""
+    then = base_clip[i]
+    delta = then - clip[i]
+    fixed = base[i]
+    return vec8(delta[0], delta[1], delta[2], then[2], facing[i] - fixed[0], fixed[0], fixed[1], fixed[2])
+
+
+@wp.func
+def exact_dot(a: vec8, b: vec8):
+    """In double precision: differences between corners matter, which are small beside the values."""
+    total = wp.float64(a[0]) * wp.float64(b[0])
+    for k in range(1, 8):
+        total += wp.float64(a[k]) * wp.float64(b[k])
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def look_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    clip: wp.array(dtype=wp.vec3f),
+    facing: wp.array(dtype=wp.float32),
+    base_clip: wp.array(dtype=wp.vec3f),
+    base: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    out: wp.array(dtype=vec8),
+):
+    i = start + wp.tid()
+    value = vec8()
+    if face[i] >= 0:
+        at = table[i]
+        hit = find_hit(face[i], at[1], at[2], clip, faces)
+        a = corner_values(hit.i0, clip, facing, base_clip, base) * wp.float32(hit.b[0])
+        a += corner_values(hit.i1, clip, facing, base_clip, base) * wp.float32(hit.b[1])
+        a += corner_values(hit.i2, clip, facing, base_clip, base) * wp.float32(hit.b[2])
+        value = vec8(FAR_AWAY, FAR_AWAY, a[3], a[3] - a[2], a[4], a[5], a[6], a[7])
+        if a[3] > NEAR:
+            value[0] = (a[0] - wp.float32(at[1]) * a[2]) / a[3]
+            value[1] = (a[1] - wp.float32(at[2]) * a[2]) / a[3]
+    out[i] = value
+
+
+@wp.kernel(enable_backward=False)
+def look_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    clip: wp.array(dtype=wp.vec3f),
+    facing: wp.array(dtype=wp.float32),
+    base_clip: wp.array(dtype=wp.vec3f),
+    base: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    value: wp.array(dtype=vec8),
+    grad_out: wp.array(dtype=vec8),
+    grad_clip: wp.array(dtype=wp.vec3d),
+    grad_facing: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    if face[i] >= 0:
+        at = table[i]
+        x = wp.float32(at[1])
+        y = wp.float32(at[2])
+        hit = find_hit(face[i], at[1], at[2], clip, faces)
+        v = value[i]
+        go = grad_out[i]
+        # Back through the division, to the interpolated values.
+        g = vec8(0.0, 0.0, -go[3], go[2] + go[3], go[4], go[5], go[6], go[7])
+        if v[2] > NEAR:
+            g[0] = go[0] / v[2]
+            g[1] = go[1] / v[2]
+            g[2] -= g[0] * x + g[1] * y
+            g[3] -= g[0] * v[0] + g[1] * v[1]
+        s0 = exact_dot(g, corner_values(hit.i0, clip, facing, base_clip, base))
+        s1 = exact_dot(g, corner_values(hit.i1, clip, facing, base_clip, base))
+        s2 = exact_dot(g, corner_values(hit.i2, clip, facing, base_clip, base))
+        mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+        add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
+        d = wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[2]))
+        wp.atomic_add(grad_clip, hit.i0, d * -hit.b[0])
+        wp.atomic_add(grad_clip, hit.i1, d * -hit.b[1])
+        wp.atomic_add(grad_clip, hit.i2, d * -hit.b[2])
+        wp.atomic_add(grad_facing, hit.i0, g[4] * wp.float32(hit.b[0]))
+        wp.atomic_add(grad_facing, hit.i1, g[4] * wp.float32(hit.b[1]))
+        wp.atomic_add(grad_facing, hit.i2, g[4] * wp.float32(hit.b[2]))
+
+
+class Look(torch.autograd.Function):
+    """Where the photograph shows what each hit pixel shows, and how that has turned: (T, 8), 0 where nothing is hit.
+
+    Displacement px (2), depth then and now m, cosine now minus then, cosine then, paint, height. clip (V, 3), facing
+    (V,) now; base_clip (V, 3), base (V, 3): cosine then, paint, height; faces (F, 3) int32; edges: the draws' first
+    pixels, and T.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, clip, facing, fragments: Fragments, table, base_clip, base, faces, edges) -> Tensor:
+        out = clip.new_empty(fragments.face.shape[0], 8)
+        fixed = (table, fragments.face, clip, facing, base_clip, base, faces)
+        launch(look_kernel, halves(out.shape[0]), [*_look_inputs(fixed), _array(out, vec8)])
+        ctx.save_for_backward(*fixed, out)
+        ctx.edges = edges
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor):
+        *fixed, out = ctx.saved_tensors
+        clip, facing = fixed[2], fixed[3]
+        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
+        grad_facing = torch.zeros_like(facing)
+        inputs = [
+            *(*_look_inputs(fixed), _array(out, vec8), _array(grad_out.contiguous(), vec8)),
+            *(_array(grad_clip, wp.vec3d), _array(grad_facing)),
+        ]
+        launch(look_backward_kernel, between(ctx.edges), inputs)
+        return grad_clip.to(clip.dtype), grad_facing, None, None, None, None, None, None
+
+
+def _look_inputs(fixed) -> list:
+    table, face, clip, facing, base_clip, base, faces = fixed
+    return [
+        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _array(facing)),
+        *(_vec3(base_clip), _vec3(base), _array(faces, wp.vec3i)),
+    ]
+
+
+# ------------------------------------------------------------------------------------------------------ the outline
+
+
+@wp.struct
+class Fringe:
+    """How a pixel at a mesh's outline leans on its neighbours: `compositor._Fringe`, one row of it."""
+
+    known: wp.vec4f
+    weight: wp.vec4f
+    total: float
+    own: float
+    hit: float
+    pixel: wp.vec4i
+
+
+@wp.func
+def fringe_of(
+    i: int,
+    at: wp.vec4i,
+    rects: wp.array2d(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+):
+    out = Fringe()
+    draw = at[0]
+    out.pixel = wp.vec4i(i, i, i, i)
+    if at[1] > wp.int32(rects[draw, 0]):
+        out.pixel[0] = i - 1
+    if at[1] + 1 < wp.int32(rects[draw, 2]):
+        out.pixel[1] = i + 1
+    if at[2] > wp.int32(rects[draw, 1]):
+        out.pixel[2] = i - at[3]
+    if at[2] + 1 < wp.int32(rects[draw, 3]):
+        out.pixel[3] = i + at[3]
+    total = float(0.0)
+    for k in range(4):
+        j = out.pixel[k]
+        if j != i:
+            if face[j] >= 0:
+                raw = wp.max(2.0 * coverage[j] - 1.0, 0.0) + 1e-3
+                out.known[k] = 1.0
+                out.weight[k] = raw
+                total += raw
+    out.total = wp.max(total, 1e-3)
+    out.weight = out.weight / out.total
+    if face[i] >= 0:
+        out.hit = 1.0
+    out.own = 1.0
+    if total > 0.0:
+        out.own = step(coverage[i], 0.5, 1.0) * out.hit
+    return out
+
+
+@wp.func
+def leans(i: int, face: wp.array(dtype=wp.int32), coverage: wp.array(dtype=wp.float32)):
+    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
+    return coverage[i] < 1.0 and (face[i] >= 0 or coverage[i] > 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def fill_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    rects: wp.array2d(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
+    out: wp.array2d(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    if leans(i, face, coverage):
+        f = fringe_of(i, table[i], rects, face, coverage)
+        for k in range(values.shape[1]):
+            mean = f.weight[0] * values[f.pixel[0], k] + f.weight[1] * values[f.pixel[1], k]
+            mean += f.weight[2] * values[f.pixel[2], k] + f.weight[3] * values[f.pixel[3], k]
+            out[i, k] = f.own * f.hit * values[i, k] + (1.0 - f.own) * mean
+
+
+@wp.kernel(enable_backward=False)
+def fill_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    rects: wp.array2d(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
+    grad_out: wp.array2d(dtype=wp.float32),
+    grad_values: wp.array2d(dtype=wp.float32),
+    grad_coverage: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    if leans(i, face, coverage):
+        f = fringe_of(i, table[i], rects, face, coverage)
+        to_own = float(0.0)
+        to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+        for k in range(values.shape[1]):
+            g = grad_out[i, k]
+            if g != 0.0:
+                # grad_values holds grad_out here; what does not come from this pixel's own value goes back out.
+                wp.atomic_add(grad_values, i, k, g * (f.own * f.hit - 1.0))
+                mean = float(0.0)
+                for n in range(4):
+                    if f.known[n] > 0.0:
+                        wp.atomic_add(grad_values, f.pixel[n], k, g * (1.0 - f.own) * f.weight[n])
+                        mean += f.weight[n] * values[f.pixel[n], k]
+                        to_weight[n] += g * (1.0 - f.own) * values[f.pixel[n], k]
+                to_own += g * (f.hit * values[i, k] - mean)
+        shared = wp.dot(to_weight, f.weight)
+        for n in range(4):
+            if f.known[n] > 0.0:
+                if coverage[f.pixel[n]] >= 0.5:
+                    wp.atomic_add(grad_coverage, f.pixel[n], 2.0 * (to_weight[n] - shared) / f.total)
+        if f.known[0] + f.known[1] + f.known[2] + f.known[3] > 0.0:
+            wp.atomic_add(grad_coverage, i, to_own * f.hit * step_slope(coverage[i], 0.5, 1.0))
+
+
+class Fill(torch.autograd.Function):
+    """Values (T, K), 0 where nothing is hit, continued over the mesh's outline; differentiable to them and to
+    coverage (T,)."""
+
+    @staticmethod
+    def forward(ctx: Any, values, coverage, fragments: Fragments, table, edges) -> Tensor:
+        out = values.clone()
+        fixed = (table, fragments.layout.rects, fragments.face, coverage.contiguous(), values)
+        launch(fill_kernel, halves(out.shape[0]), [*_fill_inputs(fixed), _array(out)])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor):
+        fixed = ctx.saved_tensors
+        grad_out = grad_out.contiguous()
+        grad_values, grad_coverage = grad_out.clone(), torch.zeros_like(fixed[3])
+        inputs = [
+            *(*_fill_inputs(fixed), _array(grad_out)),
+            *(_array(grad_values), _array(grad_coverage)),
+        ]
+        launch(fill_backward_kernel, between(ctx.edges), inputs)
+        return grad_values, grad_coverage, None, None, None
+
+
+def _fill_inputs(fixed) -> list:
+    table, rects, face, coverage, values = fixed
+    arrays = [_array(t) for t in (rects, face, coverage, values)]
+    return [_array(table, wp.vec4i), *arrays]
+
+
+# --------------------------------------------------------------------------------------- looking up the photograph
+
+
+@wp.struct
+class Taps:
+    """The 4 x 4 texels of a Catmull-Rom sample, of those inside the crop: flat places, weights and their slopes."""
+
+    columns: wp.vec4i
+    rows: wp.vec4i
+    wx: wp.vec4f
+    wy: wp.vec4f
+    sx: wp.vec4f
+    sy: wp.vec4f
+
+
+@wp.func
+def weights(t: float):
+    """Catmull-Rom weights of the pixels at -1, 0, 1, 2 for a sample at t in [0, 1)."""
+    return wp.vec4f(
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
+    )
+
+
+@wp.func
+def slopes(t: float):
+    """Derivatives of `weights`."""
+    return wp.vec4f(
+        (-1.5 * t + 2.0) * t - 0.5, (4.5 * t - 5.0) * t, (-4.5 * t + 4.0) * t + 0.5, (1.5 * t - 1.0) * t
+    )
+
+
+@wp.func
+def kept(weight: wp.vec4f, first: int, size: int):
+    """Weights with those of taps outside the crop set to 0."""
+    out = weight
+    for k in range(4):
+        if first + k - 1 < 0 or first + k - 1 >= size:
+            out[k] = 0.0
+    return out
+
+
+@wp.func
+def taps_at(uv: wp.vec2f, rect: wp.vec4i, start: int, zero_border: bool):
+    taps = Taps()
+    width = rect[2] - rect[0]
+    height = rect[3] - rect[1]
+    u = wp.clamp(uv[0] - wp.float32(rect[0]), -4.0, wp.float32(width + 3))
+    v = wp.clamp(uv[1] - wp.float32(rect[1]), -4.0, wp.float32(height + 3))
+    x = wp.int32(wp.floor(u))
+    y = wp.int32(wp.floor(v))
+    for k in range(4):
+        taps.columns[k] = wp.clamp(x + k - 1, 0, width - 1)
+        taps.rows[k] = start + wp.clamp(y + k - 1, 0, height - 1) * width
+    tu = u - wp.floor(u)
+    tv = v - wp.floor(v)
+    taps.wx = weights(tu)
+    taps.wy = weights(tv)
+    taps.sx = slopes(tu)
+    taps.sy = slopes(tv)
+    if zero_border:
+        taps.wx = kept(taps.wx, x, width)
+        taps.wy = kept(taps.wy, y, height)
+        taps.sx = kept(taps.sx, x, width)
+        taps.sy = kept(taps.sy, y, height)
+    return taps
+
+
+@wp.func
+def texel_row(texels: wp.array(dtype=vec8), row: int, t: Taps, w: wp.vec4f):
+    low = texels[row + t.columns[0]] * w[0] + texels[row + t.columns[1]] * w[1]
+    return low + (texels[row + t.columns[2]] * w[2] + texels[row + t.columns[3]] * w[3])
+
+
+@wp.func
+def sample(texels: wp.array(dtype=vec8), t: Taps):
+    low = texel_row(texels, t.rows[0], t, t.wx) * t.wy[0] + texel_row(texels, t.rows[1], t, t.wx) * t.wy[1]
+    return low + (texel_row(texels, t.rows[2], t, t.wx) * t.wy[2] + texel_row(texels, t.rows[3], t, t.wx) * t.wy[3])
+
+
+@wp.func
+def sample_slope(texels: wp.array(dtype=vec8), t: Taps, g: vec8):
+    """The gradient to the place of a sample, from that to its value."""
+    to_u = float(0.0)
+    to_v = float(0.0)
+    for k in range(4):
+        d0 = wp.dot(g, texels[t.rows[k] + t.columns[0]])
+        d1 = wp.dot(g, texels[t.rows[k] + t.columns[1]])
+        d2 = wp.dot(g, texels[t.rows[k] + t.columns[2]])
+        d3 = wp.dot(g, texels[t.rows[k] + t.columns[3]])
+        to_u += t.wy[k] * (d0 * t.sx[0] + d1 * t.sx[1] + d2 * t.sx[2] + d3 * t.sx[3])
+        to_v += t.sy[k] * (d0 * t.wx[0] + d1 * t.wx[1] + d2 * t.wx[2] + d3 * t.wx[3])
+    return wp.vec2f(to_u, to_v)
+
+
+@wp.func
+def texel_at(texels: wp.array(dtype=vec8), rect: wp.vec4i, start: int, uv: wp.vec2f):
+    """The texel at a place of the frame; 0 in an empty crop."""
+    out = vec8()
+    if rect[2] > rect[0]:
+        out = sample(texels, taps_at(uv, rect, start, False))
+    return out
+
+
+@wp.func
+def texel_slope(texels: wp.array(dtype=vec8), rect: wp.vec4i, start: int, uv: wp.vec2f, g: vec8):
+    """The gradient to the place, from that to the texel."""
+    out = wp.vec2f(0.0, 0.0)
+    if rect[2] > rect[0]:
+        out = sample_slope(texels, taps_at(uv, rect, start, False), g)
+    return out
+
+
+@wp.func
+def rect_of(rects: wp.array2d(dtype=wp.int64), i: int):
+    return wp.vec4i(wp.int32(rects[i, 0]), wp.int32(rects[i, 1]), wp.int32(rects[i, 2]), wp.int32(rects[i, 3]))
+
+
+# ------------------------------------------------------------------------------------ a pixel of mesh, of its halo
+
+
+@wp.func
+def inside_weight(u: float, v: float, wh: wp.vec2f, low: float, high: float):
+    """`texture.inside_weight`."""
+    beyond_u = wp.max(-u, u - (wh[0] - 1.0))
+    beyond_v = wp.max(-v, v - (wh[1] - 1.0))
+    return (1.0 - step(beyond_u, low, high)) * (1.0 - step(beyond_v, low, high))
+
+
+@wp.func
+def facing_weight(turned: float, cos_then: float):
+    """`texture.facing_weight`."""
+    positive = 0.5 * (cos_then + wp.sqrt(cos_then * cos_then + 1e-4))
+    return 1.0 - step(turned - positive, TURN_LOW, TURN_HIGH)
+
+
+@wp.func
+def seen_weight(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+    """How much of what is shown the photograph knows; and how much of it it sees there at all."""
+    u = xy[0] + look[0]
+    v = xy[1] + look[1]
+    clear = 1.0 - step(texel[4], 0.0, 1.0)
+    inside = inside_weight(u, v, wh, BORDER_LOW, BORDER_HIGH)
+    facing = facing_weight(look[4], look[5])
+    weight = facing * inside * clear
+    if inside < 1.0:
+        near = inside_weight(u, v, wh, EXTENDED_LOW, EXTENDED_HIGH) * step(texel[3], 0.5, 0.95)
+        weight = weight + facing * (1.0 - inside) * near * clear
+    weight = weight * (1.0 - step(look[2] - texel[6], DEPTH_LOW, DEPTH_HIGH))
+    return wp.vec2f(weight, inside * clear)
+
+
+@wp.func
+def mesh_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+    """Premultiplied RGB, opacity, and how much is left to be completed."""
+    seen = seen_weight(look, texel, xy, wh)
+    weight = seen[0]
+    alpha = texel[3]
+    rim = 1.0 - step(look[5], RIM_LOW, RIM_HIGH)
+    opened = step(look[4], OPEN_TURN_LOW, OPEN_TURN_HIGH) * rim * wp.max(1.0 - alpha, 0.0)
+    empty = seen[1] * (1.0 - step(texel[7], 0.1, 0.9))
+    closed = weight * opened * (1.0 - empty) * step(alpha, OPEN_ALPHA_LOW, OPEN_ALPHA_HIGH)
+    shown = weight + closed / wp.max(alpha, OPEN_ALPHA_LOW)
+    out = vec5()
+    out[0] = shown * texel[0]
+    out[1] = shown * texel[1]
+    out[2] = shown * texel[2]
+    out[3] = shown * alpha
+    out[4] = (1.0 - weight) * (1.0 - empty)
+    return out
+
+
+@wp.func
+def mesh_loss(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_fill: float):
+    p = mesh_pixel(look, texel, xy, wh)
+    return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[4] * to_fill
+
+
+@wp.func
+def halo_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+    """Premultiplied RGB and opacity."""
+    seen = seen_weight(look, texel, xy, wh)
+    on_outline = 1.0 - step(look[4] * look[4], OUTLINE_LOW, OUTLINE_HIGH)
+    shown = seen[0] * step(texel[5], 0.0, 1.0) * on_outline
+    return wp.vec4f(shown * texel[0], shown * texel[1], shown * texel[2], shown * texel[3])
+
+
+@wp.func
+def halo_loss(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
+    return wp.dot(halo_pixel(look, texel, xy, wh), g)
+
+
+@wp.func
+def in_mesh(i: int, face: wp.array(dtype=wp.int32), coverage: wp.array(dtype=wp.float32)):
+    return face[i] >= 0 or coverage[i] > 0.0
+
+
+@wp.func
+def in_halo(i: int, nearest: wp.array(dtype=wp.int64), coverage: wp.array(dtype=wp.float32)):
+    return nearest[i] >= wp.int64(0) and coverage[i] < 1.0
+
+
+@wp.kernel(enable_backward=False)
+def shade_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+    nearest: wp.array(dtype=wp.int64),
+    texels: wp.array(dtype=vec8),
+    rects: wp.array2d(dtype=wp.int64),
+    offsets: wp.array(dtype=wp.int64),
+    frame_wh: wp.array(dtype=wp.vec2f),
+    look: wp.array(dtype=vec8),
+    mesh: wp.array(dtype=wp.vec4f),
+    halo: wp.array(dtype=wp.vec4f),
+    fill: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    at = table[i]
+    to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    left = float(0.0)
+    rect = rect_of(rects, at[0])
+    first = wp.int32(offsets[at[0]])
+    xy = wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
+    wh = frame_wh[at[0]]
+    if in_mesh(i, face, coverage):
+        a = look[i]
+        p = mesh_pixel(a, texel_at(texels, rect, first, wp.vec2f(xy[0] + a[0], xy[1] + a[1])), xy, wh)
+        to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
+        left = p[4]
+    if in_halo(i, nearest, coverage):
+        a = look[wp.int32(nearest[i])]
+        to_halo = halo_pixel(a, texel_at(texels, rect, first, wp.vec2f(xy[0] + a[0], xy[1] + a[1])), xy, wh)
+    mesh[i] = to_mesh
+    halo[i] = to_halo
+    fill[i] = left
+
+
+@wp.kernel(enable_backward=False)
+def shade_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+    nearest: wp.array(dtype=wp.int64),
+    texels: wp.array(dtype=vec8),
+    rects: wp.array2d(dtype=wp.int64),
+    offsets: wp.array(dtype=wp.int64),
+    frame_wh: wp.array(dtype=wp.vec2f),
+    look: wp.array(dtype=vec8),
+    grad_mesh: wp.array(dtype=wp.vec4f),
+    grad_halo: wp.array(dtype=wp.vec4f),
+    grad_fill: wp.array(dtype=wp.float32),
+    grad_look: wp.array(dtype=vec8),
+):
+    i = start + wp.tid()
+    at = table[i]
+    rect = rect_of(rects, at[0])
+    first = wp.int32(offsets[at[0]])
+    xy = wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
+    wh = frame_wh[at[0]]
+    if in_mesh(i, face, coverage):
+        a = look[i]
+        uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
+        to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(
+            a, texel_at(texels, rect, first, uv), xy, wh, grad_mesh[i], grad_fill[i]
+        )
+        move = texel_slope(texels, rect, first, uv, to_texel)
+        to_look[0] += move[0]
+        to_look[1] += move[1]
+        wp.atomic_add(grad_look, i, to_look)
+    if in_halo(i, nearest, coverage):
+        j = wp.int32(nearest[i])
+        b = look[j]
+        uw = wp.vec2f(xy[0] + b[0], xy[1] + b[1])
+        to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(
+            b, texel_at(texels, rect, first, uw), xy, wh, grad_halo[i]
+        )
+        move2 = texel_slope(texels, rect, first, uw, to_texel2)
+        to_look2[0] += move2[0]
+        to_look2[1] += move2[1]
+        wp.atomic_add(grad_look, j, to_look2)
+
+
+class Shade(torch.autograd.Function):
+    """look (T, 8) -> premultiplied RGBA of mesh (T, 4) and of halo (T, 4), and what is left to complete (T,).
+
+    coverage (T,), nearest (T,) int64: see `compositor.Drawn` (they only say which pixels are of which part); texels
+    (S, 8) of crops rects (N, 4), offsets (N + 1,); frame_wh (N, 2) px.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, look, coverage, fragments: Fragments, table, nearest, texels, frame_wh, edges):
+        size = look.shape[0]
+        mesh, halo, fill = look.new_empty(size, 4), look.new_empty(size, 4), look.new_empty(size)
+        fixed = (table, fragments.face, coverage, nearest, *texels, frame_wh, look.contiguous())
+        outputs = [_array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
+        launch(shade_kernel, halves(size), [*_shade_inputs(fixed), *outputs])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return mesh, halo, fill
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_mesh: Tensor, grad_halo: Tensor, grad_fill: Tensor):
+        fixed = ctx.saved_tensors
+        grad_look = torch.zeros_like(fixed[-1])
+        inputs = [
+            *(*_shade_inputs(fixed), _array(grad_mesh.contiguous(), wp.vec4f)),
+            *(_array(grad_halo.contiguous(), wp.vec4f), _array(grad_fill.contiguous())),
+            _array(grad_look, vec8),
+        ]
+        launch(shade_backward_kernel, between(ctx.edges), inputs)
+        return grad_look, None, None, None, None, None, None, None
+
+
+def _shade_inputs(fixed) -> list:
+    table, face, coverage, nearest, texels, rects, offsets, frame_wh, look = fixed
+    return [
+        *(_array(table, wp.vec4i), _array(face), _array(coverage)),
+        *(_array(nearest), _array(texels, vec8), _array(rects), _array(offsets)),
+        *(_array(frame_wh, wp.vec2f), _array(look, vec8)),
+    ]
+
+
+# ------------------------------------------------------------------- completion of what the photograph did not see
+
+
+@wp.func
+def wanted(i: int, at: wp.vec4i, rects: wp.array2d(dtype=wp.int64), fill: wp.array(dtype=wp.float32)):
+    """Whether this pixel, or a neighbour that may lean on it, is to be completed."""
+    found = fill[i] != 0.0
+    if not found and at[1] > wp.int32(rects[at[0], 0]):
+        found = fill[i - 1] != 0.0
+    if not found and at[1] + 1 < wp.int32(rects[at[0], 2]):
+        found = fill[i + 1] != 0.0
+    if not found and at[2] > wp.int32(rects[at[0], 1]):
+        found = fill[i - at[3]] != 0.0
+    if not found and at[2] + 1 < wp.int32(rects[at[0], 3]):
+        found = fill[i + at[3]] != 0.0
+    return found
+
+
+@wp.func
+def exact_dot13(a: vec13, b: vec13):
+    """See `exact_dot`."""
+    total = wp.float64(a[0]) * wp.float64(b[0])
+    for k in range(1, 13):
+        total += wp.float64(a[k]) * wp.float64(b[k])
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def own_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    rects: wp.array2d(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    fill: wp.array(dtype=wp.float32),
+    clip: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    attributes: wp.array(dtype=vec13),
+    out: wp.array(dtype=vec13),
+):
+    i = start + wp.tid()
+    value = vec13()
+    if face[i] >= 0:
+        at = table[i]
+        if wanted(i, at, rects, fill):
+            hit = find_hit(face[i], at[1], at[2], clip, faces)
+            value = attributes[hit.i0] * wp.float32(hit.b[0])
+            value += attributes[hit.i1] * wp.float32(hit.b[1])
+            value += attributes[hit.i2] * wp.float32(hit.b[2])
+    out[i] = value
+
+
+@wp.kernel(enable_backward=False)
+def own_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    rects: wp.array2d(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    fill: wp.array(dtype=wp.float32),
+    clip: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    attributes: wp.array(dtype=vec13),
+    grad_out: wp.array(dtype=vec13),
+    grad_clip: wp.array(dtype=wp.vec3d),
+):
+    i = start + wp.tid()
+    if face[i] >= 0:
+        at = table[i]
+        if wanted(i, at, rects, fill):
+            hit = find_hit(face[i], at[1], at[2], clip, faces)
+            g = grad_out[i]
+            s0 = exact_dot13(g, attributes[hit.i0])
+            s1 = exact_dot13(g, attributes[hit.i1])
+            s2 = exact_dot13(g, attributes[hit.i2])
+            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+            add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
+
+
+class Own(torch.autograd.Function):
+    """Fixed attributes (V, 13) of the meshes at hit pixels (T, 13) where `fill` (T,) is not 0, and beside them."""
+
+    @staticmethod
+    def forward(ctx: Any, clip, fragments: Fragments, table, fill, faces, attributes, edges) -> Tensor:
+        out = clip.new_empty(fill.shape[0], 13)
+        fixed = (table, fragments.layout.rects, fragments.face, fill, clip, faces, attributes)
+        launch(own_kernel, halves(fill.shape[0]), [*_own_inputs(fixed), _array(out, vec13)])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor):
+        fixed = ctx.saved_tensors
+        clip = fixed[4]
+        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
+        inputs = [*_own_inputs(fixed), _array(grad_out.contiguous(), vec13)]
+        launch(own_backward_kernel, between(ctx.edges), [*inputs, _array(grad_clip, wp.vec3d)])
+        return grad_clip.to(clip.dtype), None, None, None, None, None, None
+
+
+def _own_inputs(fixed) -> list:
+    table, rects, face, fill, clip, faces, attributes = fixed
+    return [
+        *(_array(table, wp.vec4i), _array(rects), _array(face), _array(fill)),
+        *(_vec3(clip), _array(faces, wp.vec3i), _array(attributes, vec13)),
+    ]
+
+
+@wp.func
+def unit(v: wp.vec3f):
+    return v / wp.max(wp.length(v), 1e-6)
+
+
+@wp.func
+def clamped(v: wp.vec3f):
+    return wp.vec3f(wp.clamp(v[0], 0.0, 1.0), wp.clamp(v[1], 0.0, 1.0), wp.clamp(v[2], 0.0, 1.0))
+
+
+@wp.func
+def shade(normal: wp.vec3f, to_eye: wp.vec3f, albedo: wp.vec3f, paint: float, glass: float, height: float, sun: wp.vec3f):
+    """`texture.shade`, one row of it."""
+    dome = 0.5 - 0.5 * normal[1]
+    soft = wp.dot(normal, sun)
+    direct = 0.5 * (soft + wp.sqrt(soft * soft + 0.01))
+    occluded = 0.45 + 0.55 * step(height, -0.05, 0.4)
+    diffuse = ((0.30 + 0.38 * dome) + 0.62 * direct) * occluded
+    cosine = wp.clamp(wp.dot(normal, to_eye), 0.0, 1.0)
+    mirror = normal * (2.0 * cosine) - to_eye
+    above = HORIZON_RGB + (ZENITH_RGB - HORIZON_RGB) * step(-mirror[1], 0.0, 0.9)
+    surround = GROUND_RGB + (above - GROUND_RGB) * step(-mirror[1], -0.08, 0.12)
+    rest = 1.0 - cosine
+    fresnel = 0.04 + 0.96 * (rest * rest) * (rest * rest) * rest
+    strength = (0.55 * paint * fresnel + glass * (0.10 + 0.75 * fresnel)) * (0.5 + 0.5 * occluded)
+    g = wp.clamp(wp.dot(mirror, sun), 0.0, 1.0)
+    g2 = g * g
+    g4 = g2 * g2
+    g8 = g4 * g4
+    g32 = (g8 * g8) * (g8 * g8)
+    glint = (g32 * g8) * (0.35 * paint + 0.5 * glass)
+    lit = albedo * diffuse
+    return clamped(lit + (surround - lit) * strength + (wp.vec3f(1.0, 1.0, 1.0) - lit) * glint)
+
+
+@wp.func
+def mirror_place(own: vec13):
+    """Where the photograph shows the other side of the car, px."""
+    safe = wp.max(own[11], 0.1)
+    return wp.vec2f(own[9] / safe, own[10] / safe)
+
+
+@wp.func
+def completed(
+    own: vec13, facing: float, texel: vec8, turn: wp.vec2f, to_eye: wp.vec3f, sun: wp.vec3f, tint: wp.vec3f, wh: wp.vec2f
+):
+    """`Compositor._completion`, one row of it. own: colours (3), local normal (3), paint, glass, height, mirror clip
+    (3), mirror cosine; facing: cosine towards the camera now."""
+    normal = unit(wp.vec3f(turn[0] * own[3] + turn[1] * own[5], own[4], turn[0] * own[5] - turn[1] * own[3]))
+    white = wp.vec3f(1.0, 1.0, 1.0)
+    albedo = wp.cw_mul(wp.vec3f(own[0], own[1], own[2]), white + (tint - white) * own[6])
+    colour = shade(normal, to_eye, albedo, own[6], own[7], own[8], sun)
+    uv = mirror_place(own)
+    weight = inside_weight(uv[0], uv[1], wh, BORDER_LOW, BORDER_HIGH)
+    weight = weight * (1.0 - step(texel[4], 0.0, 1.0)) * step(texel[3], 0.5, 0.95)
+    weight = weight * (1.0 - step(own[11] - texel[6], DEPTH_LOW, DEPTH_HIGH))
+    weight = weight * facing_weight(facing - own[12], own[12]) * step(own[12], 0.05, 0.2)
+    straight = clamped(wp.vec3f(texel[0], texel[1], texel[2]) / wp.max(texel[3], 0.4))
+    return colour + (straight - colour) * weight
+
+
+@wp.func
+def completed_loss(
+    own: vec13,
+    facing: float,
+    texel: vec8,
+    turn: wp.vec2f,
+    to_eye: wp.vec3f,
+    sun: wp.vec3f,
+    tint: wp.vec3f,
+    wh: wp.vec2f,
+    g: wp.vec3f,
+):
+    return wp.dot(completed(own, facing, texel, turn, to_eye, sun, tint, wh), g)
+
+
+@wp.func
+def mirror_loss(own: vec13, g: wp.vec2f):
+    return wp.dot(mirror_place(own), g)
+
+
+@wp.struct
+class View:
+    """What completion knows of an object: see `Complete`."""
+
+    turn: wp.array(dtype=wp.vec2f)
+    sun: wp.array(dtype=wp.vec3f)
+    tint: wp.array(dtype=wp.vec3f)
+    frame_wh: wp.array(dtype=wp.vec2f)
+    unproject: wp.array(dtype=wp.mat33f)
+
+
+@wp.func
+def eye_of(view: View, at: wp.vec4i):
+    """Unit vector towards the camera at a pixel."""
+    ray = view.unproject[at[0]] @ wp.vec3f(wp.float32(at[1]), wp.float32(at[2]), 1.0)
+    return unit(ray) * -1.0
+
+
+@wp.kernel(enable_backward=False)
+def complete_kernel(
+    start: int,
+    need: wp.array(dtype=wp.int64),
+    table: wp.array(dtype=wp.vec4i),
+    texels: wp.array(dtype=vec8),
+    rects: wp.array2d(dtype=wp.int64),
+    offsets: wp.array(dtype=wp.int64),
+    view: View,
+    own: wp.array(dtype=vec13),
+    look: wp.array(dtype=vec8),
+    fill: wp.array(dtype=wp.float32),
+    mesh: wp.array(dtype=wp.vec4f),
+):
+    i = wp.int32(need[start + wp.tid()])
+    at = table[i]
+    o = at[0]
+    v = own[i]
+    texel = texel_at(texels, rect_of(rects, o), wp.int32(offsets[o]), mirror_place(v))
+    a = look[i]
+    c = completed(v, a[4] + a[5], texel, view.turn[o], eye_of(view, at), view.sun[o], view.tint[o], view.frame_wh[o])
+    f = fill[i]
+    mesh[i] = mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
+
+
+@wp.kernel(enable_backward=False)
+def complete_backward_kernel(
+    start: int,
+    need: wp.array(dtype=wp.int64),
+    table: wp.array(dtype=wp.vec4i),
+    texels: wp.array(dtype=vec8),
+    rects: wp.array2d(dtype=wp.int64),
+    offsets: wp.array(dtype=wp.int64),
+    view: View,
+    own: wp.array(dtype=vec13),
+    look: wp.array(dtype=vec8),
+    fill: wp.array(dtype=wp.float32),
+    grad_mesh: wp.array(dtype=wp.vec4f),
+    grad_own: wp.array(dtype=vec13),
+    grad_look: wp.array(dtype=vec8),
+    grad_fill: wp.array(dtype=wp.float32),
+    grad_turn: wp.array(dtype=wp.vec2d),
+):
+    i = wp.int32(need[start + wp.tid()])
+    at = table[i]
+    o = at[0]
+    v = own[i]
+    a = look[i]
+    rect = rect_of(rects, o)
+    first = wp.int32(offsets[o])
+    texel = texel_at(texels, rect, first, mirror_place(v))
+    eye = eye_of(view, at)
+    c = completed(v, a[4] + a[5], texel, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o])
+    g = grad_mesh[i]
+    f = fill[i]
+    to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
+    grad_fill[i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
+    to_own, to_facing, to_texel, to_turn, to_eye, to_sun, to_tint, to_wh, to_g = wp.grad(completed_loss)(
+        v, a[4] + a[5], texel, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o], to_colour
+    )
+    more, to_move = wp.grad(mirror_loss)(v, texel_slope(texels, rect, first, mirror_place(v), to_texel))
+    grad_own[i] = to_own + more
+    to_look = vec8()
+    to_look[4] = to_facing
+    to_look[5] = to_facing
+    grad_look[i] = to_look
+    wp.atomic_add(grad_turn, o, wp.vec2d(wp.float64(to_turn[0]), wp.float64(to_turn[1])))
+
+
+class Complete(torch.autograd.Function):
+    """mesh (T, 4) with what `fill` (T,) leaves of it completed: by the car's other side, or the template's colours.
+
+    own (T, 13), look (T, 8): of the pixels; need (K,) int64: those with fill, ascending; yaw (N,). view: sun (N, 3)
+    unit, tint (N, 3) RGB of the paint, frame_wh (N, 2) px, unproject (N, 3, 3): the inverse of the camera's.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, mesh, fill, own, look, yaw, table, need, texels, view, edges) -> Tensor:
+        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
+        out = mesh.clone()
+        fixed = (need, table, *texels, turn, *view, own.contiguous(), look, fill)
+        launch(
+            complete_kernel,
+            halves(need.shape[0]),
+            [*_complete_inputs(fixed), _array(out, wp.vec4f)],
+        )
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_mesh: Tensor):
+        fixed = ctx.saved_tensors
+        need, turn, own, look, fill = fixed[0], fixed[5], *fixed[-3:]
+        grad_mesh = grad_mesh.contiguous()
+        grad_own, grad_look, grad_fill = torch.zeros_like(own), torch.zeros_like(look), torch.zeros_like(fill)
+        grad_turn = torch.zeros(turn.shape, dtype=torch.float64, device=turn.device)
+        inputs = [
+            *(*_complete_inputs(fixed), _array(grad_mesh, wp.vec4f)),
+            *(_array(grad_own, vec13), _array(grad_look, vec8)),
+            *(_array(grad_fill), _array(grad_turn, wp.vec2d)),
+        ]
+        starts = torch.searchsorted(need, torch.tensor(ctx.edges, device=need.device)).tolist()
+        launch(complete_backward_kernel, between(starts), inputs)
+        to_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
+        return grad_mesh, grad_fill, grad_own, grad_look, to_yaw, None, None, None, None, None
+
+
+def _complete_inputs(fixed) -> list:
+    need, table, texels, rects, offsets, turn, sun, tint, frame_wh, unproject, own, look, fill = fixed
+    view = View()
+    view.turn, view.sun, view.tint = _array(turn, wp.vec2f), _vec3(sun), _vec3(tint)
+    view.frame_wh = _array(frame_wh, wp.vec2f)
+    view.unproject = _array(unproject, wp.mat33f)
+    return [
+        *(_array(need), _array(table, wp.vec4i), _array(texels, vec8)),
+        *(_array(rects), _array(offsets), view, _array(own, vec13)),
+        *(_array(look, vec8), _array(fill)),
+    ]
+
+
+# --------------------------------------------------------------------------------------------- mesh and halo as one
+
+
+@wp.kernel(enable_backward=False)
+def combine_kernel(
+    start: int,
+    face: wp.array(dtype=wp.int32),
+    nearest: wp.array(dtype=wp.int64),
+    coverage: wp.array(dtype=wp.float32),
+    mesh: wp.array(dtype=wp.vec4f),
+    halo: wp.array(dtype=wp.vec4f),
+    look: wp.array(dtype=vec8),
+    colour: wp.array(dtype=wp.vec4f),
+    opacity: wp.array(dtype=wp.float32),
+    depth: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    c = wp.vec3f(0.0, 0.0, 0.0)
+    inverse = float(0.0)
+    solid = float(0.0)
+    z = float(wp.inf)
+    if in_mesh(i, face, coverage):
+        share = coverage[i]
+        m = mesh[i]
+        near = look[i][3]
+        a = m[3] * share
+        c = wp.vec3f(m[0], m[1], m[2]) * share
+        solid = a
+        inverse = a / wp.max(near, NEAR)
+        z = near
+    if in_halo(i, nearest, coverage):
+        share = 1.0 - coverage[i]
+        h = halo[i]
+        near = look[wp.int32(nearest[i])][3]
+        a = h[3] * share
+        c += wp.vec3f(h[0], h[1], h[2]) * share
+        solid += a
+        inverse += a / wp.max(near, NEAR)
+        z = wp.min(z, near)
+    colour[i] = wp.vec4f(c[0], c[1], c[2], inverse)
+    opacity[i] = solid
+    depth[i] = z
+
+
+@wp.kernel(enable_backward=False)
+def combine_backward_kernel(
+    start: int,
+    face: wp.array(dtype=wp.int32),
+    nearest: wp.array(dtype=wp.int64),
+    coverage: wp.array(dtype=wp.float32),
+    mesh: wp.array(dtype=wp.vec4f),
+    halo: wp.array(dtype=wp.vec4f),
+    look: wp.array(dtype=vec8),
+    grad_colour: wp.array(dtype=wp.vec4f),
+    grad_opacity: wp.array(dtype=wp.float32),
+    grad_mesh: wp.array(dtype=wp.vec4f),
+    grad_halo: wp.array(dtype=wp.vec4f),
+    grad_coverage: wp.array(dtype=wp.float32),
+    grad_look: wp.array(dtype=vec8),
+):
+    i = start + wp.tid()
+    g = grad_colour[i]
+    to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    to_share = float(0.0)
+    if in_mesh(i, face, coverage):
+        m = mesh[i]
+        z = look[i][3]
+        safe = wp.max(z, NEAR)
+        to_a = grad_opacity[i] + g[3] / safe
+        to_share = g[0] * m[0] + g[1] * m[1] + g[2] * m[2] + to_a * m[3]
+        to_mesh = wp.vec4f(g[0], g[1], g[2], to_a) * coverage[i]
+        if g[3] != 0.0 and z > NEAR:
+            to_z = vec8()
+            to_z[3] = -g[3] * m[3] * coverage[i] / (safe * safe)
+            wp.atomic_add(grad_look, i, to_z)
+    if in_halo(i, nearest, coverage):
+        h = halo[i]
+        j = wp.int32(nearest[i])
+        z = look[j][3]
+        safe = wp.max(z, NEAR)
+        to_a = grad_opacity[i] + g[3] / safe
+        to_share -= g[0] * h[0] + g[1] * h[1] + g[2] * h[2] + to_a * h[3]
+        to_halo = wp.vec4f(g[0], g[1], g[2], to_a) * (1.0 - coverage[i])
+        if g[3] != 0.0 and z > NEAR:
+            to_z = vec8()
+            to_z[3] = -g[3] * h[3] * (1.0 - coverage[i]) / (safe * safe)
+            wp.atomic_add(grad_look, j, to_z)
+    grad_mesh[i] = to_mesh
+    grad_halo[i] = to_halo
+    grad_coverage[i] = to_share
+
+
+class Combine(torch.autograd.Function):
+    """Mesh (T, 4) and halo (T, 4) by their shares of each pixel -> premultiplied RGB and opacity / depth (T, 4),
+    opacity (T,), depth (T,) m of the nearest of both, inf where neither is (not differentiated)."""
+
+    @staticmethod
+    def forward(ctx: Any, mesh, halo, coverage, look, fragments: Fragments, nearest, edges):
+        size = mesh.shape[0]
+        colour, opacity, depth = mesh.new_empty(size, 4), mesh.new_empty(size), mesh.new_empty(size)
+        fixed = (fragments.face, nearest, coverage, mesh.contiguous(), halo.contiguous(), look)
+        outputs = [_array(colour, wp.vec4f), _array(opacity), _array(depth)]
+        launch(combine_kernel, halves(size), [*_combine_inputs(fixed), *outputs])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        ctx.mark_non_differentiable(depth)
+        return colour, opacity, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor):
+        fixed = ctx.saved_tensors
+        _, _, coverage, mesh, halo, look = fixed
+        grad_mesh, grad_halo = torch.empty_like(mesh), torch.empty_like(halo)
+        grad_coverage, grad_look = torch.empty_like(coverage), torch.zeros_like(look)
+        inputs = [
+            *(*_combine_inputs(fixed), _array(grad_colour.contiguous(), wp.vec4f)),
+            *(_array(grad_opacity.contiguous()), _array(grad_mesh, wp.vec4f)),
+            *(_array(grad_halo, wp.vec4f), _array(grad_coverage)),
+            _array(grad_look, vec8),
+        ]
+        launch(combine_backward_kernel, between(ctx.edges), inputs)
+        return grad_mesh, grad_halo, grad_coverage, grad_look, None, None, None
+
+
+def _combine_inputs(fixed) -> list:
+    face, nearest, coverage, mesh, halo, look = fixed
+    return [
+        *(_array(face), _array(nearest), _array(coverage), _array(mesh, wp.vec4f)),
+        *(_array(halo, wp.vec4f), _array(look, vec8)),
+    ]
+
+
+# ---------------------------------------------------------------------------------------------------------- shadows
+
+
+@wp.struct
+class Ground:
+    """Photographed shadows: what they take away, three numbers a texel, and where the crops lie."""
+
+    dark: wp.array(dtype=wp.vec3f)
+    rects: wp.array2d(dtype=wp.int64)
+    offsets: wp.array(dtype=wp.int64)
+    frame_wh: wp.array(dtype=wp.vec2f)
+
+
+@wp.func
+def ground_place(d: wp.vec3d, then: wp.float64, x: int, y: int):
+    """Where the photograph shows a ground point, px."""
+    out = wp.vec2f(FAR_AWAY, FAR_AWAY)
+    if then > wp.float64(NEAR):
+        out = wp.vec2f(
+            wp.float32(wp.float64(x) + (d[0] - wp.float64(x) * d[2]) / then),
+            wp.float32(wp.float64(y) + (d[1] - wp.float64(y) * d[2]) / then),
+        )
+    return out
+
+
+@wp.func
+def dark_row(dark: wp.array(dtype=wp.vec3f), row: int, t: Taps, w: wp.vec4f):
+    low = dark[row + t.columns[0]] * w[0] + dark[row + t.columns[1]] * w[1]
+    return low + (dark[row + t.columns[2]] * w[2] + dark[row + t.columns[3]] * w[3])
+
+
+@wp.func
+def in_frame(uv: wp.vec2f, wh: wp.vec2f):
+    """Kept within two pixels of the frame, where crops repeat their border."""
+    return wp.vec2f(wp.min(wp.max(uv[0], -2.0), wh[0] + 1.0), wp.min(wp.max(uv[1], -2.0), wh[1] + 1.0))
+
+
+@wp.func
+def reached(uv: wp.vec2f, rect: wp.vec4i):
+    """Whether a lookup can find anything in a crop."""
+    found = uv[0] > wp.float32(rect[0] - 2) and uv[0] < wp.float32(rect[2] + 1)
+    return found and uv[1] > wp.float32(rect[1] - 2) and uv[1] < wp.float32(rect[3] + 1)
+
+
+@wp.kernel(enable_backward=False)
+def shadow_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    clip: wp.array(dtype=wp.vec3f),
+    base_clip: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    ground: Ground,
+    out: wp.array(dtype=wp.vec3f),
+):
+    i = start + wp.tid()
+    factor = wp.vec3f(1.0, 1.0, 1.0)
+    if face[i] >= 0:
+        at = table[i]
+        rect = rect_of(ground.rects, at[0])
+        hit = find_hit(face[i], at[1], at[2], clip, faces)
+        t0 = base_clip[hit.i0]
+        t1 = base_clip[hit.i1]
+        t2 = base_clip[hit.i2]
+        d = wp.vec3d(t0 - clip[hit.i0]) * hit.b[0] + wp.vec3d(t1 - clip[hit.i1]) * hit.b[1]
+        d += wp.vec3d(t2 - clip[hit.i2]) * hit.b[2]
+        then = wp.float64(t0[2]) * hit.b[0] + wp.float64(t1[2]) * hit.b[1] + wp.float64(t2[2]) * hit.b[2]
+        place = ground_place(d, then, at[1], at[2])
+        wh = ground.frame_wh[at[0]]
+        uv = in_frame(place, wh)
+        if reached(uv, rect):
+            t = taps_at(uv, rect, wp.int32(ground.offsets[at[0]]), True)
+            dark = dark_row(ground.dark, t.rows[0], t, t.wx) * t.wy[0]
+            dark += dark_row(ground.dark, t.rows[1], t, t.wx) * t.wy[1]
+            dark += dark_row(ground.dark, t.rows[2], t, t.wx) * t.wy[2]
+            dark += dark_row(ground.dark, t.rows[3], t, t.wx) * t.wy[3]
+            factor = factor - dark * inside_weight(place[0], place[1], wh, EXTENDED_LOW, EXTENDED_HIGH)
+    out[i] = factor
+
+
+@wp.func
+def border_loss(place: wp.vec2f, wh: wp.vec2f):
+    return inside_weight(place[0], place[1], wh, EXTENDED_LOW, EXTENDED_HIGH)
+
+
+@wp.kernel(enable_backward=False)
+def shadow_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    face: wp.array(dtype=wp.int32),
+    clip: wp.array(dtype=wp.vec3f),
+    base_clip: wp.array(dtype=wp.vec3f),
+    faces: wp.array(dtype=wp.vec3i),
+    ground: Ground,
+    grad_out: wp.array(dtype=wp.vec3f),
+    grad_clip: wp.array(dtype=wp.vec3d),
+):
+    i = start + wp.tid()
+    g = grad_out[i]
+    if face[i] >= 0 and (g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0):
+        at = table[i]
+        rect = rect_of(ground.rects, at[0])
+        hit = find_hit(face[i], at[1], at[2], clip, faces)
+        t0 = wp.vec3d(base_clip[hit.i0])
+        t1 = wp.vec3d(base_clip[hit.i1])
+        t2 = wp.vec3d(base_clip[hit.i2])
+        d0 = t0 - hit.c0
+        d1 = t1 - hit.c1
+        d2 = t2 - hit.c2
+        d = d0 * hit.b[0] + d1 * hit.b[1] + d2 * hit.b[2]
+        then = t0[2] * hit.b[0] + t1[2] * hit.b[1] + t2[2] * hit.b[2]
+        place = ground_place(d, then, at[1], at[2])
+        wh = ground.frame_wh[at[0]]
+        uv = in_frame(place, wh)
+        if reached(uv, rect) and then > wp.float64(NEAR):
+            t = taps_at(uv, rect, wp.int32(ground.offsets[at[0]]), True)
+            dark = float(0.0)
+            to_u = float(0.0)
+            to_v = float(0.0)
+            for k in range(4):
+                e0 = wp.dot(g, ground.dark[t.rows[k] + t.columns[0]])
+                e1 = wp.dot(g, ground.dark[t.rows[k] + t.columns[1]])
+                e2 = wp.dot(g, ground.dark[t.rows[k] + t.columns[2]])
+                e3 = wp.dot(g, ground.dark[t.rows[k] + t.columns[3]])
+                along = e0 * t.wx[0] + e1 * t.wx[1] + e2 * t.wx[2] + e3 * t.wx[3]
+                dark += t.wy[k] * along
+                to_v += t.sy[k] * along
+                to_u += t.wy[k] * (e0 * t.sx[0] + e1 * t.sx[1] + e2 * t.sx[2] + e3 * t.sx[3])
+            border = border_loss(place, wh)
+            to_border, to_wh = wp.grad(border_loss)(place, wh)
+            if uv[0] != place[0]:
+                to_u = float(0.0)
+            if uv[1] != place[1]:
+                to_v = float(0.0)
+            q = wp.vec2d(
+                wp.float64(-(to_u * border + dark * to_border[0])), wp.float64(-(to_v * border + dark * to_border[1]))
+            ) / then
+            x = wp.float64(at[1])
+            y = wp.float64(at[2])
+            to_d = wp.vec3d(q[0], q[1], -(q[0] * x + q[1] * y))
+            to_then = -(q[0] * (d[0] - x * d[2]) + q[1] * (d[1] - y * d[2])) / then
+            s0 = wp.dot(to_d, d0) + to_then * t0[2]
+            s1 = wp.dot(to_d, d1) + to_then * t1[2]
+            s2 = wp.dot(to_d, d2) + to_then * t2[2]
+            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+            add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
+            wp.atomic_add(grad_clip, hit.i0, to_d * -hit.b[0])
+            wp.atomic_add(grad_clip, hit.i1, to_d * -hit.b[1])
+            wp.atomic_add(grad_clip, hit.i2, to_d * -hit.b[2])
+
+
+class Shadow(torch.autograd.Function):
+    """Factors (Ts, 3) by which the photographed shadows darken the ground, moved along with the patches.
+
+    clip, base_clip (4N, 3): the patches' corners now and then; dark (S, 3) of crops rects (N, 4), offsets (N + 1,).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, clip, fragments: Fragments, table, base_clip, faces, dark, frame_wh, edges) -> Tensor:
+        out = clip.new_empty(fragments.face.shape[0], 3)
+        fixed = (table, fragments.face, clip.contiguous(), base_clip, faces, *dark, frame_wh)
+        launch(shadow_kernel, halves(out.shape[0]), [*_shadow_inputs(fixed), _vec3(out)])
+        ctx.save_for_backward(*fixed)
+        ctx.edges = edges
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor):
+        fixed = ctx.saved_tensors
+        clip = fixed[2]
+        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
+        inputs = [*_shadow_inputs(fixed), _vec3(grad_out.contiguous()), _array(grad_clip, wp.vec3d)]
+        launch(shadow_backward_kernel, between(ctx.edges), inputs)
+        return grad_clip.to(clip.dtype), None, None, None, None, None, None, None
+
+
+def _shadow_inputs(fixed) -> list:
+    table, face, clip, base_clip, faces, dark, rects, offsets, frame_wh = fixed
+    ground = Ground()
+    ground.dark, ground.rects, ground.offsets = _vec3(dark), _array(rects), _array(offsets)
+    ground.frame_wh = _array(frame_wh, wp.vec2f)
+    return [
+        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _vec3(base_clip)),
+        *(_array(faces, wp.vec3i), ground),
+    ]
+
+
+@wp.kernel(enable_backward=True)
+def adjoints_kernel(out: wp.array(dtype=wp.float32)):
+    """Never run. Warp writes adjoints of what a differentiable kernel calls; those that `wp.grad` alone asks for may
+    miss some of the functions below them (Warp 1.19), and then their gradients are silently 0."""
+    a = vec8()
+    xy = wp.vec2f(0.0, 0.0)
+    c = wp.vec3f(0.0, 0.0, 0.0)
+    g = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    out[0] = mesh_loss(a, a, xy, xy, g, 0.0) + halo_loss(a, a, xy, xy, g) + border_loss(xy, xy)
+    out[1] = completed_loss(vec13(), 0.0, a, xy, c, c, c, xy, c) + mirror_loss(vec13(), xy)
+
+
+def _array(values: Tensor, dtype: Any = None) -> wp.array:
+    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
+
+
+def _vec3(values: Tensor) -> wp.array:
+    return _array(values, wp.vec3f)
