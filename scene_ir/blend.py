@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 
 from scene_ir.geometry import ground_footprint
+from scene_ir.raster.layout import Layout
+from scene_ir.raster.verbs import Backend
 
 Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
@@ -17,29 +20,77 @@ Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is blended where: shadows first, then layers back to front; rectangles that are empty are left out."""
+    """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles are
+    left out of `order` and `shadows`, the draws that have a shadow."""
 
-    shadows: tuple[Span, ...]
-    layers: tuple[Span, ...]
+    layout: Layout
+    shadow_layout: Layout
+    order: tuple[int, ...]
+    shadows: tuple[int, ...]
+    spans: tuple[Span, ...]
+    shadow_spans: tuple[Span, ...]
+
+    @classmethod
+    def of(cls, layout: Layout, shadow_layout: Layout, order: Sequence[int]) -> Plan:
+        """order: all layers, back to front."""
+        spans, shadow_spans = _spans(layout), _spans(shadow_layout)
+        drawn = tuple(i for i in order if min(spans[i][2]) > 0)
+        shadows = tuple(i for i, span in enumerate(shadow_spans) if min(span[2]) > 0)
+        return cls(layout, shadow_layout, drawn, shadows, spans, shadow_spans)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Packed pixels of each layer."""
+        return [size[0] * size[1] for _, _, size in self.spans]
 
 
-def spans(rects: Tensor, offsets: Tensor) -> list[Span]:
-    """Where the packed pixels of each rectangle (N, 4) px go. offsets (N + 1,)."""
-    edges = offsets.tolist()
+def _spans(layout: Layout) -> tuple[Span, ...]:
+    """Where the packed pixels of each draw go."""
     out: list[Span] = []
-    for i, (x0, y0, x1, y1) in enumerate(rects.tolist()):
-        size = (max(y1 - y0, 0), max(x1 - x0, 0))
-        out.append((slice(edges[i], edges[i + 1]), (slice(y0, y0 + size[0]), slice(x0, x0 + size[1])), size))
-    return out
+    for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.rects.tolist(), strict=True):
+        out.append((packed, (slice(y0, y0 + size[0]), slice(x0, x0 + size[1])), size))
+    return tuple(out)
 
 
-def blend(canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:
-    """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to all tensors.
+def composite(
+    canvas: Tensor,
+    depth: Tensor,
+    what: tuple[Tensor, Tensor, Tensor, Tensor],
+    plan: Plan,
+    clamped: bool,
+    backend: Backend = "reference",
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to canvas, factors, colour, opacity.
 
-    canvas: (C, H, W), its first three channels RGB. shadow: (Ts, 3) factors. colour: (T, C) premultiplied;
-    opacity: (T,). -> (C, H, W). Pixels outside the plan's rectangles keep their bits.
+    canvas: (C, H, W), RGB and, with C = 4, 1 / depth. depth: (H, W) m behind everything. what: shadow factors (Ts, 3);
+    premultiplied colours (T, 4), the fourth opacity / depth; opacity (T,); depth (T,) m. clamped: whether RGB is kept
+    in [0, 1]. -> (C, H, W); (H, W) m and (H, W) int64, i + 1, of the front-most object i that is at least half
+    opaque. Pixels outside the plan's rectangles keep their bits.
     """
-    return _Blend.apply(canvas, shadow, colour, opacity, plan)
+    factor, colour, opacity, z = what
+    if backend == "warp":
+        from scene_ir.raster import blending
+
+        rects = [(plan.layout, plan.order), (plan.shadow_layout, plan.shadows)]
+        layers, shadows = (_stack(layout, order) for layout, order in rects)
+        edges = blending.row_edges(canvas.shape[1], torch.cat([layers[1], shadows[1]]).cpu().numpy())
+        return blending.Blend.apply(canvas, factor, colour, opacity, z, depth, (shadows, layers, edges), clamped)
+    image = _Blend.apply(canvas, factor, colour[:, : canvas.shape[0]], opacity, plan)
+    if clamped:
+        image = torch.cat([image[:3].clamp(0.0, 1.0), image[3:]])
+    with torch.no_grad():
+        nearest = depth.clone()
+        number = torch.zeros(depth.shape, dtype=torch.int64, device=depth.device)
+        for i in plan.order:
+            packed, (rows, columns), size = plan.spans[i]
+            solid = (opacity[packed] >= 0.5).reshape(size)
+            number[rows, columns] = torch.where(solid, i + 1, number[rows, columns])
+            nearest[rows, columns] = torch.where(solid, z[packed].reshape(size).to(depth), nearest[rows, columns])
+    return image, nearest, number
+
+
+def _stack(layout: Layout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.tensor(order, dtype=torch.int32, device=layout.rects.device), layout.rects, layout.offsets
 
 
 class _Blend(torch.autograd.Function):
@@ -50,11 +101,11 @@ class _Blend(torch.autograd.Function):
     def forward(ctx: Any, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:
         out = canvas.clone(memory_format=torch.contiguous_format)
         under: list[Tensor] = []
-        for packed, (rows, columns), size in plan.shadows:
+        for packed, (rows, columns), size in (plan.shadow_spans[i] for i in plan.shadows):
             region = out[:3, rows, columns]
             under.append(region.clone())
             region.mul_(shadow[packed].T.reshape(3, *size))
-        for packed, (rows, columns), size in plan.layers:
+        for packed, (rows, columns), size in (plan.spans[i] for i in plan.order):
             region = out[:, rows, columns]
             under.append(region.clone())
             clear = 1.0 - opacity[packed].reshape(1, *size)
@@ -70,15 +121,16 @@ class _Blend(torch.autograd.Function):
         to_shadow = torch.zeros_like(shadow)
         to_colour = opacity.new_zeros(opacity.shape[0], ctx.channels)
         to_opacity = torch.zeros_like(opacity)
-        steps = len(ctx.plan.shadows)
-        for k in range(len(ctx.plan.layers) - 1, -1, -1):
-            packed, (rows, columns), size = ctx.plan.layers[k]
+        plan: Plan = ctx.plan
+        steps = len(plan.shadows)
+        for k in range(len(plan.order) - 1, -1, -1):
+            packed, (rows, columns), size = plan.spans[plan.order[k]]
             region = grad[:, rows, columns]
             to_colour[packed] = region.reshape(ctx.channels, -1).T
             to_opacity[packed] = -(region * ctx.under[steps + k]).sum(dim=0).reshape(-1)
             region.mul_(1.0 - opacity[packed].reshape(1, *size))
         for k in range(steps - 1, -1, -1):
-            packed, (rows, columns), size = ctx.plan.shadows[k]
+            packed, (rows, columns), size = plan.shadow_spans[plan.shadows[k]]
             region = grad[:3, rows, columns]
             to_shadow[packed] = (region * ctx.under[k]).reshape(3, -1).T
             region.mul_(shadow[packed].T.reshape(3, *size))
@@ -96,45 +148,45 @@ def paint_order(size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tens
     count = int(translation.shape[0])
     corners = ground_footprint(size_lhw.detach(), yaw.detach(), translation.detach()).cpu().double().numpy()
     eye = centre.detach().cpu().double().numpy()[[0, 2]]
-    nearest = [_nearest_distance(corners[i], eye) for i in range(count)]
+    nearest = _nearest_distance(corners, eye)
+    first, second = np.triu_indices(count, 1)
+    side = _in_front(corners[first], corners[second], eye, nearest[second] - nearest[first])
     behind = np.zeros((count, count), dtype=bool)
-    for i in range(count):
-        for j in range(i + 1, count):
-            side = _in_front(corners[i], corners[j], eye)
-            behind[i, j], behind[j, i] = side < 0, side > 0
+    behind[first, second], behind[second, first] = side < 0, side > 0
     remaining = sorted(range(count), key=lambda i: (-nearest[i], i))
     order: list[int] = []
     while remaining:
-        free = [i for i in remaining if not any(behind[j, i] for j in remaining)]
-        chosen = (free or remaining)[0]
+        hidden = behind[np.ix_(remaining, remaining)].any(axis=0)
+        chosen = remaining[int(np.argmin(hidden))]  # the first that hides none of the others; in a cycle, the first
         order.append(chosen)
         remaining.remove(chosen)
     return order
 
 
-def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray) -> int:
-    """1 where footprint `a` (4, 2) can hide `b`, -1 the other way round, 0 where neither can."""
-    best, sign = 0.0, 0
+def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray) -> np.ndarray:
+    """(P,): 1 where footprint a[i] (P, 4, 2) can hide b[i], -1 the other way round, 0 where neither can.
+
+    farther: (P,) how much farther b's outline is, which decides where the footprints are not apart.
+    """
+    gaps, signs = [], []
     for corners in (a, b):
         for start, end in ((0, 1), (1, 2)):
-            axis = corners[end] - corners[start]
-            axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
-            pa, pb, at = a @ axis, b @ axis, float(eye @ axis)
+            axis = corners[:, end] - corners[:, start]
+            axis = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+            pa, pb = np.einsum("pkc,pc->pk", a, axis), np.einsum("pkc,pc->pk", b, axis)
+            at = axis @ eye
             for direction in (1.0, -1.0):
-                low, high = (pa * direction).max(), (pb * direction).min()
-                if high - low > best:
-                    best = high - low
-                    where = at * direction
-                    sign = 1 if where <= low else -1 if where >= high else 0
-    if best > 0.0:
-        return sign
-    gap = _nearest_distance(b, eye) - _nearest_distance(a, eye)
-    return int(np.sign(gap))
+                low, high, where = (pa * direction).max(axis=1), (pb * direction).min(axis=1), at * direction
+                gaps.append(high - low)
+                signs.append(np.where(where <= low, 1, np.where(where >= high, -1, 0)))
+    best = np.argmax(gaps, axis=0)
+    pair = np.arange(len(a))
+    return np.where(np.array(gaps)[best, pair] > 0, np.array(signs)[best, pair], np.sign(farther))
 
 
-def _nearest_distance(corners: np.ndarray, eye: np.ndarray) -> float:
-    """Distance from the eye to the outline of a footprint (4, 2)."""
-    ends = np.roll(corners, -1, axis=0) - corners
-    along = ((eye - corners) * ends).sum(1) / np.maximum((ends**2).sum(1), 1e-12)
-    closest = corners + np.clip(along, 0, 1)[:, None] * ends
-    return float(np.linalg.norm(closest - eye, axis=1).min())
+def _nearest_distance(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Distance (N,) from the eye to the outlines of footprints (N, 4, 2)."""
+    ends = np.roll(corners, -1, axis=1) - corners
+    along = ((eye - corners) * ends).sum(-1) / np.maximum((ends**2).sum(-1), 1e-12)
+    closest = corners + np.clip(along, 0, 1)[..., None] * ends
+    return np.linalg.norm(closest - eye, axis=-1).min(axis=1)

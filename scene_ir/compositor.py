@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -212,20 +213,21 @@ class Compositor:
     def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
         """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
         picked = [Surface.of(self.scene.meshes[int(i)], self._like.dtype) for i in objects.mesh_index]
-        self._fleet = Fleet.of(picked, self._like)
+        self.fleet = Fleet.of(picked, self._like)
         base = _photographed(objects)
-        local = self._fleet.local(base.ffd, base.size_lhw)
-        self._sharp, self._smooth = self._fleet.normals(local)
-        self._rig = fused.Rig.of(self._fleet, self._smooth, self.scene.camera.matrix, self._centre)
+        local = self.fleet.local(base.ffd, base.size_lhw)
+        self._sharp, self._smooth = self.fleet.normals(local)
+        self.rig = fused.Rig.of(self.fleet, self._smooth, self.scene.camera.matrix, self._centre)
         inflation = self._like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
         self._halo = inflation * self.scene.camera.matrix[0, 0].to(self._like)
         self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
         self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
         self._size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
+        self._pack = _Pack([self])
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
-        self._texels, self._shadows, self._fixed = None, None, None
+        self._texels, self._shadows, self.fixed = None, None, None
         ones = torch.ones_like(base.translation)
         self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
         if objects.source:
@@ -233,12 +235,12 @@ class Compositor:
 
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
         drawn = self.draw(base)
-        mirrored = self._fleet.place(
-            self._fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
+        mirrored = self.fleet.place(
+            self.fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
         )
         self._mirror_clip = surfaces.project_vertices(mirrored, self.scene.camera)
         flipped = surfaces.rotate(
-            self._smooth * self._like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self._fleet.owner]
+            self._smooth * self._like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.fleet.owner]
         )
         self._mirror_cos = surfaces.facing(mirrored, flipped, self._centre)
         order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self._centre)
@@ -257,11 +259,11 @@ class Compositor:
         self._texels = Texels.pack(crops + crops, self._like)
         self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
         if self.settings.backend == "warp":
-            self._fixed = self._fuse()
+            self.fixed = self._fuse()
 
     def _fuse(self) -> fused.Fixed:
         """What the fast kernels read, gathered."""
-        fleet, base, count = self._fleet, self._base, len(self.scene.objects)
+        fleet, base, count = self.fleet, self._base, len(self.scene.objects)
         assert self._texels is not None
         assert self._shadows is not None
         own = (fleet.colours, self._sharp, fleet.paint[:, None], fleet.glass[:, None], self._height[:, None])
@@ -272,7 +274,11 @@ class Compositor:
             base_clip=base.clip,
             base=torch.stack([base.cos, fleet.paint, self._height], dim=1),
             own=torch.cat([*own, self._mirror_clip, self._mirror_cos[:, None]], dim=1),
-            texels=(self._texels.values, self._texels.rects, self._texels.offsets),
+            texels=(
+                self._texels.values[: int(self._texels.offsets[count])],
+                self._texels.rects[:count],
+                self._texels.offsets[: count + 1],
+            ),
             ground_clip=base.ground_clip,
             ground_faces=faces.to(torch.int32).contiguous(),
             dark=(self._shadows.values, self._shadows.rects, self._shadows.offsets),
@@ -283,66 +289,54 @@ class Compositor:
 
     def repaint(self, paint: Tensor) -> None:
         """Give the templates, which complete what the photograph did not see, the paint (N, 3)."""
-        self._paint = paint.to(self._like)
-        self._paint_lightness = self._base_lightness()
+        self.paint = paint.to(self._like)
+        self.paint_lightness = self._base_lightness()
 
     def _base_lightness(self) -> Tensor:
         """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
-        fleet = self._fleet
-        total = torch.zeros_like(self._paint).index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
-        count = self._paint.new_zeros(len(self._paint)).index_add(0, fleet.owner, fleet.paint)
+        fleet = self.fleet
+        total = torch.zeros_like(self.paint).index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
+        count = self.paint.new_zeros(len(self.paint)).index_add(0, fleet.owner, fleet.paint)
         mean = total / count.clamp(min=1e-3)[:, None]
-        return texture.lab((mean * self._paint).clamp(0.0, 1.0))[:, 0]
+        return texture.lab((mean * self.paint).clamp(0.0, 1.0))[:, 0]
 
     def _place(self, objects: Objects) -> _Geometry:
-        fleet, camera = self._fleet, self.scene.camera
-        bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
-        local = fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
-        ground = surfaces.place_on_ground(
-            self._corners, objects.yaw, objects.translation, self.scene.environment.ground
-        )
-        ground_clip = surfaces.project_vertices(ground, camera)
-        if self.settings.backend == "warp" and len(objects):
-            clip, cos = fused.place(self._rig, local, objects.yaw, objects.translation)
-            return _Geometry(clip, cos, ground_clip)
-        points = fleet.place(local, objects.yaw, objects.translation)
-        normals = surfaces.rotate(self._smooth, fleet.spread(objects.yaw))
-        cos = surfaces.facing(points, normals, self._centre)
-        return _Geometry(surfaces.project_vertices(points, camera), cos, ground_clip)
+        return self._pack.place([objects])
 
     def draw(self, objects: Objects) -> Drawn:
         """Find which surfaces the pixels see."""
-        fleet, camera, backend = self._fleet, self.scene.camera, self.settings.backend
-        geometry = self._place(objects)
-        reach = self._reach_px(objects) if objects.source else [0.0] * len(objects)
-        rects = surfaces.crop_rects(
-            geometry.clip, fleet.faces, fleet.vertex_ranges, fleet.face_ranges, camera, [2.0 + r for r in reach]
-        )
-        layout = verbs.Layout.of(rects)
-        mesh = verbs.rasterize(geometry.clip, fleet.faces, fleet.face_ranges, layout, backend)
-        coverage = verbs.antialias(mesh, geometry.clip, fleet.faces, backend=backend)
-        nearest = surfaces.nearest_hits(mesh, reach)
-        faces, vertex_ranges, face_ranges = _patches(len(objects), self._like.device)
-        patch_rects = surfaces.crop_rects(
-            geometry.ground_clip, faces, vertex_ranges, face_ranges, camera, [0.0] * len(objects)
-        )
-        shadowless = [not self.settings.shadows or (bool(objects.source) and objects.source[i].shadow is None)
-                      for i in range(len(objects))]  # fmt: skip
-        patch_rects[torch.tensor(shadowless, dtype=torch.bool)] = 0
-        ground_layout = verbs.Layout.of(patch_rects)
-        ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return Drawn(geometry, mesh, coverage, nearest, ground)
+        return self._pack.draw([objects])
 
-    def _reach_px(self, objects: Objects) -> list[float]:
+    def local(self, objects: Objects) -> Tensor:
+        """Vertices (V, 3) m in their objects' frames."""
+        bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
+        return self.fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
+
+    def ground(self, objects: Objects) -> Tensor:
+        """Clip coordinates (4N, 3) of the corners of the shadows' patches."""
+        ground = self.scene.environment.ground
+        corners = surfaces.place_on_ground(self._corners, objects.yaw, objects.translation, ground)
+        return surfaces.project_vertices(corners, self.scene.camera)
+
+    def shadowless(self) -> list[bool]:
+        """Which objects darken no ground."""
+        source = self.scene.objects.source
+        count = len(self.scene.objects)
+        return [not self.settings.shadows or (bool(source) and source[i].shadow is None) for i in range(count)]
+
+    def reach_px(self, objects: Objects) -> list[float]:
         """How far the halo of each object reaches beyond its mesh."""
+        if not objects.source:
+            return [0.0] * len(objects)
         distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
         return (self._halo / distance).clamp(max=HALO_MAX_PX).tolist()
 
     def layers(self, objects: Objects) -> Layers:
         """The objects drawn one by one, not yet blended."""
-        drawn = self.draw(objects)
-        if self._fixed is not None:
-            return self._fused_layers(objects, drawn, self._fixed)
+        return self._pack.layers([objects])[0]
+
+    def reference_layers(self, objects: Objects, drawn: Drawn) -> Layers:
+        """`layers` in plain torch."""
         rows = self._rows(drawn, bool(objects.source))
         size = drawn.mesh.layout.size
         if objects.source:
@@ -353,7 +347,7 @@ class Compositor:
             shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
         colour, depth = shaded.colour, shaded.depth
         if _active(objects.texture_code):
-            code, base = objects.texture_code.index_select(0, rows.owner), self._paint_lightness[rows.owner]
+            code, base = objects.texture_code.index_select(0, rows.owner), self.paint_lightness[rows.owner]
             colour = texture.apply_texture_code(colour, shaded.opacity, code, shaded.paint, shaded.height, base)
         opacity = shaded.opacity * rows.share
         inverse = (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]
@@ -369,15 +363,6 @@ class Compositor:
             drawn.ground.layout,
             self._shadow_factors(objects, drawn),
         )
-
-    def _fused_layers(self, objects: Objects, drawn: Drawn, fixed: fused.Fixed) -> Layers:
-        """`layers` of photographed objects by the fast kernels."""
-        code = None
-        if _active(objects.texture_code):
-            code = (objects.texture_code, self._paint_lightness)
-        colour, opacity, depth = fused.photographed(fixed, drawn, objects.yaw, self._paint, code)
-        shadow = fused.shadows(fixed, drawn)
-        return Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)
 
     def _rows(self, drawn: Drawn, with_halo: bool) -> _Rows:
         layout = drawn.mesh.layout
@@ -407,13 +392,13 @@ class Compositor:
     def _mesh_attributes(self, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
         """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
         dense = verbs.interpolate(
-            drawn.mesh, drawn.geometry.clip, self._fleet.faces, attributes, self.settings.backend
+            drawn.mesh, drawn.geometry.clip, self.fleet.faces, attributes, self.settings.backend
         )
         return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
     def _photographed_rows(self, objects: Objects, drawn: Drawn, rows: _Rows) -> _Shaded:
         """All rows, coloured by the photograph, and completed where it did not see the mesh."""
-        geometry, base, fleet, m = drawn.geometry, self._base, self._fleet, rows.mesh_rows
+        geometry, base, fleet, m = drawn.geometry, self._base, self.fleet, rows.mesh_rows
         turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, self._height], dim=1)
 
         attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
@@ -456,7 +441,7 @@ class Compositor:
 
     def _own_attributes(self, objects: Objects, geometry: _Geometry) -> Tensor:
         """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
-        fleet = self._fleet
+        fleet = self.fleet
         normals = surfaces.rotate(self._sharp, fleet.spread(objects.yaw))
         parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self._height)
         return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
@@ -483,7 +468,7 @@ class Compositor:
         own = self._own_attributes(objects, drawn.geometry)
         mirror = torch.cat([self._mirror_clip, self._mirror_cos[:, None]], dim=1)
         both = self._mesh_attributes(drawn, rows, torch.cat([own, mirror], dim=1))[need]
-        colour = self._own_colour(rows, both[:, :10], need, self._paint)
+        colour = self._own_colour(rows, both[:, :10], need, self.paint)
         clip, cos_then = both[:, 10:13], both[:, 13]
         z = clip[:, 2]
         safe = z.clamp(min=0.1)
@@ -556,44 +541,156 @@ class Compositor:
 
     def render(self, perturbed: SceneIR) -> Render:
         """The picture of a perturbed scene; with nothing perturbed, the photograph."""
+        objects = self.moved(perturbed)
+        return self.compose(perturbed, objects, self.layers(objects) if len(objects) else None)
+
+    def moved(self, perturbed: SceneIR) -> Objects:
+        """The objects of a perturbed scene in this one's dtype. Raises ShapeError where it has other objects."""
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
         moving = {n: getattr(objects, n).to(self._like) for n in ("translation", "yaw", "ffd", "texture_code")}
-        objects = replace(self.scene.objects, **moving)
-        environment = perturbed.environment
+        return replace(self.scene.objects, **moving)
+
+    def compose(self, perturbed: SceneIR, objects: Objects, layers: Layers | None) -> Render:
+        """The picture of drawn objects. perturbed: for its environment; layers: None where there are no objects."""
+        environment, backend = perturbed.environment, self.settings.backend
         weather, foliage = _active(environment.weather), _active(environment.foliage)
-        canvas = self._canvas
+        canvas = self._canvas if weather else self._canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self._like))
-            canvas = torch.cat([apply_foliage(canvas[:3], changed, self._air), canvas[3:]])
-        opacity: tuple[Crop, ...] = ()
-        with torch.no_grad():
-            depth = self.scene.depth.clone()
-            object_id = torch.zeros(self._frame_hw, dtype=torch.int64, device=depth.device)
-        if len(objects):
-            layers = self.layers(objects)
+            canvas = torch.cat([apply_foliage(canvas[:3], changed, self._air, backend), canvas[3:]])
+        if layers is None:
+            with torch.no_grad():
+                depth = self.scene.depth.clone()
+                number = torch.zeros(self._frame_hw, dtype=torch.int64, device=depth.device)
+            opacity: tuple[Crop, ...] = ()
+        else:
             factors = layers.shadow
             if weather:
                 factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self._like))
             order = blend.paint_order(objects.size_lhw, objects.yaw, objects.translation, self._centre)
-            spans = blend.spans(layers.layout.rects, layers.layout.offsets)
-            shadow_spans = blend.spans(layers.shadow_layout.rects, layers.shadow_layout.offsets)
-            plan = blend.Plan(
-                tuple(s for s in shadow_spans if min(s[2]) > 0),
-                tuple(spans[i] for i in order if min(spans[i][2]) > 0),
-            )
-            canvas = blend.blend(canvas, factors, layers.colour, layers.opacity, plan)
-            _mark(layers, spans, order, depth, object_id)
+            plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
+            what = (factors, layers.colour, layers.opacity, layers.depth)
+            canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
             opacity = tuple(
-                Crop(layers.opacity[packed].reshape(1, *size).clamp(0.0, 1.0), window[1].start, window[0].start)
-                for packed, window, size in spans
+                Crop(crop.reshape(1, *size), window[1].start, window[0].start)
+                for crop, (_, window, size) in zip(
+                    layers.opacity.clamp(0.0, 1.0).split(plan.sizes), plan.spans, strict=True
+                )
             )
         image = canvas[:3]
         if weather:
             changed = replace(self.scene.environment, weather=environment.weather.to(self._like))
-            image = apply_weather(image, canvas[3], changed, self._air)
-        return Render(image.clamp(0.0, 1.0), depth, object_id, opacity)
+            image = apply_weather(image, canvas[3], changed, self._air, backend)
+        if weather or layers is None:
+            image = image.clamp(0.0, 1.0)
+        return Render(image, depth, number, opacity)
+
+
+class _Pack:
+    """Compositors whose objects are drawn in one go: each stage passes once over all pixels, of however many scenes.
+
+    A compositor may occur more than once, for several perturbations of one scene.
+    """
+
+    def __init__(self, members: Sequence[Compositor]) -> None:
+        self._members = tuple(members)
+        self._backend = members[0].settings.backend
+        self._rig = fused.Rig.pack([m.rig for m in members])
+        self._faces, self._vertex_ranges, self._face_ranges = Fleet.joined([m.fleet for m in members])
+        self._ranges = torch.tensor(self._face_ranges, dtype=torch.int64, device=self._faces.device).reshape(-1, 2)
+        closed = [s.closed for m in members for s in m.fleet.surfaces]
+        self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
+        self._counts = [len(m.scene.objects) for m in members]
+        cameras = [m.scene.camera for m in members]
+        self._frames_hw = [(c.height, c.width) for c, n in zip(cameras, self._counts, strict=True) for _ in range(n)]
+        self._patches = _patches(sum(self._counts), self._faces.device)
+        self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self._counts))]
+        self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self._counts))]
+        self._shadowless = [s for m in members for s in m.shadowless()]
+        self._fixed: fused.Fixed | None = None
+
+    def place(self, objects: Sequence[Objects]) -> _Geometry:
+        """Where the vertices of perturbed objects, of each member, come to lie."""
+        local = _joined([m.local(o) for m, o in zip(self._members, objects, strict=True)])
+        yaw, translation = _joined([o.yaw for o in objects]), _joined([o.translation for o in objects])
+        ground = _joined([m.ground(o) for m, o in zip(self._members, objects, strict=True)])
+        if self._backend == "warp" and len(yaw):
+            clip, cos = fused.place(self._rig, local, yaw, translation)
+        else:
+            clip, cos = fused.reference_place(self._rig, local, yaw, translation)
+        return _Geometry(clip, cos, ground)
+
+    def draw(self, objects: Sequence[Objects]) -> Drawn:
+        """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
+        geometry, backend = self.place(objects), self._backend
+        reach = [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
+        rects = surfaces.crop_rects(
+            geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
+            [2.0 + r for r in reach],
+        )  # fmt: skip
+        layout = verbs.Layout.of(rects)
+        mesh = verbs.rasterize(geometry.clip, self._faces, self._ranges, layout, backend, cull=self._cull)
+        coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
+        nearest = surfaces.nearest_hits(mesh, reach)
+        faces, _, face_ranges = self._patches
+        patch_rects = surfaces.crop_rects(
+            geometry.ground_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
+        )
+        patch_rects[torch.tensor(self._shadowless, dtype=torch.bool)] = 0
+        ground_layout = verbs.Layout.of(patch_rects)
+        ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
+        return Drawn(geometry, mesh, coverage, nearest, ground)
+
+    def layers(self, objects: Sequence[Objects]) -> list[Layers]:
+        """The layers of each member."""
+        fixed = [m.fixed for m in self._members]
+        known = [f for f in fixed if f is not None]
+        if len(known) < len(fixed):
+            return [m.reference_layers(o, m.draw(o)) for m, o in zip(self._members, objects, strict=True)]
+        if len(self._members) > 1 and self._fixed is None:
+            self._fixed = fused.Fixed.pack(known)
+        drawn = self.draw(objects)
+        code = None
+        if any(_active(o.texture_code) for o in objects):
+            code = (_joined([o.texture_code for o in objects]), _joined([m.paint_lightness for m in self._members]))
+        yaw, tint = _joined([o.yaw for o in objects]), _joined([m.paint for m in self._members])
+        whole = self._fixed or known[0]
+        colour, opacity, depth = fused.photographed(whole, drawn, yaw, tint, code)
+        shadow = fused.shadows(whole, drawn)
+        if len(self._members) == 1:
+            return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)]
+        layouts, grounds = drawn.mesh.layout.split(self._counts), drawn.ground.layout.split(self._counts)
+        sizes, ground_sizes = [part.size for part in layouts], [part.size for part in grounds]
+        parts = zip(
+            layouts, colour.split(sizes), opacity.split(sizes), depth.split(sizes), grounds,
+            shadow.split(ground_sizes), strict=True,
+        )  # fmt: skip
+        return [Layers(*part) for part in parts]
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+
+
+@lru_cache(maxsize=2)
+def _pack(members: tuple[Compositor, ...]) -> _Pack:
+    return _Pack(members)
+
+
+def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
+    """The picture of each perturbed scene by its compositor, their objects drawn in one go where they can be.
+
+    A compositor may occur several times. The pictures are those that `Compositor.render` gives, one by one.
+    """
+    members = tuple(c for c, _ in pairs)
+    together = len(pairs) > 1 and all(c.fixed is not None for c in members)
+    if not together:
+        return [c.render(scene) for c, scene in pairs]
+    objects = [c.moved(scene) for c, scene in pairs]
+    layers = _pack(members).layers(objects)
+    return [c.compose(p, o, part) for (c, p), o, part in zip(pairs, objects, layers, strict=True)]
 
 
 def _photographed(objects: Objects) -> Objects:
@@ -642,19 +739,3 @@ def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
 def _active(code: Tensor) -> bool:
     """Whether a code has to be applied: it is not 0, or somebody wants its gradient."""
     return code.requires_grad or bool((code.detach() != 0).any())
-
-
-def _mark(
-    layers: Layers, spans: Sequence[blend.Span], order: Sequence[int], depth: Tensor, object_id: Tensor
-) -> None:
-    """Write the depth and number of the front-most objects whose opacity is at least one half."""
-    with torch.no_grad():
-        for i in order:
-            packed, (rows, columns), size = spans[i]
-            if min(size) == 0:
-                continue
-            solid = (layers.opacity[packed] >= 0.5).reshape(size)
-            object_id[rows, columns] = torch.where(solid, i + 1, object_id[rows, columns])
-            depth[rows, columns] = torch.where(
-                solid, layers.depth[packed].reshape(size).to(depth), depth[rows, columns]
-            )

@@ -5,13 +5,14 @@ The kernels are in `raster.shading`, which is imported on first use. Shapes as i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from scene_ir import texture
+from scene_ir import surfaces, texture
 from scene_ir.surfaces import Fleet
 
 if TYPE_CHECKING:
@@ -28,6 +29,24 @@ class Rig:
     matrix: Tensor
     centre: Tensor
     edges: list[int]
+
+    @classmethod
+    def pack(cls, rigs: Sequence[Rig]) -> Rig:
+        """Several scenes' objects, one after the other."""
+        if len(rigs) == 1:
+            return rigs[0]
+        counts = [r.matrix.shape[0] for r in rigs]
+        shifts = [sum(counts[:i]) for i in range(len(counts))]
+        edges = [0]
+        for rig in rigs:
+            edges += [edges[-1] + e for e in rig.edges[1:]]
+        return cls(
+            torch.cat([r.normal for r in rigs]),
+            torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
+            torch.cat([r.matrix for r in rigs]),
+            torch.cat([r.centre for r in rigs]),
+            edges,
+        )
 
     @classmethod
     def of(cls, fleet: Fleet, normal: Tensor, matrix: Tensor, centre: Tensor) -> Rig:
@@ -62,6 +81,33 @@ class Fixed:
     sun: Tensor
     unproject: Tensor
 
+    @classmethod
+    def pack(cls, parts: Sequence[Fixed]) -> Fixed:
+        """Several scenes' objects, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        plain = ("base_clip", "base", "own", "ground_clip", "frame_wh", "sun", "unproject")
+        return cls(
+            faces=_shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts]),
+            ground_faces=_shifted([p.ground_faces for p in parts], [p.ground_clip.shape[0] for p in parts]),
+            texels=_packed([p.texels for p in parts]),
+            dark=_packed([p.dark for p in parts]),
+            **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
+        )
+
+
+def _shifted(faces: Sequence[Tensor], vertices: Sequence[int]) -> Tensor:
+    """Faces of several sets of vertices, once these lie one after the other."""
+    return torch.cat([f + sum(vertices[:i]) for i, f in enumerate(faces)])
+
+
+def _packed(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """Values, rectangles and offsets of several packs of crops as one."""
+    starts = [sum(c[0].shape[0] for c in crops[:i]) for i in range(len(crops))]
+    ends = [c[2][1:] + start for c, start in zip(crops, starts, strict=True)]
+    offsets = torch.cat([crops[0][2][:1], *ends])
+    return torch.cat([c[0] for c in crops]), torch.cat([c[1] for c in crops]), offsets
+
 
 def place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
     """Clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals to the camera."""
@@ -71,6 +117,16 @@ def place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Te
         local, yaw, translation, rig.normal, rig.owner, rig.matrix, rig.centre, rig.edges
     )
     return clip, facing
+
+
+def reference_place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """`place` in plain torch, any dtype."""
+    owner = rig.owner.long()
+    turn = yaw.index_select(0, owner)
+    points = surfaces.rotate(local, turn) + translation.index_select(0, owner)
+    matrix = rig.matrix.index_select(0, owner)
+    clip = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
+    return clip, surfaces.facing(points, surfaces.rotate(rig.normal, turn), rig.centre.index_select(0, owner))
 
 
 def photographed(

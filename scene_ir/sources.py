@@ -20,6 +20,7 @@ from scene_ir.compositor import Compositor, Drawn, RenderSettings
 from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
+from scene_ir.raster.layout import Layout
 from scene_ir.surfaces import nearest_true
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
@@ -324,9 +325,9 @@ def _paint_of(alone: Compositor) -> Tensor:
 
 def _with_layer(alone: Compositor) -> Tensor:
     """The background of a scene of one object with that object laid over it, without its shadow."""
-    objects = alone.scene.objects
+    objects, background = alone.scene.objects, alone.scene.background
     layers = alone.layers(objects)
-    spans = blend.spans(layers.layout.rects, layers.layout.offsets)
-    plan = blend.Plan((), tuple(s for s in spans if min(s[2]) > 0))
-    background = alone.scene.background
-    return blend.blend(background, layers.shadow[:0], layers.colour[:, :3].contiguous(), layers.opacity, plan)
+    no_shadow = Layout.of(layers.shadow_layout.rects * 0)
+    plan = blend.Plan.of(layers.layout, no_shadow, range(len(objects)))
+    what = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
+    return blend.composite(background, alone.scene.depth, what, plan, False, alone.settings.backend)[0]

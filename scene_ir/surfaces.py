@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -36,7 +37,7 @@ class Surface:
 
     unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its
     mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0,
-    1].
+    1]; closed: whether its faces bound volumes and look outwards.
     """
 
     unit: Tensor
@@ -47,6 +48,7 @@ class Surface:
     colours: Tensor
     paint: Tensor
     glass: Tensor
+    closed: bool
 
     @classmethod
     def of(cls, mesh: Mesh, dtype: torch.dtype) -> Surface:
@@ -74,7 +76,26 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
         grey[origin].to(dtype),
         _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
     )  # fmt: skip
-    return Surface(*(t.to(vertices.device) for t in tensors))
+    return Surface(*(t.to(vertices.device) for t in tensors), closed=_closed(points[triangles], weld[triangles]))
+
+
+def _closed(corners: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether faces (F, 3) of welded points bound volumes and look outwards, so that their backs are never seen.
+
+    corners (F, 3, 3): where the faces' corners lie. Each edge must be passed once in each direction, and every piece
+    that hangs together must have a positive volume.
+    """
+    if not len(faces):
+        return False
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    count = int(faces.max()) + 1
+    forth, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    if len(np.unique(forth)) != len(forth) or not np.array_equal(np.sort(forth), np.sort(back)):
+        return False
+    joined = scipy.sparse.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    piece = scipy.sparse.csgraph.connected_components(joined, directed=False)[1][faces[:, 0]]
+    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return bool((np.bincount(piece, volume)[np.unique(piece)] > 0).all())
 
 
 def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
@@ -148,6 +169,20 @@ class Fleet:
             packed([s.paint for s in surfaces], 0),
             packed([s.glass for s in surfaces], 0),
         )
+
+    @staticmethod
+    def joined(fleets: Sequence[Fleet]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
+        """Faces (F, 3) of several fleets' vertices, one after the other; vertex and face ranges of all objects."""
+        vertex_ranges: list[list[int]] = []
+        face_ranges: list[list[int]] = []
+        faces, vertices, triangles = [], 0, 0
+        for fleet in fleets:
+            faces.append(fleet.faces + vertices)
+            vertex_ranges += [[vertices + a, vertices + b] for a, b in fleet.vertex_ranges.tolist()]
+            face_ranges += [[triangles + a, triangles + b] for a, b in fleet.face_ranges.tolist()]
+            vertices += fleet.owner.shape[0]
+            triangles += fleet.faces.shape[0]
+        return torch.cat(faces), vertex_ranges, face_ranges
 
     def local(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
         """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right
@@ -258,36 +293,55 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
 def crop_rects(
     clip: Tensor,
     faces: Tensor,
-    vertex_ranges: Tensor,
-    face_ranges: Tensor,
-    camera: Camera,
+    vertex_ranges: Sequence[Sequence[int]],
+    face_ranges: Sequence[Sequence[int]],
+    frames_hw: Sequence[tuple[int, int]],
     margins_px: Sequence[float],
 ) -> Tensor:
     """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near
     plane.
 
-    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges (N, 2); margins_px: of each draw. A draw
-    wholly behind the camera or beside the image has an empty rectangle.
+    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges: [start, end) of each draw, the vertices' one after the
+    other; frames_hw, margins_px: of each draw. A draw wholly behind the camera or beside its image has an empty
+    rectangle.
     """
-    points = clip.detach().to("cpu", torch.float64)
-    triangles = faces.cpu()
-    limit = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    rects = torch.zeros(vertex_ranges.shape[0], 4, dtype=torch.int64)
-    pairs = zip(vertex_ranges.tolist(), face_ranges.tolist(), strict=True)
-    for i, ((start, end), (face_start, face_end)) in enumerate(pairs):
-        inside = points[start:end]
-        front = inside[:, 2] >= verbs.NEAR_M
-        if not bool(front.any()):
-            continue
-        if not bool(front.all()):
-            inside = torch.cat([inside[front], _near_crossings(points, triangles[face_start:face_end])])
-        px = inside[:, :2] / inside[:, 2:]
-        margin = margins_px[i]
-        low = (px.amin(dim=0) - margin).ceil().clamp(min=0).minimum(limit)
-        high = ((px.amax(dim=0) + margin).floor() + 1).clamp(min=0).minimum(limit)
-        if bool((high > low).all()):
-            rects[i] = torch.cat([low, high]).to(torch.int64)
-    return rects.to(clip.device)
+    rects = np.zeros((len(vertex_ranges), 4), dtype=np.int64)
+    filled = [i for i, (start, end) in enumerate(vertex_ranges) if end > start]
+    if filled:
+        points = clip.detach().cpu().numpy().astype(np.float64)
+        starts = np.array([vertex_ranges[i][0] for i in filled])
+        nearest = np.minimum.reduceat(points[:, 2], starts)
+        px = points[:, :2] / np.maximum(points[:, 2:], verbs.NEAR_M)
+        bounds = np.concatenate([np.minimum.reduceat(px, starts), np.maximum.reduceat(px, starts)], axis=1)
+        for row, i in enumerate(filled):
+            box = bounds[row] if nearest[row] >= verbs.NEAR_M else _clipped_bounds(points, faces, face_ranges[i])
+            if box is None:
+                continue
+            limit = np.array(frames_hw[i][::-1], dtype=np.float64)
+            low = np.clip(np.ceil(box[:2] - margins_px[i]), 0.0, limit)
+            high = np.clip(np.floor(box[2:] + margins_px[i]) + 1.0, 0.0, limit)
+            if (high > low).all():
+                rects[i] = np.concatenate([low, high])
+    return torch.from_numpy(rects).to(clip.device)
+
+
+def _clipped_bounds(points: np.ndarray, faces: Tensor, face_range: Sequence[int]) -> np.ndarray | None:
+    """Bounds (4,) px of what of a draw lies in front of the near plane; None where nothing does.
+
+    points: (V, 3) clip coordinates.
+    """
+    corners = faces[face_range[0] : face_range[1]].cpu().numpy()
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    a, b = points[edges[:, 0]], points[edges[:, 1]]
+    front = a[:, 2] >= verbs.NEAR_M
+    crosses = front != (b[:, 2] >= verbs.NEAR_M)
+    start, end = a[crosses], b[crosses]
+    share = (verbs.NEAR_M - start[:, 2:]) / (end[:, 2:] - start[:, 2:])
+    seen = np.concatenate([a[front], start + share * (end - start)])
+    if not len(seen):
+        return None
+    px = seen[:, :2] / seen[:, 2:]
+    return np.concatenate([px.min(axis=0), px.max(axis=0)])
 
 
 def nearest_hits(fragments: verbs.Fragments, reach_px: Sequence[float]) -> Tensor:
@@ -311,15 +365,6 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
     pixel_of[numbers[mask]] = np.flatnonzero(mask)
     return np.asarray(distance), pixel_of[numbers]
-
-
-def _near_crossings(points: Tensor, faces: Tensor) -> Tensor:
-    """Clip coordinates (K, 3) where the edges of the faces pass through the near plane."""
-    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    a, b = points[edges[:, 0]], points[edges[:, 1]]
-    crosses = (a[:, 2] >= verbs.NEAR_M) != (b[:, 2] >= verbs.NEAR_M)
-    a, b = a[crosses], b[crosses]
-    return a + ((verbs.NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
 
 
 def project_vertices(points: Tensor, camera: Camera) -> Tensor:

@@ -7,6 +7,7 @@ write to one place belong to one thread. So gradients that many pixels add to a 
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -65,9 +66,9 @@ def between(edges: Sequence[int], weights: Sequence[float] | None = None) -> lis
 
     weights: the work of each range, by default its length.
     """
-    work = [float(b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)] if weights is None else list(weights)
+    work = [float(b - a) for a, b in itertools.pairwise(edges)] if weights is None else list(weights)
     parts, total = threads(), sum(work)
-    if parts < 2 or edges[-1] - edges[0] < _WORTH or len(work) < 2 or total <= 0:
+    if parts < 2 or total < _WORTH or len(work) < 2:
         return [edges[0], edges[-1]]
     cuts, done, wanted = [edges[0]], 0.0, total / parts
     for i, share in enumerate(work):
@@ -96,7 +97,7 @@ def launch(kernel: Any, edges: Sequence[int], inputs: Sequence[Any], outputs: Se
             wp.stream_from_torch(wp.device_to_torch(device)),
         )
         return
-    ranges = [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    ranges = [(a, b - a) for a, b in itertools.pairwise(edges) if b > a]
     if len(ranges) > 1:
         wp.load_module(kernel.module, device)  # once, before several threads ask for it
     pool = _pool(os.getpid())
