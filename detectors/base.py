@@ -40,6 +40,17 @@ class RawPredictions:
     def __len__(self) -> int:
         return int(self.confidence_logits.shape[0])
 
+    def one(self, index: int) -> RawPredictions:
+        """What is said about one image of the batch, as a batch of one."""
+        rows = slice(index, index + 1)
+        return RawPredictions(
+            self.boxes_xyxy[rows],
+            self.deltas[rows],
+            self.class_logits[rows],
+            self.confidence_logits[rows],
+            self.image_hw,
+        )
+
 
 class Detector(nn.Module, ABC):
     """A detector: `name`, `classes` (labels are indices into it), `t_star` (score of best F1 on benign frames)."""

@@ -18,10 +18,12 @@ def area(boxes_xyxy: Tensor) -> Tensor:
 
 def intersection_matrix(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
     """Intersection areas (N, M) px^2 of boxes (N, 4) with boxes (M, 4)."""
-    top_left = torch.maximum(first_xyxy[:, None, :2], second_xyxy[None, :, :2])
-    bottom_right = torch.minimum(first_xyxy[:, None, 2:], second_xyxy[None, :, 2:])
-    size = (bottom_right - top_left).clamp_min(0)
-    return size[..., 0] * size[..., 1]
+    # Coordinate by coordinate: pairs of coordinates as the innermost dimension take thrice as long.
+    left, top, right, bottom = first_xyxy.T.contiguous()[..., None].unbind()
+    other_left, other_top, other_right, other_bottom = second_xyxy.T.contiguous().unbind()
+    width = (torch.minimum(right, other_right) - torch.maximum(left, other_left)).clamp_min(0)
+    height = (torch.minimum(bottom, other_bottom) - torch.maximum(top, other_top)).clamp_min(0)
+    return width * height
 
 
 def iou_matrix(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
@@ -74,4 +76,5 @@ def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float, labels: Tensor
 
 
 def _quotient(part: Tensor, whole: Tensor) -> Tensor:
-    return torch.where(whole > 0, part / whole.clamp_min(torch.finfo(whole.dtype).tiny), torch.zeros_like(part))
+    # Where the whole is 0, so is the part.
+    return part / whole.clamp_min(torch.finfo(whole.dtype).tiny)

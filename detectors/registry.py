@@ -21,8 +21,15 @@ SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safeten
 """Detectors that come with the package."""
 
 
-def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") -> Detector:
+def load_detector(
+    name_or_path: str | Path,
+    device: str | torch.device = "cpu",
+    gradient_precision: torch.dtype | None = None,
+) -> Detector:
     """The shipped detector of that name, or the one in a `.safetensors` file; frozen, eval mode, channels-last.
+
+    gradient_precision: torch.bfloat16 or, on GPUs, torch.float16, for passes that a gradient follows; without it,
+    all compute in float32. Detections and losses that are judged always do.
 
     Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
     to another architecture; the message names the file, what was expected and what was found.
@@ -48,6 +55,7 @@ def load_detector(name_or_path: str | Path, device: str | torch.device = "cpu") 
     detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
     _load_into(detector, tensors, path)
     detector.requires_grad_(False)
+    detector.gradient_precision = gradient_precision
     return detector.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors import boxes
+from detectors import boxes, frozen
 from detectors.base import Detector, RawPredictions
 from detectors.types import CLASSES, Detections, Targets
 
@@ -126,7 +127,11 @@ class Assignment:
 
 
 class SqueezeDet(Detector):
-    """SqueezeDet for images of any size: padded right and below to a multiple of 16 px, never resized."""
+    """SqueezeDet for images of any size: padded right and below to a multiple of 16 px, never resized.
+
+    In eval mode with all weights frozen it runs as `detectors.frozen` has it. gradient_precision: what passes
+    compute in that a gradient to the images may follow; the others, which judge, always use the weights' own.
+    """
 
     name = "squeezedet"
     fresh_layers = ("convdet.", "fires.fire10.", "fires.fire11.")
@@ -139,6 +144,8 @@ class SqueezeDet(Detector):
         self.fires = nn.ModuleDict({fire[0]: Fire(*fire[1:]) for fire in _FIRE if fire is not None})
         self.dropout = SeededDropout(dropout)
         self.convdet = nn.Conv2d(768, len(ANCHOR_SIZES_WH) * (len(self.classes) + 1 + 4), 3, padding=1)
+        self.gradient_precision: torch.dtype | None = None
+        self._nets: dict[torch.dtype, tuple[object, frozen.FrozenNet]] = {}
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
@@ -173,6 +180,8 @@ class SqueezeDet(Detector):
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
         height, width = int(images.shape[2]), int(images.shape[3])
+        if not self.training and not any(parameter.requires_grad for parameter in self.parameters()):
+            return self._interpret(self._frozen(images)(images), (height, width))
         mean = images.new_tensor(BGR_MEAN).view(1, 3, 1, 1)
         x = images.flip(1) * 255.0 - mean
         # To a multiple of 16, and one more row and column for conv1: TensorFlow's SAME puts its single row of
@@ -183,6 +192,38 @@ class SqueezeDet(Detector):
         for fire in _FIRE:
             x = _pool(x) if fire is None else self.fires[fire[0]](x)
         return self._interpret(self.convdet(self.dropout(x)), (height, width))
+
+    def _frozen(self, images: Tensor) -> frozen.FrozenNet:
+        """The layers as attacks run them, made anew where the weights have changed since."""
+        dtype = self.conv1.weight.dtype
+        if self.gradient_precision is not None and torch.is_grad_enabled() and images.requires_grad:
+            dtype = self.gradient_precision
+        state = [(p.data_ptr(), p._version, p.dtype, p.device) for p in self.parameters()]
+        known = self._nets.get(dtype)
+        if known is None or known[0] != state:
+            known = self._nets[dtype] = (state, self._freeze(dtype))
+        return known[1]
+
+    @torch.no_grad()
+    def _freeze(self, dtype: torch.dtype) -> frozen.FrozenNet:
+        fires = [fire for fire in self.fires.values() if isinstance(fire, Fire)]
+        pooled = {layer[0] for layer, after in pairwise(_FIRE) if layer is not None and after is None}
+        following = [*(fire.squeeze for fire in fires[1:]), self.convdet]
+        stages = [
+            frozen.Stage(
+                expansions=(
+                    frozen.convolution(fire.expand1x1, [fire.squeeze.out_channels], dtype),
+                    frozen.convolution(fire.expand3x3, [fire.squeeze.out_channels], dtype),
+                ),
+                pools=name in pooled,
+                following=frozen.convolution(
+                    after, [fire.expand1x1.out_channels, fire.expand3x3.out_channels], dtype
+                ),
+            )
+            for name, fire, after in zip(self.fires, fires, following, strict=True)
+        ]
+        first = frozen.convolution(fires[0].squeeze, [self.conv1.out_channels], dtype)
+        return frozen.FrozenNet(frozen.stem(self.conv1, BGR_MEAN, first, dtype), tuple(stages), STRIDE)
 
     def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
         """The published loss; what it aims at (`assign`) is taken as constant, as in the published code."""
@@ -198,25 +239,20 @@ class SqueezeDet(Detector):
             raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
         height, width = raw.image_hw
         like = raw.deltas
-        anchors_cxcywh = _anchors(-(-height // STRIDE), -(-width // STRIDE), like.dtype, like.device)
-        anchors_xyxy = _corners(anchors_cxcywh)
+        grid = -(-height // STRIDE), -(-width // STRIDE)
+        anchors_cxcywh = _anchors(*grid, like.dtype, like.device)
+        anchors_xyxy = _anchor_corners(*grid, like.dtype, like.device)
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
         image, anchor, true_boxes, labels, meeting = [], [], [], [], []
         for b, target in enumerate(targets):
             ignore = target.ignore.to(like.device)
-            ignored_xyxy, wanted_xyxy = target.boxes_xyxy.to(like)[ignore], target.boxes_xyxy.to(like)[~ignore]
+            # Regions are named once for each class.
+            ignored_xyxy = torch.unique(target.boxes_xyxy.to(like)[ignore], dim=0)
+            wanted_xyxy = target.boxes_xyxy.to(like)[~ignore]
             if len(ignored_xyxy):
                 negative[b] = ~(_covered(anchors_xyxy, ignored_xyxy) | _covered(raw.boxes_xyxy[b], ignored_xyxy))
-            taken = torch.zeros(len(anchors_xyxy), dtype=torch.bool, device=like.device)
-            for box, overlap in zip(wanted_xyxy, boxes.iou_matrix(wanted_xyxy, anchors_xyxy), strict=True):
-                fit = overlap.masked_fill(taken, 0)
-                if float(fit.max()) <= 0:
-                    distance = (_centred(box) - anchors_cxcywh).square().sum(-1)
-                    fit = -distance.masked_fill(taken, torch.inf)
-                best = int(fit.argmax())
-                taken[best] = True
-                image.append(b)
-                anchor.append(best)
+            anchor += _distribute(wanted_xyxy, anchors_cxcywh, anchors_xyxy)
+            image += [b] * len(wanted_xyxy)
             true_boxes.append(wanted_xyxy)
             meets = boxes.iou_matrix(wanted_xyxy, raw.boxes_xyxy[b]) >= MEETING_IOU
             meeting.append(raw.confidence_logits[b].expand_as(meets).masked_fill(~meets, -torch.inf).max(1))
@@ -275,13 +311,15 @@ class SqueezeDet(Detector):
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:
         """Score = confidence x class probability; the 64 best, NMS at 0.4 in each class, score >= 0.005."""
-        probability, labels = torch.softmax(raw.class_logits, -1).max(-1)
-        scores = torch.sigmoid(raw.confidence_logits) * probability
         found = []
-        for boxes_xyxy, label, score in zip(raw.boxes_xyxy, labels, scores, strict=True):
+        for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
+            # No score exceeds its confidence, and few of the anchors have any.
+            (likely,) = torch.nonzero(confidence >= SCORE_MINIMUM, as_tuple=True)
+            probability, label = torch.softmax(raw.class_logits[b, likely], -1).max(-1)
+            score = confidence[likely] * probability
             top = torch.sort(score, descending=True, stable=True).indices[:TOP_DETECTIONS]
             top = top[score[top] >= SCORE_MINIMUM]
-            clipped = boxes.clip(boxes_xyxy[top], *raw.image_hw)
+            clipped = boxes.clip(raw.boxes_xyxy[b, likely[top]], *raw.image_hw)
             keep = boxes.nms(clipped, score[top], NMS_IOU, label[top])
             found.append(Detections(clipped[keep], label[top][keep], score[top][keep]))
         return found
@@ -291,7 +329,7 @@ class SqueezeDet(Detector):
         batch, _, rows, columns = output.shape
         count, classes = len(ANCHOR_SIZES_WH), len(self.classes)
         cells = output.permute(0, 2, 3, 1)
-        if cells.dtype == torch.bfloat16:  # under autocast; boxes need more than its 8 bits
+        if cells.dtype in (torch.bfloat16, torch.float16):  # boxes need more than their 8 or 11 bits
             cells = cells.float()
         class_logits, confidence, deltas = cells.split((count * classes, count, count * 4), -1)
         anchors = _anchors(rows, columns, cells.dtype, cells.device)
@@ -323,6 +361,11 @@ def _anchors(rows: int, columns: int, dtype: torch.dtype, device: torch.device) 
     return torch.cat((centres[:, :, None].expand(shape), sizes.expand(shape)), -1).reshape(-1, 4)
 
 
+@lru_cache(maxsize=16)
+def _anchor_corners(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return _corners(_anchors(rows, columns, dtype, device))
+
+
 def _corners(boxes_cxcywh: Tensor) -> Tensor:
     half = boxes_cxcywh[..., 2:] / 2
     return torch.cat((boxes_cxcywh[..., :2] - half, boxes_cxcywh[..., :2] + half), -1)
@@ -333,9 +376,28 @@ def _centred(boxes_xyxy: Tensor) -> Tensor:
     return torch.cat(((top_left + bottom_right) / 2, bottom_right - top_left), -1)
 
 
+def _distribute(wanted_xyxy: Tensor, anchors_cxcywh: Tensor, anchors_xyxy: Tensor) -> list[int]:
+    """An anchor for each box (N, 4): the best that is not taken yet, the nearest where none overlaps."""
+    if not len(wanted_xyxy):
+        return []
+    overlaps = boxes.iou_matrix(wanted_xyxy, anchors_xyxy)
+    highest, best = overlaps.max(1)
+    taken: list[int] = []
+    for row, (value, index) in enumerate(zip(highest.tolist(), best.tolist(), strict=True)):
+        if value <= 0 or index in taken:
+            fit = overlaps[row].index_fill(0, best.new_tensor(taken), 0)
+            if float(fit.max()) <= 0:
+                distance = (_centred(wanted_xyxy[row]) - anchors_cxcywh).square().sum(-1)
+                fit = -distance.index_fill(0, best.new_tensor(taken), torch.inf)
+            index = int(fit.argmax())
+        taken.append(index)
+    return taken
+
+
 def _covered(candidates_xyxy: Tensor, ignored_xyxy: Tensor) -> Tensor:
-    shared = boxes.iou_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP
-    return (shared | (boxes.ioa_matrix(candidates_xyxy, ignored_xyxy) > IGNORE_OVERLAP)).any(1)
+    """Candidates (N,) of which an ignored box covers more than IGNORE_OVERLAP. No IoU exceeds that share."""
+    shared = boxes.intersection_matrix(ignored_xyxy, candidates_xyxy)
+    return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
 
 
 def _safe_exp(x: Tensor) -> Tensor:

@@ -89,7 +89,8 @@ class _Worker:
     def __post_init__(self) -> None:
         self.source: SceneSource = open_source(self.config)
         try:
-            self.detector: Detector = load_detector(self.config.detector, self.config.device)
+            precision = None if self.config.precision == "float32" else getattr(torch, self.config.precision)
+            self.detector: Detector = load_detector(self.config.detector, self.config.device, precision)
         except DetectorError as error:
             raise UsageError("--detector", "a detector", error) from error
 

@@ -10,7 +10,17 @@ from collections.abc import Sequence
 
 import tyro
 
-from drivesem.config import COMMANDS, Attack, Common, Synth, UsageError, validate, yaml_arguments
+from drivesem.config import (
+    COMMANDS,
+    Attack,
+    Bench,
+    Common,
+    Gradcheck,
+    Synth,
+    UsageError,
+    validate,
+    yaml_arguments,
+)
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
 _EXIT_BAD_INPUT = 2
@@ -66,7 +76,7 @@ def _unboxed(text: str) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
         return _run(config)
@@ -102,6 +112,14 @@ def _run(config: Common) -> int:
         from drivesem.synth import command
 
         return command.run(config)
+    if isinstance(config, Bench):
+        from drivesem.bench import command as bench_command
+
+        return bench_command.run(config)
+    if isinstance(config, Gradcheck):
+        from drivesem import gradcheck
+
+        return gradcheck.run(config)
     raise UsageError("command", ", ".join(COMMANDS), type(config).__name__)
 
 

@@ -79,6 +79,8 @@ class Attack(Common):
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,53 @@ class Synth(Common):
     """Pools of vehicle shapes and surroundings; the two share nothing."""
 
 
-COMMANDS: dict[str, type[Common]] = {"attack": Attack, "synth": Synth}
+@dataclass(frozen=True)
+class Bench(Common):
+    """Measure speed and memory: one attack step, the renderer, or peak memory."""
+
+    what: tyro.conf.Positional[Literal["step", "render", "memory"]] = "step"
+    """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
+    memory above the detector's own."""
+    quick: Flag = False
+    """Fewer repetitions: some 50 s."""
+    cars: str = "1,4,8,16"
+    """How many cars, 1 to 16, with commas."""
+    triangles: str = "2000,5000"
+    """Triangles a car, with commas."""
+    threads: int | None = None
+    """Threads of torch and of the kernels; by default as many as torch chooses."""
+    detector: str = "squeezedet"
+    """Name of a shipped detector, or a .safetensors file of one."""
+    markdown: str | None = None
+    """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
+
+
+@dataclass(frozen=True)
+class Gradcheck(Common):
+    """Compare gradients with central differences; exit code 1 where they disagree. One scene without --limit."""
+
+    dataset: str = "demo"
+    """demo (generated scenes, needs no data) or kitti."""
+    root: str | None = None
+    """Folder of the data set: KITTI's folder with training/image_2, label_2 and calib."""
+    detector: str = "squeezedet"
+    """Name of a shipped detector, or a .safetensors file of one."""
+    directions: int = 2
+    """Random directions of each parameter along which differences are taken; each costs six renders a point."""
+    min_cosine: float = 0.99
+    """Least cosine between gradient and differences."""
+    max_error: float = 0.05
+    """Largest relative error of the gradient."""
+    fit: bool = True
+    """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+
+
+COMMANDS: dict[str, type[Common]] = {
+    "attack": Attack,
+    "synth": Synth,
+    "bench": Bench,
+    "gradcheck": Gradcheck,
+}
 
 
 def processes(config: Common) -> int:
@@ -107,21 +155,47 @@ def validate(config: Common) -> None:
         raise UsageError("--workers", "at least 1", config.workers)
     if config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)
-    if isinstance(config, Attack):
-        if config.steps < 1:
-            raise UsageError("--steps", "at least 1", config.steps)
-        if config.combo is not None and config.combo not in COMBO_NUMBERS:
-            raise UsageError("--combo", "1, 2, 3 or 4", config.combo)
-        if config.combo is not None and config.params is not None:
-            raise UsageError("--params", "no --combo beside it", f"--combo {config.combo}")
+    if isinstance(config, Attack | Gradcheck):
         if config.dataset != "demo" and config.root is None:
             raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
         if config.dataset == "demo" and config.root is not None:
             raise UsageError(
                 "--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root
             )
+    if isinstance(config, Gradcheck):
+        if config.directions < 1:
+            raise UsageError("--directions", "at least 1", config.directions)
+        if not -1 <= config.min_cosine <= 1:
+            raise UsageError("--min-cosine", "a number in [-1, 1]", config.min_cosine)
+        if not config.max_error > 0:
+            raise UsageError("--max-error", "a positive number", config.max_error)
+    if isinstance(config, Attack):
+        if config.steps < 1:
+            raise UsageError("--steps", "at least 1", config.steps)
+        if config.precision == "float16" and config.device.startswith("cpu"):
+            raise UsageError("--precision", "float32 or bfloat16 on a CPU", config.precision)
+        if config.combo is not None and config.combo not in COMBO_NUMBERS:
+            raise UsageError("--combo", "1, 2, 3 or 4", config.combo)
+        if config.combo is not None and config.params is not None:
+            raise UsageError("--params", "no --combo beside it", f"--combo {config.combo}")
     if isinstance(config, Synth) and config.frames < 1:
         raise UsageError("--frames", "at least 1", config.frames)
+    if isinstance(config, Bench):
+        numbers("--cars", config.cars)
+        numbers("--triangles", config.triangles, least=4)
+        if config.threads is not None and config.threads < 1:
+            raise UsageError("--threads", "at least 1", config.threads)
+
+
+def numbers(setting: str, text: str, least: int = 1) -> list[int]:
+    """The whole numbers of "1,4,8", each once, in order. Raises UsageError naming the setting."""
+    try:
+        found = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        found = []
+    if not found or found[0] < least:
+        raise UsageError(setting, f"numbers of at least {least}, with commas", repr(text))
+    return found
 
 
 def yaml_arguments(path: str, command: type[Common]) -> list[str]:

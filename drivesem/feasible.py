@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from drivesem.space import Parameter, ParameterSpace
+from drivesem.space import Parameter, ParameterSpace, ground_axes
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.types import LATTICE, LATTICE_POINTS, Mesh, SceneIR
@@ -29,6 +29,9 @@ from scene_ir.types import LATTICE, LATTICE_POINTS, Mesh, SceneIR
 Array = NDArray[np.float64]
 Values = NDArray[np.floating[Any]]
 """Of theta's own dtype, float32 or float64."""
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Turns = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,48 +73,109 @@ _STRAIN_GRID = (5, 5, 5)
 """Points of the unit box at which the strain is bounded; the independent check uses a finer grid."""
 _SURFACE_POINTS = 160
 """At most this many mesh vertices, besides the convex hull's, carry a car's extents."""
+_SLICE = LATTICE[1] * LATTICE[2]
+"""Lattice points in a slice across the length."""
+_NEAR_M = 0.1
+"""Points nearer to the camera plane are projected as if they lay there."""
+
+
+@dataclass(slots=True)
+class _Cars:
+    """N cars as they stand, changed in place. low, high (N, 3) m: bounds of the deformed car in its own frame;
+    turn (N,): cos(yaw) + i sin(yaw); translation (N, 3) m. Found by `_Street.see`: box (N, 4) px, clipped;
+    near, far (N,) m: least and largest distance of the bounds from the camera plane.
+    """
+
+    low: Array
+    high: Array
+    turn: Turns
+    translation: Array
+    box: Array
+    near: Array
+    far: Array
+
+    @classmethod
+    def of(cls, low: Array, high: Array, yaw: Array, translation: Array) -> _Cars:
+        n = len(yaw)
+        return cls(low, high, _turn(yaw), translation, np.zeros((n, 4)), np.zeros(n), np.zeros(n))
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
-    """What the constraints look at, for N cars. road: share of the footprint on the road map; gap, overlap (N, N):
-    signed separation of footprints in m and their shared area in m2; box: (N, 4) px, clipped; in_frame,
-    visible_height (px), visible_area (share), near (m): (N,); covers (N, N): car j hides a part of car i.
+class _Sight:
+    """What is seen of some cars. rows (R,): which; height (R,) px visible; area (R,): visible share;
+    covers (R, N): car j hides a part of the car.
     """
 
-    road: Array
-    gap: Array
-    overlap: Array
-    box: Array
+    rows: Indices
+    height: Array
+    area: Array
+    covers: Flags
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """How the M cars `rows` lie in the picture. in_frame (M,): share of the image box inside; size (M, 2) px of
+    the clipped box; near (M,) m; corner (M, 3), edges (M, 3, 2): of the footprint, in clip space.
+    """
+
+    rows: Indices
     in_frame: Array
-    visible_height: Array
-    visible_area: Array
+    size: Array
     near: Array
-    covers: NDArray[np.bool_]
+    corner: Array
+    edges: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Violations among N cars. road, frame, hidden (N,); collide, covers (N, N): car j hides a part of car i."""
+
+    road: Flags
+    frame: Flags
+    hidden: Flags
+    collide: Flags
+    covers: Flags
+
+    def cars(self) -> Flags:
+        """Cars (N,) that take part in any violation."""
+        alone = self.road | self.frame | self.hidden
+        return alone | np.logical_or.reduce(self.collide, axis=1) | _coverers(self.covers, self.hidden)
+
+    def names(self) -> list[str]:
+        """`objects[3]: collision` and the like, of all that is violated."""
+        named = {
+            "road": self.road,
+            "frame": self.frame,
+            "visibility": self.hidden,
+            "collision": self.collide.any(axis=1),
+        }
+        return [f"objects[{i}]: {name}" for name, cars in named.items() for i in np.flatnonzero(cars)]
 
 
 class FeasibleSet:
-    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a few milliseconds."""
+    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond."""
 
     def __init__(self, space: ParameterSpace, limits: Limits | None = None) -> None:
         self.space = space
         self.limits = limits or Limits()
-        scene, objects = space.scene, space.scene.objects
+        objects = space.scene.objects
         self._lower = _array(space.lower)
         self._upper = _array(space.upper)
+        if space.count == 0:
+            return
         self._translation = _array(objects.translation)
         self._yaw = _array(objects.yaw)
-        self._size = _array(objects.size_lhw)
-        self._ffd = _array(objects.ffd)
-        self._matrix = _array(scene.camera.matrix)
-        self._inverse = np.linalg.inv(self._matrix[:, :3])
-        self._centre = -self._inverse @ self._matrix[:, 3]
-        self._ground = _array(scene.environment.ground)
-        self._road = _array(scene.environment.road)
-        self._image = (scene.camera.width, scene.camera.height)
-        self._surfaces = [_surface(scene.meshes[index]) for index in objects.mesh_index.tolist()]
-        self._strain = _StrainBound(self._ffd, self.limits.strain)
-        self._start = self._state(np.zeros(space.dim)) if space.count else None
+        ground = space.scene.environment.ground.detach().cpu().double()
+        length_m = objects.size_lhw[:, 0].detach().cpu().double()
+        # (N, 2, 3): what one own length along and one across move.
+        self._shift = _array(ground_axes(objects.yaw.detach().cpu().double(), length_m, ground))
+        self._surface = _Surface(space.scene)
+        self._strain = _StrainBound(self._surface.offsets, self.limits.strain)
+        self._street = _Street(space.scene)
+        low, high = _extents(self._surface.rest)
+        cars = _Cars.of(low, high, self._yaw, self._translation)
+        self._everyone = np.arange(space.count)
+        self._bounds = _Bounds.around(self._street, cars, self.limits)
 
     def project(self, theta: Tensor) -> Projected:
         """The nearest feasible theta (D,) we can find; `theta` itself where it is feasible.
@@ -121,277 +185,231 @@ class FeasibleSet:
         each as far as all constraints allow. Raises ShapeError; RangeError naming a coordinate that is not finite.
         """
         self.space.unflatten(theta)
-        bad = (~torch.isfinite(theta)).nonzero()
-        if len(bad):
-            i = int(bad[0])
-            raise RangeError(f"theta: {self.space.name(i)}", "a finite value", float(theta[i]))
         values = theta.detach().cpu().numpy()
+        finite = np.isfinite(values)
+        if not finite.all():
+            i = int(np.flatnonzero(~finite)[0])
+            raise RangeError(f"theta: {self.space.name(i)}", "a finite value", float(values[i]))
         result, active = self._project(values)
         # theta0 and the like carry the dtype and device of the scene.
-        return Projected(torch.from_numpy(result.copy()).to(theta), tuple(active))
+        return Projected(torch.from_numpy(result).to(theta), tuple(active))
 
     def violations(self, theta: Tensor) -> tuple[str, ...]:
         """What theta (D,) violates, as `objects[3]: collision`; empty where it is feasible."""
         values = theta.detach().cpu().numpy()
-        found = [f"{self.space.name(int(i))}: bounds" for i in np.flatnonzero(self._box(values) != values)]
+        found = self._out_of_bounds(values, self._box(values))
         if self.space.count == 0:
             return tuple(found)
-        mesh = self._mesh(values)
+        mesh = self._block(values, Parameter.MESH)
         if mesh is not None:
             found += [f"objects[{i}]: lowest layer" for i in np.flatnonzero((_lowest(mesh) != 0).any(axis=(1, 2)))]
-            found += [f"objects[{i}]: strain" for i in np.flatnonzero(~self._strain.holds(_offsets(mesh)))]
-        return tuple(found + self._named(self._violated(self._state(values))))
+            wrong = self._strained(self._strain.change(mesh))
+            found += [f"objects[{i}]: strain" for i in np.flatnonzero(wrong)]
+        surface = None if mesh is None else self._surface.deformed(mesh)
+        return tuple(found + self._examine(self._cars(values, surface)).names())
 
     def _project(self, values: Values) -> tuple[Values, list[str]]:
-        active: list[str] = []
         boxed = self._box(values)
-        active += [f"{self.space.name(int(i))}: bounds" for i in np.flatnonzero(boxed != values)]
+        active = self._out_of_bounds(values, boxed)
         if self.space.count == 0:
             return boxed, active
-        mesh = self._mesh(boxed)
+        mesh, surface = self._block(boxed, Parameter.MESH), None
         if mesh is not None:
             _lowest(mesh)[:] = 0
-            scaled = self._bound_strain(mesh)
-            active += [f"objects[{i}]: strain" for i in np.flatnonzero(scaled)]
-        violated = self._violated(self._state(boxed))
-        if not _any(violated):
-            return boxed, active
-        active += self._named(violated)
-        return self._back_off(boxed, _cars(violated)), active
+            active += [f"objects[{i}]: strain" for i in np.flatnonzero(self._bound_strain(mesh))]
+            surface = self._surface.deformed(mesh)
+        cars = self._cars(boxed, surface)
+        found = self._examine(cars)
+        offenders = found.cars()
+        if offenders.any():
+            active += found.names()
+            self._back_off(cars, boxed, surface, offenders)
+        return boxed, active
 
     def _box(self, values: Values) -> Values:
-        return np.clip(values, self._lower, self._upper).astype(values.dtype)
+        return np.minimum(np.maximum(values, self._lower), self._upper).astype(values.dtype)
+
+    def _out_of_bounds(self, values: Values, boxed: Values) -> list[str]:
+        return [f"{self.space.name(int(i))}: bounds" for i in np.flatnonzero(boxed != values)]
 
     def _block(self, values: Values, parameter: Parameter) -> Values | None:
         """theta's block of one parameter of cars, (N, size), a view; None where it is held."""
         where = self.space.slice_of(parameter)
         return None if where is None else values[where].reshape(self.space.count, -1)
 
-    def _mesh(self, values: Values) -> Values | None:
-        return self._block(values, Parameter.MESH)
-
-    def _bound_strain(self, mesh: Values) -> NDArray[np.bool_]:
+    def _bound_strain(self, mesh: Values) -> Flags:
         """Scale each car's mesh offsets (N, 96) back, in place, until its strain holds; returns who was scaled."""
-        wrong = ~self._strain.holds(_offsets(mesh))
+        change, full = self._strain.change(mesh), np.ones(len(mesh))
+        wrong = self._strained(change)
         if not wrong.any():
             return wrong
-        full = mesh.copy()
-        low, high = np.zeros(len(mesh)), np.ones(len(mesh))
+        path = self._strain.path(change, wrong, 0.5 * _TOLERANCE)
+        low, high = np.zeros_like(full), full
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            trial = (full * middle[:, None]).astype(mesh.dtype)
-            good = self._strain.holds(_offsets(trial))
+            good = ~path.wrong_at(middle)
             low, high = np.where(good, middle, low), np.where(good, high, middle)
-        mesh[wrong] = (full * low[:, None]).astype(mesh.dtype)[wrong]
+        mesh[wrong] = (mesh * low[:, None]).astype(mesh.dtype)[wrong]
         return wrong
 
-    def _back_off(self, wanted: Values, offenders: NDArray[np.bool_]) -> Values:
-        """Feasible values: offenders go back to 0 and take each block up again as far as everything allows.
+    def _strained(self, change: Array) -> Flags:
+        """Whose strain (N,) a change (N, 10, P) of it does not keep."""
+        everyone = np.ones(self.space.count)
+        return self._strain.path(change, everyone > 0).wrong_at(everyone)
 
-        Where an offender at 0 is still hit by a car that moved, that car is an offender too.
-        """
-        blocks = [p for p in _BLOCKS if self.space.slice_of(p) is not None]
-        while True:
-            current = wanted.copy()
-            for parameter in blocks:
-                block = self._block(current, parameter)
-                assert block is not None
-                block[offenders] = 0
-            hit = _cars(self._violated(self._state(current)))
-            if not hit.any():
-                break
-            if not (hit & ~offenders).any():
-                raise AssertionError("theta = 0 is feasible")
-            offenders = offenders | hit
-        for parameter in blocks:
-            self._take_up(current, wanted, parameter, offenders)
-        return current
-
-    def _take_up(
-        self, current: Values, wanted: Values, parameter: Parameter, offenders: NDArray[np.bool_]
-    ) -> None:
-        """Bring the offenders' block of `parameter` from 0 towards `wanted`, in place, feasible throughout."""
-        block, goal = self._block(current, parameter), self._block(wanted, parameter)
-        assert block is not None
-        assert goal is not None
-        # A kerb stops a car across its heading, not along: the two are found one after the other.
-        columns = [slice(0, 1), slice(1, 2)] if parameter is Parameter.TRANSLATE else [slice(None)]
-        moves_mesh = parameter is Parameter.MESH
-        extents = None if moves_mesh else self._extents(current)
-        for column in columns:
-
-            def wrong_at(scale: Array, column: slice = column) -> NDArray[np.bool_]:
-                scaled = (goal[:, column] * scale[:, None]).astype(block.dtype)
-                block[offenders, column] = scaled[offenders]
-                wrong = _cars(self._violated(self._state(current, extents)))
-                if moves_mesh:  # the feasible scales of a strain need not be an interval
-                    wrong |= ~self._strain.holds(_offsets(block))
-                return wrong & offenders
-
-            _largest_scales(wrong_at, len(offenders))
-
-    def _state(self, values: Values, extents: tuple[Array, Array] | None = None) -> _State:
-        """What the constraints look at; `extents` where they are known already."""
-        translate = self._block(values, Parameter.TRANSLATE)
-        rotate = self._block(values, Parameter.ROTATE)
+    def _cars(self, values: Values, surface: Array | None) -> _Cars:
+        """The cars at theta; `surface`: their deformed points, None where they are as photographed."""
+        rotate, translate = self._block(values, Parameter.ROTATE), self._block(values, Parameter.TRANSLATE)
+        low, high = _extents(self._surface.rest if surface is None else surface)
         yaw = self._yaw if rotate is None else self._yaw + rotate[:, 0]
-        translation = self._translation
-        if translate is not None:
-            metres = translate * self._size[:, :1]
-            cos, sin = np.cos(self._yaw), np.sin(self._yaw)
-            x, z = metres[:, 0] * cos + metres[:, 1] * sin, metres[:, 1] * cos - metres[:, 0] * sin
-            y = -(self._ground[0] * x + self._ground[2] * z) / self._ground[1]
-            translation = translation + np.stack([x, y, z], axis=-1)
-        low, high = extents or self._extents(values)
-        return self._measure(low, high, yaw, translation)
+        translation = self._translation if translate is None else self._moved(translate, slice(None))
+        return _Cars.of(low, high, yaw, translation.copy())
 
-    def _extents(self, values: Values) -> tuple[Array, Array]:
-        """Bounds (N, 3), (N, 3) m of the deformed cars in their own frames."""
-        mesh = self._mesh(values)
-        offsets = self._ffd if mesh is None else self._ffd + _offsets(mesh)
-        bounds = []
-        for (unit, weights), offset, size in zip(self._surfaces, offsets, self._size, strict=True):
-            deformed = (unit + weights @ offset) * size
-            bounds.append((deformed.min(axis=0), deformed.max(axis=0)))
-        return np.stack([b[0] for b in bounds]), np.stack([b[1] for b in bounds])
+    def _moved(self, translate: Values, rows: Indices | slice) -> Array:
+        """Where cars `rows` are (M, 3) m, moved by own lengths (M, 2)."""
+        shift = self._shift[rows]
+        return self._translation[rows] + translate[:, :1] * shift[:, 0] + translate[:, 1:] * shift[:, 1]
 
-    def _measure(self, low: Array, high: Array, yaw: Array, translation: Array) -> _State:
-        cos, sin = np.cos(yaw), np.sin(yaw)
-
-        zero, one = np.zeros_like(cos), np.ones_like(cos)
-        # Rows: where the car's length, height and width point in camera space.
-        axes = np.stack([cos, zero, -sin, zero, one, zero, sin, zero, cos], axis=-1).reshape(-1, 3, 3)
-
-        def to_camera(local: Array) -> Array:
-            """Points (N, P, 3) m of the cars' frames to camera space."""
-            return local @ axes + translation[:, None]
-
-        corners = to_camera(low[:, None] + _CORNERS * (high - low)[:, None])
-        footprint = corners[:, :4][:, :, [0, 2]]
-        gap, overlap = _separation(footprint, cos, sin)
-        grid = low[:, None] + _FOOTPRINT * (high - low)[:, None]
-        grid[..., 1] = 0
-        box, clipped, near = self._image_boxes(corners)
-        in_frame = _box_area(clipped) / np.maximum(_box_area(box), 1e-9)
-        enter = self._first_hits(clipped, axes, low, high, translation)
-        covers, height, area = _visible(enter, _RAY_ROWS)
-        return _State(
-            road=self._road_share(to_camera(grid)),
-            gap=gap,
-            overlap=overlap,
-            box=clipped,
-            in_frame=in_frame,
-            visible_height=height * _box_size(clipped)[:, 1],
-            visible_area=area,
-            near=near,
-            covers=covers,
+    def _examine(self, cars: _Cars) -> _Found:
+        """All that the cars violate."""
+        street, bounds = self._street, self._bounds
+        view = street.view(cars, self._everyone)
+        sight = street.sight(cars, self._everyone)
+        return _Found(
+            road=bounds.off_road(street.road_share(view.corner, view.edges), self._everyone),
+            frame=bounds.out_of_frame(view),
+            hidden=bounds.hidden(sight),
+            collide=bounds.collide(cars, self._everyone),
+            covers=sight.covers,
         )
 
-    def _image_boxes(self, corners: Array) -> tuple[Array, Array, Array]:
-        """Image boxes (N, 4) of box corners (N, 8, 3), as they are and clipped; least distance (N,) m."""
-        clip = corners @ self._matrix[:, :3].T + self._matrix[:, 3]
-        near = clip[..., 2].min(axis=1)
-        # A corner behind the camera lands far out on its own side: enough for a box that is clipped anyway.
-        pixels = clip[..., :2] / np.maximum(clip[..., 2:], 0.1)
-        box = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=-1)
-        width, height = self._image
-        limit = np.array([width - 1.0, height - 1.0, width - 1.0, height - 1.0])
-        return box, np.clip(box, 0, limit), near
+    def _wrong(self, cars: _Cars, moved: Indices, offenders: Flags) -> Flags:
+        """Which of the offenders (N,) take part in a violation, after some of them moved and none was before."""
+        street, bounds = self._street, self._bounds
+        view = street.view(cars, moved)
+        wrong = np.zeros(len(offenders), dtype=bool)
+        wrong[moved] = bounds.out_of_frame(view)
+        collide = bounds.collide(cars, moved)
+        wrong |= np.logical_or.reduce(collide, axis=0)
+        wrong[moved] |= np.logical_or.reduce(collide, axis=1)
+        # What is known to be wrong need not be looked at further, as long as it draws no other car in.
+        left = np.flatnonzero(~wrong[moved] & (bounds.road[moved] > 0))
+        if len(left):
+            road = street.road_share(view.corner[left], view.edges[left])
+            wrong[moved[left]] = bounds.off_road(road, moved[left])
+        if (wrong | ~offenders).all():
+            return wrong & offenders
+        sight = street.sight(cars, moved)
+        hidden = bounds.hidden(sight)
+        wrong[sight.rows[hidden]] = True
+        return (wrong | _coverers(sight.covers, hidden)) & offenders
 
-    def _first_hits(self, box: Array, axes: Array, low: Array, high: Array, translation: Array) -> Array:
-        """Distance (N, N, R) at which rays through a grid on image box i enter the box of car j; inf for a miss.
-
-        box (N, 4) px; axes (N, 3, 3): rows are the cars' axes in camera space; low, high (N, 3) m along them.
+    def _back_off(self, cars: _Cars, values: Values, surface: Array | None, offenders: Flags) -> None:
+        """Make values feasible, in place: offenders go back to 0 and take each block up again as far as everything
+        allows. Where an offender at 0 is still hit by a car that moved, that car is an offender too.
         """
-        size = _box_size(box)
-        rays = box[:, None, :2] + _RAYS * size[:, None]
-        count = len(box)
-        directions = np.concatenate([rays, np.ones((count, len(_RAYS), 1))], axis=-1) @ self._inverse.T
-        enter = np.full((count, count, len(_RAYS)), np.inf)
-        # Only a car whose image box meets box i can be in the way.
-        meets = (box[:, None, :2] <= box[None, :, 2:]).all(axis=2) & (box[None, :, :2] <= box[:, None, 2:]).all(
-            axis=2
-        )
-        i, j = np.nonzero(meets)
-        along = directions[i] @ axes[j].swapaxes(-1, -2)
-        along = np.where(np.abs(along) < 1e-12, 1e-12, along)
-        origin = ((self._centre - translation)[:, None] @ axes.swapaxes(-1, -2))[:, 0]
-        first = (low - origin)[j, None] / along
-        second = (high - origin)[j, None] / along
-        nearest = np.minimum(first, second).max(axis=-1)
-        furthest = np.maximum(first, second).min(axis=-1)
-        enter[i, j] = np.where((nearest <= furthest) & (furthest > 0), nearest, np.inf)
-        return enter
+        rest, everyone = self._surface.rest, np.ones_like(offenders)
+        while True:
+            rows = np.flatnonzero(offenders)
+            cars.low[rows], cars.high[rows] = _extents(rest[rows])
+            cars.turn[rows], cars.translation[rows] = _turn(self._yaw[rows]), self._translation[rows]
+            if offenders.all():
+                break
+            joined = offenders | self._wrong(cars, rows, everyone)
+            if joined.sum() == len(rows):
+                break
+            offenders = joined
+        if surface is not None:
+            self._take_up_mesh(cars, values, surface, offenders)
+        rotate, translate = self._block(values, Parameter.ROTATE), self._block(values, Parameter.TRANSLATE)
+        if rotate is not None:
 
-    def _road_share(self, points: Array) -> Array:
-        """Mean of the road map under points (N, P, 3) in the image; 1 where fewer than a quarter of them are."""
-        clip = points @ self._matrix[:, :3].T + self._matrix[:, 3]
-        depth = np.maximum(clip[..., 2], 0.1)
-        u, v = clip[..., 0] / depth, clip[..., 1] / depth
-        width, height = self._image
-        inside = (clip[..., 2] > 0.1) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-        u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
-        x0, y0 = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-        fx, fy = u - x0, v - y0
-        road = self._road
-        top = road[y0, x0] * (1 - fx) + road[y0, x0 + 1] * fx
-        bottom = road[y0 + 1, x0] * (1 - fx) + road[y0 + 1, x0 + 1] * fx
-        value = top * (1 - fy) + bottom * fy
-        count = inside.sum(axis=1)
-        share = (value * inside).sum(axis=1) / np.maximum(count, 1)
-        return np.where(count * 4 >= inside.shape[1], share, 1.0)
+            def turn(moved: Indices) -> None:
+                cars.turn[moved] = _turn(self._yaw[moved] + rotate[moved, 0])
 
-    def _violated(self, state: _State) -> dict[str, NDArray[np.bool_]]:
-        """Constraint -> (N, N) bool: on the diagonal what a car violates alone, else what a pair does."""
-        start, limits, slack = self._start, self.limits, _TOLERANCE
-        assert start is not None
-        size, size0 = _box_size(state.box), _box_size(start.box)
-        alone = {
-            "road": state.road < start.road - limits.road_loss - slack,
-            "frame": (state.in_frame < np.minimum(start.in_frame, limits.in_frame) - slack)
-            | (size < np.minimum(size0, limits.minimum_px) - slack).any(axis=1)
-            | (size[:, 1] < limits.height_kept * size0[:, 1] - slack)
-            | (state.near < np.minimum(start.near, limits.near_m) - slack),
-        }
-        hidden = (state.visible_height < limits.height_kept * start.visible_height - slack) | (
-            state.visible_area < np.minimum(start.visible_area, limits.area_kept) - slack
-        )
-        collide = (state.gap < np.minimum(start.gap, limits.clearance_m) - slack) | (
-            state.overlap > start.overlap + slack
-        )
-        np.fill_diagonal(collide, False)
-        pairs = {name: np.diag(flags) for name, flags in alone.items()}
-        pairs["visibility"] = np.diag(hidden) | (state.covers & hidden[:, None])
-        pairs["collision"] = collide
-        return pairs
+            self._take_up(cars, offenders, rotate, turn)
+        if translate is not None:
+            # A kerb stops a car across its heading, not along: the two are found one after the other.
+            for column in range(2):
+                start = cars.translation.copy()
 
-    @staticmethod
-    def _named(violated: dict[str, NDArray[np.bool_]]) -> list[str]:
-        return [
-            f"objects[{i}]: {name}" for name, pairs in violated.items() for i in np.flatnonzero(pairs.any(axis=1))
-        ]
+                def move(moved: Indices, start: Array = start, column: int = column) -> None:
+                    shift = self._shift[moved, column]
+                    cars.translation[moved] = start[moved] + translate[moved, column, None] * shift
+
+                self._take_up(cars, offenders, translate[:, column : column + 1], move)
+
+    def _take_up_mesh(self, cars: _Cars, values: Values, surface: Array, offenders: Flags) -> None:
+        """Bring the offenders' mesh up from 0 to what `values` hold, in place, as far as is feasible.
+
+        surface: the points (N, 3, K) at those values. Between, both they and the strain go along straight lines.
+        """
+        mesh = self._block(values, Parameter.MESH)
+        assert mesh is not None
+        goal, rest = mesh.copy(), self._surface.rest
+        path = self._strain.path(self._strain.change(mesh), offenders, 0.5 * _TOLERANCE)
+
+        def wrong_at(moved: Indices, scale: Array) -> Flags:
+            part = scale[moved, None, None]
+            cars.low[moved], cars.high[moved] = _extents(rest[moved] * (1 - part) + surface[moved] * part)
+            wrong = self._wrong(cars, moved, offenders)
+            # The feasible scales of a strain need not be an interval; at 1 it is known to hold.
+            return wrong | (path.wrong_at(scale) & (scale < 1) & offenders)
+
+        def settle(moved: Indices, scale: Array, known: bool) -> Flags:
+            del known  # theta's rounding, which the straight line leaves out, may tip what a ray sees
+            mesh[moved] = goal[moved] * scale[moved, None]
+            cars.low[moved], cars.high[moved] = _extents(self._surface.deformed(mesh[moved], moved))
+            return self._wrong(cars, moved, offenders)
+
+        if goal[offenders].any():
+            _largest_scales(wrong_at, settle, offenders)
+
+    def _take_up(self, cars: _Cars, offenders: Flags, block: Values, follow: Callable[[Indices], None]) -> None:
+        """Bring the offenders' columns `block` (N, k) up from 0 to what they hold, in place, while feasible.
+
+        follow: moves cars to where their block says.
+        """
+        goal = block.copy()
+
+        def wrong_at(moved: Indices, scale: Array) -> Flags:
+            return settle(moved, scale, False)
+
+        def settle(moved: Indices, scale: Array, known: bool) -> Flags:
+            block[moved] = goal[moved] * scale[moved, None]
+            follow(moved)
+            return np.zeros_like(offenders) if known else self._wrong(cars, moved, offenders)
+
+        if goal[offenders].any():
+            _largest_scales(wrong_at, settle, offenders)
 
 
-def _largest_scales(wrong_at: Callable[[Array], NDArray[np.bool_]], count: int) -> None:
-    """Bisect a scale in [0, 1] for each of `count` cars; the last call of `wrong_at` is with the scales found.
+def _largest_scales(
+    wrong_at: Callable[[Indices, Array], Flags], settle: Callable[[Indices, Array, bool], Flags], cars: Flags
+) -> None:
+    """Bisect a scale in [0, 1] for each of some cars (N,), and settle there.
 
-    `wrong_at` applies scales (count,) and says which cars (count,) they leave in a violation; none at 0.
+    wrong_at: takes cars, all that move since its last call, to their scales (N,) and says which cars (N,) are in a
+    violation then; at 0 none is. settle: the same, for good; it hears whether it is known that none is.
     """
-    full = np.ones(count)
-    search = wrong_at(full)
+    full = np.ones(len(cars))
+    search = wrong_at(np.flatnonzero(cars), full)
     if not search.any():
         return
-    low, high = np.zeros(count), np.ones(count)
+    low, high, good = np.zeros_like(full), full, [np.zeros_like(full)]
     for _ in range(_HALVINGS):
         scale = np.where(search, 0.5 * (low + high), full)
-        wrong = wrong_at(scale)
+        wrong = wrong_at(np.flatnonzero(search), scale)
         # A car that was well alone may clash with one that is coming up: it joins the search.
         search = search | wrong
         low = np.where(search & ~wrong, scale, low)
         high = np.where(wrong, np.minimum(high, scale), high)
+        if not wrong.any():
+            good.append(scale)
     scale = np.where(search, low, full)
+    moved, known = np.flatnonzero(search), any(np.array_equal(scale, well) for well in good)
     # Scales found side by side may clash together: the cars involved fall back to 0, which is known to be good.
-    while (wrong := wrong_at(scale) & (scale > 0)).any():
+    while (wrong := settle(moved, scale, known) & (scale > 0)).any():
         scale = np.where(wrong, 0.0, scale)
 
 
@@ -416,127 +434,378 @@ def _feasible_set(space: ParameterSpace, scene: SceneIR, limits: Limits | None) 
     return FeasibleSet(space, limits)
 
 
+class _Surface:
+    """The points of N cars' meshes that carry their extents, in m of the cars' own frames.
+
+    offsets (N, 64, 3): of the scene as photographed; rest (N, 3, K): where the points are then.
+    """
+
+    def __init__(self, scene: SceneIR) -> None:
+        chosen = {index: _surface_points(scene.meshes[index]) for index in set(scene.objects.mesh_index.tolist())}
+        most = max(len(points) for points in chosen.values())
+        units: dict[int, Array] = {}
+        along: dict[int, Array] = {}
+        across: dict[int, Array] = {}
+        for index, points in chosen.items():
+            # All as many as the most: the last point again changes no extents.
+            padded = np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
+            weights = ffd.lattice_weights(torch.from_numpy(padded)).numpy().reshape(most, LATTICE[0], _SLICE)
+            # Either factor of the weights sums to 1. Apart they take a third of the memory, and of the time.
+            units[index], along[index], across[index] = padded.T, weights.sum(axis=2).T, weights.sum(axis=1).T
+        owners = scene.objects.mesh_index.tolist()
+        # `stack` keeps the transposed order, with which the products take three times as long.
+        self._unit, self._along, self._across = (
+            np.ascontiguousarray(np.stack([part[i] for i in owners])) for part in (units, along, across)
+        )
+        self._size = _array(scene.objects.size_lhw)[:, :, None]
+        self.offsets = _array(scene.objects.ffd)
+        self.rest = self._bent(self.offsets, slice(None))
+
+    def deformed(self, mesh: Values, rows: Indices | slice = slice(None)) -> Array:
+        """The points (M, 3, K) m of cars `rows` under mesh codes (M, 96)."""
+        return self._bent(self.offsets[rows] + _offsets(mesh), rows)
+
+    def _bent(self, offsets: Array, rows: Indices | slice) -> Array:
+        slices = offsets.swapaxes(1, 2).reshape(len(offsets), -1, _SLICE) @ self._across[rows]
+        slices = slices.reshape(len(offsets), 3, LATTICE[0], -1)
+        moved = np.einsum("ncik,nik->nck", slices, self._along[rows])
+        return (self._unit[rows] + moved) * self._size[rows]
+
+
 class _StrainBound:
     """Bounds on the deformation of N cars: singular values, determinant of its Jacobian, nothing below y = 0.
 
-    A bound that a car violates at theta = 0 is widened to what it has there.
+    A bound that a car violates at theta = 0 is widened to what it has there. All is measured at P points of the
+    unit box.
     """
 
     def __init__(self, source: Array, strain: tuple[float, float]) -> None:
         axes = [np.linspace(0, 1, n) for n in _STRAIN_GRID]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) - [0.5, 1.0, 0.5]
-        unit = torch.from_numpy(grid)
-        self._y = grid[:, 1]
-        # The Jacobian and the height are linear in the offsets: two matrices instead of tensor expressions.
-        self._slopes = _jacobian_weights(unit)
-        self._weights = ffd.lattice_weights(unit).numpy()
-        self._source = source
-        slack = _TOLERANCE
-        if len(source):
-            smallest, largest, lowest = self._extremes(source)
-            self._low = np.minimum(strain[0], smallest) - slack
-            self._high = np.maximum(strain[1], largest) + slack
-            self._floor = np.maximum(0.0, lowest) + slack
-            inverted = _determinant(self._jacobian(source)) <= 0
-            self._inverted: NDArray[np.bool_] = np.logical_or.reduce(inverted, axis=1)
+        mirrored = source.reshape(-1, *LATTICE, 3)[:, :, :, ::-1] * [1.0, 1.0, -1.0]
+        if np.array_equal(mirrored.reshape(source.shape), source):
+            grid = grid[grid[:, 2] <= 0]  # codes are symmetric, so that left and right are strained alike
+        unit, start = torch.from_numpy(grid), torch.from_numpy(source)
+        # Jacobian and height are linear in the codes: one matrix (96, 10 P) instead of tensor expressions.
+        basis = ffd.from_symmetric(torch.eye(ffd.SYMMETRIC_DIM, dtype=torch.float64))
+        weights, rest = ffd.lattice_weights(unit), torch.eye(3, dtype=torch.float64)
+        self._linear = _jacobian_and_height(ffd.jacobian(unit, basis) - rest, (weights @ basis)[..., 1])
+        self._linear = self._linear.reshape(ffd.SYMMETRIC_DIM, -1)
+        jacobian, height = ffd.jacobian(unit, start), unit[:, 1] + (weights @ start)[..., 1]
+        self._start = _jacobian_and_height(jacobian, height)
+        values = np.linalg.svd(jacobian.numpy(), compute_uv=False)
+        self._smallest, largest = values.min(axis=2), values.max(axis=2)
+        self._low = np.minimum(strain[0], self._smallest.min(axis=1)) - _TOLERANCE
+        self._high = np.maximum(strain[1], largest.max(axis=1)) + _TOLERANCE
+        self._floor = np.maximum(0.0, height.numpy().max(axis=1)) + _TOLERANCE
+        # A Jacobian that changes by less, in Frobenius' norm, stays within the bounds (Weyl's inequality).
+        self._room = np.minimum(self._smallest - self._low[:, None], self._high[:, None] - largest)
+        self._inverted = (np.linalg.det(jacobian.numpy()) <= 0).any(axis=1)
 
-    def _jacobian(self, offsets: Array) -> Array:
-        """(N, G, 3, 3) of offsets (N, 64, 3)."""
-        n = len(offsets)
-        slopes = (self._slopes @ offsets).reshape(n, -1, 3, 3)
-        return np.eye(3) + slopes.swapaxes(-1, -2)
+    def change(self, mesh: Values) -> Array:
+        """By how much mesh codes (N, 96) change Jacobian and height: (N, 10, P)."""
+        return (mesh @ self._linear).reshape(len(mesh), 10, -1)
 
-    def _extremes(self, offsets: Array) -> tuple[Array, Array, Array]:
-        values = np.linalg.svd(self._jacobian(offsets), compute_uv=False)
-        height = self._y + (self._weights @ offsets)[..., 1]
-        return values.min(axis=(1, 2)), values.max(axis=(1, 2)), height.max(axis=1)
+    def path(self, change: Array, cars: Flags, slack: float = 0.0) -> _StrainPath:
+        """The way of `cars` (N,) from theta = 0 to a change (N, 10, P), the bounds tighter by `slack`."""
+        slopes = change[:, :9]
+        norm = np.sqrt(np.einsum("ncp,ncp->np", slopes, slopes))
+        owner, point = np.nonzero((norm >= self._room - slack) & cars[:, None])
+        low, high = self._low[owner] + slack, self._high[owner] - slack
+        # Only beyond the smallest singular value can a point turn inside out.
+        flips = (norm[owner, point] >= self._smallest[owner, point]) & ~self._inverted[owner]
+        return _StrainPath(
+            owner=owner,
+            start=self._start[owner, :9, point].T.copy(),
+            slope=slopes[owner, :, point].T.copy(),
+            bounds=np.stack([low * np.abs(low), high * high])[:, None],
+            flips=np.flatnonzero(flips),
+            height=self._start[:, 9],
+            rise=change[:, 9] * cars[:, None],
+            floor=self._floor - slack,
+        )
 
-    def holds(self, change: Array) -> NDArray[np.bool_]:
-        """Whether each car (N,) with offsets source + change (N, 64, 3) is within the bounds.
 
-        Singular values lie in [low, high] where J'J - low^2 and high^2 - J'J have no negative eigenvalue: leading
-        minors tell, at a tenth of the cost of a singular value decomposition.
+@dataclass(frozen=True, slots=True)
+class _StrainPath:
+    """The strain of N cars on the straight way from theta = 0 to a mesh code, at the K points in question.
+
+    owner (K,): their cars; start, slope (9, K): of the Jacobian; bounds (2, 1, K): least and greatest square of a
+    singular value; flips: points that might turn inside out; height, rise (N, P): of all points; floor (N,).
+    """
+
+    owner: Indices
+    start: Array
+    slope: Array
+    bounds: Array
+    flips: Indices
+    height: Array
+    rise: Array
+    floor: Array
+
+    def wrong_at(self, scale: Array) -> Flags:
+        """Which cars (N,) are out of bounds at scales (N,) of the way.
+
+        Singular values lie in [low, high] where J J' - low^2 is positive definite and J J' - high^2 negative
+        definite: leading minors tell (Sylvester), at a tenth of the cost of a singular value decomposition.
         """
-        offsets = self._source + change
-        jacobian = self._jacobian(offsets)
-        gram = jacobian.swapaxes(-1, -2) @ jacobian
-        eye = np.eye(3)
-        low = _positive(gram - self._low[:, None, None, None] ** 2 * eye)
-        high = _positive(self._high[:, None, None, None] ** 2 * eye - gram)
-        upright = (_determinant(jacobian) > 0) | self._inverted[:, None]
-        height = self._y + (self._weights @ offsets)[..., 1]
-        good = np.stack([low, high, upright]).all(axis=(0, 2))
-        return np.logical_and(good, height.max(axis=1) <= self._floor)
+        wrong: Flags = (self.height + scale[:, None] * self.rise).max(axis=1) > self.floor
+        jacobian = (self.start + scale[self.owner] * self.slope).reshape(3, 3, -1)
+        # Products of the rows: 0 0, 1 1, 2 2, and 0 1, 1 2, 2 0.
+        squares, (g01, g12, g20) = (jacobian**2).sum(axis=1), (jacobian * jacobian[[1, 2, 0]]).sum(axis=1)
+        left = squares - self.bounds
+        d0, d1, d2 = left[:, 0], left[:, 1], left[:, 2]
+        minor, other, mixed = d0 * d1 - g01 * g01, d0 * d2 - g20 * g20, d0 * g12 - g01 * g20
+        # The determinant, times d0, which has its sign where the matrix is definite.
+        last = minor * other - mixed * mixed
+        good = ((minor > 0) & (last > 0)).all(axis=0) & (d0[0] > 0) & (d0[1] < 0)
+        wrong[self.owner[~good]] = True
+        if len(self.flips):
+            flipped = np.linalg.det(jacobian[:, :, self.flips].transpose(2, 0, 1)) <= 0
+            wrong[self.owner[self.flips[flipped]]] = True
+        return wrong
 
 
-def _jacobian_weights(unit: Tensor) -> Array:
-    """(G * 3, 64): maps offsets (64, 3) to d deformation / d axis, rows (point, axis), columns the component."""
-    basis = torch.eye(LATTICE_POINTS, dtype=unit.dtype)
-    # One lattice point at a time moves along x: column x of the offsets, first row of the Jacobian.
-    offsets = torch.stack([basis, torch.zeros_like(basis), torch.zeros_like(basis)], dim=-1)
-    rows = ffd.jacobian(unit, offsets)[:, :, 0, :] - torch.tensor([1.0, 0.0, 0.0], dtype=unit.dtype)
-    return rows.permute(1, 2, 0).reshape(-1, LATTICE_POINTS).numpy()
-
-
-def _positive(matrix: Array) -> NDArray[np.bool_]:
-    """Whether symmetric 3x3 matrices are positive definite (Sylvester)."""
-    minor2 = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
-    return (matrix[..., 0, 0] > 0) & (minor2 > 0) & (_determinant(matrix) > 0)
-
-
-def _determinant(m: Array) -> Array:
-    return (
-        m[..., 0, 0] * (m[..., 1, 1] * m[..., 2, 2] - m[..., 1, 2] * m[..., 2, 1])
-        - m[..., 0, 1] * (m[..., 1, 0] * m[..., 2, 2] - m[..., 1, 2] * m[..., 2, 0])
-        + m[..., 0, 2] * (m[..., 1, 0] * m[..., 2, 1] - m[..., 1, 1] * m[..., 2, 0])
-    )
+def _jacobian_and_height(jacobian: Tensor, height: Tensor) -> Array:
+    """(N, 10, P) of (N, P, 3, 3) and (N, P)."""
+    parts = [jacobian.flatten(2), height[..., None]]
+    return np.ascontiguousarray(torch.cat(parts, dim=2).transpose(1, 2).numpy())
 
 
 _CORNERS = np.array(
     [[1, 1, 1], [1, 1, 0], [0, 1, 0], [0, 1, 1], [1, 0, 1], [1, 0, 0], [0, 0, 0], [0, 0, 1]], dtype=np.float64
+).T.copy()
+"""Corners (3, 8) of a box between its bounds; the first four run around the bottom."""
+
+
+def _cells(along: int, across: int) -> Array:
+    """Centres (2, along * across) of the cells of a unit square, `across` fastest."""
+    first, second = (np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across
+    return np.stack([a.reshape(-1) for a in np.meshgrid(first, second, indexing="ij")])
+
+
+_FOOTPRINT = _cells(*_FOOTPRINT_GRID)
+"""Points of a footprint (2, P) between a car's bounds, along and across."""
+_RAYS = _cells(_RAY_ROWS, _RAY_COLUMNS)[::-1].copy()
+"""Where in an image box its rays pass, (2, R), as shares of width and height, row by row."""
+
+
+class _Street:
+    """What stands still: camera and road; measures cars against it and against each other."""
+
+    def __init__(self, scene: SceneIR) -> None:
+        matrix = _array(scene.camera.matrix)
+        x, y, z = matrix[:, :3].T
+        zero = np.zeros(3)
+        # Clip-space directions of a car's axes, columns, are even + cos * by_cos + sin * by_sin.
+        self._even = np.stack([zero, y, zero], axis=1)
+        self._by_cos = np.stack([x, zero, z], axis=1)
+        self._by_sin = np.stack([-z, zero, x], axis=1)
+        self._matrix = matrix
+        self._inverse = np.linalg.inv(matrix[:, :3])
+        self._centre = -self._inverse @ matrix[:, 3]
+        self._road = _array(scene.environment.road).reshape(-1)
+        self._width = scene.camera.width
+        self._limit = np.array([scene.camera.width - 1.0, scene.camera.height - 1.0])
+
+    def view(self, cars: _Cars, rows: Indices) -> _View:
+        """The cars `rows` in the picture; brings their boxes and distances up to date."""
+        low, extent, turn = cars.low[rows], cars.high[rows] - cars.low[rows], cars.turn[rows]
+        axes = self._even + turn.real[:, None, None] * self._by_cos + turn.imag[:, None, None] * self._by_sin
+        base = cars.translation[rows] @ self._matrix[:, :3].T + self._matrix[:, 3]
+        ground = base + axes[:, :, 0] * low[:, :1] + axes[:, :, 2] * low[:, 2:]
+        edges = axes * extent[:, None]
+        corners = (ground + axes[:, :, 1] * low[:, 1:2])[:, :, None] + edges @ _CORNERS
+        depth = corners[:, 2]
+        near = depth.min(axis=1)
+        cars.near[rows], cars.far[rows] = near, depth.max(axis=1)
+        # A corner behind the camera lands far out on its own side: enough for a box that is clipped anyway.
+        pixels = corners[:, :2] / np.maximum(depth, _NEAR_M)[:, None]
+        first, last = pixels.min(axis=2), pixels.max(axis=2)
+        whole = last - first
+        first, last = (np.minimum(np.maximum(p, 0), self._limit) for p in (first, last))
+        size = last - first
+        cars.box[rows, :2], cars.box[rows, 2:] = first, last
+        in_frame = size[:, 0] * size[:, 1] / np.maximum(whole[:, 0] * whole[:, 1], 1e-9)
+        return _View(rows, in_frame, size, near, ground, edges[:, :, ::2])
+
+    def road_share(self, origin: Array, edges: Array) -> Array:
+        """Mean of the road map (M,) under footprints of corner (M, 3) and edges (M, 3, 2) in clip space; 1 where
+        fewer than a quarter of their points are in the image.
+        """
+        clip = origin[:, :, None] + edges @ _FOOTPRINT
+        depth = clip[:, 2]
+        exact = clip[:, :2] / np.maximum(depth, _NEAR_M)[:, None]
+        pixels = np.minimum(np.maximum(exact, 0), self._limit[:, None])
+        inside = (exact == pixels).all(axis=1) & (depth > _NEAR_M)
+        cell = np.minimum(pixels, self._limit[:, None] - 1).astype(np.int64)
+        across, down = (pixels - cell).swapaxes(0, 1)
+        index = cell[:, 1] * self._width + cell[:, 0]
+        top, bottom = self._road[index], self._road[index + self._width]
+        top = top + across * (self._road[index + 1] - top)
+        bottom = bottom + across * (self._road[index + self._width + 1] - bottom)
+        count = inside.sum(axis=1)
+        share = ((top + down * (bottom - top)) * inside).sum(axis=1) / np.maximum(count, 1)
+        return np.where(count * 4 >= inside.shape[1], share, 1.0)
+
+    def sight(self, cars: _Cars, rows: Indices) -> _Sight:
+        """What is seen of the cars `rows`, and of those that one of them may hide, by rays through their boxes."""
+        box, count = cars.box, len(cars.turn)
+        starts = (box[:, None, 0] <= box[:, 2]) & (box[:, None, 1] <= box[:, 3])
+        # Only a car whose image box meets box i, and that begins before car i ends, can be in the way.
+        near = starts & starts.T & (cars.near <= cars.far[:, None])
+        seen = np.flatnonzero(near[:, rows].any(axis=1))
+        i, j = np.nonzero(near[seen])
+        rays = np.empty((len(seen), 3, _RAYS.shape[1]))
+        rays[:, :2] = box[seen, :2, None] + _RAYS * (box[seen, 2:] - box[seen, :2])[:, :, None]
+        rays[:, 2] = 1
+        directions = self._inverse @ rays
+        enter = np.full((len(seen), count, _RAYS.shape[1]), np.inf)
+        enter[i, j] = _entered(cars, self._centre, directions[i], j)
+        own = enter[np.arange(len(seen)), seen]
+        met = np.isfinite(own)
+        before = enter < np.where(met, own, -np.inf)[:, None]
+        shown = met & ~before.any(axis=1)
+        rows_shown = shown.reshape(len(seen), _RAY_ROWS, _RAY_COLUMNS).any(axis=2).sum(axis=1)
+        return _Sight(
+            rows=seen,
+            height=rows_shown / _RAY_ROWS * (box[seen, 3] - box[seen, 1]),
+            area=shown.sum(axis=1) / np.maximum(met.sum(axis=1), 1),
+            covers=np.logical_or.reduce(before, axis=2),
+        )
+
+
+_AXES = np.array(
+    [[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, -1], [0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 1, 0], [0, 0, 0]]],
+    dtype=np.float64,
 )
-"""Corners of a box between its bounds; the first four run around the bottom."""
-_FOOTPRINT = np.stack(
-    np.meshgrid(
-        (np.arange(_FOOTPRINT_GRID[0]) + 0.5) / _FOOTPRINT_GRID[0],
-        [1.0],
-        (np.arange(_FOOTPRINT_GRID[1]) + 0.5) / _FOOTPRINT_GRID[1],
-        indexing="ij",
-    ),
-    axis=-1,
-).reshape(-1, 3)
-"""Points of a footprint (K, 3) between a car's bounds."""
-_RAYS = np.stack(
-    np.meshgrid(
-        (np.arange(_RAY_ROWS) + 0.5) / _RAY_ROWS, (np.arange(_RAY_COLUMNS) + 0.5) / _RAY_COLUMNS, indexing="ij"
-    )[::-1],
-    axis=-1,
-).reshape(-1, 2)
-"""Where in an image box its rays pass, (R, 2), as shares of width and height, row by row."""
+"""Rows: where a car's axes point in camera space, by the cosine of its yaw, by its sine, and always."""
 
 
-def _separation(footprint: Array, cos: Array, sin: Array) -> tuple[Array, Array]:
-    """Signed gap (N, N) m by separating axes (negative: depth of overlap) and shared area (N, N) m2.
+def _entered(cars: _Cars, centre: Array, directions: Array, j: Indices) -> Array:
+    """Distance (K, R) at which rays (K, 3, R) from `centre` enter the boxes of cars j (K,); inf for a miss."""
+    axes = cars.turn.real[:, None, None] * _AXES[0] + cars.turn.imag[:, None, None] * _AXES[1] + _AXES[2]
+    origin = (axes @ (centre - cars.translation)[:, :, None])[:, :, 0]
+    # The sum is the ray's own slope, unless that is 0.
+    slowness = 1 / (axes[j] @ directions + 1e-30)
+    one, other = (cars.low - origin)[j, :, None] * slowness, (cars.high - origin)[j, :, None] * slowness
+    nearest, furthest = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+    return np.where((nearest <= furthest) & (furthest > 0), nearest, np.inf)
 
-    footprint (N, 4, 2): corners (x, z) around the bottom. The diagonal means nothing.
+
+@dataclass(frozen=True, slots=True)
+class _Bounds:
+    """The least (and of `overlap`, the greatest) measures that are no violation, each with its slack.
+
+    road, in_frame, near, height, area (N,); size (N, 2) px; gap, overlap (N, N): never violated on the diagonal.
     """
-    n = len(footprint)
-    axes = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=1).reshape(-1, 2)
-    spans = footprint @ axes.T
-    low, high = spans.min(axis=1), spans.max(axis=1)
-    gaps = np.maximum(low[:, None] - high[None], low[None] - high[:, None])
-    # Only the two axes of either box separate a pair.
-    index = np.arange(n)
-    own = 2 * index[:, None]
-    best = np.maximum(gaps[index[:, None], index[None], own], gaps[index[:, None], index[None], own + 1])
-    gap = np.maximum(best, best.T)
-    area = np.zeros((n, n))
-    first, second = np.nonzero(np.triu(gap < 0, k=1))
-    if len(first):
-        shared = _shared_area(footprint[first], footprint[second])
-        area[first, second] = shared
-        area[second, first] = shared
-    return gap, area
+
+    road: Array
+    in_frame: Array
+    near: Array
+    height: Array
+    area: Array
+    size: Array
+    gap: Array
+    overlap: Array
+
+    @classmethod
+    def around(cls, street: _Street, cars: _Cars, limits: Limits) -> _Bounds:
+        """What is asked of cars that stand like this at theta = 0."""
+        everyone = np.arange(len(cars.turn))
+        view = street.view(cars, everyone)
+        road, sight = street.road_share(view.corner, view.edges), street.sight(cars, everyone)
+        size = np.minimum(view.size, limits.minimum_px)
+        size[:, 1] = np.maximum(size[:, 1], limits.height_kept * view.size[:, 1])
+        gap = _gap(cars, everyone)
+        overlap = np.zeros_like(gap)
+        i, j = np.nonzero(gap < 0)
+        overlap[i, j] = _overlap(cars, i, j)
+        gap = np.minimum(gap, limits.clearance_m)
+        np.fill_diagonal(gap, -np.inf)
+        np.fill_diagonal(overlap, np.inf)
+        return cls(
+            road=road - limits.road_loss - _TOLERANCE,
+            in_frame=np.minimum(view.in_frame, limits.in_frame) - _TOLERANCE,
+            near=np.minimum(view.near, limits.near_m) - _TOLERANCE,
+            height=limits.height_kept * sight.height - _TOLERANCE,
+            area=np.minimum(sight.area, limits.area_kept) - _TOLERANCE,
+            size=size - _TOLERANCE,
+            gap=gap - _TOLERANCE,
+            overlap=overlap + _TOLERANCE,
+        )
+
+    def off_road(self, share: Array, rows: Indices) -> Flags:
+        """(M,) of road shares (M,) of the cars `rows`."""
+        return share < self.road[rows]
+
+    def out_of_frame(self, view: _View) -> Flags:
+        """(M,): too far out of the picture, too small in it, or too near."""
+        rows = view.rows
+        small = view.size < self.size[rows]
+        return small[:, 0] | small[:, 1] | (view.in_frame < self.in_frame[rows]) | (view.near < self.near[rows])
+
+    def hidden(self, sight: _Sight) -> Flags:
+        """(R,): too much behind others."""
+        return (sight.height < self.height[sight.rows]) | (sight.area < self.area[sight.rows])
+
+    def collide(self, cars: _Cars, rows: Indices) -> Flags:
+        """(M, N): the cars `rows` with all others."""
+        gap = _gap(cars, rows)
+        collide = gap < self.gap[rows]
+        # No nearer than before, yet two that overlapped may overlap more.
+        m, j = np.nonzero((gap < 0) & ~collide & np.isfinite(self.overlap[rows]))
+        if len(m):
+            collide[m, j] = _overlap(cars, rows[m], j) > self.overlap[rows[m], j]
+        return collide
+
+
+def _coverers(covers: Flags, hidden: Flags) -> Flags:
+    """Cars (N,) that hide a part of one that is hidden (R,) too much. covers (R, N): car j hides a part of it."""
+    return np.logical_or.reduce(covers & hidden[:, None], axis=0)
+
+
+def _turn(yaw: Array) -> Turns:
+    """cos(yaw) + i sin(yaw): times x + i z it turns camera axes into a car's own, and its conjugate back."""
+    return np.cos(yaw) + 1j * np.sin(yaw)
+
+
+def _centres(cars: _Cars) -> Turns:
+    """Middles of the footprints, x + i z (N,) m."""
+    middle = 0.5 * (cars.low + cars.high)
+    place = cars.translation[:, 0] + 1j * cars.translation[:, 2]
+    return place + cars.turn.conj() * (middle[:, 0] + 1j * middle[:, 2])
+
+
+def _gap(cars: _Cars, rows: Indices) -> Array:
+    """Signed gap (M, N) m between the footprints of the cars `rows` and all, by separating axes; negative: depth
+    of overlap.
+    """
+    centre, turn = _centres(cars), cars.turn
+    half = 0.5 * (cars.high - cars.low)[:, ::2]
+    apart = centre[rows, None] - centre
+    # Along and across, (M, N, 2): the way between them in the frames of both, one's axes in the other's frame.
+    way = _parts(turn[rows, None] * apart)
+    way_there = _parts(turn * apart)
+    mixed = _parts(turn[rows, None] * turn.conj())
+    mixed_back = mixed[..., ::-1]
+    here = way - half[rows, None] - mixed * half[:, :1] - mixed_back * half[:, 1:]
+    there = way_there - half - mixed * half[rows, None, :1] - mixed_back * half[rows, None, 1:]
+    return np.maximum(here, there).max(axis=2)
+
+
+def _parts(numbers: Turns) -> Array:
+    """Absolute real and imaginary parts (..., 2)."""
+    return np.abs(numbers.view(np.float64).reshape(*numbers.shape, 2))
+
+
+def _overlap(cars: _Cars, i: Indices, j: Indices) -> Array:
+    """Area (K,) m2 that the footprints of the cars i and j (K,) share."""
+    half, centre = 0.5 * (cars.high - cars.low), _centres(cars)
+    corners = half[:, :1] * [1, 1, -1, -1] + 1j * half[:, 2:] * [1, -1, -1, 1]
+    corners = centre[:, None] + cars.turn.conj()[:, None] * corners
+    footprint = corners.view(np.float64).reshape(*corners.shape, 2)
+    return _shared_area(footprint[i], footprint[j])
 
 
 def _shared_area(a: Array, b: Array) -> Array:
@@ -562,63 +831,32 @@ def _inside_integral(a: Array, b: Array) -> Array:
     return (np.where(inside, leave - enter, 0.0) * cross).sum(axis=1)
 
 
-def _visible(enter: Array, rows: int) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Who hides whom. enter (N, N, R): distance at which ray r towards car i enters the box of car j, inf where it
-    misses; rays of car i in `rows` rows.
-
-    covers (N, N): car j hides a part of car i; height (N,): share of the rows in which car i shows; area (N,):
-    share of the rays that meet car i's box first, among those that meet it.
-    """
-    count = len(enter)
-    index = np.arange(count)
-    own = enter[index, index]
-    met = np.isfinite(own)
-    before = np.logical_and(enter < own[:, None], met[:, None])
-    before[index, index] = False
-    shown = met & ~before.any(axis=1)
-    height = shown.reshape(count, rows, -1).any(axis=2).mean(axis=1)
-    return np.logical_or.reduce(before, axis=2), height, shown.sum(axis=1) / np.maximum(met.sum(axis=1), 1)
-
-
-def _surface(mesh: Mesh) -> tuple[Array, Array]:
-    """Vertices (K, 3) of the unit box that carry the extents, and their lattice weights (K, 64)."""
+def _surface_points(mesh: Mesh) -> Array:
+    """Vertices (K, 3) of the unit box that carry the extents."""
     vertices = mesh.vertices.detach().cpu().double().numpy()
     try:
         chosen = set(ConvexHull(vertices).vertices.tolist())
     except QhullError:  # a flat mesh has no hull with a volume; its vertices do as well
         chosen = set()
     stride = max(1, -(-len(vertices) // _SURFACE_POINTS))
-    keep = np.array(sorted(chosen | set(range(0, len(vertices), stride))))
-    unit = vertices[keep]
-    return unit, ffd.lattice_weights(torch.from_numpy(unit)).numpy()
+    return vertices[sorted(chosen | set(range(0, len(vertices), stride)))]
+
+
+def _extents(surface: Array) -> tuple[Array, Array]:
+    """Bounds (N, 3), (N, 3) of points (N, 3, K)."""
+    return surface.min(axis=2), surface.max(axis=2)
 
 
 def _offsets(mesh: Values) -> Array:
-    """Lattice offsets (N, 64, 3) of symmetric codes (N, 96)."""
-    return ffd.from_symmetric(torch.from_numpy(np.ascontiguousarray(mesh)).double()).numpy()
+    """Lattice offsets (N, 64, 3) of symmetric codes (N, 96), as `ffd.from_symmetric`, without its detour."""
+    half = mesh.astype(np.float64).reshape(len(mesh), LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)
+    mirror = half[:, :, :, ::-1] * [1.0, 1.0, -1.0]
+    return np.concatenate([half, mirror], axis=3).reshape(len(mesh), LATTICE_POINTS, 3)
 
 
 def _lowest(mesh: Values) -> Values:
     """The vertical offsets (N, 4, 2) of the lowest lattice layer: a view into symmetric codes (N, 96)."""
     return mesh.reshape(len(mesh), LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)[:, :, -1, :, 1]
-
-
-def _box_size(box: Array) -> Array:
-    return np.maximum(box[:, 2:] - box[:, :2], 0)
-
-
-def _box_area(box: Array) -> Array:
-    return _box_size(box).prod(axis=1)
-
-
-def _any(violated: dict[str, NDArray[np.bool_]]) -> bool:
-    return any(pairs.any() for pairs in violated.values())
-
-
-def _cars(violated: dict[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Cars (N,) that take part in any violation."""
-    pairs: NDArray[np.bool_] = np.logical_or.reduce(np.stack(list(violated.values())), axis=0)
-    return np.logical_or.reduce(pairs | pairs.T, axis=0)
 
 
 def _array(tensor: Tensor) -> Array:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from detectors.base import Detector
+from detectors.base import Detector, RawPredictions
 from detectors.types import Detections
 from drivesem.attacks.base import Problem, Score
 from drivesem.evaluation import failures
 from drivesem.feasible import FeasibleSet
 from drivesem.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.space import ParameterSpace
-from scene_ir.compositor import Compositor
-from scene_ir.errors import RangeError
+from scene_ir.compositor import Compositor, render_batch
+from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Render, SceneIR
 
 _REMEMBERED = 3
@@ -69,22 +70,21 @@ class Objective:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
-        scene = self.space.apply(self.space.scene, theta)
-        render = self.compositor.render(scene)
-        labels = self._labeller.labels(self.label_mode, scene, render)
-        terms = self.detector.loss(self.detector(render.image[None]), [labels.targets])
-        return self._term(terms)
+        return _losses([self], [theta])[0]
 
     def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
         """Loss and its gradient (D,). Raises RangeError naming the coordinate where either is not finite."""
-        leaf = theta.detach().clone().requires_grad_(True)
-        loss = self(leaf)
-        (gradient,) = torch.autograd.grad(loss, leaf)
-        bad = (~torch.isfinite(gradient)).nonzero()
-        if len(bad):
-            i = int(bad[0])
-            raise RangeError(f"gradient of {self.space.name(i)}", "a finite value", float(gradient[i]))
-        return float(loss.detach()), gradient
+        losses, gradients = self.loss_and_grad_many(theta[None])
+        return float(losses[0]), gradients[0]
+
+    def loss_and_grad_many(self, thetas: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses (B,) and gradients (B, D) at thetas (B, D), such as restarts: one step for all. Raises as
+        `loss_and_grad` does.
+        """
+        if thetas.ndim != 2 or len(thetas) == 0 or thetas.shape[1] != self.space.dim:
+            raise ShapeError("thetas", f"(B, {self.space.dim})", tuple(thetas.shape))
+        outcome = _losses_and_gradients([self] * len(thetas), thetas.unbind())
+        return torch.stack([loss for loss, _ in outcome]), torch.stack([gradient for _, gradient in outcome])
 
     @torch.no_grad()
     def evaluate(self, theta: Tensor) -> Rendered:
@@ -131,6 +131,11 @@ class Objective:
             step=self.space.step,
         )
 
+    def loss_of(self, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
+        """The loss () of one image's predictions, by the labels of its scene and render."""
+        labels = self._labeller.labels(self.label_mode, scene, render)
+        return self._term(self.detector.loss(raw, [labels.targets]))
+
     @torch.no_grad()
     def _judged(self, scene: SceneIR, render: Render) -> Rendered:
         # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
@@ -148,3 +153,54 @@ class Objective:
         if not bool(torch.isfinite(loss)):
             raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
         return loss
+
+
+class BatchObjective:
+    """Objectives of several scenes before one detector, which sees all images of a size at once.
+
+    Raises RangeError where there is no objective, or they have several detectors.
+    """
+
+    def __init__(self, objectives: Sequence[Objective]) -> None:
+        detectors = {id(objective.detector) for objective in objectives}
+        if len(detectors) != 1:
+            raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
+        self.objectives = tuple(objectives)
+
+    def loss_and_grad(self, thetas: Sequence[Tensor]) -> list[tuple[float, Tensor]]:
+        """Loss and gradient (D,) of each scene at its own theta (D,). Raises as `Objective.loss_and_grad` does."""
+        if len(thetas) != len(self.objectives):
+            raise ShapeError("thetas", f"{len(self.objectives)}, one for each scene", len(thetas))
+        outcome = _losses_and_gradients(self.objectives, thetas)
+        return [(float(loss), gradient) for loss, gradient in outcome]
+
+
+def _losses_and_gradients(
+    objectives: Sequence[Objective], thetas: Sequence[Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
+    losses = _losses(objectives, leaves)
+    gradients = torch.autograd.grad(losses, leaves)
+    for objective, gradient in zip(objectives, gradients, strict=True):
+        bad = (~torch.isfinite(gradient)).nonzero()
+        if len(bad):
+            i = int(bad[0])
+            raise RangeError(f"gradient of {objective.space.name(i)}", "a finite value", float(gradient[i]))
+    return [(loss.detach(), gradient) for loss, gradient in zip(losses, gradients, strict=True)]
+
+
+def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
+    """The loss () of each objective at its theta (D,), differentiable; all of them have one detector."""
+    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
+    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
+    of_size: dict[torch.Size, list[int]] = {}
+    for i, render in enumerate(renders):
+        of_size.setdefault(render.image.shape, []).append(i)
+    losses: dict[int, Tensor] = {}
+    for members in of_size.values():
+        images = [renders[i].image for i in members]
+        raw = objectives[members[0]].detector(images[0][None] if len(images) == 1 else torch.stack(images))
+        for row, i in enumerate(members):
+            # Each by itself: the loss of a batch is a mean over its images, and weighs them by their objects.
+            losses[i] = objectives[i].loss_of(raw.one(row), scenes[i], renders[i])
+    return [losses[i] for i in range(len(renders))]

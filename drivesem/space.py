@@ -180,6 +180,8 @@ class ParameterSpace:
             self._slices[parameter] = slice(start, end)
             start = end
         self.dim = start
+        # Constant, as nobody asks for a gradient to the photographed scene.
+        self._axes = _ground_axes_of(scene).detach()
         reference = scene.objects.translation
         self.theta0 = reference.new_zeros(self.dim)
         self.lower = reference.new_zeros(self.dim)
@@ -253,8 +255,8 @@ class ParameterSpace:
         objects, environment = scene.objects, scene.environment
         changes: dict[str, Tensor] = {}
         if part.translate is not None:
-            shift = ground_shift(part.translate, objects.yaw, objects.size_lhw[:, 0], environment.ground)
-            changes["translation"] = objects.translation + shift
+            axes = self._axes if scene is self.scene else _ground_axes_of(scene)
+            changes["translation"] = objects.translation + (part.translate[:, None] @ axes)[:, 0]
         if part.rotate is not None:
             changes["yaw"] = objects.yaw + part.rotate[:, 0]
         if part.mesh is not None:
@@ -331,18 +333,20 @@ class ParameterSpace:
         return (low - start).clamp(max=0), (limit - start).clamp(min=0)
 
 
-def ground_shift(translate: Tensor, yaw: Tensor, length_m: Tensor, ground: Tensor) -> Tensor:
-    """Shift (N, 3) m of cars on the ground plane. translate (N, 2): fractions of the car's length along its
-    heading and across it (towards +z of its own frame); yaw (N,) rad; length_m (N,); ground (4,): n.x + d = 0.
+def ground_axes(yaw: Tensor, length_m: Tensor, ground: Tensor) -> Tensor:
+    """Shifts (N, 2, 3) m of cars on the ground plane: by one own length along the heading, and by one across it
+    (towards +z of their own frame). yaw (N,) rad; length_m (N,); ground (4,): n.x + d = 0.
 
     The horizontal part follows heading; y follows the plane, so the height above it is kept.
     """
-    metres = translate * length_m[:, None]
-    rotation = yaw_matrix(yaw)
-    flat = metres[:, :1] * rotation[:, :, 0] + metres[:, 1:] * rotation[:, :, 2]
-    x, z = flat[:, 0], flat[:, 2]
-    y = -(ground[0] * x + ground[2] * z) / ground[1]
-    return torch.stack([x, y, z], dim=-1)
+    flat = yaw_matrix(yaw).transpose(-1, -2)[:, ::2]
+    y = -(ground[0] * flat[..., 0] + ground[2] * flat[..., 2]) / ground[1]
+    return torch.stack([flat[..., 0], y, flat[..., 2]], dim=-1) * length_m[:, None, None]
+
+
+def _ground_axes_of(scene: SceneIR) -> Tensor:
+    objects = scene.objects
+    return ground_axes(objects.yaw, objects.size_lhw[:, 0], scene.environment.ground)
 
 
 def _within(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:

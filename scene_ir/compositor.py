@@ -22,6 +22,7 @@ from torch import Tensor
 from scene_ir import blend, fused, surfaces, texture
 from scene_ir.environment import apply_foliage, apply_weather, shadow_softening, sky_colour
 from scene_ir.errors import ShapeError
+from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.surfaces import Fleet, Surface
 from scene_ir.texture import Texels, smoothstep
@@ -37,11 +38,13 @@ sixth."""
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
     """backend: `warp` (float32, fast) or `reference` (plain torch, the scene's dtype, for gradient checks).
-    shadows: whether vehicles darken the ground.
+    shadows: whether vehicles darken the ground. lod: whether meshes are drawn as coarsely as their size in pixels
+    allows; a scene is rendered as it was taken apart where both were done alike.
     """
 
     backend: verbs.Backend = "warp"
     shadows: bool = True
+    lod: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,9 +215,13 @@ class Compositor:
 
     def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
         """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
-        picked = [Surface.of(self.scene.meshes[int(i)], self._like.dtype) for i in objects.mesh_index]
-        self.fleet = Fleet.of(picked, self._like)
         base = _photographed(objects)
+        meshes = [self.scene.meshes[int(i)] for i in objects.mesh_index]
+        if self.settings.lod:
+            heights = self._height_px(base)
+            meshes = [detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
+        picked = [Surface.of(mesh, self._like.dtype) for mesh in meshes]
+        self.fleet = Fleet.of(picked, self._like)
         local = self.fleet.local(base.ffd, base.size_lhw)
         self._sharp, self._smooth = self.fleet.normals(local)
         self.rig = fused.Rig.of(self.fleet, self._smooth, self.scene.camera.matrix, self._centre)
@@ -232,6 +239,12 @@ class Compositor:
         self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
+
+    def _height_px(self, objects: Objects) -> list[float]:
+        """How high the objects are in the image at their nearest point, at least."""
+        middle = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2]
+        nearest = (middle - 0.5 * objects.size_lhw[:, [0, 2]].norm(dim=1)).clamp(min=1.0)
+        return (self.scene.camera.matrix[1, 1].to(nearest) * objects.size_lhw[:, 1] / nearest).tolist()
 
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
         drawn = self.draw(base)
@@ -661,7 +674,10 @@ class _Pack:
         shadow = fused.shadows(whole, drawn)
         if len(self._members) == 1:
             return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)]
-        layouts, grounds = drawn.mesh.layout.split(self._counts), drawn.ground.layout.split(self._counts)
+        layouts, grounds = (
+            [verbs.Layout.of(rects) for rects in whole_layout.rects.split(self._counts)]
+            for whole_layout in (drawn.mesh.layout, drawn.ground.layout)
+        )
         sizes, ground_sizes = [part.size for part in layouts], [part.size for part in grounds]
         parts = zip(
             layouts, colour.split(sizes), opacity.split(sizes), depth.split(sizes), grounds,

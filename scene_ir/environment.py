@@ -7,11 +7,13 @@ differentiable there from both sides, though the weather code is bounded to [0, 
 from __future__ import annotations
 
 from functools import lru_cache
+from importlib import import_module
 
 import kornia
 import torch
 from torch import Tensor
 
+from scene_ir.raster.verbs import Backend
 from scene_ir.texture import lab, rgb_of, smoothstep
 from scene_ir.types import Environment
 
@@ -21,13 +23,15 @@ RAIN_EXTINCTION_PER_M = 0.006
 """Haze of strong rain at rain code 1."""
 HAZE_CAP_M = 300.0
 """Haze is a layer on the ground: the sky is seen through this much of it."""
+FEWEST_LEAVES = 0.004
+"""Below this share of foliage a pixel stays as it is: one step of a picture of 8 bits."""
 _SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
-_LUMA = (0.299, 0.587, 0.114)
+LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
-_DARKENING = (2.0, 1.75, 1.25)
+DARKENING = (2.0, 1.75, 1.25)
 """Optical depth of red, green and blue at time code 1: night is blue and dark, not black."""
-_WARMTH = (0.70, 0.12, -0.42)
+WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
 
 
@@ -47,14 +51,18 @@ def shadow_softening(weather: Tensor) -> Tensor:
     return torch.exp(-(0.5 * fog + 0.4 * rain + 0.5 * time + 0.6 * overcast))
 
 
-def apply_foliage(image: Tensor, environment: Environment, air: Tensor) -> Tensor:
+def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference") -> Tensor:
     """The picture (3, H, W) with its foliage changed by `environment.foliage`, (3,) in [-1, 1].
 
     Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is
     a curve in CIE L*; density darkens the crowns (1) or lets the air (3,) RGB show through them (-1).
+    Differentiable to all, with backend `warp` (float32, fused) to all but the airlight and the map.
     """
+    if backend == "warp":
+        gaps = _leaf_gaps(*environment.foliage_map.shape).to(image)
+        return import_module("scene_ir.raster.effects").foliage(image, environment, air, gaps)
     amount = environment.foliage_map.to(image)
-    index = (amount.flatten() > 0.004).nonzero()[:, 0]
+    index = (amount.flatten() > FEWEST_LEAVES).nonzero()[:, 0]
     if index.numel() == 0:
         return image
     rows = image.flatten(1)[:, index].T
@@ -85,15 +93,21 @@ def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
     return out + (thin * 0.8 * gaps)[:, None] * (air - out)
 
 
-def apply_weather(image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor) -> Tensor:
+def apply_weather(
+    image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference"
+) -> Tensor:
     """The picture (3, H, W) under `environment.weather`, (4,): fog, rain, time of day, overcast, each in [0, 1].
 
-    inverse_depth: (H, W) 1/m of what is seen, 0 in the sky; air: (3,) RGB, the airlight. Differentiable to all.
+    inverse_depth: (H, W) 1/m of what is seen, 0 in the sky; air: (3,) RGB, the airlight. Differentiable to all,
+    with backend `warp` (float32, fused) to all but the airlight and the maps.
     """
+    if backend == "warp":
+        streaks = _streaks(*environment.sky.shape).to(image)
+        return import_module("scene_ir.raster.effects").weather(image, inverse_depth, environment, air, streaks)
     fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
     sky, road = environment.sky.to(image), environment.road.to(image)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / HAZE_CAP_M)
-    luma = image.new_tensor(_LUMA)
+    luma = image.new_tensor(LUMA)
     grey_air = (air * luma).sum().expand(3)
 
     # Overcast: less colour, less contrast, a plain sky.
@@ -106,8 +120,8 @@ def apply_weather(image: Tensor, inverse_depth: Tensor, environment: Environment
     air = air + 0.85 * overcast * (0.9 * grey_air - air)
 
     # Time of day: warm light at one half, then blue darkness.
-    gain = torch.expm1(-image.new_tensor(_DARKENING) * time * time) + (
-        image.new_tensor(_WARMTH) * time * torch.exp(-3.5 * time * time)
+    gain = torch.expm1(-image.new_tensor(DARKENING) * time * time) + (
+        image.new_tensor(WARMTH) * time * torch.exp(-3.5 * time * time)
     ) - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip
     image = image + gain[:, None, None] * image
     air = air + gain * air
@@ -128,10 +142,14 @@ def apply_weather(image: Tensor, inverse_depth: Tensor, environment: Environment
     return image - torch.expm1(-FOG_EXTINCTION_PER_M * fog * depth) * (air[:, None, None] - image)
 
 
+def mirror_reach(height: int) -> int:
+    """Over how many rows of a picture of `height` rows a wet road smears what it mirrors: an odd number."""
+    return max(3, (height // 12) | 1)
+
+
 def _mirror(image: Tensor) -> Tensor:
     """What a wet road reflects, coarsely: the picture smeared downwards."""
-    height = image.shape[1]
-    reach = max(3, (height // 12) | 1)
+    height, reach = image.shape[1], mirror_reach(image.shape[1])
     smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate")[0]
     shift = reach // 2
     return torch.cat([smeared[:, :1].expand(-1, shift, -1), smeared[:, : height - shift]], dim=1)

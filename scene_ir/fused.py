@@ -165,7 +165,9 @@ def photographed(
 
 
 def _painted(rgba: Tensor, look: Tensor, code: Tensor, lightness: Tensor) -> Tensor:
-    colour = texture.apply_texture_code(rgba[:, :3], rgba[:, 3], code, look[:, 6], look[:, 7], lightness)
+    colour = texture.apply_texture_code(
+        rgba[:, :3], rgba[:, 3], code, look[:, 6], look[:, 7], lightness, "warp"
+    )
     return torch.cat([colour, rgba[:, 3:]], dim=1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -27,7 +27,7 @@ from drivesem.synth.soup import GROUND
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
 from scene_ir.sources import solve_sources
-from scene_ir.types import LATTICE_POINTS, TEXTURE_DIM, Category, Crop, Objects, SceneIR
+from scene_ir.types import LATTICE_POINTS, TEXTURE_DIM, Category, Crop, Mesh, Objects, SceneIR
 
 _KINDS = ("residential", "city", "junction", "arterial", "residential", "motorway", "city", "arterial")
 """Roads of the scenes, in turn."""
@@ -117,9 +117,9 @@ def demo_scenes(count: int = 10, seed: int = 0) -> list[SceneIR]:
     return [demo_scene(seed, index) for index in range(count)]
 
 
-def take_apart(frame: SynthFrame, name: str) -> SceneIR:
+def take_apart(frame: SynthFrame, name: str, shape: Callable[[str, int], Mesh] = template) -> SceneIR:
     """The scene of a frame rendered with its background: exact objects, mattes, shadows and maps; all its actors
-    must be vehicles that appear in the image.
+    must be vehicles that appear in the image. shape: the mesh of a kind and variant.
     """
     assert frame.background is not None
     assert frame.background_depth_m is not None
@@ -127,7 +127,7 @@ def take_apart(frame: SynthFrame, name: str) -> SceneIR:
     vehicles = [t.actor for t in truths]
     meshes, index = [], []
     for actor in vehicles:
-        mesh = template(actor.kind, actor.variant)
+        mesh = shape(actor.kind, actor.variant)
         known = [m.name for m in meshes]
         index.append(known.index(mesh.name) if mesh.name in known else len(meshes))
         if mesh.name not in known:

@@ -5,44 +5,27 @@
 
 The mathematics, its order of operations and its constants are those of `reference`, so that both decide alike
 which triangle a pixel shows; fusing of multiply and add is off for the same reason. Gradients are written by hand.
+
+On a CPU the draws are dealt out to the threads, a large one in bands of rows, so that each pixel belongs to one
+thread (`Plan`). Triangles are sorted out by the pixels around their corners, which cost one division a vertex;
+for the outlines only those are cut with rows and columns that have a hit pixel beside an empty one.
 """
 
 from __future__ import annotations
-
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 
 import torch
 import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.raster.layout import Fragments, Layout, Plan, version_of
+from scene_ir.raster.plan import gpu_lanes, int32_faces, parts_on_gpu, share_on_cpu
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
 from scene_ir.raster.reference import SLACK_PX as _SLACK_PX
 from scene_ir.raster.reference import SNAP_PX as _SNAP_PX
-from scene_ir.raster.reference import first_largest
 
-
-@contextmanager
-def _without_stderr() -> Iterator[None]:
-    """Drops what native code writes to the standard error stream meanwhile."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-wp.config.quiet = True
-wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
-# On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
-with nullcontext() if torch.cuda.is_available() else _without_stderr():
-    wp.init()
+start_warp()
 wp.set_module_options({"fuse_fp": False, "fast_math": False, "enable_backward": False})
 
 DEGENERATE = wp.constant(wp.float64(_DEGENERATE))
@@ -52,22 +35,26 @@ FAR = wp.constant(wp.float64(1e300))
 ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
+ALL = wp.constant(wp.uint64((1 << 64) - 1))
+LIMIT_PX = wp.constant(wp.float64(1e9))
+"""Places beyond this are as good as there: it keeps them within int32."""
+BEHIND = wp.constant(-(1 << 31))
+"""Marks a vertex in front of the near plane's cut, whose place in the image says nothing."""
+WIDE = wp.constant(12)
+"""Rows of more pixels than this are worth the divisions that find where a triangle begins and ends on them."""
+STEEP = wp.constant(wp.float64(1e-6))
+"""An edge function that changes less than this share of itself over a pixel does not tell where it ends."""
 
-NOTHING = (1 << 63) - 1
-"""Key of a pixel that no triangle has reached: above all (depth bits << 32 | face)."""
+NOTHING = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
+"""Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinitely far, face -1."""
+X0, Y0, X1, Y1, ROW, ROW_END, OFFSET, FACE, FACE_END, CULL, FIRST = (wp.constant(i) for i in range(11))
+"""Columns of Plan.parts."""
 
 
 @wp.struct
-class Job:
-    """One triangle of one draw: its pixel bounds, signed edge normals and |det|; the draw's rectangle and offset."""
+class Edges:
+    """Signed edge normals and |det| of a triangle; det is 0 where it is not seen."""
 
-    face: int
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-    offset: int
-    bounds: wp.vec4i
     n0: wp.vec3d
     n1: wp.vec3d
     n2: wp.vec3d
@@ -89,29 +76,84 @@ def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
 
 
 @wp.func
-def grow(box: wp.vec4d, x: wp.float64, y: wp.float64, w: wp.float64):
-    scale = ONE / w
-    u = x * scale
-    v = y * scale
-    return wp.vec4d(wp.min(box[0], u), wp.min(box[1], v), wp.max(box[2], u), wp.max(box[3], v))
+def find_part(parts: wp.array2d(dtype=wp.int32), i: int):
+    """The part that packed pixel i belongs to."""
+    low = int(0)
+    high = parts.shape[0]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if parts[middle, FIRST] <= i:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 @wp.func
-def grow_side(box: wp.vec4d, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
+def whole(value: wp.float64):
+    """A whole number as an int."""
+    return wp.int32(wp.clamp(value, -LIMIT_PX, LIMIT_PX))
+
+
+@wp.func
+def around(u: wp.float64, v: wp.float64):
+    """The first and the last pixel (x, y, x, y) that a point at u, v may touch: none, where the first is later."""
+    return wp.vec4i(
+        whole(wp.ceil(u - SLACK_PX)),
+        whole(wp.ceil(v - SLACK_PX)),
+        whole(wp.floor(u + SLACK_PX)),
+        whole(wp.floor(v + SLACK_PX)),
+    )
+
+
+@wp.func
+def both(a: wp.vec4i, b: wp.vec4i):
+    return wp.vec4i(wp.min(a[0], b[0]), wp.min(a[1], b[1]), wp.max(a[2], b[2]), wp.max(a[3], b[3]))
+
+
+@wp.kernel
+def corner_kernel(start: int, clip: wp.array(dtype=wp.vec3f), near: wp.float64, boxes: wp.array(dtype=wp.vec4i)):
+    i = start + wp.tid()
+    c = wp.vec3d(clip[i])
+    if c[2] >= near:
+        scale = ONE / c[2]
+        boxes[i] = around(c[0] * scale, c[1] * scale)
+    else:
+        boxes[i] = wp.vec4i(BEHIND, 0, 0, 0)
+
+
+@wp.func
+def with_side(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
     """`box` widened by corner a and by where the side from a to b passes the near plane."""
     grown = box
     if a[2] >= near:
-        grown = grow(grown, a[0], a[1], a[2])
+        scale = ONE / a[2]
+        grown = both(grown, around(a[0] * scale, a[1] * scale))
     if (a[2] >= near) != (b[2] >= near):
         share = (near - a[2]) / (b[2] - a[2])
-        grown = grow(grown, a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), near)
+        scale = ONE / near
+        u = (a[0] + share * (b[0] - a[0])) * scale
+        v = (a[1] + share * (b[1] - a[1])) * scale
+        grown = both(grown, around(u, v))
     return grown
 
 
 @wp.func
-def whole(value: wp.float64, low: int, high: int):
-    """A whole number as an int, kept within [low, high]."""
-    return wp.int32(wp.max(wp.float64(low), wp.min(wp.float64(high), value)))
+def bounds_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64):
+    """First and last pixel (x, y, x, y) of the part of a triangle that lies beyond the near plane."""
+    a = boxes[corner[0]]
+    b = boxes[corner[1]]
+    c = boxes[corner[2]]
+    box = both(a, both(b, c))
+    if box[0] == BEHIND:
+        c0 = wp.vec3d(clip[corner[0]])
+        c1 = wp.vec3d(clip[corner[1]])
+        c2 = wp.vec3d(clip[corner[2]])
+        box = wp.vec4i(2000000000, 2000000000, -2000000000, -2000000000)
+        box = with_side(box, c0, c1, near)
+        box = with_side(box, c1, c2, near)
+        box = with_side(box, c2, c0, near)
+    return box
 
 
 @wp.func
@@ -125,104 +167,135 @@ def extent(c: wp.vec3d):
 
 
 @wp.func
-def inside(e: wp.float64, n: wp.vec3d):
-    """Whether a pixel with edge function e is inside; on the edge, one of the two sides' triangles owns it."""
+def owns(e: wp.float64, n: wp.vec3d):
+    """Whether a pixel with edge function e >= 0 is inside; on the edge, one of the two sides' triangles owns it."""
     first = n[0]
     if first == ZERO:
         first = n[1]
     if first == ZERO:
         first = n[2]
-    return e > ZERO or (e == ZERO and first > ZERO)
+    return e > ZERO or first > ZERO
 
 
 @wp.func
-def make_job(
-    i: int,
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
-    job_offsets: wp.array(dtype=wp.int64),
-    face_ranges: wp.array2d(dtype=wp.int64),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
+def edges_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
+    """Edge functions of a triangle; of one seen from behind none, where that is culled."""
+    c0 = wp.vec3d(clip[corner[0]])
+    c1 = wp.vec3d(clip[corner[1]])
+    c2 = wp.vec3d(clip[corner[2]])
+    found = Edges()
+    n0 = wp.cross(c1, c2)
+    det = (c0[0] * n0[0] + c0[1] * n0[1]) + c0[2] * n0[2]
+    if cull == 0 or det < ZERO:
+        if wp.abs(det) > DEGENERATE * (extent(c0) * extent(c1) * extent(c2)):
+            sign = ONE
+            if det < ZERO:
+                sign = -ONE
+            found.n0 = n0 * sign
+            found.n1 = wp.cross(c2, c0) * sign
+            found.n2 = wp.cross(c0, c1) * sign
+            found.det = det * sign
+    return found
+
+
+@wp.func
+def narrow(span: wp.vec2i, n: wp.vec3d, y: int):
+    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it."""
+    base = n[1] * wp.float64(y) + n[2]
+    first = span[0]
+    end = span[1]
+    if wp.abs(n[0]) > STEEP * (wp.abs(n[1] * wp.float64(y)) + wp.abs(n[2])):
+        x = wp.clamp(-base / n[0], -LIMIT_PX, LIMIT_PX)
+        if n[0] > ZERO:
+            first = wp.max(first, wp.int32(wp.floor(x)) - 1)
+        else:
+            end = wp.min(end, wp.int32(wp.ceil(x)) + 2)
+    return wp.vec2i(first, end)
+
+
+@wp.func
+def fill(
+    e: Edges,
+    face: int,
+    box: wp.vec4i,
+    origin: int,
+    width: int,
     near: wp.float64,
+    alone: bool,
+    keys: wp.array(dtype=wp.int64),
 ):
-    """The i-th triangle over all draws; its bounds are empty where it cannot be seen."""
-    job = Job()
-    draw = find(job_offsets, rects.shape[0], i)
-    job.face = wp.int32(face_ranges[draw, 0]) + i - wp.int32(job_offsets[draw])
-    job.x0 = wp.int32(rects[draw, 0])
-    job.y0 = wp.int32(rects[draw, 1])
-    job.x1 = wp.int32(rects[draw, 2])
-    job.y1 = wp.int32(rects[draw, 3])
-    job.offset = wp.int32(offsets[draw])
-    job.bounds = wp.vec4i(0, 0, 0, 0)
-    c0 = wp.vec3d(clip[faces[job.face, 0]])
-    c1 = wp.vec3d(clip[faces[job.face, 1]])
-    c2 = wp.vec3d(clip[faces[job.face, 2]])
-    if (c0[2] >= near or c1[2] >= near or c2[2] >= near) and job.x0 < job.x1 and job.y0 < job.y1:
-        box = wp.vec4d(FAR, FAR, -FAR, -FAR)
-        box = grow_side(box, c0, c1, near)
-        box = grow_side(box, c1, c2, near)
-        box = grow_side(box, c2, c0, near)
-        xa = whole(wp.ceil(box[0] - SLACK_PX), job.x0, job.x1)
-        ya = whole(wp.ceil(box[1] - SLACK_PX), job.y0, job.y1)
-        xb = whole(wp.floor(box[2] + SLACK_PX) + ONE, xa, job.x1)
-        yb = whole(wp.floor(box[3] + SLACK_PX) + ONE, ya, job.y1)
-        if xb > xa or yb > ya:
-            n0 = wp.cross(c1, c2)
-            n1 = wp.cross(c2, c0)
-            n2 = wp.cross(c0, c1)
-            det = (c0[0] * n0[0] + c0[1] * n0[1]) + c0[2] * n0[2]
-            if wp.abs(det) > DEGENERATE * (extent(c0) * extent(c1) * extent(c2)):
-                sign = ONE
-                if det < ZERO:
-                    sign = -ONE
-                job.n0 = n0 * sign
-                job.n1 = n1 * sign
-                job.n2 = n2 * sign
-                job.det = det * sign
-                job.bounds = wp.vec4i(xa, ya, xb, yb)
-    return job
+    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have."""
+    for y in range(box[1], box[3]):
+        row = origin + y * width
+        span = wp.vec2i(box[0], box[2])
+        if span[1] - span[0] > WIDE:
+            span = narrow(span, e.n0, y)
+            span = narrow(span, e.n1, y)
+            span = narrow(span, e.n2, y)
+        for x in range(span[0], span[1]):
+            e0 = edge(e.n0, x, y)
+            e1 = edge(e.n1, x, y)
+            e2 = edge(e.n2, x, y)
+            least = wp.min(e0, wp.min(e1, e2))
+            if least == ZERO:
+                if not (owns(e0, e.n0) and owns(e1, e.n1) and owns(e2, e.n2)):
+                    least = -ONE
+            w = e.det / ((e0 + e1) + e2)
+            bits = wp.int64(wp.cast(wp.float32(w), wp.int32))
+            key = (bits << wp.int64(32)) | wp.int64(face)
+            key = wp.where(least >= ZERO, key, NOTHING)
+            key = wp.where(w >= near, key, NOTHING)
+            key = wp.where(w < FAR, key, NOTHING)
+            if alone or key < NOTHING:
+                wp.atomic_min(keys, row + x, key)
 
 
 @wp.kernel
 def rasterize_kernel(
+    start: int,
+    lanes: int,
+    parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
-    job_offsets: wp.array(dtype=wp.int64),
-    face_ranges: wp.array2d(dtype=wp.int64),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
+    faces: wp.array(dtype=wp.vec3i),
+    boxes: wp.array(dtype=wp.vec4i),
     near: wp.float64,
     keys: wp.array(dtype=wp.int64),
 ):
-    job = make_job(wp.tid(), clip, faces, job_offsets, face_ranges, rects, offsets, near)
-    for y in range(job.bounds[1], job.bounds[3]):
-        row = job.offset + (y - job.y0) * (job.x1 - job.x0) - job.x0
-        for x in range(job.bounds[0], job.bounds[2]):
-            e0 = edge(job.n0, x, y)
-            e1 = edge(job.n1, x, y)
-            e2 = edge(job.n2, x, y)
-            if e0 >= ZERO and e1 >= ZERO and e2 >= ZERO:
-                if inside(e0, job.n0) and inside(e1, job.n1) and inside(e2, job.n2):
-                    w = job.det / ((e0 + e1) + e2)
-                    if w >= near and w < FAR:
-                        bits = wp.int64(wp.cast(wp.float32(w), wp.int32))
-                        wp.atomic_min(keys, row + x, (bits << wp.int64(32)) | wp.int64(job.face))
+    i = start + wp.tid()
+    part = i // lanes
+    x0 = parts[part, X0]
+    x1 = parts[part, X1]
+    row = parts[part, ROW]
+    row_end = parts[part, ROW_END]
+    width = x1 - x0
+    origin = parts[part, OFFSET] - parts[part, Y0] * width - x0
+    face = parts[part, FACE] + (i - part * lanes)
+    end = parts[part, FACE_END]
+    if x1 <= x0 or row_end <= row:
+        end = face
+    while face < end:
+        box = bounds_of(faces[face], clip, boxes, near)
+        box = wp.vec4i(
+            wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
+        )
+        if box[0] < box[2] and box[1] < box[3]:
+            e = edges_of(faces[face], clip, parts[part, CULL])
+            if e.det > ZERO:
+                fill(e, face, box, origin, width, near, lanes == 1, keys)
+        face += lanes
 
 
 @wp.kernel
 def unpack_kernel(
-    keys: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32)
+    start: int,
+    keys: wp.array(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    depth: wp.array(dtype=wp.float32),
 ):
-    i = wp.tid()
-    bits = wp.int32(keys[i] >> wp.int64(32))
-    if bits < 0x7F800000:
-        face[i] = wp.int32(keys[i] & wp.int64(0xFFFFFFFF))
-        depth[i] = wp.cast(bits, wp.float32)
-    else:
-        face[i] = -1
-        depth[i] = wp.float32(wp.inf)
+    i = start + wp.tid()
+    key = keys[i]
+    face[i] = wp.int32(key & wp.int64(0xFFFFFFFF))
+    depth[i] = wp.cast(wp.int32(key >> wp.int64(32)), wp.float32)
 
 
 @wp.func
@@ -239,21 +312,23 @@ def pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=
 
 @wp.kernel
 def interpolate_kernel(
+    start: int,
     face: wp.array(dtype=wp.int32),
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
     attributes: wp.array2d(dtype=wp.float32),
     out: wp.array2d(dtype=wp.float32),
 ):
-    i = wp.tid()
+    i = start + wp.tid()
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        i0 = faces[f, 0]
-        i1 = faces[f, 1]
-        i2 = faces[f, 2]
+        corner = faces[f]
+        i0 = corner[0]
+        i1 = corner[1]
+        i2 = corner[2]
         c0 = wp.vec3d(clip[i0])
         c1 = wp.vec3d(clip[i1])
         c2 = wp.vec3d(clip[i2])
@@ -268,11 +343,12 @@ def interpolate_kernel(
 
 @wp.kernel
 def interpolate_backward_kernel(
+    start: int,
     face: wp.array(dtype=wp.int32),
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
     attributes: wp.array2d(dtype=wp.float32),
     grad_out: wp.array2d(dtype=wp.float32),
     with_clip: bool,
@@ -280,13 +356,14 @@ def interpolate_backward_kernel(
     grad_clip: wp.array(dtype=wp.vec3d),
     grad_attributes: wp.array2d(dtype=wp.float32),
 ):
-    i = wp.tid()
+    i = start + wp.tid()
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        i0 = faces[f, 0]
-        i1 = faces[f, 1]
-        i2 = faces[f, 2]
+        corner = faces[f]
+        i0 = corner[0]
+        i1 = corner[1]
+        i2 = corner[2]
         c0 = wp.vec3d(clip[i0])
         c1 = wp.vec3d(clip[i1])
         c2 = wp.vec3d(clip[i2])
@@ -431,6 +508,7 @@ def row_sum(texels: wp.array(dtype=wp.float32), base: int, columns: wp.vec4i, we
 
 @wp.kernel
 def texture_kernel(
+    start: int,
     texels: wp.array(dtype=wp.float32),
     channels: int,
     channel_stride: int,
@@ -442,7 +520,7 @@ def texture_kernel(
     clamp: bool,
     out: wp.array2d(dtype=wp.float32),
 ):
-    i = wp.tid()
+    i = start + wp.tid()
     draw = find(offsets, crops.shape[0], i)
     x0 = wp.int32(crops[draw, 0])
     y0 = wp.int32(crops[draw, 1])
@@ -461,6 +539,7 @@ def texture_kernel(
 
 @wp.kernel
 def texture_backward_kernel(
+    start: int,
     texels: wp.array(dtype=wp.float32),
     channels: int,
     channel_stride: int,
@@ -476,7 +555,7 @@ def texture_backward_kernel(
     grad_uv: wp.array(dtype=wp.vec2f),
     grad_texels: wp.array(dtype=wp.float32),
 ):
-    i = wp.tid()
+    i = start + wp.tid()
     draw = find(offsets, crops.shape[0], i)
     x0 = wp.int32(crops[draw, 0])
     y0 = wp.int32(crops[draw, 1])
@@ -580,208 +659,386 @@ def cut(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: wp.float64):
 
 
 @wp.func
+def bits_at(words: wp.array(dtype=wp.uint64), first: int, count: int):
+    """`count` bits, 1 to 64, from bit `first` on; the lowest is bit `first`. Reads one word beyond them."""
+    word = first >> 6
+    bit = wp.uint64(first & 63)
+    high = (words[word + 1] << wp.uint64(1)) << (wp.uint64(63) - bit)
+    return ((words[word] >> bit) | high) & (ALL >> wp.uint64(64 - count))
+
+
+@wp.func
+def any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end: int, origin: int, width: int):
+    """Whether a bit is set in columns [x, x_end) of rows [y, y_end)."""
+    seen = wp.uint64(0)
+    if x_end - x <= 64:
+        at = origin + y * width + x
+        last = origin + y_end * width + x
+        keep = ALL >> wp.uint64(64 - (x_end - x))
+        while at < last and seen == wp.uint64(0):
+            word = at >> 6
+            bit = wp.uint64(at & 63)
+            seen = ((words[word] >> bit) | ((words[word + 1] << wp.uint64(1)) << (wp.uint64(63) - bit))) & keep
+            at += width
+    else:
+        for row in range(y, y_end):
+            first = int(x)
+            while first < x_end:
+                seen = seen | bits_at(words, origin + row * width + first, wp.min(x_end - first, 64))
+                first += 64
+    return seen != wp.uint64(0)
+
+
+@wp.func
+def low_place(bits: wp.uint64):
+    """The place, 0 to 63, of the lowest bit that is set."""
+    return wp.int32(wp.bit_count((bits & (~bits + wp.uint64(1))) - wp.uint64(1)))
+
+
+@wp.kernel
+def hit_kernel(
+    start: int,
+    face: wp.array(dtype=wp.int32),
+    hits: wp.array(dtype=wp.uint64),
+    coverage: wp.array(dtype=wp.float32),
+):
+    """64 packed pixels: a bit of `hits` and a coverage of 1 where one is hit."""
+    word = start + wp.tid()
+    bits = wp.uint64(0)
+    for i in range(64 * word, wp.min(64 * word + 64, face.shape[0])):
+        hit = wp.where(face[i] >= 0, wp.uint64(1), wp.uint64(0))
+        bits = bits | (hit << wp.uint64(i & 63))
+        coverage[i] = float(hit)
+    hits[word] = bits
+
+
+@wp.kernel
+def mark_kernel(
+    start: int,
+    parts: wp.array2d(dtype=wp.int32),
+    hits: wp.array(dtype=wp.uint64),
+    beside: wp.array(dtype=wp.uint64),
+    right: wp.array(dtype=wp.uint64),
+    below: wp.array(dtype=wp.uint64),
+    either: wp.array(dtype=wp.uint64),
+    keys: wp.array2d(dtype=wp.int64),
+):
+    """64 packed pixels: in `right` and `below` a bit where the next pixel in the row or column is hit and this one is
+    not, or the other way, with an empty key; in `either` both; in `beside` where any of the four neighbours differs
+    so."""
+    word = start + wp.tid()
+    i = int(64 * word)
+    end = wp.min(i + 64, keys.shape[1])
+    beside_bits = wp.uint64(0)
+    right_bits = wp.uint64(0)
+    below_bits = wp.uint64(0)
+    while i < end:  # a run of pixels in one row
+        part = find_part(parts, i)
+        width = parts[part, X1] - parts[part, X0]
+        within = i - parts[part, OFFSET]
+        y = within // width
+        x = within - y * width
+        count = wp.min(end - i, width - x)
+        run = ALL >> wp.uint64(64 - count)
+        here = bits_at(hits, i, count)
+        to_right = here ^ bits_at(hits, i + 1, count)
+        if x + count == width:
+            to_right = to_right & (run >> wp.uint64(1))
+        to_below = wp.uint64(0)
+        if parts[part, Y0] + y + 1 < parts[part, Y1]:
+            to_below = here ^ bits_at(hits, i + width, count)
+        differs = to_right | to_below
+        if x > 0:
+            differs = differs | (here ^ bits_at(hits, i - 1, count))
+        else:
+            differs = differs | ((here ^ (here << wp.uint64(1))) & run & ~wp.uint64(1))
+        if y > 0:
+            differs = differs | (here ^ bits_at(hits, i - width, count))
+        place = wp.uint64(i & 63)
+        right_bits = right_bits | (to_right << place)
+        below_bits = below_bits | (to_below << place)
+        beside_bits = beside_bits | (differs << place)
+        i += count
+    beside[word] = beside_bits
+    right[word] = right_bits
+    below[word] = below_bits
+    either[word] = right_bits | below_bits
+    while right_bits != wp.uint64(0):
+        keys[0, 64 * word + low_place(right_bits)] = wp.int64(-1)
+        right_bits = right_bits & (right_bits - wp.uint64(1))
+    while below_bits != wp.uint64(0):
+        keys[1, 64 * word + low_place(below_bits)] = wp.int64(-1)
+        below_bits = below_bits & (below_bits - wp.uint64(1))
+
+
+@wp.func
 def scan(
-    job: Job,
+    e: Edges,
+    code: int,
     axis: int,
     line: int,
+    low: int,
+    high: int,
+    origin: int,
+    step: int,
     near: wp.float64,
     face: wp.array(dtype=wp.int32),
     keys: wp.array2d(dtype=wp.int64),
 ):
-    """Offers the ends of the triangle's interval on a row (axis 0) or column (axis 1) of pixels."""
+    """Offers the ends of the triangle's interval on pixels [low, high) of a row (axis 0) or column (axis 1).
+
+    code: 3 * face; origin: packed index that pixel 0 of the line would have; step: to the next pixel's.
+    """
     other = 1 - axis
     at = wp.float64(line)
-    b0 = job.n0[other] * at + job.n0[2]
-    b1 = job.n1[other] * at + job.n1[2]
-    b2 = job.n2[other] * at + job.n2[2]
+    b0 = e.n0[other] * at + e.n0[2]
+    b1 = e.n1[other] * at + e.n1[2]
+    b2 = e.n2[other] * at + e.n2[2]
     span = wp.vec4d(-FAR, FAR, ZERO, ZERO)
-    span = cut(span, job.n0[axis], b0, ZERO)
-    span = cut(span, job.n1[axis], b1, ONE)
-    span = cut(span, job.n2[axis], b2, ONE + ONE)
-    slope = (job.n0[axis] + job.n1[axis]) + job.n2[axis]
+    span = cut(span, e.n0[axis], b0, ZERO)
+    span = cut(span, e.n1[axis], b1, ONE)
+    span = cut(span, e.n2[axis], b2, ONE + ONE)
+    slope = (e.n0[axis] + e.n1[axis]) + e.n2[axis]
     # w >= near is sum e <= |det| / near: a fourth side, which is never an outline.
-    span = cut(span, -slope, job.det / near - ((b0 + b1) + b2), wp.float64(3.0))
+    span = cut(span, -slope, e.det / near - ((b0 + b1) + b2), wp.float64(3.0))
     if span[0] <= span[1]:
-        width = job.x1 - job.x0
-        low = job.x0
-        high = job.x1
-        step = 1
-        origin = job.offset + (line - job.y0) * width - job.x0
-        if axis == 1:
-            low = job.y0
-            high = job.y1
-            step = width
-            origin = job.offset + (line - job.x0) - job.y0 * width
         low_edge = wp.int32(span[2])
         high_edge = wp.int32(span[3])
         if low_edge < 3:
-            offer_end(keys, face, axis, span[0], low, high, origin, step, False, job.face * 3 + low_edge)
+            offer_end(keys, face, axis, span[0], low, high, origin, step, False, code + low_edge)
         if high_edge < 3:
-            offer_end(keys, face, axis, span[1], low, high, origin, step, True, job.face * 3 + high_edge)
-
-
-SMALL = wp.constant(64)
-"""Bounds of up to this many pixels are searched for an empty one before the triangle is cut with its lines."""
-
-
-@wp.func
-def meets_empty(job: Job, face: wp.array(dtype=wp.int32)):
-    """Whether there is an empty pixel in the triangle's bounds or beside them; without one it makes no outline."""
-    found = (job.bounds[2] - job.bounds[0]) * (job.bounds[3] - job.bounds[1]) > SMALL
-    if not found:
-        width = job.x1 - job.x0
-        for y in range(wp.max(job.bounds[1] - 1, job.y0), wp.min(job.bounds[3] + 1, job.y1)):
-            row = job.offset + (y - job.y0) * width - job.x0
-            for x in range(wp.max(job.bounds[0] - 1, job.x0), wp.min(job.bounds[2] + 1, job.x1)):
-                if face[row + x] < 0:
-                    found = bool(True)
-    return found
+            offer_end(keys, face, axis, span[1], low, high, origin, step, True, code + high_edge)
 
 
 @wp.kernel
 def outline_kernel(
+    start: int,
+    lanes: int,
+    parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
-    job_offsets: wp.array(dtype=wp.int64),
-    face_ranges: wp.array2d(dtype=wp.int64),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
+    faces: wp.array(dtype=wp.vec3i),
+    boxes: wp.array(dtype=wp.vec4i),
     near: wp.float64,
     face: wp.array(dtype=wp.int32),
+    right: wp.array(dtype=wp.uint64),
+    below: wp.array(dtype=wp.uint64),
+    either: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
-    job = make_job(wp.tid(), clip, faces, job_offsets, face_ranges, rects, offsets, near)
-    if meets_empty(job, face):
-        for line in range(job.bounds[1], job.bounds[3]):
-            scan(job, 0, line, near, face, keys)
-        for line in range(job.bounds[0], job.bounds[2]):
-            scan(job, 1, line, near, face, keys)
+    """Finds for each marked pair of pixels the triangle's edge that reaches farthest from the hit to the empty one."""
+    i = start + wp.tid()
+    part = i // lanes
+    x0 = parts[part, X0]
+    x1 = parts[part, X1]
+    row = parts[part, ROW]
+    row_end = parts[part, ROW_END]
+    column_end = wp.min(row_end + 1, parts[part, Y1])  # a column's last pair reaches into the next part
+    width = x1 - x0
+    origin = parts[part, OFFSET] - parts[part, Y0] * width - x0
+    f = parts[part, FACE] + (i - part * lanes)
+    end = parts[part, FACE_END]
+    if x1 <= x0 or row_end <= row:
+        end = f
+    while f < end:
+        box = bounds_of(faces[f], clip, boxes, near)
+        # A pair may begin one pixel before the first that the triangle touches.
+        xa = wp.max(box[0] - 1, x0)
+        ya = wp.max(box[1] - 1, row)
+        xb = wp.min(box[2] + 1, x1)
+        yb = wp.min(box[3] + 1, row_end)
+        if xa < xb and ya < yb:
+            if any_bit(either, xa, xb, ya, yb, origin, width):
+                e = edges_of(faces[f], clip, parts[part, CULL])
+                if e.det > ZERO:
+                    for y in range(wp.max(box[1], row), yb):
+                        if bits_at(right, origin + y * width + xa, wp.min(xb - xa, 64)) != wp.uint64(0):
+                            scan(e, 3 * f, 0, y, x0, x1, origin + y * width, 1, near, face, keys)
+                    x = wp.max(box[0], x0)
+                    while x < xb:
+                        columns = wp.uint64(0)
+                        for y in range(ya, yb):
+                            columns = columns | bits_at(below, origin + y * width + x, wp.min(xb - x, 64))
+                        while columns != wp.uint64(0):
+                            column = x + low_place(columns)
+                            scan(e, 3 * f, 1, column, row, column_end, origin + column, width, near, face, keys)
+                            columns = columns & (columns - wp.uint64(1))
+                        x += 64
+        f += lanes
 
 
 @wp.struct
 class Crossing:
-    """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, and its edge function
-    at both, which is 0 at the outline."""
+    """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, its edge function at
+    both, which is 0 at the outline, how far from the hit it lies, and which of the pair (0, 1) it changes."""
 
-    hit: int
-    empty: int
     ia: int
     ib: int
     p_hit: wp.vec3d
     p_empty: wp.vec3d
     e_hit: wp.float64
     e_empty: wp.float64
+    t: wp.float64
+    changes: int
 
 
 @wp.func
 def crossing(
     axis: int,
-    i: int,
+    x: int,
+    y: int,
+    first_is_hit: bool,
     code: int,
-    face: wp.array(dtype=wp.int32),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
 ):
-    """The outline on edge `code` = face * 3 + edge between packed pixel i and the next one along `axis`."""
+    """The outline on edge `code` = face * 3 + edge between pixel (x, y) and the next one along `axis`."""
     found = Crossing()
-    at = pixel_xy(i, rects, offsets)
-    p = wp.vec3d(wp.float64(at[0]), wp.float64(at[1]), ONE)
+    p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
     q = p + wp.vec3d(wp.float64(1 - axis), wp.float64(axis), ZERO)
-    step = 1
-    if axis == 1:
-        step = at[2]
-    found.hit = i
-    found.empty = i + step
-    found.p_hit = p
-    found.p_empty = q
-    if face[i] < 0:
-        found.hit = i + step
-        found.empty = i
+    if first_is_hit:
+        found.p_hit = p
+        found.p_empty = q
+    else:
         found.p_hit = q
         found.p_empty = p
     f = code // 3
-    found.ia = faces[f, (code - 3 * f + 1) % 3]
-    found.ib = faces[f, (code - 3 * f + 2) % 3]
+    corner = faces[f]
+    found.ia = corner[(code - 3 * f + 1) % 3]
+    found.ib = corner[(code - 3 * f + 2) % 3]
     n = wp.cross(wp.vec3d(clip[found.ia]), wp.vec3d(clip[found.ib]))
     found.e_hit = (n[0] * found.p_hit[0] + n[1] * found.p_hit[1]) + n[2]
     found.e_empty = (n[0] * found.p_empty[0] + n[1] * found.p_empty[1]) + n[2]
+    found.t = found.e_hit / (found.e_hit - found.e_empty)
+    if (found.t < HALF) != first_is_hit:
+        found.changes = 1
     return found
 
 
-@wp.func
-def side_of(i: int, pixel: int):
-    """0 where `pixel` is the first of the pair that starts at i, 1 where it is the second."""
-    side = 0
-    if pixel != i:
-        side = 1
-    return side
-
-
 @wp.kernel
-def change_kernel(
-    keys: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
+def coverage_kernel(
+    start: int,
+    parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
-    change: wp.array2d(dtype=wp.float64),
+    faces: wp.array(dtype=wp.vec3i),
+    face: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.uint64),
+    right: wp.array(dtype=wp.uint64),
+    below: wp.array(dtype=wp.uint64),
+    keys: wp.array2d(dtype=wp.int64),
+    choice: wp.array(dtype=wp.int64),
+    coverage: wp.array(dtype=wp.float32),
 ):
-    axis, i = wp.tid()
-    if keys[axis, i] >= wp.int64(0):
-        code = wp.int32(keys[axis, i] & wp.int64(0xFFFFFFFF))
-        found = crossing(axis, i, code, face, rects, offsets, clip, faces)
-        t = found.e_hit / (found.e_hit - found.e_empty)
-        pixel = found.empty
-        if t < HALF:
-            pixel = found.hit
-        change[2 * axis + side_of(i, pixel), pixel] = wp.abs(HALF - t)
+    """64 packed pixels: coverage of those that a hit and an empty pixel meet at, and `choice`: the edge that
+    decided it * 4 + the neighbour's side, -1 where none did."""
+    word = start + wp.tid()
+    bits = beside[word]
+    while bits != wp.uint64(0):
+        i = 64 * word + low_place(bits)
+        bits = bits & (bits - wp.uint64(1))
+        part = find_part(parts, i)
+        width = parts[part, X1] - parts[part, X0]
+        row = (i - parts[part, OFFSET]) // width
+        column = i - parts[part, OFFSET] - row * width
+        hit = face[i] >= 0
+        largest = ZERO
+        chosen = wp.int64(-1)
+        # Sides in this order: the pairs that begin here and that end here along the row, then along the column.
+        side = int(0)
+        while side < 4:
+            axis = side // 2
+            back = side - 2 * axis
+            step = 1
+            if axis == 1:
+                step = width
+            x = column - back * (1 - axis)
+            y = row - back * axis
+            if x >= 0 and y >= 0:
+                pair = i - back * step
+                marked = bits_at(below, pair, 1)
+                if axis == 0:
+                    marked = bits_at(right, pair, 1)
+                if marked != wp.uint64(0):
+                    key = keys[axis, pair]
+                    if key >= wp.int64(0):
+                        code = wp.int32(key & wp.int64(0xFFFFFFFF))
+                        first_is_hit = hit != (back == 1)
+                        c = crossing(
+                            axis, parts[part, X0] + x, parts[part, Y0] + y, first_is_hit, code, clip, faces
+                        )
+                        amount = wp.abs(HALF - c.t)
+                        if c.changes == back:
+                            if amount > largest or side == 0:
+                                largest = amount
+                                chosen = wp.int64(code) * wp.int64(4) + wp.int64(side)
+            side += 1
+        choice[i] = chosen
+        if hit:
+            coverage[i] = wp.float32(ONE - largest)
+        else:
+            coverage[i] = wp.float32(largest)
 
 
 @wp.kernel
-def change_backward_kernel(
-    keys: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
+def coverage_backward_kernel(
+    start: int,
+    parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array2d(dtype=wp.int32),
-    grad_change: wp.array2d(dtype=wp.float64),
+    faces: wp.array(dtype=wp.vec3i),
+    face: wp.array(dtype=wp.int32),
+    beside: wp.array(dtype=wp.uint64),
+    choice: wp.array(dtype=wp.int64),
+    grad_out: wp.array(dtype=wp.float32),
     grad_clip: wp.array(dtype=wp.vec3d),
 ):
-    axis, i = wp.tid()
-    if keys[axis, i] >= wp.int64(0):
-        code = wp.int32(keys[axis, i] & wp.int64(0xFFFFFFFF))
-        found = crossing(axis, i, code, face, rects, offsets, clip, faces)
-        length = found.e_hit - found.e_empty
-        pixel = found.empty
-        sign = ONE
-        if found.e_hit / length < HALF:
-            pixel = found.hit
-            sign = -ONE
-        grad_t = sign * grad_change[2 * axis + side_of(i, pixel), pixel]
-        # t = e_hit / (e_hit - e_empty), and e = p . (a x b)
-        scale = grad_t / (length * length)
-        q = (found.p_empty * found.e_hit - found.p_hit * found.e_empty) * scale
-        wp.atomic_add(grad_clip, found.ia, wp.cross(wp.vec3d(clip[found.ib]), q))
-        wp.atomic_add(grad_clip, found.ib, wp.cross(q, wp.vec3d(clip[found.ia])))
+    word = start + wp.tid()
+    bits = beside[word]
+    while bits != wp.uint64(0):
+        i = 64 * word + low_place(bits)
+        bits = bits & (bits - wp.uint64(1))
+        chosen = choice[i]
+        if chosen >= wp.int64(0):
+            part = find_part(parts, i)
+            width = parts[part, X1] - parts[part, X0]
+            row = (i - parts[part, OFFSET]) // width
+            column = i - parts[part, OFFSET] - row * width
+            code = wp.int32(chosen / wp.int64(4))
+            side = wp.int32(chosen - wp.int64(code) * wp.int64(4))
+            axis = side // 2
+            back = side - 2 * axis
+            x = parts[part, X0] + column - back * (1 - axis)
+            y = parts[part, Y0] + row - back * axis
+            hit = face[i] >= 0
+            c = crossing(axis, x, y, hit != (back == 1), code, clip, faces)
+            # An empty pixel gets t - 1/2, a hit one keeps 1/2 + t: both grow with t = e_hit / (e_hit - e_empty), and
+            # e = p . (a x b).
+            length = c.e_hit - c.e_empty
+            scale = wp.float64(grad_out[i]) / (length * length)
+            q = (c.p_empty * c.e_hit - c.p_hit * c.e_empty) * scale
+            wp.atomic_add(grad_clip, c.ia, wp.cross(wp.vec3d(clip[c.ib]), q))
+            wp.atomic_add(grad_clip, c.ib, wp.cross(q, wp.vec3d(clip[c.ia])))
 
 
 def rasterize(
-    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float
-) -> tuple[Tensor, Tensor]:
-    """See `verbs.rasterize`. Returns face (T,) int32 and depth (T,)."""
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
+) -> tuple[Tensor, Tensor, Plan]:
+    """See `verbs.rasterize`. Returns face (T,) int32, depth (T,) and what `antialias` can use again."""
+    plan = _plan(clip, faces, face_ranges, layout, near, cull)
     size = layout.size
-    keys = torch.full((size,), NOTHING, dtype=torch.int64, device=clip.device)
+    keys = torch.full((size,), int(NOTHING), dtype=torch.int64, device=clip.device)
     face = torch.empty(size, dtype=torch.int32, device=clip.device)
     depth = torch.empty(size, dtype=torch.float32, device=clip.device)
-    mesh = _mesh(clip, faces)
-    jobs, count = _jobs(face_ranges)
-    _launch(rasterize_kernel, count if size else 0, [*mesh, *jobs, *_layout(layout), near, wp.from_torch(keys)])
-    _launch(unpack_kernel, size, [wp.from_torch(keys), wp.from_torch(face), wp.from_torch(depth)])
-    return face, depth
+    if size:
+        inputs = [
+            plan.lanes,
+            wp.from_torch(plan.parts),
+            *_corners(clip, faces),
+            _boxes(plan),
+            near,
+            wp.from_torch(keys),
+        ]
+        launch(rasterize_kernel, plan.cuts, inputs)
+        launch(unpack_kernel, halves(size), [wp.from_torch(keys), wp.from_torch(face), wp.from_torch(depth)])
+    return face, depth, plan
 
 
 def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor) -> Tensor:
@@ -816,8 +1073,8 @@ class _Interpolate(torch.autograd.Function):
         ctx.layout = fragments.layout
         out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
         hits = [wp.from_torch(fragments.face), *_layout(fragments.layout)]
-        inputs = [*hits, *_mesh(clip, faces), _floats(attributes), wp.from_torch(out)]
-        _launch(interpolate_kernel, out.shape[0] if out.numel() else 0, inputs)
+        inputs = [*hits, *_corners(clip, faces), _floats(attributes), wp.from_torch(out)]
+        launch(interpolate_kernel, halves(out.shape[0] if out.numel() else 0), inputs)
         return out
 
     @staticmethod
@@ -828,11 +1085,11 @@ class _Interpolate(torch.autograd.Function):
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         grad_attributes = torch.zeros_like(attributes, memory_format=torch.contiguous_format)
         inputs = [
-            *(wp.from_torch(face), *_layout(ctx.layout), *_mesh(clip, faces)),
+            *(wp.from_torch(face), *_layout(ctx.layout), *_corners(clip, faces)),
             *(_floats(attributes), _floats(grad_out), with_clip, with_attributes),
             *(wp.from_torch(grad_clip, dtype=wp.vec3d), wp.from_torch(grad_attributes)),
         ]
-        _launch(interpolate_backward_kernel, face.shape[0] if grad_out.numel() else 0, inputs)
+        launch(interpolate_backward_kernel, _one(face.shape[0] if grad_out.numel() else 0), inputs)
         to_clip = grad_clip.to(clip.dtype) if with_clip else None
         return None, to_clip, None, grad_attributes if with_attributes else None
 
@@ -844,7 +1101,7 @@ class _Texture(torch.autograd.Function):
         ctx.strides, ctx.clamp = strides, clamp
         out = uv.new_zeros(uv.shape[0], strides[0])
         inputs = [*_sampling(texels, strides, crops, offsets, uv), clamp, wp.from_torch(out)]
-        _launch(texture_kernel, out.shape[0] if out.numel() else 0, inputs)
+        launch(texture_kernel, halves(out.shape[0] if out.numel() else 0), inputs)
         return out
 
     @staticmethod
@@ -859,62 +1116,85 @@ class _Texture(torch.autograd.Function):
             *(ctx.clamp, _floats(grad_out), with_uv, with_texels),
             *(wp.from_torch(grad_uv, dtype=wp.vec2f), wp.from_torch(grad_texels.view(-1))),
         ]
-        _launch(texture_backward_kernel, uv.shape[0] if grad_out.numel() else 0, inputs)
+        count = uv.shape[0] if grad_out.numel() else 0
+        launch(texture_backward_kernel, _one(count) if with_texels else halves(count), inputs)
         return grad_texels if with_texels else None, None, None, None, grad_uv if with_uv else None, None
 
 
 class _Antialias(torch.autograd.Function):
     @staticmethod
     def forward(ctx, fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
-        size = fragments.face.shape[0]
-        face = wp.from_torch(fragments.face)
-        mesh, layout = _mesh(clip, faces), _layout(fragments.layout)
-        jobs, count = _jobs(fragments.face_ranges)
-        keys = torch.full((2, size), -1, dtype=torch.int64, device=clip.device)
-        change = torch.zeros(4, size, dtype=torch.float64, device=clip.device)
-        inputs = [*mesh, *jobs, *layout, fragments.near, face, wp.from_torch(keys)]
-        _launch(outline_kernel, count if size else 0, inputs)
-        inputs = [wp.from_torch(keys), face, *layout, *mesh, wp.from_torch(change)]
-        _launch(change_kernel, (2, size) if size else 0, inputs)
-        amount, side = first_largest(change)
-        ctx.save_for_backward(fragments.face, clip, faces, keys, side)
-        ctx.layout = fragments.layout
-        return torch.where(fragments.face >= 0, 1 - amount, amount).to(clip.dtype)
+        plan = fragments.plan
+        if plan is None or not plan.fits(clip):
+            plan = _plan(clip, faces, fragments.face_ranges, fragments.layout, fragments.near, fragments.cull)
+        size, like = fragments.face.shape[0], fragments.face
+        coverage = torch.empty(size, dtype=clip.dtype, device=clip.device)
+        count = (size + 63) // 64
+        marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is only looked at
+        keys, choice = like.new_empty((2, size), dtype=torch.int64), like.new_empty(size, dtype=torch.int64)
+        if size:
+            parts, mesh, face = wp.from_torch(plan.parts), _corners(clip, faces), wp.from_torch(like)
+            hits, beside, right, below, either = (wp.from_torch(m, dtype=wp.uint64) for m in marks)
+            found, seen, edges = wp.from_torch(keys), wp.from_torch(coverage), _words(size)
+            launch(hit_kernel, edges, [face, hits, seen])
+            launch(mark_kernel, edges, [parts, hits, beside, right, below, either, found])
+            inputs = [plan.lanes, parts, *mesh, _boxes(plan), fragments.near, face, right, below, either, found]
+            launch(outline_kernel, plan.cuts, inputs)
+            inputs = [parts, *mesh, face, beside, right, below, found, wp.from_torch(choice), seen]
+            launch(coverage_kernel, edges, inputs)
+        ctx.save_for_backward(like, clip, faces, marks[1], choice)
+        ctx.plan = plan
+        return coverage
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out: Tensor):
-        face, clip, faces, keys, side = ctx.saved_tensors
-        grad = torch.where(face >= 0, -grad_out, grad_out).to(torch.float64)
-        grad_change = grad.new_zeros(4, face.shape[0]).scatter(0, side[None], grad[None])
+        face, clip, faces, beside, choice = ctx.saved_tensors
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
-        inputs = [
-            *(wp.from_torch(keys), wp.from_torch(face), *_layout(ctx.layout), *_mesh(clip, faces)),
-            *(wp.from_torch(grad_change), wp.from_torch(grad_clip, dtype=wp.vec3d)),
-        ]
-        _launch(change_backward_kernel, tuple(keys.shape) if keys.numel() else 0, inputs)
+        if face.shape[0]:
+            inputs = [
+                *(wp.from_torch(ctx.plan.parts), *_corners(clip, faces), wp.from_torch(face)),
+                *(wp.from_torch(beside, dtype=wp.uint64), wp.from_torch(choice)),
+                *(_floats(grad_out), wp.from_torch(grad_clip, dtype=wp.vec3d)),
+            ]
+            launch(coverage_backward_kernel, _one(beside.shape[0] - 1), inputs)
         return None, grad_clip.to(clip.dtype), None
 
 
-def _launch(kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list) -> None:
-    """Run a kernel on the device of its arrays, in torch's current stream."""
-    if dim == 0:
-        return
-    device = next(i.device for i in inputs if isinstance(i, wp.array))
-    stream = wp.stream_from_torch(wp.device_to_torch(device)) if device.is_cuda else None
-    wp.launch(kernel, dim=dim, inputs=inputs, device=device, stream=stream)
+def _one(count: int) -> list[int]:
+    """[0, count) for one thread: its pixels add to vertices or texels that they may share."""
+    return [0, count]
 
 
-def _mesh(clip: Tensor, faces: Tensor) -> list[wp.array]:
-    corners = faces.to(torch.int32).contiguous()
-    return [wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f), wp.from_torch(corners)]
+def _words(size: int) -> list[int]:
+    """Shares of the words of 64 bits that hold `size` bits."""
+    return [*(edge // 64 for edge in halves(size)[:-1]), (size + 63) // 64]
 
 
-def _jobs(face_ranges: Tensor) -> tuple[list[wp.array], int]:
-    """Running triangle counts over the draws, the face ranges, and the number of triangles over all draws."""
-    counts = face_ranges.diff(dim=1)[:, 0].clamp(min=0)
-    offsets = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    return [wp.from_torch(offsets), wp.from_torch(face_ranges.contiguous())], int(offsets[-1])
+def _plan(
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
+) -> Plan:
+    """How the threads share the draws, and where the vertices fall."""
+    if clip.device.type == "cpu":
+        rows, cuts = share_on_cpu(layout, face_ranges, cull, threads())
+        parts, lanes = torch.tensor(rows, dtype=torch.int32).view(-1, 11), 1
+    else:
+        parts, lanes = parts_on_gpu(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
+        cuts = [0, parts.shape[0] * lanes]
+    boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
+    vertices = wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f)
+    launch(corner_kernel, halves(clip.shape[0]), [vertices, near, wp.from_torch(boxes, dtype=wp.vec4i)])
+    return Plan(parts, lanes, cuts, boxes, clip.detach(), version_of(clip))
+
+
+def _corners(clip: Tensor, faces: Tensor) -> list[wp.array]:
+    """Vertices, and the three of each face."""
+    vertices = wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f)
+    return [vertices, wp.from_torch(int32_faces(faces), dtype=wp.vec3i)]
+
+
+def _boxes(plan: Plan) -> wp.array:
+    return wp.from_torch(plan.boxes, dtype=wp.vec4i)
 
 
 def _layout(layout: Layout) -> list[wp.array]:

@@ -36,7 +36,10 @@ class Layout:
         """The layout of rectangles (N, 4) int64 px, half-open (x0, y0, x1, y1)."""
         check_shape("layout.rects", rects, None, 4, floating=False)
         rects = rects.to(torch.int64)
-        return cls(rects, _offsets(rects))
+        layout = object.__new__(cls)  # its offsets need no second look
+        object.__setattr__(layout, "rects", rects)
+        object.__setattr__(layout, "offsets", _offsets(rects))
+        return layout
 
     @property
     def size(self) -> int:
@@ -64,10 +67,40 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True)
+class Plan:
+    """What the fast backend prepares for `rasterize` and uses again for `antialias`.
+
+    parts: (P, 11) int32, draws or bands of their rows: the draw's x0, y0, x1, y1; the first row and the end; the
+    draw's first packed pixel; its faces' start and end; 1 where its back faces are culled; the first packed pixel.
+    lanes: how many kernel indices share a part. cuts: where in [0, lanes * P) the threads' shares begin and end.
+    boxes: (V, 4) int32 px, the first and last pixel (x, y, x, y) that each vertex may touch. clip: (V, 3), the
+    vertices that this was made of, and their `version`, -1 where torch keeps none.
+    """
+
+    parts: Tensor
+    lanes: int
+    cuts: list[int]
+    boxes: Tensor
+    clip: Tensor
+    version: int
+
+    def fits(self, clip: Tensor) -> bool:
+        """Whether `clip` is what this was made of, not changed since."""
+        same = self.clip.data_ptr() == clip.data_ptr() and self.clip.shape == clip.shape
+        return same and self.clip.stride() == clip.stride() and self.version == version_of(clip)
+
+
+def version_of(tensor: Tensor) -> int:
+    """Counts torch's changes to a tensor; -1 for tensors of inference mode, which have no count."""
+    return -1 if tensor.is_inference() else tensor._version
+
+
+@dataclass(frozen=True, slots=True)
 class Fragments:
     """What `rasterize` found. face: (T,) int32, index into the faces, -1 where nothing is hit;
     depth: (T,) m, w of the nearest hit, inf where there is none, not differentiable (interpolate w instead).
-    face_ranges: (N, 2) int64 and near: m, as they were given.
+    face_ranges: (N, 2) int64 and near: m, as they were given. cull: (N,) bool, the draws without back faces, or
+    None. plan: what the fast backend uses again, or None.
     """
 
     layout: Layout
@@ -75,6 +108,8 @@ class Fragments:
     depth: Tensor
     face_ranges: Tensor
     near: float
+    cull: Tensor | None = None
+    plan: Plan | None = None
 
 
 def _offsets(rects: Tensor) -> Tensor:

@@ -28,13 +28,13 @@ SNAP_PX = 1e-9
 
 
 def rasterize(
-    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float
-) -> tuple[Tensor, Tensor]:
-    """See `verbs.rasterize`. Returns face (T,) int32 and depth (T,)."""
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
+) -> tuple[Tensor, Tensor, None]:
+    """See `verbs.rasterize`. Returns face (T,) int32, depth (T,), and nothing to use again."""
     size, none = layout.size, faces.shape[0]
     depth = clip.new_full((size,), torch.inf)
     face = torch.full((size,), none, dtype=torch.int64, device=clip.device)
-    for jobs in _chunks(_Jobs.of(clip, faces, face_ranges, layout, near), lines_along=None):
+    for jobs in _chunks(_Jobs.of(clip, faces, face_ranges, layout, near, cull), lines_along=None):
         bounds = jobs.bounds
         width = (bounds[:, 2] - bounds[:, 0]).clamp(min=0)
         job, within = _expand(width * (bounds[:, 3] - bounds[:, 1]).clamp(min=0))
@@ -55,7 +55,7 @@ def rasterize(
         tied = w == nearest[pixel]
         face = face.scatter_reduce(0, pixel[tied], owner[tied], "amin")
         depth = nearest
-    return torch.where(face == none, -1, face).to(torch.int32), depth
+    return torch.where(face == none, -1, face).to(torch.int32), depth, None
 
 
 def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor) -> Tensor:
@@ -131,7 +131,8 @@ def _outline_edges(
     slot[start] = torch.arange(start.shape[0], device=clip.device)
     best_t = torch.full((start.shape[0],), -1.0, dtype=torch.float32, device=clip.device)
     best_edge = torch.full((start.shape[0],), -1, dtype=torch.int64, device=clip.device)
-    jobs_all = _Jobs.of(clip.detach(), faces, fragments.face_ranges, layout, fragments.near)
+    ranges, near, cull = fragments.face_ranges, fragments.near, fragments.cull
+    jobs_all = _Jobs.of(clip.detach(), faces, ranges, layout, near, cull)
     hit = fragments.face >= 0
     for jobs in _chunks(jobs_all, lines_along=1 - axis):
         lines = (jobs.bounds[:, 3 - axis] - jobs.bounds[:, 1 - axis]).clamp(min=0)
@@ -188,7 +189,9 @@ class _Jobs:
     sign: Tensor  # (J,) of det
 
     @classmethod
-    def of(cls, clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float) -> _Jobs:
+    def of(
+        cls, clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
+    ) -> _Jobs:
         draw, within = _expand(face_ranges.diff(dim=1)[:, 0].clamp(min=0))
         face = face_ranges[draw, 0] + within
         corner = clip.to(torch.float64)[faces.to(torch.int64)[face]]  # (J, 3, 3)
@@ -198,6 +201,8 @@ class _Jobs:
         )
         seen = det.abs() > DEGENERATE * corner.abs().sum(dim=2).prod(dim=1)
         seen &= (corner[..., 2] >= near).any(dim=1)
+        if cull is not None:
+            seen &= (det < 0) | ~cull[draw]
         rect = layout.rects[draw]
         jobs = (face, rect, layout.offsets[draw], _bounds(corner, rect, near), normal, det, det.sign())
         return cls(*(field[seen] for field in jobs))

@@ -716,6 +716,19 @@ def mesh_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
 
 
 @wp.func
+def plainly_seen(look: vec8, texel: vec8, u: float, v: float, wh: wp.vec2f):
+    """Whether every weight of `mesh_pixel` is flat at full: then it is the texel, and so is its gradient."""
+    seen = texel[4] <= 0.0 and texel[7] >= 0.9 and look[2] - texel[6] <= DEPTH_LOW
+    if seen:
+        seen = u >= -BORDER_LOW and u <= wh[0] - 1.0 + BORDER_LOW and v >= -BORDER_LOW and v <= wh[1] - 1.0 + BORDER_LOW
+    if seen:
+        seen = look[4] <= OPEN_TURN_LOW or look[5] >= RIM_HIGH
+    if seen:
+        seen = look[4] <= TURN_LOW + wp.max(look[5], 0.0)
+    return seen
+
+
+@wp.func
 def mesh_loss(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_fill: float):
     p = mesh_pixel(look, texel, xy, wh)
     return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[4] * to_fill
@@ -809,9 +822,12 @@ def shade_backward_kernel(
     if in_mesh(i, face, coverage):
         a = look[i]
         uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
-        to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(
-            a, texel_at(texels, rect, first, uv), xy, wh, grad_mesh[i], grad_fill[i]
-        )
+        g = grad_mesh[i]
+        texel = texel_at(texels, rect, first, uv)
+        to_look = vec8()
+        to_texel = vec8(g[0], g[1], g[2], g[3], 0.0, 0.0, 0.0, 0.0)
+        if not plainly_seen(a, texel, uv[0], uv[1], wh):
+            to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(a, texel, xy, wh, g, grad_fill[i])
         move = texel_slope(texels, rect, first, uv, to_texel)
         to_look[0] += move[0]
         to_look[1] += move[1]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import drivesem.feasibility_check
 from drivesem.feasibility_check import check_scene, overlap_area
-from drivesem.feasible import FeasibleSet, Limits, _separation, project, violations
+from drivesem.feasible import FeasibleSet, Limits, _Cars, _gap, _overlap, project, violations
 from drivesem.space import COMBOS, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
@@ -262,15 +262,18 @@ def test_both_ways_agree_on_gap_and_overlap(seed):
     draw = np.random.default_rng(seed)
     yaw = draw.uniform(-3, 3, 2)
     cos, sin = np.cos(yaw), np.sin(yaw)
-    corners = np.array([[0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])[None] * draw.uniform(1, 5, (2, 1, 2))
+    low, size, at = draw.uniform(-3, 0, (2, 3)), draw.uniform(1, 5, (2, 3)), draw.uniform(-2.5, 2.5, (2, 3))
+    cars = _Cars.of(low, low + size, yaw, at)
+    corners = np.array([[1, 0], [1, 1], [0, 1], [0, 0]]) * size[:, None, ::2] + low[:, None, ::2]
     rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
-    footprints = corners @ rotation + draw.uniform(-2.5, 2.5, (2, 1, 2))
-    gap, area = _separation(footprints, cos, sin)
+    footprints = corners @ rotation + at[:, None, ::2]
+    gap, area = _gap(cars, np.arange(2)), _overlap(cars, np.array([0, 1]), np.array([1, 0]))
 
     def ccw(p):
         x, z = p.T
         return p if x @ np.roll(z, -1) - z @ np.roll(x, -1) > 0 else p[::-1]
 
     expected = overlap_area(ccw(footprints[0]), ccw(footprints[1]))
-    assert area[0, 1] == pytest.approx(expected, abs=1e-9)
+    assert area == pytest.approx([expected] * 2, abs=1e-9)
     assert (gap[0, 1] < 0) == (expected > 0)
+    assert gap[0, 1] == pytest.approx(gap[1, 0], abs=1e-12)

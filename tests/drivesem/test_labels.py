@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from detectors.types import CLASSES
 from drivesem.labels import Difficulty, Labeller, hidden_share, targets, to_kitti_labels
 from drivesem.space import Parameter, ParameterSpace
+from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import project_boxes
+from scene_ir.geometry import place, project_boxes, to_clip
 from scene_ir.types import Crop, Render
 
 EASY = Difficulty(min_height_px=1.0, max_occlusion=3, max_truncation=1.0)
@@ -189,3 +190,66 @@ def test_errors(street):
         targets(scene, scene, "none")
     with pytest.raises(ShapeError, match=r"perturbed\.objects"):
         Labeller(scene).moved(street(positions_xz=((0.0, 9.0),)))
+
+
+def _plain_box(scene, i):
+    """Tight box (4,) px of object i's deformed mesh, vertex by vertex, cut 0.1 m before the camera."""
+    objects, mesh = scene.objects, scene.meshes[int(scene.objects.mesh_index[i])]
+    unit = mesh.vertices.double()
+    unit = ffd.deform(unit, ffd.lattice_weights(unit), objects.ffd[i].double())
+    pose = (t[i].double() for t in (objects.size_lhw, objects.yaw, objects.translation))
+    clip = to_clip(place(unit, *pose), scene.camera.matrix.double())
+    points = [p for p in clip if p[2] >= 0.1]
+    for face in mesh.faces.tolist() if len(points) < len(clip) else []:
+        for a, b in ((face[0], face[1]), (face[1], face[2]), (face[2], face[0])):
+            if (clip[a, 2] >= 0.1) != (clip[b, 2] >= 0.1):
+                share = (0.1 - clip[a, 2]) / (clip[b, 2] - clip[a, 2])
+                points.append(clip[a] + share * (clip[b] - clip[a]))
+    if not points:
+        return torch.zeros(4).double()
+    pixels = torch.stack(points)[:, :2] / torch.stack(points)[:, 2:]
+    return torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
+
+
+@pytest.mark.parametrize("nearest_m", [7.0, 0.5, -20.0])
+def test_boxes_are_those_of_every_vertex(street, nearest_m):
+    scene = street(positions_xz=((1.5, nearest_m), (-2.0, 12.0)), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(3)
+    offsets = 0.05 * torch.randn(2, 64, 3, generator=generator, dtype=torch.float64)  # not symmetric
+    scene = scene.with_objects(ffd=offsets, yaw=scene.objects.yaw + 0.3)
+    found = torch.from_numpy(Labeller(scene)._project(scene))
+    expected = torch.stack([_plain_box(scene, i) for i in range(2)])
+    torch.testing.assert_close(found, expected, atol=1e-7, rtol=1e-9)
+
+
+def test_moved_boxes_are_the_benign_ones_plus_the_change_of_every_vertex(street):
+    scene = street(dtype=torch.float64)
+    space = ParameterSpace(scene, ("translate", "rotate", "mesh"))
+    theta = 4 * space.step * torch.randn(space.dim, generator=torch.Generator().manual_seed(4)).double()
+    after = space.apply(scene, theta)
+    limit = torch.tensor([scene.camera.width - 1.0, scene.camera.height - 1.0] * 2).double()
+    plain = (torch.stack([_plain_box(s, i) for i in range(4)]) for s in (after, scene))
+    inside = [torch.minimum(boxes.clamp(min=0), limit) for boxes in plain]
+    expected = (scene.objects.box2d + inside[0] - inside[1]).clamp(min=0)
+    expected = torch.minimum(expected, torch.maximum(limit, scene.objects.box2d))
+    torch.testing.assert_close(targets(scene, after).boxes_xyxy, expected, atol=1e-7, rtol=1e-9)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**31))
+def test_hidden_shares_are_those_of_the_whole_frame(street, seed):
+    scene, generator = street(positions_xz=((0.0, 8.0),)), torch.Generator().manual_seed(seed)
+    ids = torch.zeros(scene.camera.height, scene.camera.width, dtype=torch.int64)
+    crops, own = [], []
+    for i in range(4):  # painted one over the other, the last one without any pixel of its own
+        x, y = (int(v) for v in torch.randint(0, 100, (2,), generator=generator))
+        values = torch.rand(1, 40, 60, generator=generator) * (0.4 if i == 3 else 1.0)
+        solid = values[0] >= 0.5
+        ids[y : y + 40, x : x + 60][solid] = i + 1
+        crops.append(Crop(values, x, y))
+        own.append(float(solid.sum()))
+    image = torch.zeros(3, *ids.shape)
+    seen = torch.bincount(ids.reshape(-1), minlength=5)[1:].double()
+    expected = torch.where(torch.tensor(own) > 0, 1 - seen / torch.tensor(own).clamp(min=1), 1.0).double()
+    found = hidden_share(Render(image=image, depth=image[0], object_id=ids, opacity=tuple(crops)))
+    torch.testing.assert_close(found, expected)

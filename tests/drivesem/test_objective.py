@@ -8,10 +8,10 @@ from drivesem.attacks.si_fgsm import SiFGSM
 from drivesem.feasibility_check import check_scene
 from drivesem.feasible import FeasibleSet
 from drivesem.labels import Difficulty
-from drivesem.objective import Objective
+from drivesem.objective import BatchObjective, Objective
 from drivesem.space import ParameterSpace
 from scene_ir.compositor import Compositor, RenderSettings
-from scene_ir.errors import RangeError
+from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Crop, Render
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0))
@@ -20,6 +20,8 @@ EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1)
 
 class StubCompositor:
     """An image whose mean is a hundredth of the sum of the cars' z, and opacities without a meaning."""
+
+    fixed = None  # what `render_batch` asks for: nothing of this can be drawn together
 
     def render(self, scene) -> Render:
         h, w = scene.camera.height, scene.camera.width
@@ -177,3 +179,85 @@ def test_the_whole_chain_is_deterministic_and_feasible(street):
     assert result.loss_trace[0] == pytest.approx(objective.benign.loss, rel=0.05)
     assert not objective.score(space.theta0).success
     assert check_scene(scene, space.apply(scene, result.theta)) == []
+
+
+class PatternCompositor(StubCompositor):
+    """Images of a size of its own, whose brightness in each third is that of one coordinate of the first car."""
+
+    def __init__(self, height: int, width: int) -> None:
+        generator = torch.Generator().manual_seed(height)
+        self.pattern = torch.rand(3, height, width, generator=generator, dtype=torch.float64)
+
+    def render(self, scene) -> Render:
+        stub = super().render(scene)
+        value = (scene.objects.translation[0] / 20).sigmoid()
+        return Render(value[:, None, None] * self.pattern, stub.depth, stub.object_id, stub.opacity)
+
+
+def _frozen_squeezedet() -> SqueezeDet:
+    detector = SqueezeDet(t_star=0.3).double()
+    detector.initialise(torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(detector.convdet.weight, std=0.02, generator=torch.Generator().manual_seed(1))
+    return detector.eval().requires_grad_(False)
+
+
+def _pattern_objectives(street, detector, sizes) -> list[Objective]:
+    found = []
+    for i, (height, width) in enumerate(sizes):
+        # Scenes of one, two, three objects: a mean over the batch's objects would mix them.
+        scene = street(positions_xz=[(-2.0, 9.0 + i), (2.4, 13.0), (-2.0, 19.0)][: i + 1], dtype=torch.float64)
+        space = ParameterSpace(scene, ("translate",))
+        found.append(Objective(PatternCompositor(height, width), space, detector, difficulty=EVERYTHING))
+    return found
+
+
+def test_several_scenes_at_once_are_each_by_itself(street):
+    detector = _frozen_squeezedet()
+    objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
+    generator = torch.Generator().manual_seed(3)
+    thetas = [torch.randn(o.space.dim, generator=generator, dtype=torch.float64) / 10 for o in objectives]
+    batch = BatchObjective(objectives).loss_and_grad(thetas)
+    single = [o.loss_and_grad(theta) for o, theta in zip(objectives, thetas, strict=True)]
+    assert len({round(loss, 3) for loss, _ in single}) == 3
+    for (loss, gradient), (expected_loss, expected) in zip(batch, single, strict=True):
+        assert loss == pytest.approx(expected_loss, rel=1e-6)
+        assert float(expected.norm()) > 0
+        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
+
+
+def test_images_of_one_size_share_a_call_of_the_detector(street):
+    detector = _frozen_squeezedet()
+    objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
+    seen = []
+    detector.register_forward_hook(lambda _module, inputs, _output: seen.append(tuple(inputs[0].shape)))
+    BatchObjective(objectives).loss_and_grad([o.space.theta0 for o in objectives])
+    assert seen == [(2, 3, 64, 96), (1, 3, 48, 80)]
+
+
+def test_restarts_at_once_are_each_by_itself(street):
+    objective = _real(street(positions_xz=NEAR, dtype=torch.float64), ("translate", "color"))
+    space = objective.space
+    noise = torch.randn(3, space.dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    thetas = space.theta0 + 0.5 * space.step * noise
+    losses, gradients = objective.loss_and_grad_many(thetas)
+    assert losses.shape == (3,)
+    assert gradients.shape == (3, space.dim)
+    for i, theta in enumerate(thetas):
+        loss, gradient = objective.loss_and_grad(theta)
+        assert float(losses[i]) == pytest.approx(loss, rel=1e-6)
+        assert float((gradients[i] - gradient).norm()) <= 1e-4 * float(gradient.norm())
+
+
+def test_batches_that_do_not_fit_are_refused(street):
+    scene = street(positions_xz=NEAR)
+    first, second = (_objective(scene, StubDetector(scene.objects.box2d)) for _ in range(2))
+    with pytest.raises(RangeError, match="objectives: expected one detector for all, found 2 detectors"):
+        BatchObjective([first, second])
+    with pytest.raises(RangeError, match="objectives: expected one detector for all, found 0 detectors"):
+        BatchObjective([])
+    with pytest.raises(ShapeError, match=r"thetas: expected 1, one for each scene, found 2"):
+        BatchObjective([first]).loss_and_grad([first.space.theta0] * 2)
+    with pytest.raises(ShapeError, match=r"thetas: expected \(B, 4\)"):
+        first.loss_and_grad_many(first.space.theta0)
+    with pytest.raises(ShapeError, match=r"thetas: expected \(B, 4\)"):
+        first.loss_and_grad_many(torch.zeros(0, 4))

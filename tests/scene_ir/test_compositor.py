@@ -16,6 +16,7 @@ from torch import Tensor
 from scene_ir import blend, surfaces
 from scene_ir.compositor import Compositor, RenderSettings, render, scene_to
 from scene_ir.errors import ShapeError
+from scene_ir.raster.layout import Layout
 from scene_ir.raster import verbs
 from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
 from scene_ir.types import Crop, Objects, Render, SceneIR
@@ -267,18 +268,18 @@ def test_blend_is_the_plain_formula_and_has_its_gradients() -> None:
     layers = torch.tensor([[0, 0, 4, 3], [2, 1, 6, 5]])
     shadows = torch.tensor([[1, 1, 5, 4]])
 
-    def offsets(rects: Tensor) -> Tensor:
-        return torch.nn.functional.pad((rects[:, 2:] - rects[:, :2]).prod(dim=1).cumsum(0), (1, 0))
-
-    plan = blend.Plan(
-        tuple(blend.spans(shadows, offsets(shadows))), tuple(reversed(blend.spans(layers, offsets(layers))))
-    )
+    plan = blend.Plan.of(Layout.of(layers), Layout.of(shadows), (1, 0))
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
     canvas, shadow, colour, opacity = rand(4, 5, 6), rand(12, 3), rand(28, 4), rand(28)
-    out = blend.blend(canvas, shadow, colour, opacity, plan)
+    behind, z = torch.full((5, 6), 9.0, dtype=torch.float64), torch.arange(28, dtype=torch.float64) / 4
+
+    def blended(*what: Tensor) -> Tensor:
+        return blend.composite(what[0], behind, (*what[1:], z), plan, False)[0]
+
+    out = blended(canvas, shadow, colour, opacity)
     expected = canvas.detach().clone()
     expected[:3, 1:4, 1:5] *= shadow.detach().T.reshape(3, 3, 4)
     for part, (rows, columns), size in ((slice(12, 28), (slice(1, 5), slice(2, 6)), (4, 4)),
@@ -287,7 +288,21 @@ def test_blend_is_the_plain_formula_and_has_its_gradients() -> None:
         clear = 1 - opacity.detach()[part].reshape(size)
         expected[:, rows, columns] = colour.detach()[part].T.reshape(4, *size) + clear * under
     torch.testing.assert_close(out.detach(), expected)
-    assert torch.autograd.gradcheck(lambda *inputs: blend.blend(*inputs, plan), (canvas, shadow, colour, opacity))
+    assert torch.autograd.gradcheck(blended, (canvas, shadow, colour, opacity))
+
+    single = tuple(t.detach().float().requires_grad_() for t in (canvas, shadow, colour, opacity))
+    scaled = [single[0], single[1], 3.0 * single[2] - 1.0, single[3]]  # layers beyond [0, 1], for the clamping
+    for clamped in (False, True):
+        what = (scaled[1], scaled[2], scaled[3], z.float())
+        fast = blend.composite(scaled[0], behind.float(), what, plan, clamped, "warp")
+        plain = blend.composite(scaled[0], behind.float(), what, plan, clamped, "reference")
+        torch.testing.assert_close(fast, plain)
+        weight = torch.rand(4, 5, 6, generator=generator)
+        for a, b in zip(
+            *(torch.autograd.grad((o[0] * weight).sum(), single, retain_graph=True) for o in (fast, plain)),
+            strict=True,
+        ):
+            torch.testing.assert_close(a, b)
 
 
 def _order(cars: list[tuple[float, float, float, float]]) -> list[int]:

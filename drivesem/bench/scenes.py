@@ -1,0 +1,208 @@
+"""Streets to measure on: exactly N cars of K triangles each, seen as KITTI's camera sees them.
+
+The photographs are the scene generator's, taken apart as the embedded scenes are, so that nothing perturbed
+renders the photograph. The cars cover about as many pixels as in KITTI's frames with so many vehicles: that, more
+than their number, is what costs time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+
+from drivesem.bench.remesh import with_triangles
+from drivesem.synth.demo import take_apart
+from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, plan_frame, render_frame
+from drivesem.synth.layout import Actor, Lane, LayoutSettings, Road
+from scene_ir.errors import RangeError
+from scene_ir.geometry import clip_boxes, place, project_boxes, to_clip
+from scene_ir.meshes.templates import template, typical_size_lhw
+from scene_ir.raster import verbs
+from scene_ir.types import Camera, Mesh, SceneIR
+
+HEIGHT, WIDTH = 375, 1242
+"""Pixels of a frame of KITTI's first camera."""
+_CAMERA = 0
+"""That camera among the generator's."""
+KITTI_BOX_PIXELS = {1: 2_700, 4: 18_100, 8: 87_000, 16: 137_700}
+"""Median area, px, of the union of the boxes of cars, vans and trucks, over those of KITTI's 7,481 labelled frames
+with that many of them."""
+_SHAPES = (("hatchback", 101), ("sedan", 100), ("estate", 102), ("suv", 101))
+"""Kinds and variants of the cars, in turn; their templates have 4.6 to 4.8 thousand triangles."""
+_PAINTS = ((0.42, 0.43, 0.44), (0.018, 0.018, 0.02), (0.36, 0.025, 0.025), (0.78, 0.78, 0.77), (0.03, 0.07, 0.22))
+_FAR, _MIDDLE, _NEAR, _LEFT, _OWN, _RIGHT = range(6)
+"""Lanes of a motorway, from left to right: three oncoming ones, and the camera's with its neighbours."""
+_PLACES: dict[int, tuple[tuple[int, float], ...]] = {
+    1: ((_OWN, 14.0),),
+    4: ((_LEFT, 14.0), (_RIGHT, 21.0), (_OWN, 24.0), (_NEAR, 25.0)),
+    8: ((_NEAR, 12.2), (_RIGHT, 10.4), (_LEFT, 11.5), (_OWN, 20.0), (_MIDDLE, 23.5), (_RIGHT, 22.0), (_LEFT, 27.0),
+        (_RIGHT, 42.0)),
+    16: ((_NEAR, 12.2), (_RIGHT, 8.3), (_LEFT, 12.0), (_OWN, 13.0), (_RIGHT, 17.0), (_LEFT, 19.0), (_NEAR, 20.0),
+         (_RIGHT, 24.0), (_MIDDLE, 22.0), (_LEFT, 26.0), (_NEAR, 29.0), (_RIGHT, 33.0), (_LEFT, 36.0),
+         (_MIDDLE, 32.0), (_NEAR, 45.0), (_FAR, 36.0)),
+}  # fmt: skip
+"""Lane and depth, m, of each car; the image's left border cuts the first of eight and of sixteen."""
+MOST_CARS = max(_PLACES)
+"""As many cars a street may have."""
+_ROADS = 400
+"""Roads that are drawn until one has the lanes that are asked for."""
+_STRAIGHT = 3e-4
+"""Curvature, 1/m, up to which a road counts as straight: a quarter of a metre at 40 m."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchScene:
+    """A scene to measure on. cars; triangles: nominal, a car; triangles_actual: their mean over the cars;
+    crop_pixels: of the rectangles that hold the cars' meshes; hit_pixels: pixel centres that the meshes hit, car
+    by car; box_pixels: the area of the boxes' union, px.
+    """
+
+    scene: SceneIR
+    cars: int
+    triangles: int
+    triangles_actual: float
+    crop_pixels: int
+    hit_pixels: int
+    box_pixels: int
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """The cars' meshes of a scene in one list, as the four verbs take them. points (V, 3) m in camera axes; clip
+    (V, 3); faces (F, 3) int64; vertex_ranges, face_ranges (N, 2) int64.
+    """
+
+    points: torch.Tensor
+    clip: torch.Tensor
+    faces: torch.Tensor
+    vertex_ranges: torch.Tensor
+    face_ranges: torch.Tensor
+
+    @classmethod
+    def of(cls, scene: SceneIR) -> Placed:
+        """The meshes where the scene has them, undeformed."""
+        objects = scene.objects
+        points, faces, corners, ends = [], [], 0, [(0, 0)]
+        for i, index in enumerate(objects.mesh_index.tolist()):
+            mesh = scene.meshes[index]
+            points.append(place(mesh.vertices, objects.size_lhw[i], objects.yaw[i], objects.translation[i]))
+            faces.append(mesh.faces + corners)
+            corners += mesh.vertices.shape[0]
+            ends.append((corners, ends[-1][1] + mesh.faces.shape[0]))
+        edges = torch.tensor(ends, dtype=torch.int64)
+        all_points = torch.cat(points)
+        ranges = torch.stack([edges[:-1], edges[1:]], dim=1)
+        return cls(
+            points=all_points,
+            clip=to_clip(all_points, scene.camera.matrix),
+            faces=torch.cat(faces),
+            vertex_ranges=ranges[..., 0].contiguous(),
+            face_ranges=ranges[..., 1].contiguous(),
+        )
+
+    def layout(self, camera: Camera) -> verbs.Layout:
+        """The rectangles of the image that hold the meshes."""
+        return verbs.Layout.of(verbs.bounding_rects(self.clip, self.vertex_ranges, camera.height, camera.width))
+
+
+def bench_scene(cars: int, triangles: int, seed: int = 0, scale: float = 1.0) -> BenchScene:
+    """`cars` cars of `triangles` triangles each on a street, in a frame of 1242x375 px times `scale`.
+
+    Equal arguments give equal scenes. Raises RangeError for a number of cars there is no street for.
+    """
+    if not 1 <= cars <= MOST_CARS:
+        raise RangeError("cars", f"1 to {MOST_CARS}", cars)
+    scene = take_apart(
+        _photograph(cars, seed, scale),
+        f"bench-{cars}x{triangles}",
+        lambda kind, variant: _mesh(kind, variant, triangles),
+    )
+    assert len(scene.objects) == cars
+    placed = Placed.of(scene)
+    layout = placed.layout(scene.camera)
+    fragments = verbs.rasterize(placed.clip, placed.faces, placed.face_ranges, layout)
+    return BenchScene(
+        scene=scene,
+        cars=cars,
+        triangles=triangles,
+        triangles_actual=placed.faces.shape[0] / cars,
+        crop_pixels=layout.size,
+        hit_pixels=int((fragments.face >= 0).sum()),
+        box_pixels=_covered(scene),
+    )
+
+
+@lru_cache(maxsize=16)
+def _mesh(kind: str, variant: int, triangles: int) -> Mesh:
+    return with_triangles(template(kind, variant), triangles)
+
+
+@lru_cache(maxsize=4)
+def _photograph(cars: int, seed: int, scale: float) -> SynthFrame:
+    """The street with its cars, rendered once for all numbers of triangles."""
+    plan = _road(seed)
+    road, lanes = plan.setting.road, _lanes(plan.setting.road)
+    places = _PLACES[min(count for count in _PLACES if count >= cars)][:cars]
+    actors = tuple(_car(i, lanes[lane], depth, road, seed) for i, (lane, depth) in enumerate(places))
+    view = plan.setting.view
+    setting = replace(plan.setting, view=replace(view, camera=_scaled(view.camera, scale)))
+    frame = render_frame(replace(plan, actors=actors, setting=setting), with_background=True)
+    assert frame is not None
+    return frame
+
+
+def _road(seed: int) -> Plan:
+    """The first straight motorway of a stream with the camera on the middle one of three lanes."""
+    layout = LayoutSettings(people=False, vehicles=(0, 0), kinds=("motorway",))
+    settings = SynthSettings(layout, sunny=True, tilt_rad=0.004, camera=_CAMERA)
+    for attempt in range(_ROADS):
+        plan = plan_frame(seed, 0, "heldout", settings, attempt)
+        road = plan.setting.road
+        lanes = _lanes(road)
+        if len(lanes) == 6 and lanes[_OWN].middle_m == 0 and abs(road.curvature) < _STRAIGHT:
+            return plan
+    raise RangeError(f"road of seed {seed}", f"a straight one among {_ROADS}", "none")
+
+
+def _lanes(road: Road) -> list[Lane]:
+    """From left to right."""
+    return sorted(road.lanes, key=lambda lane: lane.middle_m)
+
+
+def _car(index: int, lane: Lane, depth_m: float, road: Road, seed: int) -> Actor:
+    kind, variant = _SHAPES[index % len(_SHAPES)]
+    x, z = road.point(lane.middle_m, depth_m)
+    return Actor(
+        kind=kind,
+        variant=variant,
+        position_xz=(float(x), float(z)),
+        # A trace of a turn, another for each car: cars that stand exactly along an axis are an easy case.
+        yaw=road.yaw(depth_m, lane.direction) + 0.02 * ((index * 7) % 5 - 2),
+        size_lhw=typical_size_lhw(kind, variant),
+        paint=_PAINTS[index % len(_PAINTS)],
+        parked=False,
+        seed=seed + index,
+    )
+
+
+def _scaled(camera: Camera, scale: float) -> Camera:
+    """The same view with `scale` times as many pixels along each axis; pixel centres at integers."""
+    if scale == 1.0:
+        return camera
+    shift = (scale - 1.0) / 2.0
+    to_new = torch.tensor([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
+    height, width = round(camera.height * scale), round(camera.width * scale)
+    projection = None if camera.projection is None else to_new @ camera.projection
+    return Camera(to_new @ camera.intrinsics, height, width, projection)
+
+
+def _covered(scene: SceneIR) -> int:
+    """Pixels in the union of the cars' projected boxes."""
+    objects, camera = scene.objects, scene.camera
+    boxes = project_boxes(objects.size_lhw, objects.yaw, objects.translation, camera.matrix)
+    covered = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for x0, y0, x1, y1 in clip_boxes(boxes, camera.height, camera.width).round().to(torch.int64).tolist():
+        covered[y0 : y1 + 1, x0 : x1 + 1] = True
+    return int(covered.sum())

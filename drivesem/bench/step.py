@@ -1,0 +1,218 @@
+"""One whole attack step beside the detector alone, measured in turn in one process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from detectors.base import Detector
+from detectors.types import Targets
+from drivesem.bench.scenes import BenchScene, bench_scene
+from drivesem.bench.timing import Budget, Clock, Spread, rounds
+from drivesem.feasible import FeasibleSet
+from drivesem.labels import Labeller
+from drivesem.objective import Objective
+from drivesem.space import Parameter, ParameterSpace, combo
+from scene_ir.compositor import Compositor, RenderSettings, scene_to
+
+METHOD = (
+    "A step is Objective.loss_and_grad at a feasible theta other than 0 (scene at theta, render, labels, "
+    "detector forward, loss, backward through all of it) and FeasibleSet.project of the theta that a sign "
+    "step leads to; the steps follow each other as an attack's do, and start anew at another random theta now "
+    "and then. detector_ms is the same detector's forward and backward to the input image, with the same loss "
+    "and fixed targets, in the faster of the two memory layouts of that image. Both are measured in turn in "
+    "one process after a warm-up, the order swapped every time; ratio is the median of the paired ratios, "
+    "ratio_iqr the distance of their quartiles, the milliseconds are medians. render_forward_ms (scene at "
+    "theta and render, recorded for gradients), render_backward_ms, labels_ms and project_ms are medians of "
+    "the parts on their own. pixels: crop_pixels of the rectangles around the meshes, hit_pixels of the "
+    "meshes."
+)
+_TERM = "objectness"
+_START_STEPS = 10
+"""Random starts lie within so many steps of the photograph: an attack of the paper takes 10."""
+_RESTART = 12
+"""Steps until the attack starts anew, so that measured thetas are neither all near a start nor far out."""
+_FEWEST, _MOST = 3, 200
+_WARM_UP = 1
+_LAYOUT_TRIES = 3
+_HAS_LOD = "lod" in {field.name for field in fields(RenderSettings)}
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One row to measure. lod: level of detail on."""
+
+    cars: int
+    triangles: int
+    params: tuple[Parameter, ...] = combo(2)
+    lod: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What was measured: times in ms, medians. pixels: hit and crop pixels of the meshes; box_pixels of the boxes'
+    union; repetitions: pairs of step and detector.
+    """
+
+    cars: int
+    triangles: int
+    triangles_actual: float
+    params: str
+    lod: bool
+    ratio: float
+    ratio_iqr: float
+    step_ms: float
+    detector_ms: float
+    render_forward_ms: float
+    render_backward_ms: float
+    labels_ms: float
+    project_ms: float
+    pixels: int
+    crop_pixels: int
+    box_pixels: int
+    repetitions: int
+
+
+def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[Case], list[Case]]:
+    """The sizes to measure, and what stands beside the one nearest to 8 cars of the most triangles: weather and
+    foliage, and level of detail off."""
+    sizes = [Case(n, k) for n in cars for k in triangles]
+    usual = 8 if 8 in cars else max(cars)
+    beside = [Case(usual, max(triangles), (Parameter.WEATHER, Parameter.FOLIAGE))]
+    if _HAS_LOD:
+        beside.append(Case(usual, max(triangles), lod=False))
+    return sizes, beside
+
+
+def measure(
+    case_list: Sequence[Case], detector: Detector, seconds: float, seed: int, device: str
+) -> Iterator[Row]:
+    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow."""
+    budget = Budget(seconds, len(case_list))
+    clock = Clock(device)
+    layout: torch.memory_format | None = None
+    for case in case_list:
+        start = time.perf_counter()
+        bench = bench_scene(case.cars, case.triangles, seed)
+        step = _Step(case, bench, detector, seed, device)
+        layout = layout or step.faster_layout(clock)
+        alone = step.detector_alone(layout)
+        for _ in range(_WARM_UP):
+            alone()
+            step()
+        step.parts(clock)
+        yield _row(case, bench, step, alone, clock, budget.share(time.perf_counter() - start))
+
+
+def _row(
+    case: Case, bench: BenchScene, step: _Step, alone: Callable[[], None], clock: Clock, seconds: float
+) -> Row:
+    pairs: list[tuple[float, float]] = []
+    parts: list[tuple[float, ...]] = []
+    # On a machine so busy that the seconds are gone, one pair a row has to do.
+    for i in rounds(seconds, _FEWEST if seconds > 0 else 1, _MOST):
+        if i % 2:
+            whole = clock.ms(step)
+            pairs.append((whole, clock.ms(alone)))
+        else:
+            single = clock.ms(alone)
+            pairs.append((clock.ms(step), single))
+        if i % 2 == 0:
+            parts.append(step.parts(clock))
+    ratio = Spread.of([whole / single for whole, single in pairs])
+    medians = [Spread.of(part).median for part in zip(*parts, strict=True)]
+    return Row(
+        cars=case.cars,
+        triangles=case.triangles,
+        triangles_actual=bench.triangles_actual,
+        params=",".join(case.params),
+        lod=case.lod and _HAS_LOD,
+        ratio=round(ratio.median, 4),
+        ratio_iqr=round(ratio.iqr, 4),
+        step_ms=round(Spread.of([p[0] for p in pairs]).median, 3),
+        detector_ms=round(Spread.of([p[1] for p in pairs]).median, 3),
+        render_forward_ms=round(medians[0], 3),
+        render_backward_ms=round(medians[1], 3),
+        labels_ms=round(medians[2], 3),
+        project_ms=round(medians[3], 3),
+        pixels=bench.hit_pixels,
+        crop_pixels=bench.crop_pixels,
+        box_pixels=bench.box_pixels,
+        repetitions=len(pairs),
+    )
+
+
+class _Step:
+    """An attack on one scene, step by step."""
+
+    def __init__(self, case: Case, bench: BenchScene, detector: Detector, seed: int, device: str) -> None:
+        scene = scene_to(bench.scene, torch.float32, device)
+        settings = replace(RenderSettings(), **({"lod": case.lod} if _HAS_LOD else {}))
+        self.space = ParameterSpace(scene, case.params)
+        self.compositor = Compositor(scene, settings)
+        self.objective = Objective(self.compositor, self.space, detector, term=_TERM)
+        self.feasible = FeasibleSet(self.space)
+        self.detector = detector
+        with torch.no_grad():
+            self._benign = self.compositor.render(scene)
+        self._labeller = Labeller(scene, self._benign)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._taken = 0
+        self.theta = self._start()
+        self._cotangent = torch.randn(scene.photograph.shape, generator=self._generator).to(scene.photograph)
+
+    def _start(self) -> Tensor:
+        """A feasible theta other than 0, as an attack passes through."""
+        noise = torch.rand(self.space.dim, generator=self._generator).to(self.space.step)
+        theta = self.feasible.project(_START_STEPS * self.space.step * (2 * noise - 1)).theta
+        assert bool(theta.any())
+        return theta
+
+    def __call__(self) -> None:
+        """One step: gradient, sign step, projection."""
+        _, gradient = self.objective.loss_and_grad(self.theta)
+        self.theta = self.feasible.project(self.theta + self.space.step * torch.sign(gradient)).theta
+        self._taken += 1
+        if self._taken % _RESTART == 0:
+            self.theta = self._start()
+
+    def parts(self, clock: Clock) -> tuple[float, float, float, float]:
+        """Milliseconds of render forward, render backward, labels and projection at the present theta."""
+        leaf = self.theta.detach().clone().requires_grad_(True)
+        kept: list[Tensor] = []
+        scene = self.space.apply(self.space.scene, self.theta)
+
+        def forward() -> None:
+            kept.append(self.compositor.render(self.space.apply(self.space.scene, leaf)).image)
+
+        first = clock.ms(forward)
+        second = clock.ms(lambda: torch.autograd.grad(kept[0], leaf, self._cotangent))
+        with torch.no_grad():
+            render = self.compositor.render(scene)
+        third = clock.ms(lambda: self._labeller.moved(scene, render))
+        signs = torch.randn(self.space.dim, generator=self._generator).sign().to(self.theta)
+        fourth = clock.ms(lambda: self.feasible.project(self.theta + self.space.step * signs))
+        return first, second, third, fourth
+
+    def faster_layout(self, clock: Clock) -> torch.memory_format:
+        """The layout of its input in which the detector is faster."""
+        layouts = (torch.contiguous_format, torch.channels_last)
+        calls = [self.detector_alone(layout) for layout in layouts]
+        calls[0]()
+        times = [min(clock.ms(call) for _ in range(_LAYOUT_TRIES)) for call in calls]
+        return layouts[times.index(min(times))]
+
+    def detector_alone(self, layout: torch.memory_format) -> Callable[[], None]:
+        """The detector's forward and backward to its input, of that layout."""
+        image = self._benign.image[None].detach().contiguous(memory_format=layout)
+        targets = self._labeller.paper().targets
+        return lambda: self._alone(image, targets)
+
+    def _alone(self, image: Tensor, targets: Targets) -> None:
+        leaf = image.detach().requires_grad_(True)
+        loss = self.detector.loss(self.detector(leaf), [targets])[_TERM]
+        torch.autograd.grad(loss, leaf)

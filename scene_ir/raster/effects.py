@@ -1,0 +1,813 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
+"""Weather over the whole picture as fused NVIDIA Warp kernels, with gradients written by hand; float32.
+
+The model, and what its numbers mean, is in `scene_ir.environment`. Only a wet road looks at other pixels than its
+own: it mirrors the column above it. So the rows that hold some road (the wet rows) go through three kernels: what
+comes before the mirror, the mirror, the rest; all other rows go through one.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from scene_ir import environment as model
+from scene_ir.raster.colour import (
+    array,
+    clamped,
+    clamped_adjoint,
+    lab_adjoint,
+    lab_of,
+    level_of,
+    lifted,
+    rgb_adjoint,
+    rgb_of,
+    within,
+)
+from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, store, store3, total
+from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.types import Environment
+
+start_warp()
+wp.set_module_options(OPTIONS)
+
+FOG = wp.constant(wp.float32(model.FOG_EXTINCTION_PER_M))
+RAIN = wp.constant(wp.float32(model.RAIN_EXTINCTION_PER_M))
+NEAREST = wp.constant(wp.float32(1.0 / model.HAZE_CAP_M))
+FEWEST_LEAVES = wp.constant(wp.float32(model.FEWEST_LEAVES))
+LUMA = wp.constant(wp.vec3f(*model.LUMA))
+DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
+WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
+
+_STRIP = 64
+"""Columns that a thread of the CPU smears at a time; `mirror` and `unmirror` have room for this many."""
+_SETTINGS = 19
+"""Numbers that are the same for all pixels, in this order: 0.85 overcast; rain; fog; what overcast makes of a
+black sky; gain of the time of day (3) and its slope (3); airlight (3) and its slopes along
+overcast (3) and time (3)."""
+
+
+@wp.func
+def grey_air_of(air: wp.array(dtype=wp.float32)):
+    return wp.float64(LUMA[0] * air[0] + LUMA[1] * air[1] + LUMA[2] * air[2])
+
+
+@wp.kernel
+def settings_kernel(
+    start: int,
+    code: wp.array(dtype=wp.float32),
+    air: wp.array(dtype=wp.float32),
+    settings: wp.array(dtype=wp.float32),
+):
+    """One thread a channel."""
+    c = start + wp.tid()
+    time = wp.float64(code[2])
+    overcast = wp.float64(0.85) * wp.float64(code[3])
+    square = time * time
+    dusk = wp.exp(wp.float64(-3.5) * square)
+    dim = wp.exp(wp.float64(-2.0) * square)
+    dark = wp.exp(-DARKENING[c] * square)
+    one = wp.float64(1.0)
+    gain = (dark - one) + WARMTH[c] * time * dusk - wp.float64(0.25) * time * dim
+    slope = (
+        wp.float64(-2.0) * DARKENING[c] * time * dark
+        + WARMTH[c] * (one - wp.float64(7.0) * square) * dusk
+        - wp.float64(0.25) * (one - wp.float64(4.0) * square) * dim
+    )
+    grey = grey_air_of(air)
+    plain = wp.float64(air[c]) + overcast * (wp.float64(0.9) * grey - wp.float64(air[c]))
+    if c == 0:
+        settings[0] = wp.float32(overcast)
+        settings[1] = code[1]
+        settings[2] = code[0]
+        settings[3] = wp.float32(wp.float64(0.40) * grey + wp.float64(0.30))
+    settings[4 + c] = wp.float32(gain)
+    settings[7 + c] = wp.float32(slope)
+    settings[10 + c] = wp.float32(plain + gain * plain)
+    settings[13 + c] = wp.float32(wp.float64(0.85) * (wp.float64(0.9) * grey - wp.float64(air[c])) * (one + gain))
+    settings[16 + c] = wp.float32(slope * plain)
+
+
+@wp.func
+def grey(x: wp.vec3f):
+    return wp.dot(LUMA, x)
+
+
+@wp.func
+def same(x: wp.float32):
+    return wp.vec3f(x, x, x)
+
+
+@wp.func
+def grown(x: wp.vec3f, gain: wp.vec3f):
+    return wp.vec3f(x[0] + gain[0] * x[0], x[1] + gain[1] * x[1], x[2] + gain[2] * x[2])
+
+
+@wp.func
+def cover_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+    """What overcast, fully on, would add."""
+    y = grey(x)
+    flat = 0.324 * x + same(0.396 * y + 0.0976)  # 0.40 + 0.72 ((0.45 x + 0.55 y) - 0.42)
+    return (flat + sky * (same(load(settings, 3) + 0.15 * y) - flat)) - x
+
+
+@wp.func
+def damp_change(x: wp.vec3f):
+    """What rain, at 1 / 0.9, would add by wetting."""
+    return (0.468 * x + same(0.252 * grey(x))) - x
+
+
+@wp.func
+def before(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+    """A pixel after overcast, time of day and damp."""
+    covered = x + load(settings, 0) * cover_change(x, sky, settings)
+    timed = grown(covered, load3(settings, 4, 1))
+    return timed + (0.9 * load(settings, 1)) * damp_change(timed)
+
+
+@wp.func
+def depth_of(inverse: wp.float32):
+    return 1.0 / wp.max(inverse, NEAREST)
+
+
+@wp.func
+def far_share(depth: wp.float32):
+    return wp.min(wp.max((depth - 4.0) * (1.0 / 41.0), 0.0), 1.0)
+
+
+@wp.func
+def grazing_at(depth: wp.float32):
+    t = far_share(depth)
+    return 0.15 + 0.45 * (t * t * (3.0 - 2.0 * t))
+
+
+@wp.func
+def hazed(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
+    """A pixel after haze, streaks and fog."""
+    rain = load(settings, 1)
+    air = load3(settings, 10, 1)
+    far = x + (1.0 - exp_(-RAIN * rain * depth)) * (0.85 * air - x)
+    streaked = far + (0.22 * rain * streak) * (air - far)
+    return streaked + (1.0 - exp_(-FOG * load(settings, 2) * depth)) * (air - streaked)
+
+
+@wp.func
+def shiny(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
+    """A pixel with the road's sheen, of which `wet` in [0, 1] is seen."""
+    return x + wet * (0.55 * mirrored + 0.40 * load3(settings, 10, 1) - x)
+
+
+@wp.kernel
+def dry_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    inverse: wp.array(dtype=wp.float32),
+    sky: wp.array(dtype=wp.float32),
+    streaks: wp.array(dtype=wp.float32),
+    plane: int,
+    out: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    x = before(load3(image, i, plane), load(sky, i), settings)
+    store3(out, i, plane, hazed(x, depth_of(load(inverse, i)), load(streaks, i), settings))
+
+
+@wp.kernel
+def damp_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    sky: wp.array(dtype=wp.float32),
+    plane: int,
+    first: int,
+    kept: int,
+    out: wp.array(dtype=wp.float32),
+):
+    """Pixels before the mirror; out: planes of `kept` numbers, from pixel `first` on."""
+    i = start + wp.tid()
+    store3(out, i - first, kept, before(load3(image, i, plane), load(sky, i), settings))
+
+
+@wp.kernel
+def wet_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    damp: wp.array(dtype=wp.float32),
+    mirrored: wp.array(dtype=wp.float32),
+    first: int,
+    kept: int,
+    inverse: wp.array(dtype=wp.float32),
+    road: wp.array(dtype=wp.float32),
+    streaks: wp.array(dtype=wp.float32),
+    plane: int,
+    out: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    depth = depth_of(load(inverse, i))
+    share = load(settings, 1) * (load(road, i) * grazing_at(depth))
+    x = shiny(load3(damp, i - first, kept), load3(mirrored, i - first, kept), share, settings)
+    store3(out, i, plane, hazed(x, depth, load(streaks, i), settings))
+
+
+@wp.func
+def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
+    """Of `before`: the gradient to x, and to rain, time and overcast (3)."""
+    overcast = load(settings, 0)
+    damping = 0.9 * load(settings, 1)
+    gain = load3(settings, 4, 1)
+    change = cover_change(x, sky, settings)
+    covered = x + overcast * change
+    rain = 0.9 * wp.dot(g, damp_change(grown(covered, gain)))
+    wetted = g + damping * ((0.468 * g + 0.252 * total(g) * LUMA) - g)
+    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, 7, 1))
+    timed = grown(wetted, gain)
+    flat = (1.0 - sky) * timed
+    grey_slope = 0.396 * total(flat) + 0.15 * sky * total(timed)
+    out = timed + overcast * ((0.324 * flat + grey_slope * LUMA) - timed)
+    return out, wp.vec3f(rain, time, 0.85 * wp.dot(timed, change))
+
+
+@wp.func
+def after_adjoint(
+    x: wp.vec3f,
+    mirrored: wp.vec3f,
+    road: wp.float32,
+    inverse: wp.float32,
+    streak: wp.float32,
+    g: wp.vec3f,
+    settings: wp.array(dtype=wp.float32),
+):
+    """Of `shiny` and `hazed`: the gradient to x, to mirrored, to (fog, rain, time, overcast), to inverse."""
+    rain = load(settings, 1)
+    fog = load(settings, 2)
+    air = load3(settings, 10, 1)
+    depth = depth_of(inverse)
+    t = far_share(depth)
+    seen = road * grazing_at(depth)
+    wet = rain * seen
+    sheen = 0.55 * mirrored + 0.40 * air - x
+    wetted = x + wet * sheen
+    clear = exp_(-RAIN * rain * depth)
+    to_haze = 0.85 * air - wetted
+    far = wetted + (1.0 - clear) * to_haze
+    streaked = far + (0.22 * rain * streak) * (air - far)
+    visible = exp_(-FOG * fog * depth)
+
+    g_fogged = FOG * visible * wp.dot(g, air - streaked)
+    g_far = visible * g
+    g_streak = wp.dot(g_far, air - far)
+    g_haze = (1.0 - 0.22 * rain * streak) * g_far
+    g_hazed = RAIN * clear * wp.dot(g_haze, to_haze)
+    g_wet = clear * g_haze
+    g_sheen = wp.dot(g_wet, sheen)
+    g_air = (
+        (1.0 - visible) * g
+        + (0.22 * rain * streak) * g_far
+        + (0.85 * (1.0 - clear)) * g_haze
+        + (0.40 * wet) * g_wet
+    )
+    code = wp.vec4f(
+        g_fogged * depth,
+        g_hazed * depth + 0.22 * streak * g_streak + seen * g_sheen,
+        wp.dot(g_air, load3(settings, 16, 1)),
+        wp.dot(g_air, load3(settings, 13, 1)),
+    )
+    bend = (0.45 * 6.0 / 41.0) * (t - t * t)
+    g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
+    g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
+    return (1.0 - wet) * g_wet, (0.55 * wet) * g_wet, code, g_inverse
+
+
+@wp.kernel
+def dry_adjoint_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    inverse: wp.array(dtype=wp.float32),
+    sky: wp.array(dtype=wp.float32),
+    streaks: wp.array(dtype=wp.float32),
+    plane: int,
+    grad: wp.array(dtype=wp.float32),
+    grad_image: wp.array(dtype=wp.float32),
+    grad_inverse: wp.array(dtype=wp.float32),
+    shares: wp.array(dtype=wp.float32),
+):
+    """shares: each pixel's part of the gradients to fog, rain, time, overcast, a plane each."""
+    i = start + wp.tid()
+    colour = load3(image, i, plane)
+    cover = load(sky, i)
+    x = before(colour, cover, settings)
+    g, _mirrored, code, g_inverse = after_adjoint(
+        x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
+    )
+    g_colour, parts = before_adjoint(colour, cover, g, settings)
+    store3(grad_image, i, plane, g_colour)
+    store(grad_inverse, i, g_inverse)
+    store(shares, i, code[0])
+    store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]) + parts)
+
+
+@wp.kernel
+def wet_adjoint_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    inverse: wp.array(dtype=wp.float32),
+    sky: wp.array(dtype=wp.float32),
+    streaks: wp.array(dtype=wp.float32),
+    plane: int,
+    grad: wp.array(dtype=wp.float32),
+    road: wp.array(dtype=wp.float32),
+    mirrored: wp.array(dtype=wp.float32),
+    first: int,
+    kept: int,
+    grad_mirrored: wp.array(dtype=wp.float32),
+    grad_image: wp.array(dtype=wp.float32),
+    grad_inverse: wp.array(dtype=wp.float32),
+    shares: wp.array(dtype=wp.float32),
+):
+    """Back to the mirror: to grad_image goes the gradient to the picture before it."""
+    i = start + wp.tid()
+    x = before(load3(image, i, plane), load(sky, i), settings)
+    g, g_mirrored, code, g_inverse = after_adjoint(
+        x,
+        load3(mirrored, i - first, kept),
+        load(road, i),
+        load(inverse, i),
+        load(streaks, i),
+        load3(grad, i, plane),
+        settings,
+    )
+    store3(grad_mirrored, i - first, kept, g_mirrored)
+    store3(grad_image, i, plane, g)
+    store(grad_inverse, i, g_inverse)
+    store(shares, i, code[0])
+    store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]))
+
+
+@wp.kernel
+def damp_adjoint_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    sky: wp.array(dtype=wp.float32),
+    plane: int,
+    grad_damp: wp.array(dtype=wp.float32),
+    first: int,
+    kept: int,
+    grad_image: wp.array(dtype=wp.float32),
+    shares: wp.array(dtype=wp.float32),
+):
+    """From before the mirror back to the picture; grad_damp: what comes through the mirror."""
+    i = start + wp.tid()
+    g = load3(grad_image, i, plane) + load3(grad_damp, i - first, kept)
+    g_colour, parts = before_adjoint(load3(image, i, plane), load(sky, i), g, settings)
+    store3(grad_image, i, plane, g_colour)
+    store3(shares, i + plane, plane, load3(shares, i + plane, plane) + parts)
+
+
+@wp.func_native("""
+    // Sums run down the columns [left, right) in double, then over each three of them.
+    const float* from = (const float*)source.data + plane * kept;
+    float* to = (float*)target.data + plane * kept;
+    const int end = x0 + columns < width ? x0 + columns : width;
+    const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
+    const int begin = road_top > radius ? road_top : radius;
+    const double scale = 1.0 / (3.0 * (2 * radius + 1));
+    double sums[66];
+    for (int k = 0; k < right - left; ++k) sums[k] = 0.0;
+    for (int j = begin - 2 * radius; j <= begin; ++j) {
+        const int row = j < top ? top : (j < bottom ? j : bottom - 1);
+        for (int k = 0; k < right - left; ++k) sums[k] += from[(row - top) * width + left + k];
+    }
+    for (int y = top; y < bottom; ++y) {
+        float* __restrict__ out = to + (y - top) * width;
+        if (y < road_top) {
+            for (int x = x0; x < end; ++x) out[x] = 0.0f;
+            continue;
+        }
+        if (y > begin) {
+            const int gone = y - 2 * radius - 1;
+            const float* __restrict__ enter = from + (y - top) * width + left;
+            const float* __restrict__ leave = from + ((gone < top ? top : gone) - top) * width + left;
+            for (int k = 0; k < right - left; ++k) sums[k] += (double)enter[k] - (double)leave[k];
+        }
+        for (int x = x0; x < end; ++x) {
+            const int k = x - left;
+            out[x] = (float)(scale * (sums[x > 0 ? k - 1 : 0] + sums[k] + sums[x < width - 1 ? k + 1 : k]));
+        }
+    }
+""")
+def mirror(
+    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, kept: int, x0: int,
+    columns: int, width: int, top: int, bottom: int, road_top: int, radius: int,
+):  # fmt: skip
+    """What a wet road mirrors, in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
+
+
+@wp.func_native("""
+    // Row y of the mirror sums the rows j in [Y - 2 radius, Y] of the picture, Y = max(y, radius); those above the
+    // picture are its first row. So row j gathers the mirror's rows with Y in [j, j + 2 radius].
+    const float* from = (const float*)source.data + plane * kept;
+    float* to = (float*)target.data + plane * kept;
+    const int end = x0 + columns < width ? x0 + columns : width;
+    const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
+    const double scale = 1.0 / (3.0 * (2 * radius + 1));
+    double sums[66];
+    for (int k = 0; k < right - left; ++k) sums[k] = 0.0;
+    for (int y = top; y < bottom; ++y)
+        for (int x = x0; x < end; ++x) to[(y - top) * width + x] = 0.0f;
+    for (int j = bottom - 1 > radius ? bottom - 1 : radius; j >= (top > 0 ? top : -radius); --j) {
+        for (int y = j > radius ? j : top; j >= radius && y <= j && y < bottom; ++y)
+            for (int k = 0; k < right - left; ++k) sums[k] += from[(y - top) * width + left + k];
+        const int gone = j + 2 * radius + 1;
+        if (gone < bottom)
+            for (int k = 0; k < right - left; ++k) sums[k] -= from[(gone - top) * width + left + k];
+        const int row = j < top ? top : (j < bottom ? j : bottom - 1);
+        float* __restrict__ out = to + (row - top) * width;
+        for (int x = x0; x < end; ++x) {
+            const int k = x - left;
+            out[x] += (float)(scale * (sums[x > 0 ? k - 1 : 0] + sums[k] + sums[x < width - 1 ? k + 1 : k]));
+        }
+    }
+""")
+def unmirror(
+    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, kept: int, x0: int,
+    columns: int, width: int, top: int, bottom: int, radius: int,
+):  # fmt: skip
+    """The transpose of `mirror`: from gradients to the mirror, 0 where it is, to those to the picture."""
+
+
+@wp.kernel
+def mirror_kernel(
+    start: int,
+    source: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    columns: int,
+    width: int,
+    top: int,
+    bottom: int,
+    road_top: int,
+    radius: int,
+    forward: bool,
+):
+    """A thread takes `columns` columns of a channel."""
+    t = start + wp.tid()
+    strips = (width + columns - 1) // columns
+    kept = (bottom - top) * width
+    x0 = (t % strips) * columns
+    if forward:
+        mirror(source, target, t // strips, kept, x0, columns, width, top, bottom, road_top, radius)
+    else:
+        unmirror(source, target, t // strips, kept, x0, columns, width, top, bottom, radius)
+
+
+@dataclass(frozen=True, slots=True)
+class _Wet:
+    """Rows [top, bottom) that hold what a wet road mirrors, or the road, which begins at row road_top."""
+
+    top: int
+    bottom: int
+    road_top: int
+    radius: int
+
+    @classmethod
+    def of(cls, road: Tensor) -> _Wet:
+        height = road.shape[0]
+        radius = model.mirror_reach(height) // 2
+        if road.is_cuda:  # to look where the road is would make the CPU wait
+            return cls(0, height, 0, radius)
+        first, last = _rows(road > 0)
+        if first == last:
+            return cls(0, 0, 0, radius)
+        bottom = min(height, max(last, radius + 1))
+        return cls(max(0, max(first, radius) - 2 * radius), bottom, first, radius)
+
+
+def _rows(mask: Tensor) -> tuple[int, int]:
+    """The rows [top, bottom) of a mask (H, W) that hold all that is true."""
+    rows = mask.any(dim=1).nonzero()[:, 0]
+    return (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 0)
+
+
+def _ranges(first: int, last: int) -> list[int]:
+    return [first + edge for edge in halves(last - first)]
+
+
+class _Scratch(threading.local):
+    """Room for numbers that are dropped when a call ends; new room each time would cost the CPU more to be given
+    than to be written."""
+
+    def __init__(self) -> None:
+        self._room = torch.empty(0)
+
+    def planes(self, like: Tensor, *sizes: int) -> list[Tensor]:
+        """Vectors of these sizes, until the next call, of float32."""
+        if like.is_cuda:  # torch keeps its own there, stream by stream
+            return [like.new_empty(size) for size in sizes]
+        if self._room.numel() < sum(sizes):
+            self._room = torch.empty(sum(sizes))
+        return list(self._room[: sum(sizes)].split(sizes))
+
+
+_scratch = _Scratch()
+
+
+class _Weather(torch.autograd.Function):
+    """Weather over image (3, H, W) at inverse depth (H, W); code (4,), air (3,); sky, road, streaks (H, W)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        inverse: Tensor,
+        code: Tensor,
+        air: Tensor,
+        sky: Tensor,
+        road: Tensor,
+        streaks: Tensor,
+    ) -> Tensor:
+        height, width = image.shape[1:]
+        plane, wet = height * width, _Wet.of(road)
+        first, last = wet.top * width, wet.bottom * width
+        kept = last - first
+        settings, out = image.new_empty(_SETTINGS), torch.empty_like(image, memory_format=torch.contiguous_format)
+        damp, mirrored = _scratch.planes(image, 3 * kept)[0], image.new_empty(3 * kept)
+        kept_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
+        picture, sight, cover, way, drops = (array(t) for t in kept_maps)
+        given, target, held, shown = array(settings), array(out), array(damp), array(mirrored)
+        launch(settings_kernel, [0, 3], [array(code), array(air)], [given])
+        for top, bottom in ((0, wet.top), (wet.bottom, height)):
+            inputs = [given, picture, sight, cover, drops, plane]
+            launch(dry_kernel, _ranges(top * width, bottom * width), inputs, [target])
+        launch(damp_kernel, _ranges(first, last), [given, picture, cover, plane, first, kept], [held])
+        _mirror(wet, width, held, shown, True)
+        inputs = [given, held, shown, first, kept, sight, way, drops, plane]
+        launch(wet_kernel, _ranges(first, last), inputs, [target])
+        ctx.save_for_backward(*kept_maps, settings, mirrored)
+        ctx.wet = wet
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        wet: _Wet = ctx.wet
+        image, inverse, *_ = ctx.saved_tensors
+        picture, sight, cover, way, drops, given, shown = (array(t) for t in ctx.saved_tensors)
+        height, width = inverse.shape
+        plane, first, last = height * width, wet.top * width, wet.bottom * width
+        grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
+        scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
+        parts, to_mirror, to_damp = (array(t) for t in scratch)
+        inputs = [given, picture, sight, cover, drops, plane, array(grad)]
+        outputs = [array(grad_image), array(grad_inverse), parts]
+        for top, bottom in ((0, wet.top), (wet.bottom, height)):
+            launch(dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
+        through = [way, shown, first, last - first, to_mirror]
+        launch(wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
+        _mirror(wet, width, to_mirror, to_damp, False)
+        inputs = [given, picture, cover, plane, to_damp, first, last - first]
+        launch(damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], parts])
+        return grad_image, grad_inverse, _row_by_row(scratch[0].view(4, height, width)), None, None, None, None
+
+
+def _row_by_row(shares: Tensor) -> Tensor:
+    """Sums (K,) of planes (K, H, W), rows first: so they do not hang on the number of threads."""
+    return shares.sum(dim=2).sum(dim=1)
+
+
+def _mirror(wet: _Wet, width: int, source: Any, target: Any, forward: bool) -> None:
+    columns = 1 if source.device.is_cuda else _STRIP
+    count = 3 * -(-width // columns) if wet.bottom > wet.top else 0
+    parts = 1 if source.device.is_cuda else threads()
+    edges = [count * i // parts for i in range(parts + 1)]
+    inputs = [source, target, columns, width, wet.top, wet.bottom, wet.road_top, wet.radius, forward]
+    launch(mirror_kernel, edges, inputs)
+
+
+_LEAF_SETTINGS = 14
+"""Numbers that are the same for all leaves, in this order: factor of the odds of lightness; of chroma; cosine and
+sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn along hue, of thicker
+and thinner along density; airlight (3)."""
+
+
+@wp.kernel
+def leaf_settings_kernel(
+    start: int,
+    code: wp.array(dtype=wp.float32),
+    air: wp.array(dtype=wp.float32),
+    settings: wp.array(dtype=wp.float32),
+):
+    """Thread 0 for the code, thread 1 for no change."""
+    t = start + wp.tid()
+    on = wp.float64(1 - t)
+    one = wp.float64(1.0)
+    hue = on * wp.float64(code[0])
+    density = on * wp.float64(code[2])
+    bend = wp.tanh(wp.float64(2.0) * hue)
+    rate = wp.float64(0.70) + wp.float64(0.35) * bend
+    thick = one / (one + wp.exp(wp.float64(-6.0) * density))
+    steep = wp.float64(6.0) * density * thick * (one - thick)
+    first = t * 14
+    settings[first] = wp.float32(wp.exp(on * wp.float64(1.5) * wp.float64(code[1])))
+    settings[first + 1] = wp.float32(one + wp.float64(0.3) * hue)
+    settings[first + 2] = wp.float32(wp.cos(-rate * hue))
+    settings[first + 3] = wp.float32(wp.sin(-rate * hue))
+    settings[first + 4] = wp.float32(wp.float64(10.0) * hue)
+    settings[first + 5] = wp.float32(wp.float64(8.0) * hue)
+    settings[first + 6] = wp.float32(density * thick)
+    settings[first + 7] = wp.float32(-density * (one - thick))
+    settings[first + 8] = wp.float32(-rate - wp.float64(0.70) * (one - bend * bend) * hue)
+    settings[first + 9] = wp.float32(thick + steep)
+    settings[first + 10] = wp.float32(thick - one + steep)
+    for c in range(3):
+        settings[first + 11 + c] = air[c]
+
+
+@wp.func
+def leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+    """The leaf model before its crown's density: L*a*b*."""
+    before = level_of(lab[0])
+    odds = load(settings, at)
+    level = lifted(before, odds)
+    chroma = load(settings, at + 1) * wp.sqrt(odds / (before * odds + (1.0 - before)))
+    cos = load(settings, at + 2)
+    sin = load(settings, at + 3)
+    room = 4.0 * level * (1.0 - level)
+    red = chroma * (cos * lab[1] - sin * lab[2]) + load(settings, at + 4) * room
+    yellow = chroma * (sin * lab[1] + cos * lab[2]) + load(settings, at + 5) * room
+    return wp.vec3f(100.0 * level, red, yellow)
+
+
+@wp.func
+def crown(rgb: wp.vec3f, gap: wp.float32, settings: wp.array(dtype=wp.float32), at: int):
+    """Leaves in a thicker or thinner crown."""
+    dense = (1.0 - 0.375 * load(settings, at + 6) * (1.0 - gap)) * rgb
+    return dense + (0.8 * load(settings, at + 7) * gap) * (load3(settings, at + 11, 1) - dense)
+
+
+@wp.func
+def leaf_adjoint(lab: wp.vec3f, gap: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+    """-> gradients to lab and to hue, lightness and density (3)."""
+    changed = leaf_lab(lab, settings, at)
+    rgb = rgb_of(changed)
+    keep = 1.0 - 0.375 * load(settings, at + 6) * (1.0 - gap)
+    through = 0.8 * load(settings, at + 7) * gap
+    g_thin = 0.8 * gap * wp.dot(g, load3(settings, at + 11, 1) - keep * rgb)
+    g_dense = (1.0 - through) * g
+    g_thick = -0.375 * (1.0 - gap) * wp.dot(g_dense, rgb)
+    g_lab = rgb_adjoint(changed, keep * g_dense)
+
+    before = level_of(lab[0])
+    odds = load(settings, at)
+    bottom = before * odds + (1.0 - before)
+    level = before * odds / bottom
+    root = wp.sqrt(odds / bottom)
+    chroma = load(settings, at + 1) * root
+    cos = load(settings, at + 2)
+    sin = load(settings, at + 3)
+    along = g_lab[1] * (cos * lab[1] - sin * lab[2]) + g_lab[2] * (sin * lab[1] + cos * lab[2])
+    across = g_lab[2] * (cos * lab[1] - sin * lab[2]) - g_lab[1] * (sin * lab[1] + cos * lab[2])
+    room = 4.0 * level * (1.0 - level)
+    shift = load(settings, at + 4) * g_lab[1] + load(settings, at + 5) * g_lab[2]
+    g_level = 100.0 * g_lab[0] + 4.0 * (1.0 - 2.0 * level) * shift
+    g_odds = g_level * level * (1.0 - level) + 0.5 * along * chroma * (1.0 - level)
+    g_before = g_level * odds / (bottom * bottom) - 0.5 * along * chroma * (odds - 1.0) / bottom
+    code = wp.vec3f(
+        0.3 * root * along + load(settings, at + 8) * chroma * across + (10.0 * g_lab[1] + 8.0 * g_lab[2]) * room,
+        1.5 * g_odds,
+        load(settings, at + 9) * g_thick + load(settings, at + 10) * g_thin,
+    )
+    out = wp.vec3f(
+        0.01 * within(lab[0] * 0.01, 0.01, 0.99) * g_before,
+        chroma * (cos * g_lab[1] + sin * g_lab[2]),
+        chroma * (cos * g_lab[2] - sin * g_lab[1]),
+    )
+    return out, code
+
+
+@wp.func
+def leaf_share(amount: wp.float32):
+    return wp.where(amount > FEWEST_LEAVES, amount, 0.0)
+
+
+@wp.kernel
+def foliage_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    code: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    amount: wp.array(dtype=wp.float32),
+    gaps: wp.array(dtype=wp.float32),
+    plane: int,
+    out: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    own = load3(image, i, plane)
+    gap = load(gaps, i)
+    lab = lab_of(clamped(own))
+    now = crown(rgb_of(leaf_lab(lab, settings, 0)), gap, settings, 0)
+    then = crown(rgb_of(leaf_lab(lab, settings, 14)), gap, settings, 14)
+    size = wp.abs(load(code, 0)) + wp.abs(load(code, 1)) + wp.abs(load(code, 2))
+    share = wp.where(size > 0.0, leaf_share(load(amount, i)), 0.0)
+    store3(out, i, plane, own + share * (now - then))
+
+
+@wp.kernel
+def foliage_code_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    amount: wp.array(dtype=wp.float32),
+    gaps: wp.array(dtype=wp.float32),
+    plane: int,
+    grad: wp.array(dtype=wp.float32),
+    first: int,
+    kept: int,
+    shares: wp.array(dtype=wp.float32),
+):
+    """shares: each pixel's part of the gradient to the code, planes of `kept` numbers, from pixel `first` on."""
+    i = start + wp.tid()
+    g = leaf_share(load(amount, i)) * load3(grad, i, plane)
+    _lab, code = leaf_adjoint(lab_of(clamped(load3(image, i, plane))), load(gaps, i), g, settings, 0)
+    store3(shares, i - first, kept, code)
+
+
+@wp.kernel
+def foliage_image_kernel(
+    start: int,
+    settings: wp.array(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    amount: wp.array(dtype=wp.float32),
+    gaps: wp.array(dtype=wp.float32),
+    plane: int,
+    grad: wp.array(dtype=wp.float32),
+    grad_image: wp.array(dtype=wp.float32),
+):
+    i = start + wp.tid()
+    own = load3(image, i, plane)
+    g = load3(grad, i, plane)
+    rgb = clamped(own)
+    lab = lab_of(rgb)
+    part = leaf_share(load(amount, i)) * g
+    now, _code = leaf_adjoint(lab, load(gaps, i), part, settings, 0)
+    then, _none = leaf_adjoint(lab, load(gaps, i), part, settings, 14)
+    store3(grad_image, i, plane, g + clamped_adjoint(own, lab_adjoint(rgb, now - then)))
+
+
+class _Foliage(torch.autograd.Function):
+    """Leaves of image (3, H, W); code (3,), air (3,); amount and gaps (H, W)."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, code: Tensor, air: Tensor, amount: Tensor, gaps: Tensor) -> Tensor:
+        height, width = image.shape[1:]
+        plane = height * width
+        top, bottom = (0, height) if image.is_cuda else _rows(amount > model.FEWEST_LEAVES)
+        kept_maps = [t.detach().contiguous() for t in (image, amount, gaps)]
+        settings = image.new_empty(2 * _LEAF_SETTINGS)
+        out = kept_maps[0].clone()
+        given, own_code, maps = array(settings), array(code), [array(t) for t in kept_maps]
+        launch(leaf_settings_kernel, [0, 2], [own_code, array(air)], [given])
+        inputs = [given, own_code, *maps, plane]
+        launch(foliage_kernel, _ranges(top * width, bottom * width), inputs, [array(out)])
+        ctx.save_for_backward(*kept_maps, settings)
+        ctx.rows = (top, bottom)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        top, bottom = ctx.rows
+        image, _, _, settings = ctx.saved_tensors
+        height, width = image.shape[1:]
+        first, last = top * width, bottom * width
+        grad = grad.contiguous()
+        inputs = [array(settings), *(array(t) for t in ctx.saved_tensors[:3]), height * width, array(grad)]
+        grad_image = grad_code = None
+        if ctx.needs_input_grad[0]:
+            grad_image = grad.clone()
+            launch(foliage_image_kernel, _ranges(first, last), inputs, [array(grad_image)])
+        if ctx.needs_input_grad[1]:
+            (shares,) = _scratch.planes(image, 3 * (last - first))
+            launch(foliage_code_kernel, _ranges(first, last), [*inputs, first, last - first], [array(shares)])
+            grad_code = _row_by_row(shares.view(3, bottom - top, width))
+        return grad_image, grad_code, None, None, None
+
+
+def weather(image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor) -> Tensor:
+    """See `environment.apply_weather`; streaks: (H, W). All float32, the airlight constant."""
+    code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
+    return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
+
+
+def foliage(image: Tensor, environment: Environment, air: Tensor, gaps: Tensor) -> Tensor:
+    """See `environment.apply_foliage`; gaps: (H, W). All float32, the airlight constant."""
+    code, amount = environment.foliage.to(image), environment.foliage_map.to(image)
+    return _Foliage.apply(image, code, air.to(image).detach(), amount, gaps)

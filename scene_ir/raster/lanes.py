@@ -1,0 +1,93 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
+"""What kernels are made of that a CPU shall run on eight or sixteen pixels at once; float32, for CUDA as well.
+
+The CPU's compiler widens a kernel over its threads where the kernel is a straight line of arithmetic. So: `load`
+and `store` for an array's elements (Warp's own index may be negative, which asks for a branch), `exp_` and `log_`
+for the C library's, `wp.where` for a choice, loops only where they unroll, and no sums over pixels. Writes to few
+arrays: one with planes rather than several.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from scene_ir.raster.launch import start_warp
+
+start_warp()
+
+# The kernels name many arrays. By default LLVM gives up before it has compared whether so many might overlap, and
+# whether so many indices might overflow; a CPU that compares a hundred addresses once a launch does not feel it.
+_PATIENCE = ("vectorize-memory-check-threshold", "memory-check-merge-threshold", "vectorize-scev-check-threshold")
+OPTIONS: dict[str, Any] = {
+    "fuse_fp": True,
+    "fast_math": False,
+    "enable_backward": False,
+    "cpu_compiler_flags": " ".join(
+        [wp.config.cpu_compiler_flags or "-march=native", *(f"-mllvm=-{name}=1000" for name in _PATIENCE)]
+    ),
+}
+"""Options of modules made of these."""
+wp.set_module_options(OPTIONS)
+
+
+@wp.func_native("return ((const float*)values.data)[i];")
+def load(values: wp.array(dtype=wp.float32), i: int) -> wp.float32: ...
+
+
+@wp.func_native("((float*)values.data)[i] = value;")
+def store(values: wp.array(dtype=wp.float32), i: int, value: wp.float32): ...
+
+
+@wp.func
+def load3(values: wp.array(dtype=wp.float32), i: int, step: int):
+    """Three numbers, `step` apart: of a picture (3, H, W) a colour, with H W for `step`."""
+    return wp.vec3f(load(values, i), load(values, i + step), load(values, i + 2 * step))
+
+
+@wp.func
+def store3(values: wp.array(dtype=wp.float32), i: int, step: int, value: wp.vec3f):
+    store(values, i, value[0])
+    store(values, i + step, value[1])
+    store(values, i + 2 * step, value[2])
+
+
+@wp.func
+def exp_(x: wp.float32):
+    """e to the x, to 2e-7 of it; exactly 1 at 0; x is kept in [-87, 88]. Source: Moshier's Cephes, `expf`."""
+    y = wp.min(wp.max(x, -87.0), 88.0)
+    n = wp.floor(y * 1.44269504088896341 + 0.5)
+    r = (y - n * 0.693359375) + n * 2.12194440e-4
+    p = 1.9875691500e-4
+    p = p * r + 1.3981999507e-3
+    p = p * r + 8.3334519073e-3
+    p = p * r + 4.1665795894e-2
+    p = p * r + 1.6666665459e-1
+    p = p * r + 5.0000001201e-1
+    return ((p * r) * r + r + 1.0) * wp.cast((int(n) + 127) << 23, wp.float32)
+
+
+@wp.func
+def log_(x: wp.float32):
+    """Natural logarithm of a normal x > 0, to 2e-7 of it; exactly 0 at 1. Source: Moshier's Cephes, `logf`."""
+    bits = wp.cast(x, wp.int32)
+    n = (bits - 0x3F3504F3) >> 23  # x = 2^n m with m in [sqrt(1/2), sqrt(2))
+    r = wp.cast(bits - (n << 23), wp.float32) - 1.0
+    z = r * r
+    p = 7.0376836292e-2
+    p = p * r - 1.1514610310e-1
+    p = p * r + 1.1676998740e-1
+    p = p * r - 1.2420140846e-1
+    p = p * r + 1.4249322787e-1
+    p = p * r - 1.6668057665e-1
+    p = p * r + 2.0000714765e-1
+    p = p * r - 2.4999993993e-1
+    p = p * r + 3.3333331174e-1
+    e = float(n)
+    return (r + (p * r * z + e * -2.12194440e-4 - 0.5 * z)) + e * 0.693359375
+
+
+@wp.func
+def total(x: wp.vec3f):
+    return x[0] + x[1] + x[2]

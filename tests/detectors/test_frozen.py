@@ -1,0 +1,122 @@
+"""SqueezeDet with frozen weights against the same layers under autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors.base import RawPredictions
+from detectors.registry import load_detector
+from detectors.squeezedet import SqueezeDet
+
+FIELDS = ("boxes_xyxy", "deltas", "class_logits", "confidence_logits")
+
+
+def shipped(dtype: torch.dtype = torch.float64, frozen: bool = True) -> SqueezeDet:
+    detector = load_detector("squeezedet").to(dtype)
+    assert isinstance(detector, SqueezeDet)
+    # With a weight that may change, the detector takes the plain path.
+    return detector.requires_grad_(not frozen)
+
+
+def smooth(batch: int, height: int, width: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:
+    """Images with blobs of many sizes: noise alone excites no deep layer."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.zeros(batch, 3, height, width, dtype=dtype)
+    for cells in (3, 8, 20):
+        coarse = torch.rand(batch, 3, cells, 2 * cells, generator=generator, dtype=dtype)
+        image += F.interpolate(coarse, (height, width), mode="bicubic")
+    return (image / 3).clamp(0, 1)
+
+
+def functional(raw: RawPredictions) -> Tensor:
+    weight = torch.linspace(-1, 1, raw.deltas.numel(), dtype=raw.deltas.dtype).view_as(raw.deltas)
+    total = raw.confidence_logits.sigmoid().square().sum() + raw.class_logits.square().sum()
+    return total + (raw.deltas * weight).sum()
+
+
+def gradient(detector: SqueezeDet, images: Tensor) -> tuple[RawPredictions, Tensor]:
+    leaf = images.clone().requires_grad_(True)
+    raw = detector(leaf)
+    (slope,) = torch.autograd.grad(functional(raw), leaf)
+    return raw, slope
+
+
+def difference(first: Tensor, second: Tensor) -> float:
+    return float((first.detach().double() - second.detach().double()).norm() / second.detach().double().norm())
+
+
+# 97 to 210 rows: the stem runs in two and three bands, the last of them short.
+@pytest.mark.parametrize(("batch", "height", "width"), [(2, 93, 131), (1, 16, 16), (2, 210, 100), (1, 97, 64)])
+def test_frozen_layers_are_the_plain_ones(batch: int, height: int, width: int) -> None:
+    images = smooth(batch, height, width)
+    raw, slope = gradient(shipped(), images)
+    expected_raw, expected = gradient(shipped(frozen=False), images)
+    assert raw.image_hw == expected_raw.image_hw
+    for field in FIELDS:
+        assert difference(getattr(raw, field), getattr(expected_raw, field)) < 1e-12
+    assert slope.shape == images.shape
+    assert float(expected.norm()) > 0
+    assert difference(slope, expected) < 1e-12
+
+
+def test_single_precision_differs_by_rounding_only() -> None:
+    images = smooth(1, 120, 200)
+    expected_raw, expected = gradient(shipped(), images)
+    raw, slope = gradient(shipped(torch.float32), images.float())
+    for field in FIELDS:
+        assert difference(getattr(raw, field), getattr(expected_raw, field)) < 1e-5
+    assert slope.dtype == torch.float32
+    assert difference(slope, expected) < 1e-3
+
+
+def test_without_gradient_the_numbers_are_the_same() -> None:
+    detector, images = shipped(torch.float32), smooth(1, 64, 80, torch.float32)
+    with torch.no_grad():
+        judged = detector(images)
+    assert not judged.confidence_logits.requires_grad
+    differentiable = detector(images.requires_grad_(True))
+    assert differentiable.confidence_logits.requires_grad
+    for field in FIELDS:
+        assert torch.equal(getattr(judged, field), getattr(differentiable, field))
+
+
+def test_weights_that_changed_are_seen() -> None:
+    detector, images = shipped(), smooth(1, 48, 48)
+    with torch.no_grad():
+        before = detector(images).confidence_logits
+        detector.conv1.weight.mul_(0.5)
+        after = detector(images).confidence_logits
+    assert not torch.allclose(before, after)
+    detector.requires_grad_(True)
+    torch.testing.assert_close(after, detector(images).confidence_logits.detach())
+
+
+def test_weights_get_gradients_when_they_are_to_be_trained() -> None:
+    detector = shipped(torch.float32)
+    detector(smooth(1, 48, 48, torch.float32))  # as an attack has it, before training goes on
+    detector.requires_grad_(True).train()
+    functional(detector(smooth(1, 48, 48, torch.float32))).backward()
+    assert all(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in detector.parameters())
+
+
+def test_a_frozen_detector_prepares_no_gradient_of_a_weight() -> None:
+    detector = shipped(torch.float32)
+    raw, _ = gradient(detector, smooth(1, 48, 48, torch.float32))
+    assert raw.confidence_logits.requires_grad
+    assert all(p.grad is None for p in detector.parameters())
+
+
+def test_bfloat16_is_for_gradients_only() -> None:
+    coarse = load_detector("squeezedet", gradient_precision=torch.bfloat16)
+    assert isinstance(coarse, SqueezeDet)
+    exact, images = shipped(torch.float32), smooth(1, 120, 200, torch.float32)
+    with torch.no_grad():
+        assert torch.equal(coarse(images).confidence_logits, exact(images).confidence_logits)
+    raw, slope = gradient(coarse, images)
+    expected_raw, expected = gradient(exact, images)
+    assert raw.boxes_xyxy.dtype == slope.dtype == torch.float32
+    assert 0 < difference(raw.confidence_logits, expected_raw.confidence_logits) < 0.02
+    assert float(F.cosine_similarity(slope.flatten(), expected.flatten(), dim=0)) > 0.9

@@ -1,0 +1,44 @@
+"""Medians, and the sharing of seconds between rows."""
+
+import time
+
+import pytest
+
+from drivesem.bench.timing import Budget, Spread, machine, rounds, versions
+
+
+def test_median_and_quartiles() -> None:
+    spread = Spread.of([5.0, 1.0, 2.0, 4.0, 3.0])
+    assert (spread.median, spread.q1, spread.q3, spread.iqr) == (3.0, 2.0, 4.0, 2.0)
+
+
+def test_one_value_has_no_spread() -> None:
+    assert Spread.of([7.0]).iqr == 0
+
+
+def test_what_one_row_saves_the_others_may_use() -> None:
+    budget = Budget(10.0, 4)
+    assert budget.share() == pytest.approx(2.5, abs=0.1)
+    assert budget.share() == pytest.approx(10 / 3, abs=0.1)
+    assert budget.share(preparation=1.0) == pytest.approx(4.5, abs=0.1)
+    assert Budget(-1.0, 3).share() == 0
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.0, 3), (100.0, 7)])
+def test_rounds_keep_to_fewest_and_most(seconds: float, count: int) -> None:
+    assert list(rounds(seconds, 3, 7)) == list(range(count))
+
+
+def test_rounds_end_in_time() -> None:
+    start = time.perf_counter()
+    for _ in rounds(0.05, 1, 10_000):
+        time.sleep(0.01)
+    assert time.perf_counter() - start < 0.5
+
+
+def test_facts_of_machine_and_versions() -> None:
+    facts = machine()
+    assert facts["cpu"]
+    assert facts["cores"] >= 1
+    assert facts["threads"] >= 1
+    assert set(versions()) == {"python", "torch", "warp", "drivesem"}

@@ -1,0 +1,47 @@
+"""Depth and silhouettes against rays cast by Open3D (Embree), which shares no code with this renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from scene_ir.raster import verbs
+
+open3d: Any = pytest.importorskip("open3d", reason="Open3D is not installed", exc_type=ImportError)
+
+
+def cast(crowd: Any, height: int, width: int) -> NDArray[np.float32]:
+    """Depth (H, W) m along rays through the pixel centres, from the near plane on."""
+    scene = open3d.t.geometry.RaycastingScene()
+    for points, faces in zip(crowd.points, crowd.faces, strict=True):
+        scene.add_triangles(points.numpy(), faces.numpy().astype(np.uint32))
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1).to(torch.float64)
+    way = pixels @ torch.linalg.inv(crowd.intrinsics.to(torch.float64)).T  # its z is 1: t is the depth
+    rays = torch.cat([way * verbs.NEAR_M, way], dim=-1).to(torch.float32).numpy()
+    return scene.cast_rays(open3d.core.Tensor(rays))["t_hit"].numpy() + np.float32(verbs.NEAR_M)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_depth_and_silhouettes_agree_but_for_one_pixel_at_outlines(
+    crowd: Callable[[int], Any], outlines: Callable[[NDArray[np.float32]], NDArray[np.bool_]], seed: int
+) -> None:
+    scene = crowd(seed)
+    ours = scene.drawn(cull=False)
+    theirs = cast(scene, *ours.shape)
+    band = outlines(theirs)
+    hit = np.isfinite(theirs)
+    assert 0.05 < hit.mean() < 0.98
+    assert not ((np.isfinite(ours) != hit) & ~band).any()
+    inner = hit & ~band
+    assert inner.sum() > 500
+    np.testing.assert_allclose(ours[inner], theirs[inner], rtol=2e-4, atol=0)
+    # Both look through pixel centres: also within the band nearly everything agrees.
+    assert ((np.isfinite(ours) != hit) & band).sum() <= 0.01 * band.sum()
+    both = np.isfinite(ours) & hit & band
+    assert (np.abs(ours[both] - theirs[both]) > 0.02 * theirs[both]).mean() < 0.02
