@@ -157,7 +157,9 @@ def paint_order(size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tens
     order: list[int] = []
     while remaining:
         hidden = behind[np.ix_(remaining, remaining)].any(axis=0)
-        chosen = remaining[int(np.argmin(hidden))]  # the first that hides none of the others; in a cycle, the first
+        chosen = remaining[
+            int(np.argmin(hidden))
+        ]  # the first that hides none of the others; in a cycle, the first
         order.append(chosen)
         remaining.remove(chosen)
     return order

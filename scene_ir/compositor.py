@@ -100,15 +100,19 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); nearest (T,) int64: the packed pixel that the
-    same object's mesh hits nearest to each, -1 where the halo does not reach; ground: fragments of the patches.
+    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo; ground: fragments
+    of the patches.
     """
 
     geometry: _Geometry
     mesh: verbs.Fragments
     coverage: Tensor
-    nearest: Tensor
+    reach_px: tuple[float, ...]
     ground: verbs.Fragments
+
+    def nearest(self) -> Tensor:
+        """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo reaches."""
+        return surfaces.nearest_hits(self.mesh, self.reach_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,13 +392,14 @@ class Compositor:
         counts = torch.bincount(owner[mesh_pixel], minlength=count)
         anchor = mesh_pixel[:0]
         if with_halo:
-            halo_pixel = ((drawn.nearest >= 0) & (covered < 1)).nonzero()[:, 0]
+            nearest = drawn.nearest()
+            halo_pixel = ((nearest >= 0) & (covered < 1)).nonzero()[:, 0]
             pixel = torch.cat([mesh_pixel, halo_pixel])
             share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, halo_pixel)])
             counts = torch.cat([counts, torch.bincount(owner[halo_pixel], minlength=count)])
             rank = torch.zeros_like(owner)
             rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=rank.device)
-            anchor = rank[drawn.nearest[halo_pixel]]
+            anchor = rank[nearest[halo_pixel]]
         rows_owner = owner[pixel]
         x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
         within, width = pixel - layout.offsets[rows_owner], x1 - x0
@@ -617,7 +622,9 @@ class _Pack:
         self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
         self._counts = [len(m.scene.objects) for m in members]
         cameras = [m.scene.camera for m in members]
-        self._frames_hw = [(c.height, c.width) for c, n in zip(cameras, self._counts, strict=True) for _ in range(n)]
+        self._frames_hw = [
+            (c.height, c.width) for c, n in zip(cameras, self._counts, strict=True) for _ in range(n)
+        ]
         self._patches = _patches(sum(self._counts), self._faces.device)
         self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self._counts))]
         self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self._counts))]
@@ -635,10 +642,13 @@ class _Pack:
             clip, cos = fused.reference_place(self._rig, local, yaw, translation)
         return _Geometry(clip, cos, ground)
 
+    def reach_px(self, objects: Sequence[Objects]) -> list[float]:
+        """How far the halo of each object reaches beyond its mesh."""
+        return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
+
     def draw(self, objects: Sequence[Objects]) -> Drawn:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
-        geometry, backend = self.place(objects), self._backend
-        reach = [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
+        geometry, backend, reach = self.place(objects), self._backend, self.reach_px(objects)
         rects = surfaces.crop_rects(
             geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
             [2.0 + r for r in reach],
@@ -646,7 +656,6 @@ class _Pack:
         layout = verbs.Layout.of(rects)
         mesh = verbs.rasterize(geometry.clip, self._faces, self._ranges, layout, backend, cull=self._cull)
         coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
-        nearest = surfaces.nearest_hits(mesh, reach)
         faces, _, face_ranges = self._patches
         patch_rects = surfaces.crop_rects(
             geometry.ground_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
@@ -654,7 +663,7 @@ class _Pack:
         patch_rects[torch.tensor(self._shadowless, dtype=torch.bool)] = 0
         ground_layout = verbs.Layout.of(patch_rects)
         ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return Drawn(geometry, mesh, coverage, nearest, ground)
+        return Drawn(geometry, mesh, coverage, tuple(reach), ground)
 
     def layers(self, objects: Sequence[Objects]) -> list[Layers]:
         """The layers of each member."""
@@ -667,11 +676,13 @@ class _Pack:
         drawn = self.draw(objects)
         code = None
         if any(_active(o.texture_code) for o in objects):
-            code = (_joined([o.texture_code for o in objects]), _joined([m.paint_lightness for m in self._members]))
+            code = (
+                _joined([o.texture_code for o in objects]),
+                _joined([m.paint_lightness for m in self._members]),
+            )
         yaw, tint = _joined([o.yaw for o in objects]), _joined([m.paint for m in self._members])
         whole = self._fixed or known[0]
-        colour, opacity, depth = fused.photographed(whole, drawn, yaw, tint, code)
-        shadow = fused.shadows(whole, drawn)
+        colour, opacity, depth, shadow = fused.photographed(whole, drawn, drawn.reach_px, yaw, tint, code)
         if len(self._members) == 1:
             return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)]
         layouts, grounds = (

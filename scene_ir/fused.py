@@ -6,7 +6,7 @@ The kernels are in `raster.shading`, which is imported on first use. Shapes as i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -130,55 +130,45 @@ def reference_place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -
 
 
 def photographed(
-    fixed: Fixed, drawn: Drawn, yaw: Tensor, tint: Tensor, code: tuple[Tensor, Tensor] | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels.
+    fixed: Fixed,
+    drawn: Drawn,
+    reach_px: Sequence[float],
+    yaw: Tensor,
+    tint: Tensor,
+    code: tuple[Tensor, Tensor] | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors (Ts,
+    3) by which their shadows darken the ground.
 
-    tint (N, 3): the templates' paint; code: texture codes (N, 5) and CIE L* of the paint (N,), if there are any.
+    reach_px: of each halo; tint (N, 3): the templates' paint; code: texture codes (N, 5) and CIE L* of the paint (N,),
+    if there are any.
     """
     from scene_ir.raster import shading
 
-    fragments, geometry, coverage = drawn.mesh, drawn.geometry, drawn.coverage
-    edges = fragments.layout.offsets.tolist()
-    table = shading.pixel_table(fragments.layout)
-    look = shading.Look.apply(
-        geometry.clip, geometry.cos, fragments, table, fixed.base_clip, fixed.base, fixed.faces, edges
-    )
-    look = shading.Fill.apply(look, coverage, fragments, table, edges)
-    flat = coverage.detach()
-    mesh, halo, left = shading.Shade.apply(
-        look, flat, fragments, table, drawn.nearest, fixed.texels, fixed.frame_wh, edges
-    )
-    need = left.detach().nonzero()[:, 0]
-    if need.numel():
-        own = shading.Own.apply(geometry.clip, fragments, table, left.detach(), fixed.faces, fixed.own, edges)
-        own = shading.Fill.apply(own, coverage, fragments, table, edges)
-        view = (fixed.sun, tint.contiguous(), fixed.frame_wh, fixed.unproject)
-        mesh = shading.Complete.apply(mesh, left, own, look, yaw, table, need, fixed.texels, view, edges)
-    if code is not None:
+    def paint(
+        mesh: Tensor, halo: Tensor, look: Tensor, values: Tensor, table: Tensor, nearest: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        assert code is not None
         draw = table[:, 0].long()
-        values, lightness = code[0].index_select(0, draw), code[1].index_select(0, draw)
-        anchor = look.index_select(0, drawn.nearest.clamp(min=0))
-        mesh = _painted(mesh, look, values, lightness)
-        halo = _painted(halo, anchor, values, lightness)
-    return shading.Combine.apply(mesh, halo, coverage, look, fragments, drawn.nearest, edges)
+        rows, lightness = values.index_select(0, draw), code[1].index_select(0, draw)
+        anchor = look.index_select(0, nearest.clamp(min=0))
+        return _painted(mesh, look, rows, lightness), _painted(halo, anchor, rows, lightness)
+
+    setting = shading.Setting(
+        fragments=drawn.mesh,
+        ground=drawn.ground,
+        reach_px=reach_px,
+        tint=tint.contiguous(),
+        painter=paint if code is not None else None,
+        **{f.name: getattr(fixed, f.name) for f in fields(fixed)},
+    )
+    geometry = drawn.geometry
+    codes = code[0] if code is not None else yaw.new_zeros(0)
+    return shading.Photographed.apply(
+        geometry.clip, geometry.cos, drawn.coverage, yaw, geometry.ground_clip, codes, setting
+    )
 
 
 def _painted(rgba: Tensor, look: Tensor, code: Tensor, lightness: Tensor) -> Tensor:
-    colour = texture.apply_texture_code(
-        rgba[:, :3], rgba[:, 3], code, look[:, 6], look[:, 7], lightness, "warp"
-    )
+    colour = texture.apply_texture_code(rgba[:, :3], rgba[:, 3], code, look[:, 6], look[:, 7], lightness, "warp")
     return torch.cat([colour, rgba[:, 3:]], dim=1)
-
-
-def shadows(fixed: Fixed, drawn: Drawn) -> Tensor:
-    """Factors (Ts, 3) on the ground, of all patches."""
-    from scene_ir.raster import shading
-
-    layout, clip = drawn.ground.layout, drawn.geometry.ground_clip
-    if layout.size == 0:
-        return clip.new_zeros(0, 3)
-    return shading.Shadow.apply(
-        clip, drawn.ground, shading.pixel_table(layout), fixed.ground_clip, fixed.ground_faces, fixed.dark,
-        fixed.frame_wh, layout.offsets.tolist(),
-    )  # fmt: skip

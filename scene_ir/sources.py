@@ -101,7 +101,8 @@ def _solve(
     staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
     compositor = Compositor(staged, RenderSettings(settings.backend))
     drawn = compositor.draw(compositor.scene.objects)
-    mattes = [_cut(alphas[i], drawn, i, image) for i in range(len(objects))]
+    nearest = drawn.nearest()
+    mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(len(objects))]
     covered = torch.zeros(frame_hw, dtype=torch.bool)
     for matte in mattes:
         _window(covered[None], matte)[0] |= matte.values[0] > 0
@@ -166,12 +167,12 @@ def _window(frame: Tensor, crop: Crop) -> Tensor:
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
 
 
-def _cut(alpha: Crop, drawn: Drawn, index: int, like: Tensor) -> Crop:
+def _cut(alpha: Crop, drawn: Drawn, nearest: Tensor, index: int, like: Tensor) -> Crop:
     """The matte where mesh and halo carry it, trimmed to where it is above 0 and what it may be continued to."""
     packed, size = drawn.mesh.layout.spans()[index]
     x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
     height, width = like.shape[1:]
-    carried = (drawn.nearest[packed] >= 0).reshape(1, *size).to(like)
+    carried = (nearest[packed] >= 0).reshape(1, *size).to(like)
     values = texture.crop_of(alpha, (x0, y0, x1, y1), (height, width)).to(like).clamp(0.0, 1.0) * carried
     return _trimmed(Crop(values, x0, y0), values[0] > 0, grow=int(np.ceil(_EXTENSION_PX)))
 

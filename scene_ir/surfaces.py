@@ -190,9 +190,11 @@ class Fleet:
         parts = []
         for i, surface in enumerate(self.surfaces):
             if mirrored:
-                unit = surface.unit * surface.unit.new_tensor([1.0, 1.0, -1.0]) + surface.mirror_weights @ ffd[i]
+                unit = surface.unit * surface.unit.new_tensor([1.0, 1.0, -1.0])
+                unit = unit + torch.nn.functional.linear(ffd[i].T, surface.mirror_weights).T
             else:
-                unit = surface.unit + surface.weights @ ffd[i]
+                # weights @ ffd[i], in the order of operands that is several times faster for three columns
+                unit = surface.unit + torch.nn.functional.linear(ffd[i].T, surface.weights).T
             parts.append(unit * size_lhw[i])
         return torch.cat(parts) if parts else ffd.new_zeros(0, 3)
 
@@ -344,16 +346,28 @@ def _clipped_bounds(points: np.ndarray, faces: Tensor, face_range: Sequence[int]
     return np.concatenate([px.min(axis=0), px.max(axis=0)])
 
 
-def nearest_hits(fragments: verbs.Fragments, reach_px: Sequence[float]) -> Tensor:
+def nearest_hits(
+    fragments: verbs.Fragments, reach_px: Sequence[float], draws: range | None = None, out: Tensor | None = None
+) -> Tensor:
     """For each packed pixel (T,) int64 the nearest one of its draw that is hit, itself where it is; -1 where none
-    is within `reach_px`, one a draw."""
-    hit = (fragments.face >= 0).cpu().numpy()
-    nearest = np.full(hit.shape[0], -1, dtype=np.int64)
-    for i, (packed, size) in enumerate(fragments.layout.spans()):
-        if hit[packed].any():
-            distance, index = nearest_true(hit[packed].reshape(size))
-            nearest[packed] = np.where(distance <= reach_px[i], packed.start + index, -1).reshape(-1)
-    return torch.from_numpy(nearest).to(fragments.face.device)
+    is within `reach_px`, one a draw. draws: those that are looked at, their part of `out` (T,) is written."""
+    layout = fragments.layout
+    nearest = torch.empty_like(fragments.face, dtype=torch.int64) if out is None else out
+    spans, rects = layout.offsets.tolist(), layout.rects.tolist()
+    for i in draws if draws is not None else range(len(rects)):
+        start, end = spans[i], spans[i + 1]
+        if end == start:
+            continue
+        x0, y0, x1, y1 = rects[i]
+        hit = (fragments.face[start:end].cpu().numpy() >= 0).reshape(y1 - y0, x1 - x0)
+        if not hit.any():
+            nearest[start:end] = -1
+            continue
+        distance, index = nearest_true(hit)
+        index += start
+        index[distance > reach_px[i]] = -1
+        nearest[start:end].copy_(torch.from_numpy(index.reshape(-1)))
+    return nearest
 
 
 def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -361,10 +375,10 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distance, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    numbers = np.asarray(labels, dtype=np.int64)
-    pixel_of = np.zeros(int(numbers.max()) + 1, dtype=np.int64)
-    pixel_of[numbers[mask]] = np.flatnonzero(mask)
-    return np.asarray(distance), pixel_of[numbers]
+    where = np.flatnonzero(mask)
+    pixel_of = np.zeros(len(where) + 1, dtype=np.int64)
+    pixel_of[labels[mask]] = where
+    return distance, pixel_of[labels]
 
 
 def project_vertices(points: Tensor, camera: Camera) -> Tensor:

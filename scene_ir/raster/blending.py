@@ -213,7 +213,7 @@ class Blend(torch.autograd.Function):
             *(_array(opacity), _array(depth), clamped, _array(image), _array(nearest), _array(number)),
             *(_array(under_shadow, wp.vec3f), _array(under_layer, wp.vec4f), _array(over)),
         ]
-        launch(blend_kernel, edges, inputs)
+        launch(blend_kernel, edges, inputs, device=canvas.device)
         ctx.save_for_backward(factor, opacity, under_shadow, under_layer, over)
         ctx.plan, ctx.channels = plan, canvas.shape[0]
         ctx.mark_non_differentiable(nearest, number)
@@ -238,7 +238,7 @@ class Blend(torch.autograd.Function):
             *(_array(under_shadow, wp.vec3f), _array(under_layer, wp.vec4f), _array(over), _array(grad_image)),
             *(_array(grad), _array(grad_factor, wp.vec3f), _array(grad_colour, wp.vec4f), _array(grad_opacity)),
         ]
-        launch(blend_backward_kernel, edges, inputs)
+        launch(blend_backward_kernel, edges, inputs, device=factor.device)
         return (grad if with_canvas else None), grad_factor, grad_colour, grad_opacity, None, None, None, None
 
 
@@ -257,9 +257,13 @@ def row_edges(height: int, rects: np.ndarray) -> list[int]:
 
 def _stack(order: Tensor, rects: Tensor, offsets: Tensor) -> Any:
     stack = Stack()
-    stack.order, stack.rects, stack.offsets = _array(order), _array(rects), _array(offsets)
+    stack.order, stack.rects, stack.offsets = _field(order), _field(rects), _field(offsets)
     return stack
 
 
-def _array(values: Tensor, dtype: Any = None) -> wp.array:
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
+def _field(values: Tensor) -> wp.array:
+    return wp.from_torch(values.detach(), requires_grad=False)
+
+
+def _array(values: Tensor, dtype: Any = None) -> Any:
+    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)

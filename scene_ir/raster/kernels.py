@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from scene_ir.raster.launch import halves, launch, start_warp, threads
 from scene_ir.raster.layout import Fragments, Layout, Plan, version_of
-from scene_ir.raster.plan import gpu_lanes, int32_faces, parts_on_gpu, share_on_cpu
+from scene_ir.raster.plan import gpu_lanes, int32_faces, outline_cuts, parts_on_gpu, share_on_cpu
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
 from scene_ir.raster.reference import SLACK_PX as _SLACK_PX
 from scene_ir.raster.reference import SNAP_PX as _SNAP_PX
@@ -1139,7 +1139,7 @@ class _Antialias(torch.autograd.Function):
             launch(hit_kernel, edges, [face, hits, seen])
             launch(mark_kernel, edges, [parts, hits, beside, right, below, either, found])
             inputs = [plan.lanes, parts, *mesh, _boxes(plan), fragments.near, face, right, below, either, found]
-            launch(outline_kernel, plan.cuts, inputs)
+            launch(outline_kernel, plan.outline_cuts, inputs)
             inputs = [parts, *mesh, face, beside, right, below, found, wp.from_torch(choice), seen]
             launch(coverage_kernel, edges, inputs)
         ctx.save_for_backward(like, clip, faces, marks[1], choice)
@@ -1178,13 +1178,14 @@ def _plan(
     if clip.device.type == "cpu":
         rows, cuts = share_on_cpu(layout, face_ranges, cull, threads())
         parts, lanes = torch.tensor(rows, dtype=torch.int32).view(-1, 11), 1
+        outlines = outline_cuts(rows, len(cuts) - 1)
     else:
         parts, lanes = parts_on_gpu(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
-        cuts = [0, parts.shape[0] * lanes]
+        cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
     vertices = wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f)
     launch(corner_kernel, halves(clip.shape[0]), [vertices, near, wp.from_torch(boxes, dtype=wp.vec4i)])
-    return Plan(parts, lanes, cuts, boxes, clip.detach(), version_of(clip))
+    return Plan(parts, lanes, cuts, outlines, boxes, clip.detach(), version_of(clip))
 
 
 def _corners(clip: Tensor, faces: Tensor) -> list[wp.array]:

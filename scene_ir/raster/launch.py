@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import cache
@@ -18,8 +18,9 @@ from typing import Any
 import torch
 import warp as wp
 
-_WORTH = 2048
-"""Fewer indices than this are not worth a second thread: handing over costs some 50 microseconds."""
+_WORTH = 32768
+"""Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to 150
+microseconds. What takes several kernels is handed over once, by `share`."""
 
 
 @contextmanager
@@ -78,38 +79,52 @@ def between(edges: Sequence[int], weights: Sequence[float] | None = None) -> lis
     return [*cuts, edges[-1]] if edges[-1] > cuts[-1] else cuts
 
 
-def launch(kernel: Any, edges: Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
-    """Run a kernel over the ranges between ascending `edges`, in torch's stream on a GPU, else a thread a range.
+def load(kernel: Any) -> None:
+    """Compile or load a kernel's module for the CPU, once, before several threads ask for it."""
+    wp.load_module(kernel.module, "cpu")
 
-    inputs, outputs: the kernel's arguments after the first index.
+
+def share(work: Callable[[int, int], None], edges: Sequence[int]) -> None:
+    """Call `work(start, end)` for the ranges between ascending `edges`, each in a thread of its own.
+
+    For work that launches several kernels in turn, on the CPU; those kernels must have been loaded.
     """
-    if len(edges) < 2 or edges[-1] <= edges[0]:
-        return
-    device = next(i.device for i in inputs if isinstance(i, wp.array))
-    if device.is_cuda:
-        _run(
-            kernel,
-            edges[0],
-            edges[-1] - edges[0],
-            inputs,
-            outputs,
-            device,
-            wp.stream_from_torch(wp.device_to_torch(device)),
-        )
-        return
-    ranges = [(a, b - a) for a, b in itertools.pairwise(edges) if b > a]
-    if len(ranges) > 1:
-        wp.load_module(kernel.module, device)  # once, before several threads ask for it
+    ranges = [(a, b) for a, b in itertools.pairwise(edges) if b > a]
     pool = _pool(os.getpid())
-    rest: list[Future[None]] = [
-        pool.submit(_run, kernel, start, count, inputs, outputs, device, None) for start, count in ranges[1:]
-    ]
-    _run(kernel, *ranges[0], inputs, outputs, device, None)
+    rest: list[Future[None]] = [pool.submit(work, start, end) for start, end in ranges[1:]]
+    for start, end in ranges[:1]:
+        work(start, end)
     for future in rest:
         future.result()
 
 
-def _run(
-    kernel: Any, start: int, count: int, inputs: Sequence[Any], outputs: Sequence[Any], device: Any, stream: Any
+def launch(
+    kernel: Any,
+    edges: Sequence[int],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any] = (),
+    device: torch.device | None = None,
 ) -> None:
-    wp.launch(kernel, dim=count, inputs=[start, *inputs, *outputs], device=device, stream=stream)
+    """Run a kernel over the ranges between ascending `edges`, in torch's stream on a GPU, else a thread a range.
+
+    inputs, outputs: the kernel's arguments after the first index. device: where they lie, by default where the first
+    of them that is an array does.
+    """
+    if len(edges) < 2 or edges[-1] <= edges[0]:
+        return
+    inputs = (*inputs, *outputs)
+    where = next(i.device for i in inputs if isinstance(i, wp.array)) if device is None else None
+    if where is not None and where.is_cuda:
+        device = wp.device_to_torch(where)
+    if device is not None and device.type != "cpu":
+        stream = wp.stream_from_torch(device)
+        where = wp.device_from_torch(device)
+        _run(kernel, edges[0], edges[-1] - edges[0], inputs, where, stream)
+        return
+    if len(edges) > 2:
+        load(kernel)
+    share(lambda start, end: _run(kernel, start, end - start, inputs, "cpu", None), edges)
+
+
+def _run(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any, stream: Any) -> None:
+    wp.launch(kernel, dim=count, inputs=[start, *inputs], device=device, stream=stream)

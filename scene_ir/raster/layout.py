@@ -72,7 +72,8 @@ class Plan:
 
     parts: (P, 11) int32, draws or bands of their rows: the draw's x0, y0, x1, y1; the first row and the end; the
     draw's first packed pixel; its faces' start and end; 1 where its back faces are culled; the first packed pixel.
-    lanes: how many kernel indices share a part. cuts: where in [0, lanes * P) the threads' shares begin and end.
+    lanes: how many kernel indices share a part. cuts, outline_cuts: where in [0, lanes * P) the threads' shares
+    begin and end, for each of the two.
     boxes: (V, 4) int32 px, the first and last pixel (x, y, x, y) that each vertex may touch. clip: (V, 3), the
     vertices that this was made of, and their `version`, -1 where torch keeps none.
     """
@@ -80,6 +81,7 @@ class Plan:
     parts: Tensor
     lanes: int
     cuts: list[int]
+    outline_cuts: list[int]
     boxes: Tensor
     clip: Tensor
     version: int

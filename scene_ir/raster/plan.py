@@ -13,9 +13,11 @@ from scene_ir.raster.layout import Layout, version_of
 
 V = TypeVar("V")
 
-_TRIANGLE_WORK = 10.0
-"""What a triangle costs, in pixels of a draw, measured on a CPU with triangles of a few pixels."""
-_WORTH = 20_000.0
+_TRIANGLE_WORK = 1.5
+"""What a triangle costs `rasterize`, in pixels of a draw, measured on a CPU with triangles of a few pixels."""
+_OUTLINE_WORK = 10.0
+"""The same for `antialias`, which looks at few of the pixels."""
+_WORTH = 10_000.0
 """Less work than this is not worth a second thread: handing over costs some 50 microseconds."""
 _TOLERANCE = 0.1
 """A thread may have this share more or less than the others before a draw is cut in two."""
@@ -66,7 +68,7 @@ def int32_faces(faces: Tensor) -> Tensor:
 def share_on_cpu(
     layout: Layout, face_ranges: Tensor, cull: Tensor | None, threads: int
 ) -> tuple[list[list[int]], list[int]]:
-    """Rows of Plan.parts, those without pixels left out, and where the threads' shares begin and end.
+    """Rows of Plan.parts, those without pixels left out, and where the threads' shares of `rasterize` begin and end.
 
     A thread's share is a run of draws; where that is too uneven a draw is cut into bands of rows.
     """
@@ -103,6 +105,17 @@ def share_on_cpu(
             if row < y1:
                 cuts.append(len(parts))
     return parts, [*cuts, len(parts)]
+
+
+def outline_cuts(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
+    """Where up to `shares` shares of the rows of Plan.parts begin and end, even for `antialias`."""
+    work = [_OUTLINE_WORK * max(p[8] - p[7], 0) + (p[5] - p[4]) * (p[2] - p[0]) for p in parts]
+    total, done, cuts = sum(work), 0.0, [0]
+    for i, each in enumerate(work):
+        if i > cuts[-1] and len(cuts) < shares and done + each / 2 > total * len(cuts) / shares:
+            cuts.append(i)
+        done += each
+    return [*cuts, len(parts)]
 
 
 def _work(rect: Sequence[int], faces: Sequence[int], row: int) -> float:

@@ -9,6 +9,8 @@ from `wp.grad`, those that gather at vertices are written by hand. Shapes: N obj
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,9 +18,9 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir import texture
-from scene_ir.raster.launch import between, halves, launch, start_warp
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir import surfaces, texture
+from scene_ir.raster.launch import between, halves, launch, load, share, start_warp
+from scene_ir.raster.layout import Fragments
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
@@ -68,6 +70,7 @@ def table_kernel(
     offsets: wp.array(dtype=wp.int64),
     table: wp.array(dtype=wp.vec4i),
 ):
+    """For each packed pixel of a draw: the draw, x, y px, and the width of its rectangle."""
     draw = start + wp.tid()
     x0 = wp.int32(rects[draw, 0])
     y0 = wp.int32(rects[draw, 1])
@@ -78,14 +81,6 @@ def table_kernel(
             for x in range(width):
                 table[at] = wp.vec4i(draw, x0 + x, y0 + y, width)
                 at += 1
-
-
-def pixel_table(layout: Layout) -> Tensor:
-    """For each packed pixel (T, 4) int32: its draw, x, y px, and the width of its draw's rectangle."""
-    table = torch.empty(layout.size, 4, dtype=torch.int32, device=layout.rects.device)
-    inputs = [_array(layout.rects), _array(layout.offsets), _array(table, wp.vec4i)]
-    launch(table_kernel, [0, layout.rects.shape[0]], inputs)
-    return table
 
 
 # ------------------------------------------------------------------------------------------------------- placement
@@ -155,7 +150,9 @@ def place_backward_kernel(
         # d (turned vector) / d yaw is (z, 0, -x) of the turned vector
         angle = to_p[0] * r[2] - to_p[2] * r[0] + to_n[0] * n[2] - to_n[2] * n[0]
         wp.atomic_add(
-            grad_pose, o, wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle))
+            grad_pose,
+            o,
+            wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle)),
         )
 
 
@@ -170,8 +167,13 @@ class Place(torch.autograd.Function):
     def forward(ctx: Any, local, yaw, translation, normal, owner, matrix, centre, edges) -> tuple[Tensor, Tensor]:
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
         clip, facing = torch.empty_like(local), local.new_empty(local.shape[0])
-        fixed = (local.contiguous(), normal, owner, turn, translation.contiguous(), matrix, centre)
-        launch(place_kernel, halves(local.shape[0]), [*_place_inputs(fixed), _vec3(clip), _array(facing)])
+        fixed = (local.detach().contiguous(), normal, owner, turn, translation.detach().contiguous(), matrix, centre)
+        launch(
+            place_kernel,
+            halves(local.shape[0]),
+            [*_place_inputs(fixed), _vec3(clip), _array(facing)],
+            device=local.device,
+        )
         ctx.save_for_backward(*fixed)
         ctx.edges = edges
         return clip, facing
@@ -181,13 +183,14 @@ class Place(torch.autograd.Function):
     def backward(ctx: Any, grad_clip: Tensor, grad_facing: Tensor):
         fixed = ctx.saved_tensors
         local, turn = fixed[0], fixed[3]
+        grad_clip, grad_facing = grad_clip.contiguous(), grad_facing.contiguous()
         grad_local = torch.zeros_like(local)
         grad_pose = torch.zeros(turn.shape[0], 4, dtype=torch.float64, device=local.device)
         inputs = [
-            *(*_place_inputs(fixed), _vec3(grad_clip.contiguous()), _array(grad_facing.contiguous())),
+            *(*_place_inputs(fixed), _vec3(grad_clip), _array(grad_facing)),
             *(_vec3(grad_local), _array(grad_pose, wp.vec4d)),
         ]
-        launch(place_backward_kernel, between(ctx.edges), inputs)
+        launch(place_backward_kernel, between(ctx.edges), inputs, device=local.device)
         pose = grad_pose.to(local.dtype)
         return grad_local, pose[:, 3], pose[:, :3], None, None, None, None, None
 
@@ -352,38 +355,6 @@ def look_backward_kernel(
         wp.atomic_add(grad_facing, hit.i2, g[4] * wp.float32(hit.b[2]))
 
 
-class Look(torch.autograd.Function):
-    """Where the photograph shows what each hit pixel shows, and how that has turned: (T, 8), 0 where nothing is hit.
-
-    Displacement px (2), depth then and now m, cosine now minus then, cosine then, paint, height. clip (V, 3), facing
-    (V,) now; base_clip (V, 3), base (V, 3): cosine then, paint, height; faces (F, 3) int32; edges: the draws' first
-    pixels, and T.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, clip, facing, fragments: Fragments, table, base_clip, base, faces, edges) -> Tensor:
-        out = clip.new_empty(fragments.face.shape[0], 8)
-        fixed = (table, fragments.face, clip, facing, base_clip, base, faces)
-        launch(look_kernel, halves(out.shape[0]), [*_look_inputs(fixed), _array(out, vec8)])
-        ctx.save_for_backward(*fixed, out)
-        ctx.edges = edges
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor):
-        *fixed, out = ctx.saved_tensors
-        clip, facing = fixed[2], fixed[3]
-        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
-        grad_facing = torch.zeros_like(facing)
-        inputs = [
-            *(*_look_inputs(fixed), _array(out, vec8), _array(grad_out.contiguous(), vec8)),
-            *(_array(grad_clip, wp.vec3d), _array(grad_facing)),
-        ]
-        launch(look_backward_kernel, between(ctx.edges), inputs)
-        return grad_clip.to(clip.dtype), grad_facing, None, None, None, None, None, None
-
-
 def _look_inputs(fixed) -> list:
     table, face, clip, facing, base_clip, base, faces = fixed
     return [
@@ -458,16 +429,51 @@ def fill_kernel(
     rects: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     coverage: wp.array(dtype=wp.float32),
-    values: wp.array2d(dtype=wp.float32),
-    out: wp.array2d(dtype=wp.float32),
+    values: wp.array(dtype=vec8),
+    out: wp.array(dtype=vec8),
 ):
     i = start + wp.tid()
     if leans(i, face, coverage):
         f = fringe_of(i, table[i], rects, face, coverage)
-        for k in range(values.shape[1]):
-            mean = f.weight[0] * values[f.pixel[0], k] + f.weight[1] * values[f.pixel[1], k]
-            mean += f.weight[2] * values[f.pixel[2], k] + f.weight[3] * values[f.pixel[3], k]
-            out[i, k] = f.own * f.hit * values[i, k] + (1.0 - f.own) * mean
+        mean = values[f.pixel[0]] * f.weight[0] + values[f.pixel[1]] * f.weight[1]
+        mean += values[f.pixel[2]] * f.weight[2] + values[f.pixel[3]] * f.weight[3]
+        out[i] = values[i] * (f.own * f.hit) + mean * (1.0 - f.own)
+    else:
+        out[i] = values[i]
+
+
+@wp.kernel(enable_backward=False)
+def keep_kernel(
+    start: int,
+    face: wp.array(dtype=wp.int32),
+    coverage: wp.array(dtype=wp.float32),
+    grad: wp.array(dtype=vec8),
+    kept: wp.array(dtype=vec8),
+):
+    """Moves gradients of leaning pixels from `grad` to `kept`, so that `fill_backward_kernel` can spread them."""
+    i = start + wp.tid()
+    if leans(i, face, coverage):
+        kept[i] = grad[i]
+        grad[i] = vec8()
+
+
+@wp.func
+def fringe_to_coverage(
+    i: int,
+    f: Fringe,
+    coverage: wp.array(dtype=wp.float32),
+    to_own: float,
+    to_weight: wp.vec4f,
+    grad_coverage: wp.array(dtype=wp.float32),
+):
+    """Add what gradients to a pixel's own share and to its neighbours' weights mean for their coverages."""
+    shared = wp.dot(to_weight, f.weight)
+    for n in range(4):
+        if f.known[n] > 0.0:
+            if coverage[f.pixel[n]] >= 0.5:
+                wp.atomic_add(grad_coverage, f.pixel[n], 2.0 * (to_weight[n] - shared) / f.total)
+    if f.known[0] + f.known[1] + f.known[2] + f.known[3] > 0.0:
+        wp.atomic_add(grad_coverage, i, to_own * f.hit * step_slope(coverage[i], 0.5, 1.0))
 
 
 @wp.kernel(enable_backward=False)
@@ -477,68 +483,26 @@ def fill_backward_kernel(
     rects: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     coverage: wp.array(dtype=wp.float32),
-    values: wp.array2d(dtype=wp.float32),
-    grad_out: wp.array2d(dtype=wp.float32),
-    grad_values: wp.array2d(dtype=wp.float32),
+    values: wp.array(dtype=vec8),
+    kept: wp.array(dtype=vec8),
+    grad: wp.array(dtype=vec8),
     grad_coverage: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
     if leans(i, face, coverage):
         f = fringe_of(i, table[i], rects, face, coverage)
-        to_own = float(0.0)
+        g = kept[i]
+        rest = 1.0 - f.own
+        wp.atomic_add(grad, i, g * (f.own * f.hit))
+        to_own = f.hit * wp.dot(g, values[i])
         to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-        for k in range(values.shape[1]):
-            g = grad_out[i, k]
-            if g != 0.0:
-                # grad_values holds grad_out here; what does not come from this pixel's own value goes back out.
-                wp.atomic_add(grad_values, i, k, g * (f.own * f.hit - 1.0))
-                mean = float(0.0)
-                for n in range(4):
-                    if f.known[n] > 0.0:
-                        wp.atomic_add(grad_values, f.pixel[n], k, g * (1.0 - f.own) * f.weight[n])
-                        mean += f.weight[n] * values[f.pixel[n], k]
-                        to_weight[n] += g * (1.0 - f.own) * values[f.pixel[n], k]
-                to_own += g * (f.hit * values[i, k] - mean)
-        shared = wp.dot(to_weight, f.weight)
         for n in range(4):
             if f.known[n] > 0.0:
-                if coverage[f.pixel[n]] >= 0.5:
-                    wp.atomic_add(grad_coverage, f.pixel[n], 2.0 * (to_weight[n] - shared) / f.total)
-        if f.known[0] + f.known[1] + f.known[2] + f.known[3] > 0.0:
-            wp.atomic_add(grad_coverage, i, to_own * f.hit * step_slope(coverage[i], 0.5, 1.0))
-
-
-class Fill(torch.autograd.Function):
-    """Values (T, K), 0 where nothing is hit, continued over the mesh's outline; differentiable to them and to
-    coverage (T,)."""
-
-    @staticmethod
-    def forward(ctx: Any, values, coverage, fragments: Fragments, table, edges) -> Tensor:
-        out = values.clone()
-        fixed = (table, fragments.layout.rects, fragments.face, coverage.contiguous(), values)
-        launch(fill_kernel, halves(out.shape[0]), [*_fill_inputs(fixed), _array(out)])
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor):
-        fixed = ctx.saved_tensors
-        grad_out = grad_out.contiguous()
-        grad_values, grad_coverage = grad_out.clone(), torch.zeros_like(fixed[3])
-        inputs = [
-            *(*_fill_inputs(fixed), _array(grad_out)),
-            *(_array(grad_values), _array(grad_coverage)),
-        ]
-        launch(fill_backward_kernel, between(ctx.edges), inputs)
-        return grad_values, grad_coverage, None, None, None
-
-
-def _fill_inputs(fixed) -> list:
-    table, rects, face, coverage, values = fixed
-    arrays = [_array(t) for t in (rects, face, coverage, values)]
-    return [_array(table, wp.vec4i), *arrays]
+                wp.atomic_add(grad, f.pixel[n], g * (rest * f.weight[n]))
+                along = wp.dot(g, values[f.pixel[n]])
+                to_own -= f.weight[n] * along
+                to_weight[n] = rest * along
+        fringe_to_coverage(i, f, coverage, to_own, to_weight, grad_coverage)
 
 
 # --------------------------------------------------------------------------------------- looking up the photograph
@@ -620,22 +584,33 @@ def texel_row(texels: wp.array(dtype=vec8), row: int, t: Taps, w: wp.vec4f):
 @wp.func
 def sample(texels: wp.array(dtype=vec8), t: Taps):
     low = texel_row(texels, t.rows[0], t, t.wx) * t.wy[0] + texel_row(texels, t.rows[1], t, t.wx) * t.wy[1]
-    return low + (texel_row(texels, t.rows[2], t, t.wx) * t.wy[2] + texel_row(texels, t.rows[3], t, t.wx) * t.wy[3])
+    return low + (
+        texel_row(texels, t.rows[2], t, t.wx) * t.wy[2] + texel_row(texels, t.rows[3], t, t.wx) * t.wy[3]
+    )
+
+
+@wp.struct
+class Sampled:
+    """A texel between texels, and how it changes along u and v."""
+
+    value: vec8
+    to_u: vec8
+    to_v: vec8
 
 
 @wp.func
-def sample_slope(texels: wp.array(dtype=vec8), t: Taps, g: vec8):
-    """The gradient to the place of a sample, from that to its value."""
-    to_u = float(0.0)
-    to_v = float(0.0)
+def sample_both(texels: wp.array(dtype=vec8), t: Taps):
+    out = Sampled()
     for k in range(4):
-        d0 = wp.dot(g, texels[t.rows[k] + t.columns[0]])
-        d1 = wp.dot(g, texels[t.rows[k] + t.columns[1]])
-        d2 = wp.dot(g, texels[t.rows[k] + t.columns[2]])
-        d3 = wp.dot(g, texels[t.rows[k] + t.columns[3]])
-        to_u += t.wy[k] * (d0 * t.sx[0] + d1 * t.sx[1] + d2 * t.sx[2] + d3 * t.sx[3])
-        to_v += t.sy[k] * (d0 * t.wx[0] + d1 * t.wx[1] + d2 * t.wx[2] + d3 * t.wx[3])
-    return wp.vec2f(to_u, to_v)
+        a = texels[t.rows[k] + t.columns[0]]
+        b = texels[t.rows[k] + t.columns[1]]
+        c = texels[t.rows[k] + t.columns[2]]
+        d = texels[t.rows[k] + t.columns[3]]
+        along = (a * t.wx[0] + b * t.wx[1]) + (c * t.wx[2] + d * t.wx[3])
+        out.value += along * t.wy[k]
+        out.to_v += along * t.sy[k]
+        out.to_u += ((a * t.sx[0] + b * t.sx[1]) + (c * t.sx[2] + d * t.sx[3])) * t.wy[k]
+    return out
 
 
 @wp.func
@@ -648,11 +623,11 @@ def texel_at(texels: wp.array(dtype=vec8), rect: wp.vec4i, start: int, uv: wp.ve
 
 
 @wp.func
-def texel_slope(texels: wp.array(dtype=vec8), rect: wp.vec4i, start: int, uv: wp.vec2f, g: vec8):
-    """The gradient to the place, from that to the texel."""
-    out = wp.vec2f(0.0, 0.0)
+def texel_around(texels: wp.array(dtype=vec8), rect: wp.vec4i, start: int, uv: wp.vec2f):
+    """`texel_at`, and how it changes."""
+    out = Sampled()
     if rect[2] > rect[0]:
-        out = sample_slope(texels, taps_at(uv, rect, start, False), g)
+        out = sample_both(texels, taps_at(uv, rect, start, False))
     return out
 
 
@@ -720,7 +695,12 @@ def plainly_seen(look: vec8, texel: vec8, u: float, v: float, wh: wp.vec2f):
     """Whether every weight of `mesh_pixel` is flat at full: then it is the texel, and so is its gradient."""
     seen = texel[4] <= 0.0 and texel[7] >= 0.9 and look[2] - texel[6] <= DEPTH_LOW
     if seen:
-        seen = u >= -BORDER_LOW and u <= wh[0] - 1.0 + BORDER_LOW and v >= -BORDER_LOW and v <= wh[1] - 1.0 + BORDER_LOW
+        seen = (
+            u >= -BORDER_LOW
+            and u <= wh[0] - 1.0 + BORDER_LOW
+            and v >= -BORDER_LOW
+            and v <= wh[1] - 1.0 + BORDER_LOW
+        )
     if seen:
         seen = look[4] <= OPEN_TURN_LOW or look[5] >= RIM_HIGH
     if seen:
@@ -823,85 +803,67 @@ def shade_backward_kernel(
         a = look[i]
         uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
         g = grad_mesh[i]
-        texel = texel_at(texels, rect, first, uv)
+        texel = texel_around(texels, rect, first, uv)
         to_look = vec8()
         to_texel = vec8(g[0], g[1], g[2], g[3], 0.0, 0.0, 0.0, 0.0)
-        if not plainly_seen(a, texel, uv[0], uv[1], wh):
-            to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(a, texel, xy, wh, g, grad_fill[i])
-        move = texel_slope(texels, rect, first, uv, to_texel)
-        to_look[0] += move[0]
-        to_look[1] += move[1]
+        if not plainly_seen(a, texel.value, uv[0], uv[1], wh):
+            to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(
+                a, texel.value, xy, wh, g, grad_fill[i]
+            )
+        to_look[0] += wp.dot(to_texel, texel.to_u)
+        to_look[1] += wp.dot(to_texel, texel.to_v)
         wp.atomic_add(grad_look, i, to_look)
     if in_halo(i, nearest, coverage):
         j = wp.int32(nearest[i])
         b = look[j]
         uw = wp.vec2f(xy[0] + b[0], xy[1] + b[1])
-        to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(
-            b, texel_at(texels, rect, first, uw), xy, wh, grad_halo[i]
-        )
-        move2 = texel_slope(texels, rect, first, uw, to_texel2)
-        to_look2[0] += move2[0]
-        to_look2[1] += move2[1]
+        texel2 = texel_around(texels, rect, first, uw)
+        to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, grad_halo[i])
+        to_look2[0] += wp.dot(to_texel2, texel2.to_u)
+        to_look2[1] += wp.dot(to_texel2, texel2.to_v)
         wp.atomic_add(grad_look, j, to_look2)
-
-
-class Shade(torch.autograd.Function):
-    """look (T, 8) -> premultiplied RGBA of mesh (T, 4) and of halo (T, 4), and what is left to complete (T,).
-
-    coverage (T,), nearest (T,) int64: see `compositor.Drawn` (they only say which pixels are of which part); texels
-    (S, 8) of crops rects (N, 4), offsets (N + 1,); frame_wh (N, 2) px.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, look, coverage, fragments: Fragments, table, nearest, texels, frame_wh, edges):
-        size = look.shape[0]
-        mesh, halo, fill = look.new_empty(size, 4), look.new_empty(size, 4), look.new_empty(size)
-        fixed = (table, fragments.face, coverage, nearest, *texels, frame_wh, look.contiguous())
-        outputs = [_array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
-        launch(shade_kernel, halves(size), [*_shade_inputs(fixed), *outputs])
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return mesh, halo, fill
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_mesh: Tensor, grad_halo: Tensor, grad_fill: Tensor):
-        fixed = ctx.saved_tensors
-        grad_look = torch.zeros_like(fixed[-1])
-        inputs = [
-            *(*_shade_inputs(fixed), _array(grad_mesh.contiguous(), wp.vec4f)),
-            *(_array(grad_halo.contiguous(), wp.vec4f), _array(grad_fill.contiguous())),
-            _array(grad_look, vec8),
-        ]
-        launch(shade_backward_kernel, between(ctx.edges), inputs)
-        return grad_look, None, None, None, None, None, None, None
-
-
-def _shade_inputs(fixed) -> list:
-    table, face, coverage, nearest, texels, rects, offsets, frame_wh, look = fixed
-    return [
-        *(_array(table, wp.vec4i), _array(face), _array(coverage)),
-        *(_array(nearest), _array(texels, vec8), _array(rects), _array(offsets)),
-        *(_array(frame_wh, wp.vec2f), _array(look, vec8)),
-    ]
 
 
 # ------------------------------------------------------------------- completion of what the photograph did not see
 
 
+@wp.struct
+class Meshes:
+    """What the mesh at a pixel is found by."""
+
+    table: wp.array(dtype=wp.vec4i)
+    rects: wp.array2d(dtype=wp.int64)
+    face: wp.array(dtype=wp.int32)
+    coverage: wp.array(dtype=wp.float32)
+    clip: wp.array(dtype=wp.vec3f)
+    faces: wp.array(dtype=wp.vec3i)
+    attributes: wp.array(dtype=vec13)
+
+
 @wp.func
-def wanted(i: int, at: wp.vec4i, rects: wp.array2d(dtype=wp.int64), fill: wp.array(dtype=wp.float32)):
-    """Whether this pixel, or a neighbour that may lean on it, is to be completed."""
-    found = fill[i] != 0.0
-    if not found and at[1] > wp.int32(rects[at[0], 0]):
-        found = fill[i - 1] != 0.0
-    if not found and at[1] + 1 < wp.int32(rects[at[0], 2]):
-        found = fill[i + 1] != 0.0
-    if not found and at[2] > wp.int32(rects[at[0], 1]):
-        found = fill[i - at[3]] != 0.0
-    if not found and at[2] + 1 < wp.int32(rects[at[0], 3]):
-        found = fill[i + at[3]] != 0.0
-    return found
+def own_at(m: Meshes, i: int):
+    """The mesh's own attributes at a pixel that it hits, else 0."""
+    value = vec13()
+    if m.face[i] >= 0:
+        at = m.table[i]
+        hit = find_hit(m.face[i], at[1], at[2], m.clip, m.faces)
+        value = m.attributes[hit.i0] * wp.float32(hit.b[0])
+        value += m.attributes[hit.i1] * wp.float32(hit.b[1])
+        value += m.attributes[hit.i2] * wp.float32(hit.b[2])
+    return value
+
+
+@wp.func
+def own_filled(m: Meshes, i: int):
+    """`own_at`, continued over the outline."""
+    value = own_at(m, i)
+    if leans(i, m.face, m.coverage):
+        f = fringe_of(i, m.table[i], m.rects, m.face, m.coverage)
+        value = value * (f.own * f.hit)
+        for n in range(4):
+            if f.known[n] > 0.0:
+                value += own_at(m, f.pixel[n]) * ((1.0 - f.own) * f.weight[n])
+    return value
 
 
 @wp.func
@@ -913,85 +875,41 @@ def exact_dot13(a: vec13, b: vec13):
     return total
 
 
-@wp.kernel(enable_backward=False)
-def own_kernel(
-    start: int,
-    table: wp.array(dtype=wp.vec4i),
-    rects: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    fill: wp.array(dtype=wp.float32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    attributes: wp.array(dtype=vec13),
-    out: wp.array(dtype=vec13),
+@wp.func
+def own_to_clip(m: Meshes, i: int, g: vec13, share: float, grad_clip: wp.array(dtype=wp.vec3d)):
+    """Add what `share` of a gradient to `own_at` means for the corners; returns g . own_at."""
+    at = m.table[i]
+    hit = find_hit(m.face[i], at[1], at[2], m.clip, m.faces)
+    s0 = exact_dot13(g, m.attributes[hit.i0])
+    s1 = exact_dot13(g, m.attributes[hit.i1])
+    s2 = exact_dot13(g, m.attributes[hit.i2])
+    mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+    if share != 0.0:
+        part = wp.float64(share)
+        add_to_corners(hit, at[1], at[2], part * (s0 - mean), part * (s1 - mean), part * (s2 - mean), grad_clip)
+    return wp.float32(mean)
+
+
+@wp.func
+def own_backward(
+    m: Meshes, i: int, g: vec13, grad_clip: wp.array(dtype=wp.vec3d), grad_coverage: wp.array(dtype=wp.float32)
 ):
-    i = start + wp.tid()
-    value = vec13()
-    if face[i] >= 0:
-        at = table[i]
-        if wanted(i, at, rects, fill):
-            hit = find_hit(face[i], at[1], at[2], clip, faces)
-            value = attributes[hit.i0] * wp.float32(hit.b[0])
-            value += attributes[hit.i1] * wp.float32(hit.b[1])
-            value += attributes[hit.i2] * wp.float32(hit.b[2])
-    out[i] = value
-
-
-@wp.kernel(enable_backward=False)
-def own_backward_kernel(
-    start: int,
-    table: wp.array(dtype=wp.vec4i),
-    rects: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    fill: wp.array(dtype=wp.float32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    attributes: wp.array(dtype=vec13),
-    grad_out: wp.array(dtype=vec13),
-    grad_clip: wp.array(dtype=wp.vec3d),
-):
-    i = start + wp.tid()
-    if face[i] >= 0:
-        at = table[i]
-        if wanted(i, at, rects, fill):
-            hit = find_hit(face[i], at[1], at[2], clip, faces)
-            g = grad_out[i]
-            s0 = exact_dot13(g, attributes[hit.i0])
-            s1 = exact_dot13(g, attributes[hit.i1])
-            s2 = exact_dot13(g, attributes[hit.i2])
-            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
-            add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
-
-
-class Own(torch.autograd.Function):
-    """Fixed attributes (V, 13) of the meshes at hit pixels (T, 13) where `fill` (T,) is not 0, and beside them."""
-
-    @staticmethod
-    def forward(ctx: Any, clip, fragments: Fragments, table, fill, faces, attributes, edges) -> Tensor:
-        out = clip.new_empty(fill.shape[0], 13)
-        fixed = (table, fragments.layout.rects, fragments.face, fill, clip, faces, attributes)
-        launch(own_kernel, halves(fill.shape[0]), [*_own_inputs(fixed), _array(out, vec13)])
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor):
-        fixed = ctx.saved_tensors
-        clip = fixed[4]
-        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
-        inputs = [*_own_inputs(fixed), _array(grad_out.contiguous(), vec13)]
-        launch(own_backward_kernel, between(ctx.edges), [*inputs, _array(grad_clip, wp.vec3d)])
-        return grad_clip.to(clip.dtype), None, None, None, None, None, None
-
-
-def _own_inputs(fixed) -> list:
-    table, rects, face, fill, clip, faces, attributes = fixed
-    return [
-        *(_array(table, wp.vec4i), _array(rects), _array(face), _array(fill)),
-        *(_vec3(clip), _array(faces, wp.vec3i), _array(attributes, vec13)),
-    ]
+    """Add what a gradient to `own_filled` means for corners and coverages."""
+    if leans(i, m.face, m.coverage):
+        f = fringe_of(i, m.table[i], m.rects, m.face, m.coverage)
+        rest = 1.0 - f.own
+        to_own = float(0.0)
+        if m.face[i] >= 0:
+            to_own = own_to_clip(m, i, g, f.own, grad_clip)
+        to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+        for n in range(4):
+            if f.known[n] > 0.0:
+                along = own_to_clip(m, f.pixel[n], g, rest * f.weight[n], grad_clip)
+                to_own -= f.weight[n] * along
+                to_weight[n] = rest * along
+        fringe_to_coverage(i, f, m.coverage, to_own, to_weight, grad_coverage)
+    elif m.face[i] >= 0:
+        own_to_clip(m, i, g, 1.0, grad_clip)
 
 
 @wp.func
@@ -1005,7 +923,9 @@ def clamped(v: wp.vec3f):
 
 
 @wp.func
-def shade(normal: wp.vec3f, to_eye: wp.vec3f, albedo: wp.vec3f, paint: float, glass: float, height: float, sun: wp.vec3f):
+def shade(
+    normal: wp.vec3f, to_eye: wp.vec3f, albedo: wp.vec3f, paint: float, glass: float, height: float, sun: wp.vec3f
+):
     """`texture.shade`, one row of it."""
     dome = 0.5 - 0.5 * normal[1]
     soft = wp.dot(normal, sun)
@@ -1038,7 +958,14 @@ def mirror_place(own: vec13):
 
 @wp.func
 def completed(
-    own: vec13, facing: float, texel: vec8, turn: wp.vec2f, to_eye: wp.vec3f, sun: wp.vec3f, tint: wp.vec3f, wh: wp.vec2f
+    own: vec13,
+    facing: float,
+    texel: vec8,
+    turn: wp.vec2f,
+    to_eye: wp.vec3f,
+    sun: wp.vec3f,
+    tint: wp.vec3f,
+    wh: wp.vec2f,
 ):
     """`Compositor._completion`, one row of it. own: colours (3), local normal (3), paint, glass, height, mirror clip
     (3), mirror cosine; facing: cosine towards the camera now."""
@@ -1097,23 +1024,24 @@ def eye_of(view: View, at: wp.vec4i):
 def complete_kernel(
     start: int,
     need: wp.array(dtype=wp.int64),
-    table: wp.array(dtype=wp.vec4i),
     texels: wp.array(dtype=vec8),
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     view: View,
-    own: wp.array(dtype=vec13),
+    meshes: Meshes,
     look: wp.array(dtype=vec8),
     fill: wp.array(dtype=wp.float32),
     mesh: wp.array(dtype=wp.vec4f),
 ):
     i = wp.int32(need[start + wp.tid()])
-    at = table[i]
+    at = meshes.table[i]
     o = at[0]
-    v = own[i]
+    v = own_filled(meshes, i)
     texel = texel_at(texels, rect_of(rects, o), wp.int32(offsets[o]), mirror_place(v))
     a = look[i]
-    c = completed(v, a[4] + a[5], texel, view.turn[o], eye_of(view, at), view.sun[o], view.tint[o], view.frame_wh[o])
+    c = completed(
+        v, a[4] + a[5], texel, view.turn[o], eye_of(view, at), view.sun[o], view.tint[o], view.frame_wh[o]
+    )
     f = fill[i]
     mesh[i] = mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
 
@@ -1122,97 +1050,45 @@ def complete_kernel(
 def complete_backward_kernel(
     start: int,
     need: wp.array(dtype=wp.int64),
-    table: wp.array(dtype=wp.vec4i),
     texels: wp.array(dtype=vec8),
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     view: View,
-    own: wp.array(dtype=vec13),
+    meshes: Meshes,
     look: wp.array(dtype=vec8),
     fill: wp.array(dtype=wp.float32),
     grad_mesh: wp.array(dtype=wp.vec4f),
-    grad_own: wp.array(dtype=vec13),
     grad_look: wp.array(dtype=vec8),
     grad_fill: wp.array(dtype=wp.float32),
     grad_turn: wp.array(dtype=wp.vec2d),
+    grad_clip: wp.array(dtype=wp.vec3d),
+    grad_coverage: wp.array(dtype=wp.float32),
 ):
     i = wp.int32(need[start + wp.tid()])
-    at = table[i]
+    at = meshes.table[i]
     o = at[0]
-    v = own[i]
+    v = own_filled(meshes, i)
     a = look[i]
     rect = rect_of(rects, o)
     first = wp.int32(offsets[o])
-    texel = texel_at(texels, rect, first, mirror_place(v))
+    texel = texel_around(texels, rect, first, mirror_place(v))
     eye = eye_of(view, at)
-    c = completed(v, a[4] + a[5], texel, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o])
+    c = completed(v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o])
     g = grad_mesh[i]
     f = fill[i]
     to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
     grad_fill[i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
     to_own, to_facing, to_texel, to_turn, to_eye, to_sun, to_tint, to_wh, to_g = wp.grad(completed_loss)(
-        v, a[4] + a[5], texel, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o], to_colour
+        v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o], to_colour
     )
-    more, to_move = wp.grad(mirror_loss)(v, texel_slope(texels, rect, first, mirror_place(v), to_texel))
-    grad_own[i] = to_own + more
+    move = wp.vec2f(wp.dot(to_texel, texel.to_u), wp.dot(to_texel, texel.to_v))
+    more, to_move = wp.grad(mirror_loss)(v, move)
+    own_backward(meshes, i, to_own + more, grad_clip, grad_coverage)
     to_look = vec8()
     to_look[4] = to_facing
     to_look[5] = to_facing
-    grad_look[i] = to_look
+    wp.atomic_add(grad_look, i, to_look)
     wp.atomic_add(grad_turn, o, wp.vec2d(wp.float64(to_turn[0]), wp.float64(to_turn[1])))
-
-
-class Complete(torch.autograd.Function):
-    """mesh (T, 4) with what `fill` (T,) leaves of it completed: by the car's other side, or the template's colours.
-
-    own (T, 13), look (T, 8): of the pixels; need (K,) int64: those with fill, ascending; yaw (N,). view: sun (N, 3)
-    unit, tint (N, 3) RGB of the paint, frame_wh (N, 2) px, unproject (N, 3, 3): the inverse of the camera's.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, mesh, fill, own, look, yaw, table, need, texels, view, edges) -> Tensor:
-        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
-        out = mesh.clone()
-        fixed = (need, table, *texels, turn, *view, own.contiguous(), look, fill)
-        launch(
-            complete_kernel,
-            halves(need.shape[0]),
-            [*_complete_inputs(fixed), _array(out, wp.vec4f)],
-        )
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_mesh: Tensor):
-        fixed = ctx.saved_tensors
-        need, turn, own, look, fill = fixed[0], fixed[5], *fixed[-3:]
-        grad_mesh = grad_mesh.contiguous()
-        grad_own, grad_look, grad_fill = torch.zeros_like(own), torch.zeros_like(look), torch.zeros_like(fill)
-        grad_turn = torch.zeros(turn.shape, dtype=torch.float64, device=turn.device)
-        inputs = [
-            *(*_complete_inputs(fixed), _array(grad_mesh, wp.vec4f)),
-            *(_array(grad_own, vec13), _array(grad_look, vec8)),
-            *(_array(grad_fill), _array(grad_turn, wp.vec2d)),
-        ]
-        starts = torch.searchsorted(need, torch.tensor(ctx.edges, device=need.device)).tolist()
-        launch(complete_backward_kernel, between(starts), inputs)
-        to_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
-        return grad_mesh, grad_fill, grad_own, grad_look, to_yaw, None, None, None, None, None
-
-
-def _complete_inputs(fixed) -> list:
-    need, table, texels, rects, offsets, turn, sun, tint, frame_wh, unproject, own, look, fill = fixed
-    view = View()
-    view.turn, view.sun, view.tint = _array(turn, wp.vec2f), _vec3(sun), _vec3(tint)
-    view.frame_wh = _array(frame_wh, wp.vec2f)
-    view.unproject = _array(unproject, wp.mat33f)
-    return [
-        *(_array(need), _array(table, wp.vec4i), _array(texels, vec8)),
-        *(_array(rects), _array(offsets), view, _array(own, vec13)),
-        *(_array(look, vec8), _array(fill)),
-    ]
 
 
 # --------------------------------------------------------------------------------------------- mesh and halo as one
@@ -1306,47 +1182,6 @@ def combine_backward_kernel(
     grad_mesh[i] = to_mesh
     grad_halo[i] = to_halo
     grad_coverage[i] = to_share
-
-
-class Combine(torch.autograd.Function):
-    """Mesh (T, 4) and halo (T, 4) by their shares of each pixel -> premultiplied RGB and opacity / depth (T, 4),
-    opacity (T,), depth (T,) m of the nearest of both, inf where neither is (not differentiated)."""
-
-    @staticmethod
-    def forward(ctx: Any, mesh, halo, coverage, look, fragments: Fragments, nearest, edges):
-        size = mesh.shape[0]
-        colour, opacity, depth = mesh.new_empty(size, 4), mesh.new_empty(size), mesh.new_empty(size)
-        fixed = (fragments.face, nearest, coverage, mesh.contiguous(), halo.contiguous(), look)
-        outputs = [_array(colour, wp.vec4f), _array(opacity), _array(depth)]
-        launch(combine_kernel, halves(size), [*_combine_inputs(fixed), *outputs])
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        ctx.mark_non_differentiable(depth)
-        return colour, opacity, depth
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor):
-        fixed = ctx.saved_tensors
-        _, _, coverage, mesh, halo, look = fixed
-        grad_mesh, grad_halo = torch.empty_like(mesh), torch.empty_like(halo)
-        grad_coverage, grad_look = torch.empty_like(coverage), torch.zeros_like(look)
-        inputs = [
-            *(*_combine_inputs(fixed), _array(grad_colour.contiguous(), wp.vec4f)),
-            *(_array(grad_opacity.contiguous()), _array(grad_mesh, wp.vec4f)),
-            *(_array(grad_halo, wp.vec4f), _array(grad_coverage)),
-            _array(grad_look, vec8),
-        ]
-        launch(combine_backward_kernel, between(ctx.edges), inputs)
-        return grad_mesh, grad_halo, grad_coverage, grad_look, None, None, None
-
-
-def _combine_inputs(fixed) -> list:
-    face, nearest, coverage, mesh, halo, look = fixed
-    return [
-        *(_array(face), _array(nearest), _array(coverage), _array(mesh, wp.vec4f)),
-        *(_array(halo, wp.vec4f), _array(look, vec8)),
-    ]
 
 
 # ---------------------------------------------------------------------------------------------------------- shadows
@@ -1483,9 +1318,13 @@ def shadow_backward_kernel(
                 to_u = float(0.0)
             if uv[1] != place[1]:
                 to_v = float(0.0)
-            q = wp.vec2d(
-                wp.float64(-(to_u * border + dark * to_border[0])), wp.float64(-(to_v * border + dark * to_border[1]))
-            ) / then
+            q = (
+                wp.vec2d(
+                    wp.float64(-(to_u * border + dark * to_border[0])),
+                    wp.float64(-(to_v * border + dark * to_border[1])),
+                )
+                / then
+            )
             x = wp.float64(at[1])
             y = wp.float64(at[2])
             to_d = wp.vec3d(q[0], q[1], -(q[0] * x + q[1] * y))
@@ -1500,40 +1339,265 @@ def shadow_backward_kernel(
             wp.atomic_add(grad_clip, hit.i2, to_d * -hit.b[2])
 
 
-class Shadow(torch.autograd.Function):
-    """Factors (Ts, 3) by which the photographed shadows darken the ground, moved along with the patches.
+def _shadow_inputs(s: Setting, table: Tensor, clip: Tensor) -> list:
+    ground = Ground()
+    dark, rects, offsets = s.dark
+    ground.dark, ground.rects, ground.offsets = _field(dark, wp.vec3f), _field(rects), _field(offsets)
+    ground.frame_wh = _field(s.frame_wh, wp.vec2f)
+    return [
+        *(_array(table, wp.vec4i), _array(s.ground.face), _vec3(clip), _vec3(s.ground_clip)),
+        *(_array(s.ground_faces, wp.vec3i), ground),
+    ]
 
-    clip, base_clip (4N, 3): the patches' corners now and then; dark (S, 3) of crops rects (N, 4), offsets (N + 1,).
+
+# ----------------------------------------------------------------------------------------------- all stages as one
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What `Photographed` reads and does not change. See `fused.Fixed` and `compositor.Drawn` for what is not said here.
+
+    ground: the fragments of the shadows' patches, one an object. tint (N, 3): RGB of the objects' paint. painter:
+    None, or what repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 8)
+    and the codes, differentiable. reach_px: how far each halo reaches.
+    """
+
+    fragments: Fragments
+    ground: Fragments
+    reach_px: Sequence[float]
+    faces: Tensor
+    base_clip: Tensor
+    base: Tensor
+    own: Tensor
+    texels: tuple[Tensor, Tensor, Tensor]
+    ground_clip: Tensor
+    ground_faces: Tensor
+    dark: tuple[Tensor, Tensor, Tensor]
+    frame_wh: Tensor
+    sun: Tensor
+    unproject: Tensor
+    tint: Tensor
+    painter: Painter | None
+
+
+Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From mesh, halo, look, codes, table and nearest to mesh and halo."""
+
+
+class _Parts:
+    """Objects [start, end) as ranges of packed pixels: what one thread draws from the first stage to the last."""
+
+    def __init__(self, s: Setting, code: Tensor | None) -> None:
+        self.pixels = s.fragments.layout.offsets.tolist()
+        self.ground = s.ground.layout.offsets.tolist()
+        count = len(self.pixels) - 1
+        work = [
+            2.0 * (self.pixels[i + 1] - self.pixels[i]) + self.ground[i + 1] - self.ground[i] for i in range(count)
+        ]
+        # A GPU works on all at once; a painter is torch's.
+        whole = s.faces.device.type != "cpu" or code is not None
+        self.edges = [0, count] if whole else between(list(range(count + 1)), work)
+
+
+class Photographed(torch.autograd.Function):
+    """All pixels of photographed objects, and of their shadows.
+
+    clip (V, 3), facing (V,), coverage (T,), yaw (N,), ground (4N, 3) clip coordinates of the patches' corners, code
+    (N, 5) or (0,): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth (T, 4),
+    opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
     """
 
     @staticmethod
-    def forward(ctx: Any, clip, fragments: Fragments, table, base_clip, faces, dark, frame_wh, edges) -> Tensor:
-        out = clip.new_empty(fragments.face.shape[0], 3)
-        fixed = (table, fragments.face, clip.contiguous(), base_clip, faces, *dark, frame_wh)
-        launch(shadow_kernel, halves(out.shape[0]), [*_shadow_inputs(fixed), _vec3(out)])
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return out
+    def forward(ctx: Any, clip, facing, coverage, yaw, ground, code, s: Setting):
+        size, device = coverage.shape[0], clip.device
+        clip, facing, ground = clip.detach(), facing.detach(), ground.detach().contiguous()
+        coverage, face = coverage.detach().contiguous(), s.fragments.face
+        parts = _Parts(s, code if s.painter is not None else None)
+        table, ground_table = _table_like(s.fragments), _table_like(s.ground)
+        nearest = torch.empty(size, dtype=torch.int64, device=device)
+        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1).detach()
+        found, look = clip.new_empty(size, 8), clip.new_empty(size, 8)
+        mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
+        colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
+        shadow = clip.new_empty(s.ground.face.shape[0], 3)
+        seen = _look_inputs((table, face, clip, facing, s.base_clip, s.base, s.faces))
+        filled = [*_outline(s, table, coverage), _array(found, vec8), _array(look, vec8)]
+        shades = _shade_inputs(s, table, nearest, coverage, look)
+        shaded = [*shades, _array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
+        combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
+        combined += [_array(opacity), _array(depth)]
+        shadowed = [*_shadow_inputs(s, ground_table, ground), _vec3(shadow)]
+        tables = [(s.fragments, table), (s.ground, ground_table)]
+        needs: dict[int, Tensor] = {}
+
+        def work(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            for fragments, out in tables:
+                rects, offsets = fragments.layout.rects, fragments.layout.offsets
+                launch(
+                    table_kernel, [start, end], [_array(rects), _array(offsets), _array(out, wp.vec4i)], (), device
+                )
+            ranges = [parts.ground[start], parts.ground[end]]
+            launch(shadow_kernel, ranges, shadowed, (), device)
+            if last == first:
+                return
+            surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
+            launch(look_kernel, [first, last], [*seen, _array(found, vec8)], (), device)
+            launch(fill_kernel, [first, last], filled, (), device)
+            launch(shade_kernel, [first, last], shaded, (), device)
+            needs[start] = need = fill[first:last].nonzero()[:, 0] + first
+            if need.numel():
+                inputs = _complete_inputs(s, need, table, turn, clip, coverage, look, fill)
+                launch(complete_kernel, [0, need.shape[0]], [*inputs, _array(mesh, wp.vec4f)], (), device)
+            if s.painter is None:
+                launch(combine_kernel, [first, last], combined, (), device)
+
+        load(place_kernel)
+        share(work, parts.edges)
+        ctx.painted = None
+        if s.painter is not None:
+            with torch.enable_grad():
+                leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, code))
+                ctx.painted = leaves, s.painter(*leaves, table, nearest)
+            mesh, halo = (t.detach().contiguous() for t in ctx.painted[1])
+            combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
+            launch(combine_kernel, halves(size), [*combined, _array(opacity), _array(depth)], (), device)
+        ctx.setting, ctx.parts, ctx.needs = s, parts, needs
+        ctx.save_for_backward(
+            clip, facing, coverage, turn, found, look, mesh, halo, fill, table, ground_table, nearest, ground
+        )
+        ctx.mark_non_differentiable(depth)
+        return colour, opacity, depth, shadow
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor):
-        fixed = ctx.saved_tensors
-        clip = fixed[2]
-        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=clip.device)
-        inputs = [*_shadow_inputs(fixed), _vec3(grad_out.contiguous()), _array(grad_clip, wp.vec3d)]
-        launch(shadow_backward_kernel, between(ctx.edges), inputs)
-        return grad_clip.to(clip.dtype), None, None, None, None, None, None, None
+    def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor, grad_shadow: Tensor):
+        clip, facing, coverage, turn, found, look, mesh, halo, fill, *others = ctx.saved_tensors
+        table, ground_table, nearest, ground = others
+        s: Setting = ctx.setting
+        parts: _Parts = ctx.parts
+        device = clip.device
+        grad_colour, grad_opacity = grad_colour.contiguous(), grad_opacity.contiguous()
+        grad_shadow = grad_shadow.contiguous()
+        grad_mesh, grad_halo = torch.empty_like(mesh), torch.empty_like(halo)
+        grad_coverage, grad_look = torch.empty_like(coverage), torch.empty_like(look)
+        kept, grad_fill, grad_facing = torch.empty_like(look), torch.empty_like(fill), torch.zeros_like(facing)
+        grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=device)
+        grad_ground = torch.zeros(ground.shape, dtype=torch.float64, device=device)
+        grad_turn = torch.zeros_like(turn, dtype=torch.float64)
+        to_clip, to_look = _array(grad_clip, wp.vec3d), _array(grad_look, vec8)
+        through = [
+            *(*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(grad_colour, wp.vec4f)),
+            *(_array(grad_opacity), _array(grad_mesh, wp.vec4f), _array(grad_halo, wp.vec4f)),
+            *(_array(grad_coverage), to_look),
+        ]
+        shades = _shade_inputs(s, table, nearest, coverage, look)
+        spread = [
+            *_outline(s, table, coverage),
+            _array(found, vec8),
+            _array(kept, vec8),
+            to_look,
+            _array(grad_coverage),
+        ]
+        looked = _look_inputs((table, s.fragments.face, clip, facing, s.base_clip, s.base, s.faces))
+        looked += [_array(found, vec8), to_look, to_clip, _array(grad_facing)]
+        shadowed = [*_shadow_inputs(s, ground_table, ground), _vec3(grad_shadow)]
+        shadowed.append(_array(grad_ground, wp.vec3d))
+
+        def combine(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            grad_look[first:last].zero_()
+            launch(combine_backward_kernel, [first, last], through, (), device)
+
+        def work(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            launch(shadow_backward_kernel, [parts.ground[start], parts.ground[end]], shadowed, (), device)
+            if last == first:
+                return
+            if ctx.painted is None:
+                combine(start, end)
+            grad_fill[first:last].zero_()
+            need = ctx.needs[start]
+            if need.numel():
+                inputs = [
+                    *_complete_inputs(s, need, table, turn, clip, coverage, look, fill),
+                    *(_array(grad_mesh, wp.vec4f), to_look, _array(grad_fill), _array(grad_turn, wp.vec2d)),
+                    *(to_clip, _array(grad_coverage)),
+                ]
+                launch(complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
+            inputs = [
+                *shades,
+                _array(grad_mesh, wp.vec4f),
+                _array(grad_halo, wp.vec4f),
+                _array(grad_fill),
+                to_look,
+            ]
+            launch(shade_backward_kernel, [first, last], inputs, (), device)
+            inputs = [_array(s.fragments.face), _array(coverage), to_look, _array(kept, vec8)]
+            launch(keep_kernel, [first, last], inputs, (), device)
+            launch(fill_backward_kernel, [first, last], spread, (), device)
+            launch(look_backward_kernel, [first, last], looked, (), device)
+
+        grad_code = None
+        if ctx.painted is not None:
+            combine(0, len(parts.pixels) - 1)
+            leaves, painted = ctx.painted
+            grad_mesh, grad_halo, more, grad_code = torch.autograd.grad(painted, leaves, (grad_mesh, grad_halo))
+            grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
+            grad_look += more
+        share(work, parts.edges)
+        grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
+        to_vertices, to_ground = grad_clip.to(clip.dtype), grad_ground.to(clip.dtype)
+        return to_vertices, grad_facing, grad_coverage, grad_yaw, to_ground, grad_code, None
 
 
-def _shadow_inputs(fixed) -> list:
-    table, face, clip, base_clip, faces, dark, rects, offsets, frame_wh = fixed
-    ground = Ground()
-    ground.dark, ground.rects, ground.offsets = _vec3(dark), _array(rects), _array(offsets)
-    ground.frame_wh = _array(frame_wh, wp.vec2f)
+def _table_like(fragments: Fragments) -> Tensor:
+    return torch.empty(fragments.face.shape[0], 4, dtype=torch.int32, device=fragments.face.device)
+
+
+def _outline(s: Setting, table: Tensor, coverage: Tensor) -> list:
+    rects, face = s.fragments.layout.rects, s.fragments.face
+    return [_array(table, wp.vec4i), _array(rects), _array(face), _array(coverage)]
+
+
+def _shade_inputs(s: Setting, table: Tensor, nearest: Tensor, coverage: Tensor, look: Tensor) -> list:
+    texels, rects, offsets = s.texels
     return [
-        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _vec3(base_clip)),
-        *(_array(faces, wp.vec3i), ground),
+        *(_array(table, wp.vec4i), _array(s.fragments.face), _array(coverage), _array(nearest)),
+        *(_array(texels, vec8), _array(rects), _array(offsets), _array(s.frame_wh, wp.vec2f), _array(look, vec8)),
+    ]
+
+
+def _complete_inputs(
+    s: Setting,
+    need: Tensor,
+    table: Tensor,
+    turn: Tensor,
+    clip: Tensor,
+    coverage: Tensor,
+    look: Tensor,
+    fill: Tensor,
+) -> list:
+    view, meshes = View(), Meshes()
+    view.turn, view.sun, view.tint = _field(turn, wp.vec2f), _field(s.sun, wp.vec3f), _field(s.tint, wp.vec3f)
+    view.frame_wh, view.unproject = _field(s.frame_wh, wp.vec2f), _field(s.unproject, wp.mat33f)
+    meshes.table, meshes.rects = _field(table, wp.vec4i), _field(s.fragments.layout.rects)
+    meshes.face, meshes.coverage = _field(s.fragments.face), _field(coverage)
+    meshes.clip, meshes.faces = _field(clip, wp.vec3f), _field(s.faces, wp.vec3i)
+    meshes.attributes = _field(s.own, vec13)
+    texels, rects, offsets = s.texels
+    return [
+        *(_array(need), _array(texels, vec8), _array(rects), _array(offsets), view, meshes),
+        *(_array(look, vec8), _array(fill)),
+    ]
+
+
+def _combine_inputs(
+    s: Setting, nearest: Tensor, coverage: Tensor, mesh: Tensor, halo: Tensor, look: Tensor
+) -> list:
+    return [
+        *(_array(s.fragments.face), _array(nearest), _array(coverage), _array(mesh, wp.vec4f)),
+        *(_array(halo, wp.vec4f), _array(look, vec8)),
     ]
 
 
@@ -1549,9 +1613,15 @@ def adjoints_kernel(out: wp.array(dtype=wp.float32)):
     out[1] = completed_loss(vec13(), 0.0, a, xy, c, c, c, xy, c) + mirror_loss(vec13(), xy)
 
 
-def _array(values: Tensor, dtype: Any = None) -> wp.array:
+def _field(values: Tensor, dtype: Any = None) -> wp.array:
+    """An array for a struct."""
     return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
 
 
-def _vec3(values: Tensor) -> wp.array:
+def _array(values: Tensor, dtype: Any = None) -> Any:
+    """An array for a kernel, in the form that is made fastest."""
+    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def _vec3(values: Tensor) -> Any:
     return _array(values, wp.vec3f)
