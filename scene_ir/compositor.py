@@ -35,6 +35,10 @@ HALO_MAX_PX = 64.0
 sixth."""
 
 
+_PATCH_MARGIN_PX = 4
+"""Ground kept around a photographed shadow: the reach of the lookups' kernel, and two pixels."""
+
+
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
     """backend: `warp` (float32, fast) or `reference` (plain torch, the scene's dtype, for gradient checks).
@@ -199,14 +203,19 @@ class Compositor:
     """
 
     def __init__(
-        self, scene: SceneIR, settings: RenderSettings | None = None, hidden: Sequence[Tensor] | None = None
+        self,
+        scene: SceneIR,
+        settings: RenderSettings | None = None,
+        hidden: Sequence[Tensor] | None = None,
+        whole_patches: bool = False,
     ) -> None:
-        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not
-        given."""
+        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given.
+        whole_patches: keep all of the ground that a vehicle may darken, not only what its source's shadow does."""
         self.settings = settings or RenderSettings()
         if self.settings.backend == "warp" and scene.photograph.dtype != torch.float32:
             scene = scene_to(scene, torch.float32)
         self.scene = scene
+        self._whole_patches = whole_patches
         self._like = scene.photograph
         self._frame_hw = (scene.camera.height, scene.camera.width)
         self._centre = surfaces.camera_centre(scene.camera.matrix).to(self._like)
@@ -233,6 +242,8 @@ class Compositor:
         self._halo = inflation * self.scene.camera.matrix[0, 0].to(self._like)
         self._sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
         self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
+        if objects.source and not self._whole_patches:
+            self._corners = self._trimmed_corners(objects, base)
         self._size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
         self._pack = _Pack([self])
@@ -243,6 +254,33 @@ class Compositor:
         self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
+
+    def _trimmed_corners(self, objects: Objects, base: Objects) -> Tensor:
+        """The patches (N, 4, 2) m, cut down to what the photographed shadows darken."""
+        height, width = self._frame_hw
+        corners = self._corners.clone()
+        for i, source in enumerate(objects.source):
+            if source.shadow is None or source.shadow.values.numel() == 0:
+                continue
+            rows, columns = (source.shadow.values < 1.0).any(dim=0).nonzero().unbind(dim=1)
+            x, y = columns + source.shadow.x0, rows + source.shadow.y0
+            margin = _PATCH_MARGIN_PX
+            if not len(x) or int(x.min()) < margin or int(y.min()) < margin:
+                continue  # a shadow that the border cuts goes on beyond it
+            if int(x.max()) >= width - margin or int(y.max()) >= height - margin:
+                continue
+            steps = torch.tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
+            pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self._like)
+            found = surfaces.on_ground(
+                pixels, self._unproject, self._centre, base.translation[i], base.yaw[i], self.scene.environment.ground
+            )
+            if found is None:
+                continue
+            low = torch.maximum(found.amin(dim=0), corners[i].amin(dim=0))
+            high = torch.minimum(found.amax(dim=0), corners[i].amax(dim=0))
+            if bool((high > low).all()):
+                corners[i] = surfaces.rectangle(low, high)
+        return corners
 
     def _height_px(self, objects: Objects) -> list[float]:
         """How high the objects are in the image at their nearest point, at least."""

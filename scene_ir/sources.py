@@ -99,7 +99,7 @@ def _solve(
     frame_hw = (scene.camera.height, scene.camera.width)
     blank = [_source(scene, i, alphas[i], shadows[i], margins_px[i], settings) for i in range(len(objects))]
     staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
-    compositor = Compositor(staged, RenderSettings(settings.backend))
+    compositor = Compositor(staged, RenderSettings(settings.backend), whole_patches=True)
     drawn = compositor.draw(compositor.scene.objects)
     nearest = drawn.nearest()
     mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(len(objects))]

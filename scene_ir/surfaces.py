@@ -251,10 +251,32 @@ def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
 def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
     """Corners (N, 4, 2) m, (x, z) in the objects' frames, of the ground patches that hold the shadows."""
     half = size_lhw[:, [0, 2]] / 2 + SHADOW_MARGIN_M
-    low, high = -half + offset.clamp(max=0.0), half + offset.clamp(min=0.0)
-    x = torch.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], dim=1)
-    z = torch.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]], dim=1)
+    return rectangle(-half + offset.clamp(max=0.0), half + offset.clamp(min=0.0))
+
+
+def rectangle(low: Tensor, high: Tensor) -> Tensor:
+    """Corners (..., 4, 2), one after the other, of rectangles from low to high (..., 2)."""
+    x = torch.stack([low[..., 0], high[..., 0], high[..., 0], low[..., 0]], dim=-1)
+    z = torch.stack([low[..., 1], low[..., 1], high[..., 1], high[..., 1]], dim=-1)
     return torch.stack([x, z], dim=-1)
+
+
+def on_ground(
+    pixels: Tensor, unproject: Tensor, centre: Tensor, translation: Tensor, yaw: Tensor, ground: Tensor
+) -> Tensor | None:
+    """Points (K, 2) m, (x, z) in an object's frame, that pixels (K, 2) show of the ground at its foot.
+
+    unproject (3, 3): the inverse of the camera's; centre, translation (3,) m; yaw (); ground (4,): the plane, to
+    which the object's foot is parallel. None where a pixel shows no ground.
+    """
+    normal = ground[:3].to(pixels)
+    ray = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1) @ unproject.T
+    along, down = ray @ normal, (translation - centre) @ normal
+    distance = down / torch.where(along.abs() > 1e-6, along, torch.full_like(along, 1e-6))
+    if not bool(((distance > 0) & (along.abs() > 1e-6)).all()):
+        return None
+    points = centre + distance[:, None] * ray - translation
+    return rotate(points, -yaw.expand(len(points)))[:, [0, 2]]
 
 
 def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: Tensor) -> Tensor:

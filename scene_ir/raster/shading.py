@@ -49,15 +49,15 @@ ZENITH_RGB = wp.constant(wp.vec3f(*texture.ZENITH_RGB))
 @wp.func
 def step(x: float, low: float, high: float):
     """`texture.smoothstep`."""
-    t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
+    t = wp.clamp((x - low) * (1.0 / (high - low)), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 @wp.func
 def step_slope(x: float, low: float, high: float):
     """The derivative of `step`."""
-    t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
-    return 6.0 * (t - t * t) / (high - low)
+    t = wp.clamp((x - low) * (1.0 / (high - low)), 0.0, 1.0)
+    return 6.0 * (t - t * t) * (1.0 / (high - low))
 
 
 # ---------------------------------------------------------------------------------------------- pixels of a layout
@@ -576,17 +576,15 @@ def taps_at(uv: wp.vec2f, rect: wp.vec4i, start: int, zero_border: bool):
 
 
 @wp.func
-def texel_row(texels: wp.array(dtype=vec8), row: int, t: Taps, w: wp.vec4f):
-    low = texels[row + t.columns[0]] * w[0] + texels[row + t.columns[1]] * w[1]
-    return low + (texels[row + t.columns[2]] * w[2] + texels[row + t.columns[3]] * w[3])
-
-
-@wp.func
 def sample(texels: wp.array(dtype=vec8), t: Taps):
-    low = texel_row(texels, t.rows[0], t, t.wx) * t.wy[0] + texel_row(texels, t.rows[1], t, t.wx) * t.wy[1]
-    return low + (
-        texel_row(texels, t.rows[2], t, t.wx) * t.wy[2] + texel_row(texels, t.rows[3], t, t.wx) * t.wy[3]
-    )
+    out = vec8()
+    for k in range(4):
+        a = texels[t.rows[k] + t.columns[0]]
+        b = texels[t.rows[k] + t.columns[1]]
+        c = texels[t.rows[k] + t.columns[2]]
+        d = texels[t.rows[k] + t.columns[3]]
+        out += ((a * t.wx[0] + b * t.wx[1]) + (c * t.wx[2] + d * t.wx[3])) * t.wy[k]
+    return out
 
 
 @wp.struct
@@ -765,9 +763,13 @@ def shade_kernel(
     wh = frame_wh[at[0]]
     if in_mesh(i, face, coverage):
         a = look[i]
-        p = mesh_pixel(a, texel_at(texels, rect, first, wp.vec2f(xy[0] + a[0], xy[1] + a[1])), xy, wh)
-        to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
-        left = p[4]
+        uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
+        texel = texel_at(texels, rect, first, uv)
+        to_mesh = wp.vec4f(texel[0], texel[1], texel[2], texel[3])
+        if not plainly_seen(a, texel, uv[0], uv[1], wh):
+            p = mesh_pixel(a, texel, xy, wh)
+            to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
+            left = p[4]
     if in_halo(i, nearest, coverage):
         a = look[wp.int32(nearest[i])]
         to_halo = halo_pixel(a, texel_at(texels, rect, first, wp.vec2f(xy[0] + a[0], xy[1] + a[1])), xy, wh)
