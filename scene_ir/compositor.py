@@ -104,15 +104,16 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo; ground: fragments
-    of the patches.
+    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo; ground_layout:
+    of the patches; ground: what was found there, None where the fast kernels find out themselves.
     """
 
     geometry: _Geometry
     mesh: verbs.Fragments
     coverage: Tensor
     reach_px: tuple[float, ...]
-    ground: verbs.Fragments
+    ground_layout: verbs.Layout
+    ground: verbs.Fragments | None
 
     def nearest(self) -> Tensor:
         """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo reaches."""
@@ -272,7 +273,12 @@ class Compositor:
             steps = torch.tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
             pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self._like)
             found = surfaces.on_ground(
-                pixels, self._unproject, self._centre, base.translation[i], base.yaw[i], self.scene.environment.ground
+                pixels,
+                self._unproject,
+                self._centre,
+                base.translation[i],
+                base.yaw[i],
+                self.scene.environment.ground,
             )
             if found is None:
                 continue
@@ -322,7 +328,6 @@ class Compositor:
         assert self._texels is not None
         assert self._shadows is not None
         own = (fleet.colours, self._sharp, fleet.paint[:, None], fleet.glass[:, None], self._height[:, None])
-        faces, _, _ = _patches(count, self._like.device)
         height, width = self._frame_hw
         return fused.Fixed(
             faces=fleet.faces.to(torch.int32).contiguous(),
@@ -334,8 +339,7 @@ class Compositor:
                 self._texels.rects[:count],
                 self._texels.offsets[: count + 1],
             ),
-            ground_clip=base.ground_clip,
-            ground_faces=faces.to(torch.int32).contiguous(),
+            patches=fused.patches(base.ground_clip),
             dark=(self._shadows.values, self._shadows.rects, self._shadows.offsets),
             frame_wh=self._like.new_tensor([width, height]).expand(count, 2).contiguous(),
             sun=self.scene.environment.sun.to(self._like).expand(count, 3).contiguous(),
@@ -415,7 +419,7 @@ class Compositor:
             packed.new_zeros(size, 4).index_add(0, rows.pixel, packed),
             opacity.new_zeros(size).index_add(0, rows.pixel, opacity),
             z,
-            drawn.ground.layout,
+            drawn.ground_layout,
             self._shadow_factors(objects, drawn),
         )
 
@@ -560,7 +564,8 @@ class Compositor:
 
     def _shadow_factors(self, objects: Objects, drawn: Drawn) -> Tensor:
         """Factors (Ts, 3) on the ground, of all patches."""
-        clip, layout = drawn.geometry.ground_clip, drawn.ground.layout
+        clip, layout = drawn.geometry.ground_clip, drawn.ground_layout
+        assert drawn.ground is not None
         if layout.size == 0:
             return clip.new_zeros(0, 3)
         faces, _, _ = _patches(len(objects), clip.device)
@@ -588,10 +593,11 @@ class Compositor:
     def ground_density(self, drawn: Drawn) -> Tensor:
         """How much the objects' boxes darken the pixels (Ts,) of their patches, in [0, 1]."""
         clip = drawn.geometry.ground_clip
+        assert drawn.ground is not None
         faces, _, _ = _patches(self._corners.shape[0], clip.device)
         corners = self._corners.reshape(-1, 2).contiguous()
         local = verbs.interpolate(drawn.ground, clip, faces, corners, self.settings.backend)
-        owner = drawn.ground.layout.draw()
+        owner = drawn.ground_layout.draw()
         density = surfaces.shadow_density(local, self._size[owner], self._sun_offset[owner])
         return density * (drawn.ground.face >= 0)
 
@@ -635,10 +641,10 @@ class Compositor:
                     layers.opacity.clamp(0.0, 1.0).split(plan.sizes), plan.spans, strict=True
                 )
             )
-        image = canvas[:3]
+        image = canvas
         if weather:
             changed = replace(self.scene.environment, weather=environment.weather.to(self._like))
-            image = apply_weather(image, canvas[3], changed, self._air, backend)
+            image = apply_weather(canvas[:3], canvas[3], changed, self._air, backend)
         if weather or layers is None:
             image = image.clamp(0.0, 1.0)
         return Render(image, depth, number, opacity)
@@ -684,7 +690,7 @@ class _Pack:
         """How far the halo of each object reaches beyond its mesh."""
         return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
 
-    def draw(self, objects: Sequence[Objects]) -> Drawn:
+    def draw(self, objects: Sequence[Objects], with_ground: bool = True) -> Drawn:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
         geometry, backend, reach = self.place(objects), self._backend, self.reach_px(objects)
         rects = surfaces.crop_rects(
@@ -700,8 +706,10 @@ class _Pack:
         )
         patch_rects[torch.tensor(self._shadowless, dtype=torch.bool)] = 0
         ground_layout = verbs.Layout.of(patch_rects)
-        ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return Drawn(geometry, mesh, coverage, tuple(reach), ground)
+        ground = None
+        if with_ground:
+            ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
+        return Drawn(geometry, mesh, coverage, tuple(reach), ground_layout, ground)
 
     def layers(self, objects: Sequence[Objects]) -> list[Layers]:
         """The layers of each member."""
@@ -711,7 +719,7 @@ class _Pack:
             return [m.reference_layers(o, m.draw(o)) for m, o in zip(self._members, objects, strict=True)]
         if len(self._members) > 1 and self._fixed is None:
             self._fixed = fused.Fixed.pack(known)
-        drawn = self.draw(objects)
+        drawn = self.draw(objects, with_ground=False)
         code = None
         if any(_active(o.texture_code) for o in objects):
             code = (
@@ -722,10 +730,10 @@ class _Pack:
         whole = self._fixed or known[0]
         colour, opacity, depth, shadow = fused.photographed(whole, drawn, drawn.reach_px, yaw, tint, code)
         if len(self._members) == 1:
-            return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground.layout, shadow)]
+            return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
         layouts, grounds = (
             [verbs.Layout.of(rects) for rects in whole_layout.rects.split(self._counts)]
-            for whole_layout in (drawn.mesh.layout, drawn.ground.layout)
+            for whole_layout in (drawn.mesh.layout, drawn.ground_layout)
         )
         sizes, ground_sizes = [part.size for part in layouts], [part.size for part in grounds]
         parts = zip(

@@ -65,8 +65,8 @@ class Rig:
 class Fixed:
     """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the camera
     then, paint, height; own (V, 13): colours (3), local normal (3), paint, glass, height, mirror clip (3), mirror
-    cosine; texels, dark: values (S, 8) and (S, 3), rects (N.., 4), offsets (N.. + 1,); ground_clip (4N, 3), then;
-    ground_faces (2N, 3) int32; frame_wh (N, 2) px; sun (N, 3); unproject (N, 3, 3).
+    cosine; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches (N, 3, 3) float64: from (s, t, 1) on
+    a shadow's patch, 0 to 1 both ways, to its clip coordinates then; frame_wh (N, 2) px; sun (N, 3); unproject (N, 3, 3).
     """
 
     faces: Tensor
@@ -74,8 +74,7 @@ class Fixed:
     base: Tensor
     own: Tensor
     texels: tuple[Tensor, Tensor, Tensor]
-    ground_clip: Tensor
-    ground_faces: Tensor
+    patches: Tensor
     dark: tuple[Tensor, Tensor, Tensor]
     frame_wh: Tensor
     sun: Tensor
@@ -86,10 +85,9 @@ class Fixed:
         """Several scenes' objects, one after the other."""
         if len(parts) == 1:
             return parts[0]
-        plain = ("base_clip", "base", "own", "ground_clip", "frame_wh", "sun", "unproject")
+        plain = ("base_clip", "base", "own", "patches", "frame_wh", "sun", "unproject")
         return cls(
             faces=_shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts]),
-            ground_faces=_shifted([p.ground_faces for p in parts], [p.ground_clip.shape[0] for p in parts]),
             texels=_packed([p.texels for p in parts]),
             dark=_packed([p.dark for p in parts]),
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
@@ -154,19 +152,26 @@ def photographed(
         anchor = look.index_select(0, nearest.clamp(min=0))
         return _painted(mesh, look, rows, lightness), _painted(halo, anchor, rows, lightness)
 
+    inside = torch.linalg.inv_ex(patches(drawn.geometry.ground_clip)).inverse
+    then = fixed.patches @ inside
     setting = shading.Setting(
         fragments=drawn.mesh,
-        ground=drawn.ground,
+        ground=drawn.ground_layout,
+        inside=inside.detach().contiguous(),
         reach_px=reach_px,
         tint=tint.contiguous(),
         painter=paint if code is not None else None,
-        **{f.name: getattr(fixed, f.name) for f in fields(fixed)},
+        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
     )
     geometry = drawn.geometry
     codes = code[0] if code is not None else yaw.new_zeros(0)
-    return shading.Photographed.apply(
-        geometry.clip, geometry.cos, drawn.coverage, yaw, geometry.ground_clip, codes, setting
-    )
+    return shading.Photographed.apply(geometry.clip, geometry.cos, drawn.coverage, yaw, then, codes, setting)
+
+
+def patches(clip: Tensor) -> Tensor:
+    """(N, 3, 3) float64: from a patch's (s, t, 1) to clip coordinates, of corners (4N, 3) one after the other."""
+    first, second, _, last = clip.reshape(-1, 4, 3).double().unbind(dim=1)
+    return torch.stack([second - first, last - first, first], dim=2)
 
 
 def _painted(rgba: Tensor, look: Tensor, code: Tensor, lightness: Tensor) -> Tensor:

@@ -197,9 +197,10 @@ def _shadow_crops(
 ) -> list[Crop]:
     """The shadows' factors (3, h, w) on the patches that carry them, continued under the vehicles."""
     density = compositor.ground_density(drawn)
+    assert drawn.ground is not None
     out = []
-    for i, (packed, size) in enumerate(drawn.ground.layout.spans()):
-        x0, y0 = drawn.ground.layout.rects[i, :2].tolist()
+    for i, (packed, size) in enumerate(drawn.ground_layout.spans()):
+        x0, y0 = drawn.ground_layout.rects[i, :2].tolist()
         shadow = shadows[i]
         if shadow is None or min(size) == 0:
             out.append(Crop(density.new_ones(3, 0, 0), x0, y0))

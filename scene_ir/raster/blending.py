@@ -202,6 +202,7 @@ class Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, canvas, factor, colour, opacity, depth, background_depth, plan, clamped):
         shadows, layers, edges = plan
+        factor, colour, opacity, depth = (t.contiguous() for t in (factor, colour, opacity, depth))
         image = canvas.clone(memory_format=torch.contiguous_format)
         nearest = background_depth.clone()
         height, width = nearest.shape

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from scene_ir import surfaces, texture
 from scene_ir.raster.launch import between, halves, launch, load, share, start_warp
-from scene_ir.raster.layout import Fragments
+from scene_ir.raster.layout import Fragments, Layout
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
@@ -167,7 +167,15 @@ class Place(torch.autograd.Function):
     def forward(ctx: Any, local, yaw, translation, normal, owner, matrix, centre, edges) -> tuple[Tensor, Tensor]:
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
         clip, facing = torch.empty_like(local), local.new_empty(local.shape[0])
-        fixed = (local.detach().contiguous(), normal, owner, turn, translation.detach().contiguous(), matrix, centre)
+        fixed = (
+            local.detach().contiguous(),
+            normal,
+            owner,
+            turn,
+            translation.detach().contiguous(),
+            matrix,
+            centre,
+        )
         launch(
             place_kernel,
             halves(local.shape[0]),
@@ -820,10 +828,11 @@ def shade_backward_kernel(
         b = look[j]
         uw = wp.vec2f(xy[0] + b[0], xy[1] + b[1])
         texel2 = texel_around(texels, rect, first, uw)
-        to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, grad_halo[i])
-        to_look2[0] += wp.dot(to_texel2, texel2.to_u)
-        to_look2[1] += wp.dot(to_texel2, texel2.to_v)
-        wp.atomic_add(grad_look, j, to_look2)
+        if texel2.value[3] != 0.0 or texel2.to_u[3] != 0.0 or texel2.to_v[3] != 0.0:  # else there is nothing near
+            to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, grad_halo[i])
+            to_look2[0] += wp.dot(to_texel2, texel2.to_u)
+            to_look2[1] += wp.dot(to_texel2, texel2.to_v)
+            wp.atomic_add(grad_look, j, to_look2)
 
 
 # ------------------------------------------------------------------- completion of what the photograph did not see
@@ -1191,8 +1200,12 @@ def combine_backward_kernel(
 
 @wp.struct
 class Ground:
-    """Photographed shadows: what they take away, three numbers a texel, and where the crops lie."""
+    """Photographed shadows: what they take away, three numbers a texel, and where the crops lie; from a pixel (x, y, 1)
+    to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then, over w now.
+    """
 
+    inside: wp.array(dtype=wp.mat33d)
+    then: wp.array(dtype=wp.mat33d)
     dark: wp.array(dtype=wp.vec3f)
     rects: wp.array2d(dtype=wp.int64)
     offsets: wp.array(dtype=wp.int64)
@@ -1200,14 +1213,16 @@ class Ground:
 
 
 @wp.func
-def ground_place(d: wp.vec3d, then: wp.float64, x: int, y: int):
-    """Where the photograph shows a ground point, px."""
-    out = wp.vec2f(FAR_AWAY, FAR_AWAY)
-    if then > wp.float64(NEAR):
-        out = wp.vec2f(
-            wp.float32(wp.float64(x) + (d[0] - wp.float64(x) * d[2]) / then),
-            wp.float32(wp.float64(y) + (d[1] - wp.float64(y) * d[2]) / then),
-        )
+def ground_place(ground: Ground, o: int, x: int, y: int):
+    """Where the photograph shows the ground point that a pixel shows, px, and 1 where the patch reaches, else 0."""
+    p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
+    q = ground.inside[o] @ p
+    out = wp.vec3f(FAR_AWAY, FAR_AWAY, 0.0)
+    if q[2] > ZERO and q[2] * wp.float64(NEAR) <= ONE:
+        if q[0] >= ZERO and q[0] <= q[2] and q[1] >= ZERO and q[1] <= q[2]:
+            r = ground.then[o] @ p
+            if r[2] > wp.float64(NEAR) * q[2]:
+                out = wp.vec3f(wp.float32(r[0] / r[2]), wp.float32(r[1] / r[2]), 1.0)
     return out
 
 
@@ -1231,31 +1246,15 @@ def reached(uv: wp.vec2f, rect: wp.vec4i):
 
 
 @wp.kernel(enable_backward=False)
-def shadow_kernel(
-    start: int,
-    table: wp.array(dtype=wp.vec4i),
-    face: wp.array(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    base_clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    ground: Ground,
-    out: wp.array(dtype=wp.vec3f),
-):
+def shadow_kernel(start: int, table: wp.array(dtype=wp.vec4i), ground: Ground, out: wp.array(dtype=wp.vec3f)):
     i = start + wp.tid()
+    at = table[i]
     factor = wp.vec3f(1.0, 1.0, 1.0)
-    if face[i] >= 0:
-        at = table[i]
+    place = ground_place(ground, at[0], at[1], at[2])
+    if place[2] > 0.0:
         rect = rect_of(ground.rects, at[0])
-        hit = find_hit(face[i], at[1], at[2], clip, faces)
-        t0 = base_clip[hit.i0]
-        t1 = base_clip[hit.i1]
-        t2 = base_clip[hit.i2]
-        d = wp.vec3d(t0 - clip[hit.i0]) * hit.b[0] + wp.vec3d(t1 - clip[hit.i1]) * hit.b[1]
-        d += wp.vec3d(t2 - clip[hit.i2]) * hit.b[2]
-        then = wp.float64(t0[2]) * hit.b[0] + wp.float64(t1[2]) * hit.b[1] + wp.float64(t2[2]) * hit.b[2]
-        place = ground_place(d, then, at[1], at[2])
         wh = ground.frame_wh[at[0]]
-        uv = in_frame(place, wh)
+        uv = in_frame(wp.vec2f(place[0], place[1]), wh)
         if reached(uv, rect):
             t = taps_at(uv, rect, wp.int32(ground.offsets[at[0]]), True)
             dark = dark_row(ground.dark, t.rows[0], t, t.wx) * t.wy[0]
@@ -1275,33 +1274,22 @@ def border_loss(place: wp.vec2f, wh: wp.vec2f):
 def shadow_backward_kernel(
     start: int,
     table: wp.array(dtype=wp.vec4i),
-    face: wp.array(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    base_clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
     ground: Ground,
     grad_out: wp.array(dtype=wp.vec3f),
-    grad_clip: wp.array(dtype=wp.vec3d),
+    grad_then: wp.array(dtype=wp.mat33d),
 ):
     i = start + wp.tid()
     g = grad_out[i]
-    if face[i] >= 0 and (g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0):
-        at = table[i]
-        rect = rect_of(ground.rects, at[0])
-        hit = find_hit(face[i], at[1], at[2], clip, faces)
-        t0 = wp.vec3d(base_clip[hit.i0])
-        t1 = wp.vec3d(base_clip[hit.i1])
-        t2 = wp.vec3d(base_clip[hit.i2])
-        d0 = t0 - hit.c0
-        d1 = t1 - hit.c1
-        d2 = t2 - hit.c2
-        d = d0 * hit.b[0] + d1 * hit.b[1] + d2 * hit.b[2]
-        then = t0[2] * hit.b[0] + t1[2] * hit.b[1] + t2[2] * hit.b[2]
-        place = ground_place(d, then, at[1], at[2])
-        wh = ground.frame_wh[at[0]]
-        uv = in_frame(place, wh)
-        if reached(uv, rect) and then > wp.float64(NEAR):
-            t = taps_at(uv, rect, wp.int32(ground.offsets[at[0]]), True)
+    at = table[i]
+    o = at[0]
+    place = ground_place(ground, o, at[1], at[2])
+    if place[2] > 0.0 and (g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0):
+        rect = rect_of(ground.rects, o)
+        wh = ground.frame_wh[o]
+        flat = wp.vec2f(place[0], place[1])
+        uv = in_frame(flat, wh)
+        if reached(uv, rect):
+            t = taps_at(uv, rect, wp.int32(ground.offsets[o]), True)
             dark = float(0.0)
             to_u = float(0.0)
             to_v = float(0.0)
@@ -1314,42 +1302,31 @@ def shadow_backward_kernel(
                 dark += t.wy[k] * along
                 to_v += t.sy[k] * along
                 to_u += t.wy[k] * (e0 * t.sx[0] + e1 * t.sx[1] + e2 * t.sx[2] + e3 * t.sx[3])
-            border = border_loss(place, wh)
-            to_border, to_wh = wp.grad(border_loss)(place, wh)
             if uv[0] != place[0]:
                 to_u = float(0.0)
             if uv[1] != place[1]:
                 to_v = float(0.0)
-            q = (
-                wp.vec2d(
-                    wp.float64(-(to_u * border + dark * to_border[0])),
-                    wp.float64(-(to_v * border + dark * to_border[1])),
-                )
-                / then
-            )
-            x = wp.float64(at[1])
-            y = wp.float64(at[2])
-            to_d = wp.vec3d(q[0], q[1], -(q[0] * x + q[1] * y))
-            to_then = -(q[0] * (d[0] - x * d[2]) + q[1] * (d[1] - y * d[2])) / then
-            s0 = wp.dot(to_d, d0) + to_then * t0[2]
-            s1 = wp.dot(to_d, d1) + to_then * t1[2]
-            s2 = wp.dot(to_d, d2) + to_then * t2[2]
-            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
-            add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
-            wp.atomic_add(grad_clip, hit.i0, to_d * -hit.b[0])
-            wp.atomic_add(grad_clip, hit.i1, to_d * -hit.b[1])
-            wp.atomic_add(grad_clip, hit.i2, to_d * -hit.b[2])
+            if uv[0] != place[0] or uv[1] != place[1]:
+                border = border_loss(flat, wh)
+                to_border, to_wh = wp.grad(border_loss)(flat, wh)
+                to_u = to_u * border + dark * to_border[0]
+                to_v = to_v * border + dark * to_border[1]
+            if to_u != 0.0 or to_v != 0.0:
+                p = wp.vec3d(wp.float64(at[1]), wp.float64(at[2]), ONE)
+                scale = -ONE / wp.dot(ground.then[o][2], p)
+                a = wp.float64(to_u) * scale
+                b = wp.float64(to_v) * scale
+                c = -(a * wp.float64(place[0]) + b * wp.float64(place[1]))
+                wp.atomic_add(grad_then, o, wp.outer(wp.vec3d(a, b, c), p))
 
 
-def _shadow_inputs(s: Setting, table: Tensor, clip: Tensor) -> list:
+def _shadow_inputs(s: Setting, table: Tensor, then: Tensor) -> list:
     ground = Ground()
     dark, rects, offsets = s.dark
+    ground.inside, ground.then = _field(s.inside, wp.mat33d), _field(then, wp.mat33d)
     ground.dark, ground.rects, ground.offsets = _field(dark, wp.vec3f), _field(rects), _field(offsets)
     ground.frame_wh = _field(s.frame_wh, wp.vec2f)
-    return [
-        *(_array(table, wp.vec4i), _array(s.ground.face), _vec3(clip), _vec3(s.ground_clip)),
-        *(_array(s.ground_faces, wp.vec3i), ground),
-    ]
+    return [_array(table, wp.vec4i), ground]
 
 
 # ----------------------------------------------------------------------------------------------- all stages as one
@@ -1359,21 +1336,20 @@ def _shadow_inputs(s: Setting, table: Tensor, clip: Tensor) -> list:
 class Setting:
     """What `Photographed` reads and does not change. See `fused.Fixed` and `compositor.Drawn` for what is not said here.
 
-    ground: the fragments of the shadows' patches, one an object. tint (N, 3): RGB of the objects' paint. painter:
+    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `Ground`. tint (N, 3): RGB of the objects' paint. painter:
     None, or what repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 8)
     and the codes, differentiable. reach_px: how far each halo reaches.
     """
 
     fragments: Fragments
-    ground: Fragments
+    ground: Layout
+    inside: Tensor
     reach_px: Sequence[float]
     faces: Tensor
     base_clip: Tensor
     base: Tensor
     own: Tensor
     texels: tuple[Tensor, Tensor, Tensor]
-    ground_clip: Tensor
-    ground_faces: Tensor
     dark: tuple[Tensor, Tensor, Tensor]
     frame_wh: Tensor
     sun: Tensor
@@ -1391,7 +1367,7 @@ class _Parts:
 
     def __init__(self, s: Setting, code: Tensor | None) -> None:
         self.pixels = s.fragments.layout.offsets.tolist()
-        self.ground = s.ground.layout.offsets.tolist()
+        self.ground = s.ground.offsets.tolist()
         count = len(self.pixels) - 1
         work = [
             2.0 * (self.pixels[i + 1] - self.pixels[i]) + self.ground[i + 1] - self.ground[i] for i in range(count)
@@ -1404,41 +1380,39 @@ class _Parts:
 class Photographed(torch.autograd.Function):
     """All pixels of photographed objects, and of their shadows.
 
-    clip (V, 3), facing (V,), coverage (T,), yaw (N,), ground (4N, 3) clip coordinates of the patches' corners, code
-    (N, 5) or (0,): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth (T, 4),
+    clip (V, 3), facing (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `Ground`), code (N, 5) or (0,):
+    differentiable, the code through the painter. -> premultiplied RGB and opacity / depth (T, 4),
     opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
     """
 
     @staticmethod
-    def forward(ctx: Any, clip, facing, coverage, yaw, ground, code, s: Setting):
+    def forward(ctx: Any, clip, facing, coverage, yaw, then, code, s: Setting):
         size, device = coverage.shape[0], clip.device
-        clip, facing, ground = clip.detach(), facing.detach(), ground.detach().contiguous()
+        clip, facing, then = clip.detach(), facing.detach(), then.detach().contiguous()
         coverage, face = coverage.detach().contiguous(), s.fragments.face
         parts = _Parts(s, code if s.painter is not None else None)
-        table, ground_table = _table_like(s.fragments), _table_like(s.ground)
+        table, ground_table = _table_like(s.fragments.layout, device), _table_like(s.ground, device)
         nearest = torch.empty(size, dtype=torch.int64, device=device)
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1).detach()
         found, look = clip.new_empty(size, 8), clip.new_empty(size, 8)
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
-        shadow = clip.new_empty(s.ground.face.shape[0], 3)
+        shadow = clip.new_empty(s.ground.size, 3)
         seen = _look_inputs((table, face, clip, facing, s.base_clip, s.base, s.faces))
         filled = [*_outline(s, table, coverage), _array(found, vec8), _array(look, vec8)]
         shades = _shade_inputs(s, table, nearest, coverage, look)
         shaded = [*shades, _array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
         combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
         combined += [_array(opacity), _array(depth)]
-        shadowed = [*_shadow_inputs(s, ground_table, ground), _vec3(shadow)]
-        tables = [(s.fragments, table), (s.ground, ground_table)]
+        shadowed = [*_shadow_inputs(s, ground_table, then), _vec3(shadow)]
+        tables = [(s.fragments.layout, table), (s.ground, ground_table)]
         needs: dict[int, Tensor] = {}
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
-            for fragments, out in tables:
-                rects, offsets = fragments.layout.rects, fragments.layout.offsets
-                launch(
-                    table_kernel, [start, end], [_array(rects), _array(offsets), _array(out, wp.vec4i)], (), device
-                )
+            for layout, out in tables:
+                inputs = [_array(layout.rects), _array(layout.offsets), _array(out, wp.vec4i)]
+                launch(table_kernel, [start, end], inputs, (), device)
             ranges = [parts.ground[start], parts.ground[end]]
             launch(shadow_kernel, ranges, shadowed, (), device)
             if last == first:
@@ -1466,7 +1440,7 @@ class Photographed(torch.autograd.Function):
             launch(combine_kernel, halves(size), [*combined, _array(opacity), _array(depth)], (), device)
         ctx.setting, ctx.parts, ctx.needs = s, parts, needs
         ctx.save_for_backward(
-            clip, facing, coverage, turn, found, look, mesh, halo, fill, table, ground_table, nearest, ground
+            clip, facing, coverage, turn, found, look, mesh, halo, fill, table, ground_table, nearest, then
         )
         ctx.mark_non_differentiable(depth)
         return colour, opacity, depth, shadow
@@ -1475,7 +1449,7 @@ class Photographed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor, grad_shadow: Tensor):
         clip, facing, coverage, turn, found, look, mesh, halo, fill, *others = ctx.saved_tensors
-        table, ground_table, nearest, ground = others
+        table, ground_table, nearest, then = others
         s: Setting = ctx.setting
         parts: _Parts = ctx.parts
         device = clip.device
@@ -1485,7 +1459,7 @@ class Photographed(torch.autograd.Function):
         grad_coverage, grad_look = torch.empty_like(coverage), torch.empty_like(look)
         kept, grad_fill, grad_facing = torch.empty_like(look), torch.empty_like(fill), torch.zeros_like(facing)
         grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=device)
-        grad_ground = torch.zeros(ground.shape, dtype=torch.float64, device=device)
+        grad_then = torch.zeros_like(then)
         grad_turn = torch.zeros_like(turn, dtype=torch.float64)
         to_clip, to_look = _array(grad_clip, wp.vec3d), _array(grad_look, vec8)
         through = [
@@ -1503,8 +1477,8 @@ class Photographed(torch.autograd.Function):
         ]
         looked = _look_inputs((table, s.fragments.face, clip, facing, s.base_clip, s.base, s.faces))
         looked += [_array(found, vec8), to_look, to_clip, _array(grad_facing)]
-        shadowed = [*_shadow_inputs(s, ground_table, ground), _vec3(grad_shadow)]
-        shadowed.append(_array(grad_ground, wp.vec3d))
+        shadowed = [*_shadow_inputs(s, ground_table, then), _vec3(grad_shadow)]
+        shadowed.append(_array(grad_then, wp.mat33d))
 
         def combine(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -1549,12 +1523,11 @@ class Photographed(torch.autograd.Function):
             grad_look += more
         share(work, parts.edges)
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
-        to_vertices, to_ground = grad_clip.to(clip.dtype), grad_ground.to(clip.dtype)
-        return to_vertices, grad_facing, grad_coverage, grad_yaw, to_ground, grad_code, None
+        return grad_clip.to(clip.dtype), grad_facing, grad_coverage, grad_yaw, grad_then, grad_code, None
 
 
-def _table_like(fragments: Fragments) -> Tensor:
-    return torch.empty(fragments.face.shape[0], 4, dtype=torch.int32, device=fragments.face.device)
+def _table_like(layout: Layout, device: torch.device) -> Tensor:
+    return torch.empty(layout.size, 4, dtype=torch.int32, device=device)
 
 
 def _outline(s: Setting, table: Tensor, coverage: Tensor) -> list:
