@@ -20,8 +20,8 @@ Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles are
-    left out of `order` and `shadows`, the draws that have a shadow."""
+    """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles
+    are left out of `order` and `shadows`, the draws that have a shadow."""
 
     layout: Layout
     shadow_layout: Layout
@@ -60,12 +60,13 @@ def composite(
     clamped: bool,
     backend: Backend = "reference",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to canvas, factors, colour, opacity.
+    """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to canvas, factors, colour,
+    opacity.
 
-    canvas: (C, H, W), RGB and, with C = 4, 1 / depth. depth: (H, W) m behind everything. what: shadow factors (Ts, 3);
-    premultiplied colours (T, 4), the fourth opacity / depth; opacity (T,); depth (T,) m. clamped: whether RGB is kept
-    in [0, 1]. -> (C, H, W); (H, W) m and (H, W) int64, i + 1, of the front-most object i that is at least half
-    opaque. Pixels outside the plan's rectangles keep their bits.
+    canvas: (C, H, W), RGB and, with C = 4, 1 / depth. depth: (H, W) m behind everything. what: shadow factors (Ts,
+    3); premultiplied colours (T, 4), the fourth opacity / depth; opacity (T,); depth (T,) m. clamped: whether RGB
+    is kept in [0, 1]. -> (C, H, W); (H, W) m and (H, W) int64, i + 1, of the front-most object i that is at least
+    half opaque. Pixels outside the plan's rectangles keep their bits.
     """
     factor, colour, opacity, z = what
     if backend == "warp":

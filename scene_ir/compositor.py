@@ -104,8 +104,8 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo; ground_layout:
-    of the patches; ground: what was found there, None where the fast kernels find out themselves.
+    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo;
+    ground_layout: of the patches; ground: what was found there, None where the fast kernels find out themselves.
     """
 
     geometry: _Geometry
@@ -116,7 +116,8 @@ class Drawn:
     ground: verbs.Fragments | None
 
     def nearest(self) -> Tensor:
-        """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo reaches."""
+        """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo
+        reaches."""
         return surfaces.nearest_hits(self.mesh, self.reach_px)
 
 
@@ -615,7 +616,8 @@ class Compositor:
         return replace(self.scene.objects, **moving)
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: Layers | None) -> Render:
-        """The picture of drawn objects. perturbed: for its environment; layers: None where there are no objects."""
+        """The picture of drawn objects. perturbed: for its environment; layers: None where there are no
+        objects."""
         environment, backend = perturbed.environment, self.settings.backend
         weather, foliage = _active(environment.weather), _active(environment.foliage)
         canvas = self._canvas if weather else self._canvas[:3]
@@ -651,14 +653,15 @@ class Compositor:
 
 
 class _Pack:
-    """Compositors whose objects are drawn in one go: each stage passes once over all pixels, of however many scenes.
+    """Compositors whose objects are drawn in one go: each stage passes once over all pixels, of however many
+    scenes.
 
     A compositor may occur more than once, for several perturbations of one scene.
     """
 
     def __init__(self, members: Sequence[Compositor]) -> None:
         self._members = tuple(members)
-        self._backend = members[0].settings.backend
+        self._backend: verbs.Backend = members[0].settings.backend
         self._rig = fused.Rig.pack([m.rig for m in members])
         self._faces, self._vertex_ranges, self._face_ranges = Fleet.joined([m.fleet for m in members])
         self._ranges = torch.tensor(self._face_ranges, dtype=torch.int64, device=self._faces.device).reshape(-1, 2)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What placing vertices takes besides the pose: normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4) and
-    centre (N, 3) m of the objects' cameras; edges: the objects' first vertices, and V."""
+    """What placing vertices takes besides the pose: normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4)
+    and centre (N, 3) m of the objects' cameras; edges: the objects' first vertices, and V."""
 
     normal: Tensor
     owner: Tensor
@@ -63,10 +63,11 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the camera
-    then, paint, height; own (V, 13): colours (3), local normal (3), paint, glass, height, mirror clip (3), mirror
-    cosine; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches (N, 3, 3) float64: from (s, t, 1) on
-    a shadow's patch, 0 to 1 both ways, to its clip coordinates then; frame_wh (N, 2) px; sun (N, 3); unproject (N, 3, 3).
+    """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the
+    camera then, paint, height; own (V, 13): colours (3), local normal (3), paint, glass, height, mirror clip (3),
+    mirror cosine; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches (N, 3, 3)
+    float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then; frame_wh (N, 2)
+    px; sun (N, 3); unproject (N, 3, 3).
     """
 
     faces: Tensor
@@ -135,11 +136,11 @@ def photographed(
     tint: Tensor,
     code: tuple[Tensor, Tensor] | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors (Ts,
-    3) by which their shadows darken the ground.
+    """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors
+    (Ts, 3) by which their shadows darken the ground.
 
-    reach_px: of each halo; tint (N, 3): the templates' paint; code: texture codes (N, 5) and CIE L* of the paint (N,),
-    if there are any.
+    reach_px: of each halo; tint (N, 3): the templates' paint; code: texture codes (N, 5) and CIE L* of the paint
+    (N,), if there are any.
     """
     from scene_ir.raster import shading
 

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, SIM102 - the line above; Warp needs float(0) to declare what a branch changes.
+# ruff: noqa: E501 - the line above; Warp needs float(0) to declare what a branch changes.
 """Shadows and layers laid onto a picture, row by row, as Warp kernels: what `blend` defines in plain torch.
 
 A thread owns whole rows of the picture, so that layers which overlap are laid down in order without waiting.
@@ -56,7 +56,7 @@ def span_of(stack: Stack, k: int, y: int):
 @wp.func
 def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.uint8), y: int, x: int):
     """Clamp a pixel to [0, 1], remembering which channels had left it."""
-    bits = int(0)
+    bits = 0
     for c in range(3):
         v = image[c, y, x]
         if v < 0.0:
@@ -228,7 +228,6 @@ class Blend(torch.autograd.Function):
             return (None,) * 8
         factor, opacity, under_shadow, under_layer, over = ctx.saved_tensors
         shadows, layers, edges = ctx.plan
-        grad_image = grad_image.contiguous()
         with_canvas = ctx.needs_input_grad[0]
         grad = grad_image.clone() if with_canvas else torch.empty_like(grad_image)
         # Packed pixels that lie in no picture do not exist: every entry is written.

@@ -851,7 +851,7 @@ def outline_kernel(
                 e = edges_of(faces[f], clip, parts[part, CULL])
                 if e.det > ZERO:
                     for y in range(wp.max(box[1], row), yb):
-                        if bits_at(right, origin + y * width + xa, wp.min(xb - xa, 64)) != wp.uint64(0):
+                        if any_bit(right, xa, xb, y, y + 1, origin, width):
                             scan(e, 3 * f, 0, y, x0, x1, origin + y * width, 1, near, face, keys)
                     x = wp.max(box[0], x0)
                     while x < xb:

@@ -19,8 +19,8 @@ import torch
 import warp as wp
 
 _WORTH = 32768
-"""Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to 150
-microseconds. What takes several kernels is handed over once, by `share`."""
+"""Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to
+150 microseconds. What takes several kernels is handed over once, by `share`."""
 
 
 @contextmanager
@@ -39,7 +39,7 @@ def _without_stderr() -> Iterator[None]:
 @cache
 def start_warp() -> None:
     """Initialise Warp, silently; every module of kernels calls this first."""
-    wp.config.quiet = True
+    wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
     wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
     # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
     with nullcontext() if torch.cuda.is_available() else _without_stderr():
@@ -107,18 +107,16 @@ def launch(
 ) -> None:
     """Run a kernel over the ranges between ascending `edges`, in torch's stream on a GPU, else a thread a range.
 
-    inputs, outputs: the kernel's arguments after the first index. device: where they lie, by default where the first
-    of them that is an array does.
+    inputs, outputs: the kernel's arguments after the first index. device: where they lie, by default where the
+    first of them that is an array does.
     """
     if len(edges) < 2 or edges[-1] <= edges[0]:
         return
     inputs = (*inputs, *outputs)
-    where = next(i.device for i in inputs if isinstance(i, wp.array)) if device is None else None
-    if where is not None and where.is_cuda:
-        device = wp.device_to_torch(where)
-    if device is not None and device.type != "cpu":
-        stream = wp.stream_from_torch(device)
-        where = wp.device_from_torch(device)
+    if device is None:
+        device = torch.device(wp.device_to_torch(next(i.device for i in inputs if isinstance(i, wp.array))))
+    if device.type != "cpu":
+        where, stream = wp.device_from_torch(device), wp.stream_from_torch(device)
         _run(kernel, edges[0], edges[-1] - edges[0], inputs, where, stream)
         return
     if len(edges) > 2:

@@ -1,5 +1,6 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, SIM102 - the line above; Warp needs int(0) to declare what a loop changes.
+# ruff: noqa: E501, UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
+# returns the gradients of all arguments.
 """The compositor's per-pixel work as Warp kernels: one pass a stage, forward and backward, float32.
 
 What each stage computes is defined by the plain torch of `compositor` and `texture`, which the backend `reference`

@@ -16,8 +16,8 @@ from torch import Tensor
 from scene_ir import blend, surfaces
 from scene_ir.compositor import Compositor, RenderSettings, render, scene_to
 from scene_ir.errors import ShapeError
-from scene_ir.raster.layout import Layout
 from scene_ir.raster import verbs
+from scene_ir.raster.layout import Layout
 from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
 from scene_ir.types import Crop, Objects, Render, SceneIR
 

@@ -25,7 +25,8 @@ def perturbed(scene: SceneIR, values: dict[str, Tensor]) -> SceneIR:
     """The scene with `values` added to its parameters; ffd as (N, 96) symmetric codes."""
     objects = scene.objects
     moved = {
-        "translation": objects.translation + values["translation"] * objects.translation.new_tensor([1.0, 0.0, 1.0]),
+        "translation": objects.translation
+        + values["translation"] * objects.translation.new_tensor([1.0, 0.0, 1.0]),
         "yaw": objects.yaw + values["yaw"],
         "ffd": objects.ffd + from_symmetric(values["ffd"]),
         "texture_code": objects.texture_code + values["texture_code"],
@@ -39,8 +40,8 @@ def draws(scene: SceneIR, seed: int, spread: float, active: tuple[str, ...]) -> 
     generator = torch.Generator().manual_seed(seed)
     count = len(scene.objects)
     shapes = {
-        "translation": (count, 3), "yaw": (count,), "ffd": (count, 96), "texture_code": (count, 5), "weather": (4,),
-        "foliage": (3,),
+        "translation": (count, 3), "yaw": (count,), "ffd": (count, 96), "texture_code": (count, 5), "weather":
+        (4,), "foliage": (3,),
     }  # fmt: skip
     scales = {"translation": 0.5, "yaw": 0.3, "ffd": 0.03, "texture_code": 0.4, "weather": 0.4, "foliage": 0.5}
     out = {}
@@ -134,7 +135,8 @@ def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> N
     together = render_batch(pairs)
     alone = [c.render(s) for c, s in pairs]
     for one, other in zip(together, alone, strict=True):
-        # Not to the bit: torch computes the last few entries of a tensor, which depend on its length, in another way.
+        # Not to the bit: torch computes the last few entries of a tensor, which depend on its length, in another
+        # way.
         assert torch.allclose(one.image, other.image, rtol=0, atol=2e-6)
         assert torch.equal(one.object_id, other.object_id)
         assert torch.equal(one.depth, other.depth)
