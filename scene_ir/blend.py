@@ -14,6 +14,9 @@ from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import Layout
 from scene_ir.raster.verbs import Backend
 
+SATURATED = 1e-6
+"""A colour this near to 0 or 1 is at the bound: rounding decides on which side of it."""
+
 Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
 
@@ -52,6 +55,29 @@ def _spans(layout: Layout) -> tuple[Span, ...]:
     return tuple(out)
 
 
+class _Clamp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor) -> Tensor:
+        ctx.save_for_backward(image)
+        return image.clamp(0.0, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+        (image,) = ctx.saved_tensors
+        away = (image - 0.5).abs()
+        passing = (away <= 0.5 + SATURATED).to(image) + (away < 0.5 - SATURATED)
+        return grad_outputs[0] * (0.5 * passing)
+
+
+def clamp_colour(image: Tensor) -> Tensor:
+    """Colours kept in [0, 1].
+
+    Where one just reaches a bound, as saturated pixels of a photograph do, half of the gradient passes: the mean of
+    the slopes to both sides, which is what a central difference finds.
+    """
+    return _Clamp.apply(image)
+
+
 def composite(
     canvas: Tensor,
     depth: Tensor,
@@ -78,7 +104,7 @@ def composite(
         return blending.Blend.apply(canvas, factor, colour, opacity, z, depth, (shadows, layers, edges), clamped)
     image = _Blend.apply(canvas, factor, colour[:, : canvas.shape[0]], opacity, plan)
     if clamped:
-        image = torch.cat([image[:3].clamp(0.0, 1.0), image[3:]])
+        image = torch.cat([clamp_colour(image[:3]), image[3:]])
     with torch.no_grad():
         nearest = depth.clone()
         number = torch.zeros(depth.shape, dtype=torch.int64, device=depth.device)

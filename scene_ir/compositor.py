@@ -648,7 +648,7 @@ class Compositor:
             changed = replace(self.scene.environment, weather=environment.weather.to(self._like))
             image = apply_weather(canvas[:3], canvas[3], changed, self._air, backend)
         if weather or layers is None:
-            image = image.clamp(0.0, 1.0)
+            image = blend.clamp_colour(image[:3])
         return Render(image, depth, number, opacity)
 
 

@@ -150,7 +150,7 @@ def mirror_reach(height: int) -> int:
 def _mirror(image: Tensor) -> Tensor:
     """What a wet road reflects, coarsely: the picture smeared downwards."""
     height, reach = image.shape[1], mirror_reach(image.shape[1])
-    smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate")[0]
+    smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate", separable=True)[0]
     shift = reach // 2
     return torch.cat([smeared[:, :1].expand(-1, shift, -1), smeared[:, : height - shift]], dim=1)
 

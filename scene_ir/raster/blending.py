@@ -15,10 +15,13 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from scene_ir.blend import SATURATED as _SATURATED
 from scene_ir.raster.launch import between, launch, start_warp
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": False})
+
+SATURATED = wp.constant(wp.float32(_SATURATED))
 
 
 @wp.struct
@@ -55,16 +58,16 @@ def span_of(stack: Stack, k: int, y: int):
 
 @wp.func
 def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.uint8), y: int, x: int):
-    """Clamp a pixel to [0, 1], remembering which channels had left it."""
-    bits = 0
+    """Clamp a pixel to [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5)."""
+    bits = int(0)
     for c in range(3):
-        v = image[c, y, x]
-        if v < 0.0:
+        away = wp.abs(image[c, y, x] - 0.5)
+        if away > 0.5 + SATURATED:
             bits += 1 << c
-            image[c, y, x] = 0.0
-        if v > 1.0:
-            bits += 1 << c
-            image[c, y, x] = 1.0
+        elif away >= 0.5 - SATURATED:
+            bits += 8 << c
+        if away > 0.5:
+            image[c, y, x] = wp.clamp(image[c, y, x], 0.0, 1.0)
     if bits > 0:
         over[y, x] = wp.uint8(bits)
 
@@ -132,12 +135,15 @@ def start_gradient(
     x: int,
     grad: wp.array3d(dtype=wp.float32),
 ):
-    """The gradient to a pixel before it was clamped."""
+    """The gradient to a pixel before it was clamped: see `blend.clamp_colour`."""
     bits = wp.int32(over[y, x])
     for c in range(grad.shape[0]):
         g = grad_image[c, y, x]
-        if (bits >> c) % 2 == 1:
-            g = 0.0
+        if bits != 0 and c < 3:
+            if (bits >> c) % 2 == 1:
+                g = 0.0
+            if (bits >> (c + 3)) % 2 == 1:
+                g = 0.5 * g
         grad[c, y, x] = g
 
 

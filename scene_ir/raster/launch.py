@@ -41,9 +41,9 @@ def start_warp() -> None:
     """Initialise Warp, silently; every module of kernels calls this first."""
     wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
     wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
-    # Each CPU launch would put its tiles' memory, unused here, on its stack and point to it from one static variable:
-    # with several threads one finds another's pointer there, or none, and the process crashes (seen with Warp 1.19).
-    wp.config.enable_tiles_in_stack_memory = False
+    # Else each launch on an x86 CPU puts an arena, which no kernel here needs, on its stack and points to it from
+    # one static variable: with several threads one finds another's pointer, or none, and crashes (Warp 1.19).
+    wp.config.enable_tiles_in_stack_memory = None
     # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
     with nullcontext() if torch.cuda.is_available() else _without_stderr():
         wp.init()

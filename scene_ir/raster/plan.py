@@ -68,8 +68,7 @@ def int32_faces(faces: Tensor) -> Tensor:
 def share_on_cpu(
     layout: Layout, face_ranges: Tensor, cull: Tensor | None, threads: int
 ) -> tuple[list[list[int]], list[int]]:
-    """Rows of Plan.parts, those without pixels left out, and where the shares of the threads begin, for
-    `rasterize`.
+    """Rows of Plan.parts, those without pixels left out, and where the threads' shares begin, for `rasterize`.
 
     A thread's share is a run of draws; where that is too uneven a draw is cut into bands of rows.
     """

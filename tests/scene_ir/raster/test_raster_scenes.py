@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from scene_ir.errors import RangeError
-from scene_ir.raster import launch, plan, verbs
+from scene_ir.raster import kernels, launch, plan, verbs
 
 RECTS = torch.tensor(
     [[0, 0, 60, 44], [20, 10, 41, 33], [7, 7, 7, 20], [0, 0, 60, 44], [30, 20, 31, 21], [5, 0, 75, 9]]
@@ -164,6 +164,28 @@ def test_degenerate_and_extreme_triangles(seed: int) -> None:
     assert not torch.isin(found[0].face, torch.arange(len(faces) + len(picks), len(all_faces))).any()
     coverage = [verbs.antialias(f, clip, all_faces, b) for f, b in zip(found, ("warp", "reference"), strict=True)]
     torch.testing.assert_close(coverage[0], coverage[1], rtol=0, atol=1e-5)
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_triangles_far_wider_than_a_machine_word(seed: int) -> None:
+    """The masks of outlines are looked through 64 pixels at a time."""
+    generator = torch.Generator().manual_seed(seed)
+    u = 330 * torch.rand(9, generator=generator) - 30
+    v = 30 * torch.rand(9, generator=generator) - 3
+    w = 1 + 4 * torch.rand(9, generator=generator)
+    clip, faces = torch.stack([u * w, v * w, w], dim=1), torch.arange(9).view(3, 3)
+    layout = verbs.Layout.of(torch.tensor([[0, 0, 270, 24], [3, 1, 200, 20]]))
+    ranges = torch.tensor([[0, 3], [1, 3]])
+    assert_same(
+        everything(clip, faces, ranges, "warp", layout=layout),
+        everything(clip, faces, ranges, "reference", layout=layout),
+    )
+
+
+def test_kernels_of_several_threads_share_no_memory() -> None:
+    """Warp's arena for tiles hangs on one static pointer on x86: threads would write to one another's stacks."""
+    assert kernels.wp.config.enable_tiles_in_stack_memory is None
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5, 16])
