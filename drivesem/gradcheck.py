@@ -73,9 +73,9 @@ CODE_STEPS = (1e-4, 1e-5, 1e-6)
 GEOMETRY_STEPS = (1e-7, 1e-8, 1e-9)
 """Steps of what moves vertices. The z-buffer decides in jumps which surface a pixel sees, and that is not
 differentiated: a difference is the gradient's counterpart only where no pixel switches between its two sides. A
-near car moves by 300 px for a unit of theta, and inner edges are some thousand pixels long, so that at 1e-7 a pixel
-switches now and then and at 1e-9 hardly ever, while rounding stays far below the tolerance. As photographed nothing
-jumps, but a saturated pixel has its kink within 1e-8 of theta0, and there the larger steps are the better ones."""
+near car moves by 300 px for a unit of theta, and inner edges are some thousand pixels long, so that at 1e-7 a
+pixel switches now and then and at 1e-9 hardly ever, while rounding stays far below the tolerance. As photographed
+nothing jumps, but a saturated pixel has its kink within 1e-8 of theta0, and there larger steps are better."""
 STEPS: dict[Parameter, tuple[float, float, float]] = {
     Parameter.COLOR: CODE_STEPS,
     Parameter.WEATHER: CODE_STEPS,

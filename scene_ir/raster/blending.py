@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501 - the line above; Warp needs float(0) to declare what a branch changes.
+# ruff: noqa: E501, UP018 - the line above; Warp needs int(0) to declare what a branch changes.
 """Shadows and layers laid onto a picture, row by row, as Warp kernels: what `blend` defines in plain torch.
 
 A thread owns whole rows of the picture, so that layers which overlap are laid down in order without waiting.
@@ -58,8 +58,13 @@ def span_of(stack: Stack, k: int, y: int):
 
 @wp.func
 def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.uint8), y: int, x: int):
-    """Clamp a pixel to [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5)."""
+    """Clamp a pixel to [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5).
+
+    Rectangles overlap: a pixel that was clamped before stays as it is.
+    """
     bits = int(0)
+    if over[y, x] != wp.uint8(0):
+        return
     for c in range(3):
         away = wp.abs(image[c, y, x] - 0.5)
         if away > 0.5 + SATURATED:
