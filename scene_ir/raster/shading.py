@@ -42,6 +42,7 @@ RIM_LOW, RIM_HIGH = (wp.constant(wp.float32(v)) for v in texture.RIM)
 OUTLINE_LOW, OUTLINE_HIGH = (wp.constant(wp.float32(v * v)) for v in texture.OUTLINE_TURN)
 BORDER_LOW, BORDER_HIGH = (wp.constant(wp.float32(v)) for v in texture.BORDER_PX)
 EXTENDED_LOW, EXTENDED_HIGH = (wp.constant(wp.float32(v)) for v in texture.EXTENDED_PX)
+OPAQUE, EVEN = wp.constant(wp.float32(1.0 - 1e-6)), wp.constant(wp.float32(1e-6))
 GROUND_RGB = wp.constant(wp.vec3f(*texture.GROUND_RGB))
 HORIZON_RGB = wp.constant(wp.vec3f(*texture.HORIZON_RGB))
 ZENITH_RGB = wp.constant(wp.vec3f(*texture.ZENITH_RGB))
@@ -708,8 +709,8 @@ def plainly_seen(look: vec8, texel: vec8, u: float, v: float, wh: wp.vec2f):
             and v >= -BORDER_LOW
             and v <= wh[1] - 1.0 + BORDER_LOW
         )
-    if seen:
-        seen = look[4] <= OPEN_TURN_LOW or look[5] >= RIM_HIGH
+    if seen:  # nothing opens up: it did not turn, lies inside, or is opaque
+        seen = look[4] <= OPEN_TURN_LOW or look[5] >= RIM_HIGH or texel[3] >= OPAQUE
     if seen:
         seen = look[4] <= TURN_LOW + wp.max(look[5], 0.0)
     return seen
@@ -817,7 +818,9 @@ def shade_backward_kernel(
         texel = texel_around(texels, rect, first, uv)
         to_look = vec8()
         to_texel = vec8(g[0], g[1], g[2], g[3], 0.0, 0.0, 0.0, 0.0)
-        if not plainly_seen(a, texel.value, uv[0], uv[1], wh):
+        # Where opacity changes along a surface that turned, so does how much of it opens up.
+        even = a[4] <= OPEN_TURN_LOW or wp.max(wp.abs(texel.to_u[3]), wp.abs(texel.to_v[3])) <= EVEN
+        if not (even and plainly_seen(a, texel.value, uv[0], uv[1], wh)):
             to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(mesh_loss)(
                 a, texel.value, xy, wh, g, grad_fill[i]
             )
