@@ -68,7 +68,7 @@ SMOOTHING_PX = 2.5
 """Standard deviation of the Gaussian that smooths a functional's weights, so that none hangs on single pixels."""
 DEFAULT_SCENES = 1
 
-CODE_STEPS = (1e-4, 1e-5, 1e-6)
+CODE_STEPS = (1e-5, 1e-6, 1e-7)
 """Steps of the codes, which move no pixel: small enough that few of the detector's rectifiers switch."""
 GEOMETRY_STEPS = (1e-7, 1e-8, 1e-9)
 """Steps of what moves vertices. The z-buffer decides in jumps which surface a pixel sees, and that is not

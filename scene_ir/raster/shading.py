@@ -1284,10 +1284,12 @@ def shadow_backward_kernel(
 ):
     i = start + wp.tid()
     g = grad_out[i]
+    if g[0] == 0.0 and g[1] == 0.0 and g[2] == 0.0:
+        return  # under a vehicle
     at = table[i]
     o = at[0]
     place = ground_place(ground, o, at[1], at[2])
-    if place[2] > 0.0 and (g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0):
+    if place[2] > 0.0:
         rect = rect_of(ground.rects, o)
         wh = ground.frame_wh[o]
         flat = wp.vec2f(place[0], place[1])
