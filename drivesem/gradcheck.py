@@ -38,7 +38,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from torch import Tensor
 
-from detectors.base import DetectorError
+from detectors.base import DetectorError, RawPredictions
 from detectors.registry import load_detector
 from detectors.squeezedet import Assignment, SqueezeDet
 from drivesem.config import Attack, Gradcheck, UsageError, processes
@@ -92,6 +92,10 @@ _DRAWS = 6
 _SAME_PICTURE = 1e-3
 """Two backends draw one picture if no pixel differs by more. At a random theta a pixel may sit so close to a jump
 that rounding to float32 decides what it sees. No gradient means anything there: another theta is drawn."""
+_DITHER = 1e-4
+"""Largest number that is added to a colour before the detector sees it, the same at every theta. Saturated patches
+of a photograph are of one value, and a pooling over equal inputs has no derivative; a fortieth of a file's
+smallest step makes them differ."""
 _ROUNDING = 1e-15
 """A float64 sum of the outputs' terms is exact to about this share of their magnitude."""
 _FILE_WIDTH = 120
@@ -158,13 +162,15 @@ Gradients = dict[Backend, Array]
 class _Path:
     """theta -> picture -> outputs, by one backend in its own precision."""
 
-    def __init__(self, scene: SceneIR, backend: Backend, detector: SqueezeDet, weights: Tensor) -> None:
+    def __init__(
+        self, scene: SceneIR, backend: Backend, detector: SqueezeDet, weights: Tensor, dither: Tensor
+    ) -> None:
         self.dtype = torch.float64 if backend == "reference" else torch.float32
         device = next(detector.parameters()).device
         self.scene = scene_to(scene, self.dtype, device)
         self.space = ParameterSpace(self.scene, tuple(Parameter))
         self.detector = detector
-        self.weights = weights.to(device, self.dtype)
+        self.weights, self._dither = weights.to(device, self.dtype), dither.to(device, self.dtype)
         self.compositor = Compositor(self.scene, RenderSettings(backend=backend))
 
     def render(self, theta: Tensor) -> Tensor:
@@ -180,10 +186,14 @@ class _Path:
         start = self.scene.environment
         return scene.with_environment(weather=start.weather + part.weather, foliage=start.foliage + part.foliage)
 
+    def detect(self, picture: Tensor) -> RawPredictions:
+        """What the detector says of a picture (3, H, W)."""
+        return self.detector((picture + self._dither)[None])
+
     def loss(self, picture: Tensor, assignment: Assignment) -> Tensor:
         """The detector's loss ()."""
         fixed = scene_to(assignment, self.dtype, self.weights.device)
-        return self.detector.loss_terms(self.detector(picture[None]), fixed)[TERM]
+        return self.detector.loss_terms(self.detect(picture), fixed)[TERM]
 
     @torch.no_grad()
     def outputs(self, theta: Tensor, assignment: Assignment) -> Tensor:
@@ -220,8 +230,10 @@ class SceneCheck:
     functionals, of the random theta and of the directions; directions: K, at most."""
 
     def __init__(self, scene: SceneIR, detectors: dict[Backend, SqueezeDet], seed: int, directions: int) -> None:
-        weights = functionals(scene.camera.height, scene.camera.width, _generator(seed, 0))
-        self._paths: dict[Backend, _Path] = {b: _Path(scene, b, detectors[b], weights) for b in BACKENDS}
+        generator = _generator(seed, 0)
+        weights = functionals(scene.camera.height, scene.camera.width, generator)
+        dither = _DITHER * (2 * torch.rand(weights.shape[1:], generator=generator, dtype=weights.dtype) - 1)
+        self._paths: dict[Backend, _Path] = {b: _Path(scene, b, detectors[b], weights, dither) for b in BACKENDS}
         self._exact = self._paths["reference"]
         self._seed, self._count = seed, directions
         self._points: dict[Point, tuple[Tensor, Assignment, Tensor]] = {}
@@ -268,7 +280,7 @@ class SceneCheck:
             scene = self._exact.apply(theta)
             with torch.no_grad():
                 render = self._exact.compositor.render(scene)
-                raw = self._exact.detector(render.image[None])
+                raw = self._exact.detect(render.image)
             targets = self._labeller.moved(scene, render).targets
             self._points[at] = (theta, self._exact.detector.assign(raw, [targets]), render.image)
         return self._points[at]

@@ -13,9 +13,7 @@ from torch import Tensor
 from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import Layout
 from scene_ir.raster.verbs import Backend
-
-SATURATED = 1e-6
-"""A colour this near to 0 or 1 is at the bound: rounding decides on which side of it."""
+from scene_ir.texture import SATURATED
 
 Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
@@ -72,8 +70,8 @@ class _Clamp(torch.autograd.Function):
 def clamp_colour(image: Tensor) -> Tensor:
     """Colours kept in [0, 1].
 
-    Where one just reaches a bound, as saturated pixels of a photograph do, half of the gradient passes: the mean of
-    the slopes to both sides, which is what a central difference finds.
+    Where one just reaches a bound, as saturated pixels of a photograph do, half of the gradient passes: the mean
+    of the slopes to both sides, which is what a central difference finds.
     """
     return _Clamp.apply(image)
 

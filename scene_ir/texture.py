@@ -45,6 +45,8 @@ EXTENDED_PX = (4.0, 60.0)
 windows run on, and a soft change to the template's colours shows less than a seam."""
 SUPPORT_PX = 2
 """Beyond the matte by more than this, the photograph shows that there is no vehicle."""
+SATURATED = 1e-6
+"""A colour this near to 0 or 1 is at the bound: rounding decides on which side of it."""
 CHANNELS = 8
 """Of a texel: premultiplied RGB, opacity, hidden, outline, depth m, support."""
 _PAD = 2

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018 - the line above; Warp needs int(0) to declare what a branch changes.
+# ruff: noqa: E501 - the line above; Warp needs int(0) to declare what a branch changes.
 """Shadows and layers laid onto a picture, row by row, as Warp kernels: what `blend` defines in plain torch.
 
 A thread owns whole rows of the picture, so that layers which overlap are laid down in order without waiting.
@@ -15,8 +15,8 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.blend import SATURATED as _SATURATED
 from scene_ir.raster.launch import between, launch, start_warp
+from scene_ir.texture import SATURATED as _SATURATED
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": False})
@@ -62,7 +62,7 @@ def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.u
 
     Rectangles overlap: a pixel that was clamped before stays as it is.
     """
-    bits = int(0)
+    bits = 0
     if over[y, x] != wp.uint8(0):
         return
     for c in range(3):

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from scene_ir import surfaces, texture
+from scene_ir.raster.kernels import slopes, weights
 from scene_ir.raster.launch import between, halves, launch, load, share, start_warp
 from scene_ir.raster.layout import Fragments, Layout
 
@@ -528,25 +529,6 @@ class Taps:
     wy: wp.vec4f
     sx: wp.vec4f
     sy: wp.vec4f
-
-
-@wp.func
-def weights(t: float):
-    """Catmull-Rom weights of the pixels at -1, 0, 1, 2 for a sample at t in [0, 1)."""
-    return wp.vec4f(
-        ((-0.5 * t + 1.0) * t - 0.5) * t,
-        (1.5 * t - 2.5) * t * t + 1.0,
-        ((-1.5 * t + 2.0) * t + 0.5) * t,
-        (0.5 * t - 0.5) * t * t,
-    )
-
-
-@wp.func
-def slopes(t: float):
-    """Derivatives of `weights`."""
-    return wp.vec4f(
-        (-1.5 * t + 2.0) * t - 0.5, (4.5 * t - 5.0) * t, (-4.5 * t + 4.0) * t + 0.5, (1.5 * t - 1.0) * t
-    )
 
 
 @wp.func
