@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501 - the line above; Warp needs int(0) to declare what a branch changes.
+# ruff: noqa: E501 - the line above.
 """Shadows and layers laid onto a picture, row by row, as Warp kernels: what `blend` defines in plain torch.
 
 A thread owns whole rows of the picture, so that layers which overlap are laid down in order without waiting.
