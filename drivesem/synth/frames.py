@@ -128,7 +128,7 @@ def _into_camera(soup: Soup, view: View) -> Soup:
     """The surroundings in camera axes about the centre of projection."""
     corners = (view.to_camera(soup.corners) - view.centre).astype(np.float32)
     normals = (soup.normals @ view.rotation.T).astype(np.float32)
-    return Soup(corners, normals, soup.uv, soup.material, soup.albedo, soup.pattern, soup.owner)
+    return replace(soup, corners=corners, normals=normals)
 
 
 def _stand(actor: Actor, view: View) -> np.ndarray:
@@ -136,21 +136,18 @@ def _stand(actor: Actor, view: View) -> np.ndarray:
     return view.to_camera(np.array([actor.position_xz[0], 0.0, actor.position_xz[1]]))
 
 
+def yaw_in_camera(actor: Actor, view: View) -> float:
+    """KITTI's rotation_y of an actor, rad in [-pi, pi)."""
+    return float((actor.yaw - view.heading + np.pi) % (2 * np.pi) - np.pi)
+
+
 def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
     """An actor in camera axes about the centre of projection, upright as labels know it."""
     spot = _stand(actor, view)
     soup = actor_soup(actor, owner)
-    turn = yaw_matrix(torch.tensor(actor.yaw, dtype=torch.float64)).numpy().T
+    turn = yaw_matrix(torch.tensor(yaw_in_camera(actor, view), dtype=torch.float64)).numpy().T
     corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
-    return Soup(
-        corners,
-        (soup.normals @ turn).astype(np.float32),
-        soup.uv,
-        soup.material,
-        soup.albedo,
-        soup.pattern,
-        soup.owner,
-    )
+    return replace(soup, corners=corners, normals=(soup.normals @ turn).astype(np.float32))
 
 
 def full_boxes(actors: Sequence[Actor], view: View) -> np.ndarray:
@@ -158,7 +155,7 @@ def full_boxes(actors: Sequence[Actor], view: View) -> np.ndarray:
     if not actors:
         return np.zeros((0, 4))
     size = torch.tensor([a.size_lhw for a in actors], dtype=torch.float64)
-    yaw = torch.tensor([a.yaw for a in actors], dtype=torch.float64)
+    yaw = torch.tensor([yaw_in_camera(a, view) for a in actors], dtype=torch.float64)
     spot = torch.from_numpy(np.stack([_stand(a, view) for a in actors]))
     return project_boxes(size, yaw, spot, view.camera.matrix.double()).numpy()
 
@@ -203,7 +200,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
             Truth(
                 actor=actor,
                 translation=_stand(actor, view),
-                yaw=actor.yaw,
+                yaw=yaw_in_camera(actor, view),
                 box_xyxy=outline,
                 index=i,
                 visible=visible,
@@ -317,7 +314,9 @@ def boxes_alone(plan: Plan) -> list[Truth]:
         return []
     soups = []
     for i, actor in enumerate(plan.actors):
-        soup = placed(box(actor.size_lhw, Material.FLAT, (0.5, 0.5, 0.5)), (0, 0, 0), actor.yaw, (1, 1, 1))
+        soup = placed(
+            box(actor.size_lhw, Material.FLAT, (0.5, 0.5, 0.5)), (0, 0, 0), yaw_in_camera(actor, view), (1, 1, 1)
+        )
         corners = (soup.corners + (_stand(actor, view) - view.centre)).astype(np.float32)
         soups.append(replace(soup, corners=corners, owner=np.full(len(soup), i + 1, np.int32)))
     return measure(plan.actors, soups, see(join(soups), view).owner, view)

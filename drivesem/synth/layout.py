@@ -157,7 +157,9 @@ class Road:
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """A vehicle or person. position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details."""
+    """A vehicle or person. position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details.
+    lane_ds: road coordinates (d, s) m where it follows the road, speed_mps: along s, below 0 against it.
+    """
 
     kind: str
     variant: int
@@ -167,6 +169,8 @@ class Actor:
     paint: tuple[float, float, float]
     parked: bool
     seed: int
+    lane_ds: tuple[float, float] | None = None
+    speed_mps: float = 0.0
 
     @property
     def label(self) -> str:

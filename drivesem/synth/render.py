@@ -29,12 +29,20 @@ _SHADOW_DISTANCE_M = 3000.0
 @dataclass(frozen=True, slots=True)
 class View:
     """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of
-    projection in camera axes (KITTI's camera 2 sits beside the origin). height_m: of the origin above the ground.
+    projection in camera axes (KITTI's camera 2 sits beside the origin). height_m: of the axes' origin above the
+    ground. position_xz: of the origin, m; heading: rad that the camera is turned to the right, part of `rotation`.
     """
 
     camera: Camera
     rotation: np.ndarray
     height_m: float
+    position_xz: tuple[float, float] = (0.0, 0.0)
+    heading: float = 0.0
+
+    @property
+    def origin(self) -> np.ndarray:
+        """The origin (3,) of camera axes in world axes."""
+        return np.array([self.position_xz[0], -self.height_m, self.position_xz[1]])
 
     @property
     def centre(self) -> np.ndarray:
@@ -44,11 +52,11 @@ class View:
 
     def to_camera(self, world: np.ndarray) -> np.ndarray:
         """Camera axes of world points (..., 3)."""
-        return (world + np.array([0.0, self.height_m, 0.0])) @ self.rotation.T
+        return (world - self.origin) @ self.rotation.T
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """World axes of camera-space points (..., 3)."""
-        return points @ self.rotation.astype(points.dtype) - np.array([0.0, self.height_m, 0.0], points.dtype)
+        return points @ self.rotation.astype(points.dtype) + self.origin.astype(points.dtype)
 
     @property
     def up(self) -> np.ndarray:
@@ -177,7 +185,7 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
     slope = np.array([sun[0], sun[2]]) / -sun[1]
     to_ground = np.array([[1.0, slope[0], 0.0], [0.0, slope[1], 1.0], [0.0, 1.0 / -sun[1], 0.0]])
     rows = to_ground @ view.rotation.T
-    shift = to_ground @ (view.centre @ view.rotation - np.array([0.0, view.height_m, 0.0]))
+    shift = to_ground @ view.to_world(view.centre)
     ground = np.isin(soup.material, GROUND)
     corners = soup.corners[~ground]
     actor = soup.owner[~ground] > 0

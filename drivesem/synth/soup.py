@@ -5,7 +5,7 @@ World axes as the camera's (x right, y down, z forward), but with the ground at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import lru_cache
 
@@ -38,6 +38,39 @@ class Material(IntEnum):
     CLOTH = 20
 
 
+class Semantic(IntEnum):
+    """What a triangle belongs to: Virtual KITTI's categories, and the people it does not have."""
+
+    UNDEFINED = 0
+    TERRAIN = 1
+    SKY = 2
+    TREE = 3
+    VEGETATION = 4
+    BUILDING = 5
+    ROAD = 6
+    GUARD_RAIL = 7
+    TRAFFIC_SIGN = 8
+    TRAFFIC_LIGHT = 9
+    POLE = 10
+    MISC = 11
+    TRUCK = 12
+    CAR = 13
+    VAN = 14
+    PEDESTRIAN = 15
+    CYCLIST = 16
+
+
+_SEMANTIC_OF_MATERIAL = np.array(
+    [
+        *(Semantic.SKY, Semantic.ROAD, Semantic.ROAD, Semantic.TERRAIN, Semantic.TERRAIN, Semantic.TERRAIN),
+        *(Semantic.TERRAIN, Semantic.BUILDING, Semantic.BUILDING, Semantic.BUILDING, Semantic.BUILDING),
+        *(Semantic.VEGETATION, Semantic.TREE, Semantic.POLE, Semantic.MISC, Semantic.CAR, Semantic.CAR),
+        *(Semantic.CAR, Semantic.CAR, Semantic.CAR, Semantic.PEDESTRIAN),
+    ],
+    np.uint8,
+)
+"""What each material belongs to where nothing else is said, in the order of `Material`."""
+
 GROUND = (Material.ROAD, Material.PARKING, Material.PAVEMENT, Material.KERB, Material.GRASS, Material.GRAVEL)
 """Materials that receive vehicles' shadows."""
 
@@ -46,7 +79,8 @@ GROUND = (Material.ROAD, Material.PARKING, Material.PAVEMENT, Material.KERB, Mat
 class Soup:
     """F independent triangles. corners (F, 3, 3) m; normals (F, 3, 3) unit, one a corner; uv (F, 3, 2) m, surface
     coordinates for patterns; material (F,) uint8; albedo (F, 3) linear RGB; pattern (F, 4), meaning by material;
-    owner (F,) int32, 0 is the surroundings, i + 1 actor i. All float32 unless stated.
+    owner (F,) int32, 0 is the surroundings, i + 1 actor i; semantic (F,) uint8, a `Semantic`. All float32 unless
+    stated.
     """
 
     corners: np.ndarray
@@ -56,6 +90,7 @@ class Soup:
     albedo: np.ndarray
     pattern: np.ndarray
     owner: np.ndarray
+    semantic: np.ndarray
 
     def __len__(self) -> int:
         return int(self.corners.shape[0])
@@ -88,7 +123,13 @@ def make(
         albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
         pattern=np.broadcast_to(np.asarray(pattern, np.float32), (count, 4)).copy(),
         owner=np.zeros(count, np.int32),
+        semantic=np.full(count, _SEMANTIC_OF_MATERIAL[int(material)]),
     )
+
+
+def tagged(soup: Soup, semantic: Semantic) -> Soup:
+    """The same triangles, all belonging to `semantic`."""
+    return replace(soup, semantic=np.full(len(soup), semantic, np.uint8))
 
 
 def join(soups: list[Soup]) -> Soup:
@@ -106,7 +147,7 @@ def placed(
     corners = (soup.corners * size) @ turn.T + np.asarray(position, np.float32)
     normals = (soup.normals / size) @ turn.T
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return Soup(corners, normals, soup.uv, soup.material, soup.albedo, soup.pattern, soup.owner)
+    return replace(soup, corners=corners, normals=normals)
 
 
 def quad(points: np.ndarray) -> np.ndarray:

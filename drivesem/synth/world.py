@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from drivesem.synth import buildings, flora, people
 from drivesem.synth.layout import Actor, Road
-from drivesem.synth.soup import Material, Soup, ball, box, join, make, placed, quad, stick
+from drivesem.synth.soup import Material, Semantic, Soup, ball, box, join, make, placed, quad, stick, tagged
 from scene_ir.meshes.templates import template
 from scene_ir.types import Part
 
@@ -32,6 +32,15 @@ _PART_MATERIAL = {
     Part.LIGHT: Material.LIGHT,
     Part.OTHER: Material.TRIM,
 }
+
+_SEMANTIC = {
+    "Car": Semantic.CAR,
+    "Van": Semantic.VAN,
+    "Truck": Semantic.TRUCK,
+    "Pedestrian": Semantic.PEDESTRIAN,
+    "Cyclist": Semantic.CYCLIST,
+}
+"""What the triangles of an actor with this label belong to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +198,13 @@ def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
     x, z = b.road.point(d, s)
     detail = _detail(float(np.hypot(x, max(z, 0.0))) * 9.0 / height_m)
     width = height_m * float(b.rng.uniform(0.85, 1.15))
-    b.put(flora.tree(identifier, detail), d, s, float(b.rng.uniform(0, 6.28)), (width, height_m, width))
+    b.put(
+        tagged(flora.tree(identifier, detail), Semantic.TREE),
+        d,
+        s,
+        float(b.rng.uniform(0, 6.28)),
+        (width, height_m, width),
+    )
 
 
 def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
@@ -288,9 +303,10 @@ def _guard_rail(b: _Builder, d: float) -> None:
         x1, z1 = b.road.point(d - out, s)
         a, c = np.stack([x, np.full_like(s, -low), z], 1), np.stack([x1, np.full_like(s, -high), z1], 1)
         points = np.stack([a[:-1], c[:-1], c[1:], a[1:]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
-        b.parts.append(make(points.reshape(-1, 3, 3), Material.METAL, steel))
+        b.parts.append(tagged(make(points.reshape(-1, 3, 3), Material.METAL, steel), Semantic.GUARD_RAIL))
+    post = tagged(box((0.1, 0.6, 0.08), Material.METAL, steel * 0.8), Semantic.GUARD_RAIL)
     for at in np.arange(1.0, 80.0, 4.0):
-        b.put(box((0.1, 0.6, 0.08), Material.METAL, steel * 0.8), d + np.sign(d) * 0.08, float(at))
+        b.put(post, d + np.sign(d) * 0.08, float(at))
 
 
 def _street_furniture(b: _Builder) -> None:
@@ -344,7 +360,8 @@ def _sign(rng: np.random.Generator) -> Soup:
         )
         middle = np.broadcast_to([out, -height + size, 0.0], rim[:-1].shape)
         corners = np.stack([middle, rim[:-1], rim[1:]], axis=1)
-        parts.append(make(corners, Material.FLAT, colour, np.broadcast_to([-1.0, 0, 0], corners.shape)))
+        face = make(corners, Material.FLAT, colour, np.broadcast_to([-1.0, 0, 0], corners.shape))
+        parts.append(tagged(face, Semantic.TRAFFIC_SIGN))
     return join(parts)
 
 
@@ -409,7 +426,8 @@ def surroundings(road: Road, pool: Pool, rng: np.random.Generator) -> tuple[Soup
             _guard_rail(b, (inner[0].d0 + inner[0].d1) / 2)
     for x0, z0, x1, z1, height in ((-160, 60, -20, 190, 13), (-60, 185, 60, 200, 11), (20, 190, 160, 60, 13)):
         scale = float(rng.uniform(0.7, 1.5))
-        b.parts.append(flora.tree_line(np.array([x0, z0], float), np.array([x1, z1], float), height * scale, rng))
+        line = flora.tree_line(np.array([x0, z0], float), np.array([x1, z1], float), height * scale, rng)
+        b.parts.append(tagged(line, Semantic.TREE))
     if rng.random() < 0.35:
         _hill(b)
     return join(b.parts), {k: sorted(v) for k, v in b.used.items()}
@@ -529,13 +547,5 @@ def actor_soup(actor: Actor, owner: int) -> Soup:
         paint = soup.material == Material.PAINT
         tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
         albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
-        soup = Soup(soup.corners, soup.normals, soup.uv, soup.material, albedo, soup.pattern, soup.owner)
-    return Soup(
-        soup.corners,
-        soup.normals,
-        soup.uv,
-        soup.material,
-        soup.albedo,
-        soup.pattern,
-        np.full(len(soup), owner, np.int32),
-    )
+        soup = replace(soup, albedo=albedo)
+    return replace(tagged(soup, _SEMANTIC[actor.label]), owner=np.full(len(soup), owner, np.int32))
