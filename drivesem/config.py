@@ -88,26 +88,52 @@ class Synth(Common):
     """Make driving frames with exact ground truth by code."""
 
     frames: int = 10
-    """How many frames."""
-    layout: Literal["kitti"] = "kitti"
-    """Layout of the folder that is written."""
+    """How many frames; each is made in every one of --variations."""
+    layout: Literal["kitti", "vkitti2", "vkitti1", "coco", "yolo"] = "kitti"
+    """Layout of the folder that is written: KITTI object, Virtual KITTI 2 or 1.3.1, COCO JSON, YOLO."""
     split: Literal["train", "heldout"] = "train"
     """Pools of vehicle shapes and surroundings; the two share nothing."""
+    variations: str | None = None
+    """Virtual KITTI's, with commas, or all: clone, fog, morning, overcast, rain, sunset, 15-deg-left,
+    15-deg-right, 30-deg-left, 30-deg-right; or mixed: weather drawn for each street. By default clone for Virtual
+    KITTI's layouts, else mixed."""
+    sequence: int | None = None
+    """Frames of one drive, ten a second, with moving cars and tracks; by default 10 for Virtual KITTI's layouts,
+    else 1: every frame a street of its own."""
+    people: bool | None = None
+    """Pedestrians and cyclists too; by default in all layouts but Virtual KITTI's, which have no class for
+    them."""
+    cameras: Literal[1, 2] = 1
+    """2: Virtual KITTI 2's right camera too."""
+    validation: float = 0.0
+    """Share of the frames that make up part val, from shapes that no frame of part train shows."""
+    edits: str | None = None
+    """A YAML file of changes to the scenes: vehicles moved, turned, bent, painted, removed; weather; foliage."""
+    meshes: str | None = None
+    """A folder of vehicle meshes (OBJ, GLB, PLY) to use instead of the generated ones."""
+    assets: str | None = None
+    """A folder of the optional pack of vehicles and skies, made by tools/fetch_assets.py."""
+    sheet: Flag = False
+    """Also draw sheet.jpg: frames with boxes, depth, classes, instances, as read back from the folder."""
+    compare: Flag = False
+    """Also write distributions.png and .md: sizes, distances, angles, occlusion beside KITTI's own."""
 
 
 @dataclass(frozen=True)
 class Bench(Common):
-    """Measure speed and memory: one attack step, the renderer, or peak memory."""
+    """Measure speed and memory: one attack step, the renderer, peak memory, or the scene generator."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth"]] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
-    memory above the detector's own."""
+    memory above the detector's own; synth: the scene generator."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
     """How many cars, 1 to 16, with commas."""
     triangles: str = "2000,5000"
     """Triangles a car, with commas."""
+    frames: int | None = None
+    """Frames that bench synth makes in each row; by default 200, with --quick 40."""
     threads: int | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
@@ -178,11 +204,22 @@ def validate(config: Common) -> None:
             raise UsageError("--combo", "1, 2, 3 or 4", config.combo)
         if config.combo is not None and config.params is not None:
             raise UsageError("--params", "no --combo beside it", f"--combo {config.combo}")
-    if isinstance(config, Synth) and config.frames < 1:
-        raise UsageError("--frames", "at least 1", config.frames)
+    if isinstance(config, Synth):
+        if config.frames < 1:
+            raise UsageError("--frames", "at least 1", config.frames)
+        if config.sequence is not None and config.sequence < 1:
+            raise UsageError("--sequence", "at least 1", config.sequence)
+        if not 0 <= config.validation < 1:
+            raise UsageError("--validation", "a share in [0, 1)", config.validation)
+        if config.cameras == 2 and config.layout != "vkitti2":
+            raise UsageError("--cameras", "1, or --layout vkitti2", config.cameras)
+        if config.people and config.layout.startswith("vkitti"):
+            raise UsageError("--people", f"False with --layout {config.layout}, which has no class for them", True)
     if isinstance(config, Bench):
         numbers("--cars", config.cars)
         numbers("--triangles", config.triangles, least=4)
+        if config.frames is not None and config.frames < 10:
+            raise UsageError("--frames", "at least 10", config.frames)
         if config.threads is not None and config.threads < 1:
             raise UsageError("--threads", "at least 1", config.threads)
 

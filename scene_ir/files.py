@@ -48,13 +48,16 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image as PNG, atomically. image: (H, W, 3) RGB or (H, W), uint8 or uint16."""
+def write_png(path: Path, image: np.ndarray, compression: int | None = None) -> None:
+    """Write an image as PNG, atomically. image: (H, W, 3) RGB or (H, W), uint8 or uint16. compression: zlib's
+    level, 0 to 9, None for OpenCV's choice; 1 is several times as fast as 9 and about 15 % larger.
+    """
     import cv2
 
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
         raise ShapeError(str(path), "(H, W, 3) or (H, W) of uint8 or uint16", f"{image.shape} of {image.dtype}")
-    ok, encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    options = [] if compression is None else [cv2.IMWRITE_PNG_COMPRESSION, compression]
+    ok, encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image, options)
     if not ok:
         raise FormatError(str(path), "an image that PNG can hold", f"{image.shape} of {image.dtype}")
     write_bytes(path, encoded.tobytes())
@@ -118,12 +121,8 @@ def read_json(path: Path) -> Any:
         raise FormatError(f"{path}:{error.lineno}:{error.colno}", "JSON", error.msg) from error
 
 
-def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
-    """An 8-bit colour image as (H, W, 3) RGB uint8.
-
-    FormatError where the file is missing, is cut short, does not decode, is not 8-bit with three channels, or is
-    not of `size_hw` (height, width) where that is given.
-    """
+def _decode(path: Path) -> np.ndarray:
+    """The values of an image file as OpenCV has them, unchanged. FormatError where it is missing or no image."""
     import cv2
 
     data = read_bytes(path)
@@ -138,12 +137,36 @@ def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray
             raise FormatError(str(path), "an image", f"what does not decode ({error.err})") from error
     if image is None:
         raise FormatError(str(path), "an image", f"{len(data)} bytes that do not decode")
+    return image
+
+
+def _check_size(path: Path, image: np.ndarray, size_hw: tuple[int, int] | None) -> None:
+    if size_hw is not None and image.shape[:2] != size_hw:
+        raise FormatError(str(path), f"{size_hw[1]}x{size_hw[0]} px", f"{image.shape[1]}x{image.shape[0]} px")
+
+
+def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
+    """An 8-bit colour image as (H, W, 3) RGB uint8.
+
+    FormatError where the file is missing, is cut short, does not decode, is not 8-bit with three channels, or is
+    not of `size_hw` (height, width) where that is given.
+    """
+    image = _decode(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         channels = image.shape[2] if image.ndim == 3 else 1
         raise FormatError(str(path), "8 bits and 3 channels", f"{image.dtype.itemsize * 8} bits and {channels}")
-    if size_hw is not None and image.shape[:2] != size_hw:
-        raise FormatError(str(path), f"{size_hw[1]}x{size_hw[0]} px", f"{image.shape[1]}x{image.shape[0]} px")
+    _check_size(path, image, size_hw)
     return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_uint16(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
+    """A 16-bit image of one channel as (H, W) uint16. FormatError as `read_image`."""
+    image = _decode(path)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        channels = image.shape[2] if image.ndim == 3 else 1
+        raise FormatError(str(path), "16 bits and 1 channel", f"{image.dtype.itemsize * 8} bits and {channels}")
+    _check_size(path, image, size_hw)
+    return image
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

@@ -16,12 +16,15 @@ from typing import Any
 from scene_ir import files
 
 
+SHARED = ("split", "seed", "vehicles", "building", "tree", "bush", "surface")
+"""What a frame's manifest says of its origin and of the shapes it shows."""
+
+
 def describe(folder: Path, frames: int | None = None) -> dict[str, Any]:
     """Splits, seeds and the union of shapes over the first `frames` frames of a folder of `drivesem synth`."""
-    entries = [json.loads(files.read_text(path)) for path in sorted((folder / "entries").glob("*.json"))[:frames]]
-    other = sorted({key for entry in entries for key in entry} - {"index", "attempt", "road", "weather"})
+    entries = files.read_json(folder / "manifest.json")["frames"][:frames]
     union: dict[str, Any] = {"frames": len(entries)}
-    for key in other:
+    for key in SHARED:
         values = [entry[key] for entry in entries]
         union[key] = sorted({v for value in values for v in (value if isinstance(value, list) else [value])})
     return union

@@ -1,4 +1,4 @@
-"""`drivesem bench step|render|memory`: figures with method, machine and versions."""
+"""`drivesem bench step|render|memory|synth`: figures with method, machine and versions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rich.console import Console
 
 from detectors.base import DetectorError
 from detectors.registry import load_detector
-from drivesem.bench import memory, render, step, tables
+from drivesem.bench import memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
-from drivesem.config import Bench, UsageError, numbers
+from drivesem.config import Bench, UsageError, numbers, processes
 from scene_ir import files
 
 T = TypeVar("T")
@@ -44,6 +44,7 @@ def run(config: Bench) -> int:
         "step": _step,
         "render": _render,
         "memory": _memory,
+        "synth": _synth,
     }
     console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
     found = measure[config.what](config, cars, triangles, console)
@@ -111,6 +112,22 @@ def _memory(config: Bench, cars: list[int], triangles: list[int], console: Conso
     return {"rows": [asdict(row) for row in rows], "method": memory.METHOD}
 
 
+def _synth(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    if not memory.supported():
+        raise UsageError("bench synth", "a system with /proc", sys.platform)
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+    frames = config.frames or (synth.QUICK_FRAMES if config.quick else synth.FULL_FRAMES)
+    workers = processes(config)
+    measured = list(_watched(synth.measure(frames, config.seed, workers), 3, console))
+    return {
+        "frames_per_second": measured[0].frames_per_second,
+        "peak_rss_mb": measured[0].peak_rss_mb,
+        "rows": [asdict(row) for row in measured],
+        "method": synth.METHOD,
+    }
+
+
 def _watched(rows: Iterator[T], total: int, console: Console) -> Iterator[T]:
     """The same rows; says how far it has come."""
     with console.status("measuring") as status:
@@ -150,7 +167,7 @@ def _command(config: Bench) -> str:
     """The command line that measures this again."""
     default = Bench(what=config.what)
     words = ["drivesem", "bench", config.what, *(["--quick"] if config.quick else [])]
-    for name in ("cars", "triangles", "threads", "detector", "device", "seed"):
+    for name in ("cars", "triangles", "frames", "workers", "threads", "detector", "device", "seed"):
         value = getattr(config, name)
         if value != getattr(default, name):
             words += [f"--{name}", str(value)]

@@ -45,6 +45,11 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
         "rss_100": ("after 100, MB", "at 100"), "rss_1000": ("after 1,000, MB", "at 1000"),
         "slope_kb": ("growth, KB a step", "KB/step"),
     },
+    "synth": {
+        "layout": ("layout", "layout"), "workers": ("processes", "processes"), "frames": ("frames", "frames"),
+        "frames_per_second": ("frames a second", "frames/s"), "start_s": ("start, s", "start s"),
+        "peak_rss_mb": ("peak of all processes, MB", "peak MB"), "growth_kb": ("growth, KB a frame", "KB/frame"),
+    },
 }  # fmt: skip
 """Field of a row, its heading in the documentation, and the short one for terminals, where it is shown there."""
 TITLES = {
@@ -53,6 +58,7 @@ TITLES = {
     "render": "The renderer",
     "verbs": "The four verbs",
     "memory": "Memory",
+    "synth": "The scene generator",
 }
 
 

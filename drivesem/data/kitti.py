@@ -1,5 +1,10 @@
 """KITTI's object folders: `training/{image_2,label_2,calib,velodyne}/000000.*`, read and written.
 
+Two folders more, in the words of KITTI's other benchmarks, hold ground truth that the object benchmark has not:
+`depth_2` (uint16 PNG, 256 times the depth in metres, 0: none; Uhrig et al. 2017) and `instance_2` (uint16 PNG, 256
+times the semantic id plus the instance's number, Cityscapes' ids; Abu Alhaija et al. 2018). The instance's number
+is here the object's line in `label_2`, from 1; objects without a line have higher numbers; 0 is no instance.
+
 Labels follow the object development kit (Geiger et al. 2012): `type truncated occluded alpha left top right bottom
 h w l x y z ry`, results have the score as a 16th field. Errors name the file, the line or key, and the field.
 """
@@ -7,7 +12,7 @@ h w l x y z ry`, results have the score as a 16th field. Errors name the file, t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from drivesem.data.truth import SKY_CM, Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.types import Camera, Frame, Labels
@@ -37,6 +43,23 @@ calibration do not belong together."""
 NEAR_M = 0.1
 """The near plane of projected boxes: what lies wholly before it has no image."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+DEPTH_SCALE = 256
+"""Values a metre in `depth_2`."""
+INSTANCES = 256
+"""Values a semantic id in `instance_2`: the lower byte is the instance."""
+PNG_COMPRESSION = 1
+"""zlib's level for images: several times as fast as its best."""
+SEMANTIC_NAMES = (
+    *("Undefined", "EgoVehicle", "Border", "OutOfRoi", "Misc", "Dynamic", "Ground", "Road", "Sidewalk", "Parking"),
+    *("RailTrack", "Building", "Wall", "Fence", "GuardRail", "Bridge", "Tunnel", "Pole", "PoleGroup"),
+    *("TrafficLight", "TrafficSign", "Vegetation", "Terrain", "Sky", "Pedestrian", "Rider", "Car", "Truck", "Bus"),
+    *("Caravan", "Trailer", "Train", "Motorcycle", "Bicycle"),
+)
+"""Cityscapes' classes in the order of their ids, which KITTI's semantic benchmark uses, in Virtual KITTI's words
+where it has them (github.com/mcordts/cityscapesScripts, helpers/labels.py; "Undefined" is "unlabeled", "Misc"
+"static", "Vegetation" includes trees, "Pedestrian" is "person")."""
+_MERGED = {"tree": "vegetation", "van": "car", "cyclist": "rider", "tram": "train", "personsitting": "pedestrian"}
+"""What Cityscapes has no id for, and what it is there."""
 
 
 def _number(where: str, text: str) -> float:
@@ -159,11 +182,18 @@ def _decimal(value: float) -> str:
     return text.removesuffix("0")
 
 
+def _angle(value: float) -> str:
+    """An angle in [-pi, pi] as KITTI's angles are, also after rounding."""
+    text = _decimal(math.remainder(value, 2 * math.pi))
+    return text if abs(float(text)) <= math.pi else text.replace("3.142", "3.141")
+
+
 def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
     """KITTI's lines for labels, or for results where scores (M,) are given.
 
     Values are written to 0.001 (scores to 1e-6); alpha follows from yaw and translation. Unknown (NaN) 3D boxes
-    become -1 and -1000. Raises FormatError for what `read_labels` would not read back.
+    become -1 and -1000. Angles are wrapped to [-pi, pi]. Raises FormatError for what `read_labels` would not read
+    back.
     """
     if scores is not None and tuple(scores.shape) != (len(labels.kind),):
         raise ShapeError("scores", f"shape {(len(labels.kind),)}", tuple(scores.shape))
@@ -174,12 +204,12 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
         x, y, z = labels.translation[i].tolist()
         yaw = float(labels.yaw[i])
         known = all(map(math.isfinite, (l, h, w, x, y, z, yaw)))
-        alpha = math.remainder(yaw - math.atan2(x, z), 2 * math.pi) if known else UNKNOWN_ANGLE
+        alpha = yaw - math.atan2(x, z) if known else UNKNOWN_ANGLE
         truncation = float(labels.truncation[i])
         fields = [kind, "-1" if math.isnan(truncation) else _decimal(truncation), str(int(labels.occlusion[i]))]
-        fields += [_decimal(alpha) if known else "-10"]
+        fields += [_angle(alpha) if known else "-10"]
         fields += [_decimal(v) for v in labels.boxes_xyxy[i].tolist()]
-        fields += [_decimal(v) for v in (h, w, l, x, y, z, yaw)] if known else unknown
+        fields += [*map(_decimal, (h, w, l, x, y, z)), _angle(yaw)] if known else unknown
         fields += [] if scores is None else [f"{float(scores[i]):.6f}"]
         text.append(" ".join(fields))
     if scores is None:
@@ -307,6 +337,7 @@ class KittiDataset:
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph (3, H, W) float32, 8-bit values over 255, camera with P2, labels, points.
 
+        Also depth m, inf where there is none, and classes and masks, where the folder has depth_2 and instance_2.
         Raises FormatError naming the file and what is wrong: an image, label or calibration that is missing or
         does not read; an image whose size does not go with its labels or its calibration.
         """
@@ -320,20 +351,50 @@ class KittiDataset:
         image = files.read_image(image_path)
         height, width = image.shape[:2]
         camera = Camera(calibration.projection[:, :3].clone(), height, width, calibration.projection)
-        _check_size(image_path, camera, labels)
+        check_size(image_path, camera, labels)
         points_path = self.folder / "velodyne" / f"{identifier}.bin"
         points = read_points(points_path, calibration) if self.with_points and points_path.exists() else None
+        size_hw = (height, width)
+        classes, masks = _read_instances(self.folder / "instance_2" / f"{identifier}.png", size_hw, labels)
         return Frame(
             identifier=identifier,
             photograph=torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255,
             camera=camera,
             labels=labels,
+            masks=masks,
+            depth=_read_depth(self.folder / "depth_2" / f"{identifier}.png", size_hw),
+            classes=classes,
+            class_names=() if classes is None else SEMANTIC_NAMES,
             points=points,
             provenance={"dataset": "kitti", "image": image_path.name, "folder": self.folder.name},
         )
 
 
-def _check_size(image_path: Path, camera: Camera, labels: Labels | None) -> None:
+def _read_depth(path: Path, size_hw: tuple[int, int]) -> Tensor | None:
+    """Depth (H, W) float32 m, inf where there is none."""
+    if not path.exists():
+        return None
+    depth = torch.from_numpy(files.read_uint16(path, size_hw).astype(np.float32)) / DEPTH_SCALE
+    return depth.masked_fill(depth == 0, math.inf)
+
+
+def _read_instances(
+    path: Path, size_hw: tuple[int, int], labels: Labels | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """Classes (H, W) int64 into SEMANTIC_NAMES, and the labels' masks (M, H, W) float32."""
+    if not path.exists():
+        return None, None
+    values = files.read_uint16(path, size_hw).astype(np.int64)
+    classes, number = values // INSTANCES, torch.from_numpy(values % INSTANCES)
+    if classes.max(initial=0) >= len(SEMANTIC_NAMES):
+        raise FormatError(f"{path}: semantic id", f"0 to {len(SEMANTIC_NAMES) - 1}", int(classes.max()))
+    masks = None
+    if labels is not None:
+        masks = (number == torch.arange(1, len(labels.kind) + 1)[:, None, None]).float()
+    return torch.from_numpy(classes), masks
+
+
+def check_size(image_path: Path, camera: Camera, labels: Labels | None) -> None:
     """Refuse an image whose size contradicts its calibration or its labels."""
     found = f"{camera.width}x{camera.height} px"
     low, high = CENTRE_RANGE
@@ -353,14 +414,78 @@ def _check_size(image_path: Path, camera: Camera, labels: Labels | None) -> None
         raise FormatError(str(image_path), f"an image that holds the label's box {box}", found)
 
 
+def _plain(name: str) -> str:
+    return name.replace("_", "").lower()
+
+
+def semantic_ids(class_names: Sequence[str]) -> np.ndarray:
+    """Cityscapes' ids (C,) uint16 of classes named as Virtual KITTI does. FormatError for an unknown name."""
+    known = {_plain(name): i for i, name in enumerate(SEMANTIC_NAMES)}
+    plain = [_MERGED.get(_plain(name), _plain(name)) for name in class_names]
+    for name, key in zip(class_names, plain, strict=True):
+        if key not in known:
+            raise FormatError("class", f"one of {', '.join(SEMANTIC_NAMES)}", repr(name))
+    return np.array([known[key] for key in plain], np.uint16)
+
+
+def _instance_map(exposure: Exposure) -> np.ndarray:
+    """`instance_2` (H, W) uint16 of an exposure: lines of the label file first, then objects without a line."""
+    ordered = sorted(exposure.objects, key=lambda o: not o.labelled)  # stable: file order within both
+    if len(exposure.labels.kind) >= INSTANCES:
+        raise RangeError("labels of one frame", f"at most {INSTANCES - 1}", len(exposure.labels.kind))
+    highest = max([int(exposure.instances.max(initial=0)), *(o.track + 1 for o in ordered)])
+    number = np.zeros(highest + 1, np.uint16)
+    for i, thing in enumerate(ordered[: INSTANCES - 1]):
+        number[thing.track + 1] = i + 1
+    return semantic_ids(exposure.class_names)[exposure.classes] * np.uint16(INSTANCES) + number[exposure.instances]
+
+
+def _depth_map(depth_cm: np.ndarray) -> np.ndarray:
+    """`depth_2` (H, W) uint16 of centimetres. 0, none: the sky and what lies beyond 255.99 m."""
+    values = (depth_cm.astype(np.uint32) * DEPTH_SCALE + 50) // 100
+    return np.where((depth_cm == SKY_CM) | (values > np.iinfo(np.uint16).max), 0, values).astype(np.uint16)
+
+
 class KittiWriter:
-    """Writes frames in KITTI's layout under `root / split`, each file atomically."""
+    """Writes frames in KITTI's layout under `root / split`, each file atomically, and `root/ImageSets`.
 
-    def __init__(self, root: Path, split: str = "training") -> None:
-        self.folder = Path(root) / split
+    extras: also `depth_2` and `instance_2`. What KITTI cannot hold: tracks, extrinsics, the visible share beyond
+    its four levels; poses and boxes are rounded to 0.001 m, rad and px. In `instance_2`, trees and vegetation are
+    one class, and so are cars and vans.
+    """
 
-    def write(self, identifier: str, image_rgb: np.ndarray, labels: Labels, projection: Tensor) -> None:
-        """One frame. image_rgb: (H, W, 3) uint8; projection: (3, 4) px, written as P2. The image comes last."""
+    def __init__(self, root: Path, split: str = "training", extras: bool = True) -> None:
+        self.root = Path(root)
+        self.folder = self.root / split
+        self.extras = extras
+
+    def _image(self, identifier: str) -> Path:
+        return self.folder / "image_2" / f"{identifier}.png"
+
+    def exists(self, place: Place) -> bool:
+        """Whether the frame is there: its image is written last."""
+        return self._image(f"{place.number:06d}").exists()
+
+    def write(self, place: Place, exposure: Exposure) -> dict[str, object]:
+        """Write one frame; the image comes last. The entry says which of the lists in ImageSets it belongs to."""
+        identifier = f"{place.number:06d}"
+        if self.extras:
+            for name, values in (
+                ("depth_2", _depth_map(exposure.depth_cm)),
+                ("instance_2", _instance_map(exposure)),
+            ):
+                files.write_png(self.folder / name / f"{identifier}.png", values, PNG_COMPRESSION)
+        self.write_photograph(identifier, exposure.image, exposure.labels, exposure.camera.matrix)
+        return {"number": place.number, "part": place.part}
+
+    def write_photograph(self, identifier: str, image_rgb: np.ndarray, labels: Labels, projection: Tensor) -> None:
+        """Calibration, labels, and last the image. image_rgb: (H, W, 3) uint8; projection: (3, 4) px, as P2."""
         files.write_text(self.folder / "calib" / f"{identifier}.txt", format_calib(projection))
         write_labels(self.folder / "label_2" / f"{identifier}.txt", labels)
-        files.write_png(self.folder / "image_2" / f"{identifier}.png", image_rgb)
+        files.write_png(self._image(identifier), image_rgb, PNG_COMPRESSION)
+
+    def finish(self, entries: Sequence[Mapping[str, object]]) -> None:
+        """Write `ImageSets/{train,val,trainval}.txt`, one identifier a line, as KITTI's loaders read them."""
+        for name, parts in (("train", ("train",)), ("val", ("val",)), ("trainval", ("train", "val"))):
+            lines = [f"{entry['number']:06d}\n" for entry in entries if entry["part"] in parts]
+            files.write_text(self.root / "ImageSets" / f"{name}.txt", "".join(lines))

@@ -1,12 +1,17 @@
-"""Data sets by name."""
+"""Data sets by name: who reads them, and who writes them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from drivesem.data.kitti import KittiDataset
+from drivesem.data.coco import CocoDataset, CocoWriter
+from drivesem.data.kitti import KittiDataset, KittiWriter
+from drivesem.data.truth import Exposure, Place
+from drivesem.data.vkitti1 import Vkitti1Dataset, Vkitti1Writer
+from drivesem.data.vkitti2 import Vkitti2Dataset, Vkitti2Writer
+from drivesem.data.yolo import YoloDataset, YoloWriter
 from scene_ir.errors import RangeError
 from scene_ir.types import Frame, Labels
 
@@ -28,8 +33,38 @@ class Dataset(Protocol):
         ...
 
 
-DATASETS: dict[str, Callable[[Path], Dataset]] = {"kitti": KittiDataset}
+class Writer(Protocol):
+    """What every writer offers. Made in every worker process; between frames it knows nothing."""
+
+    def exists(self, place: Place) -> bool:
+        """Whether the frame's own files are there, whole."""
+        ...
+
+    def write(self, place: Place, exposure: Exposure) -> dict[str, object]:
+        """Write the frame's own files, each atomically, its image last; the entry, as JSON, is for `finish`."""
+        ...
+
+    def finish(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Write what frames share, from the entries of all frames in the order of `Place.number`."""
+        ...
+
+
+DATASETS: dict[str, Callable[[Path], Dataset]] = {
+    "coco": CocoDataset,
+    "kitti": KittiDataset,
+    "vkitti1": Vkitti1Dataset,
+    "vkitti2": Vkitti2Dataset,
+    "yolo": YoloDataset,
+}
 """Readers by the name that the command line takes."""
+WRITERS: dict[str, Callable[[Path], Writer]] = {
+    "vkitti2": Vkitti2Writer,
+    "vkitti1": Vkitti1Writer,
+    "kitti": KittiWriter,
+    "coco": CocoWriter,
+    "yolo": YoloWriter,
+}
+"""Writers by the name of their layout."""
 
 
 def open_dataset(name: str, root: Path | str) -> Dataset:

@@ -11,6 +11,13 @@ from scene_ir.types import Camera, Labels
 
 SKY_CM = 65535
 """Depth of the sky (Virtual KITTI)."""
+OCCLUSION_STEPS = (0.8, 0.5, 0.2)
+"""Visible fractions above which an object counts as occlusion 0, 1, 2 (KITTI's codes); below all, 3."""
+
+
+def occlusion_of(visible: float) -> int:
+    """KITTI's code, 0 to 3, of an object of which a fraction `visible` shows."""
+    return sum(visible <= step for step in OCCLUSION_STEPS)
 
 
 @dataclass(frozen=True, slots=True)

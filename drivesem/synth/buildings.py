@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from drivesem.synth.soup import Material, Soup, box, join, make, placed, quad
+from drivesem.synth.soup import Material, Semantic, Soup, box, join, make, placed, quad, stick, tagged
 
 _PLASTER = np.array(
     [
@@ -22,18 +22,31 @@ _ROOFS = np.array(
     np.float32,
 )
 
+_TRIM = np.array(
+    [[0.10, 0.05, 0.025], [0.04, 0.09, 0.05], [0.06, 0.08, 0.14], [0.30, 0.29, 0.27], [0.12, 0.03, 0.025]],
+    np.float32,
+)
+"""Linear albedo of doors, shutters and shop signs."""
+_SHOP_M = 3.5
+"""Height of a ground floor that is a shop."""
+_STEEL = np.array([0.16, 0.165, 0.17], np.float32)
+
 
 @dataclass(frozen=True, slots=True)
 class BuildingStyle:
-    """Look of one building. wall, roof: linear albedo. pattern: window pitch and storey height in metres, and the
-    window's share of both. offset_m: by which windows are shifted along the wall. pitched: roof form.
+    """Look of one building. wall, roof, trim: linear albedo. pattern: window pitch and storey height in metres,
+    and the window's share of both. pitched: roof form. shop: whether the ground floor is one. shutters: beside
+    windows. balconies: on blocks of flats.
     """
 
     wall: np.ndarray
     roof: np.ndarray
+    trim: np.ndarray
     pattern: tuple[float, float, float, float]
-    offset_m: float
     pitched: bool
+    shop: bool
+    shutters: bool
+    balconies: bool
 
 
 @lru_cache(maxsize=512)
@@ -51,30 +64,288 @@ def style(identifier: int) -> BuildingStyle:
             float(rng.uniform(0.34, 0.6)),
             float(rng.uniform(0.42, 0.6)),
         ),
-        offset_m=0.37 if rng.random() < 0.35 else 0.0,
         pitched=bool(rng.random() < 0.75),
+        trim=(_TRIM[rng.integers(len(_TRIM))] * rng.uniform(0.7, 1.2)).astype(np.float32),
+        shop=bool(rng.random() < 0.45),
+        shutters=bool(rng.random() < 0.3),
+        balconies=bool(rng.random() < 0.4),
     )
 
 
-def building(identifier: int, length_m: float, depth_m: float, storeys: int, along: bool) -> Soup:
+def building(
+    identifier: int,
+    length_m: float,
+    depth_m: float,
+    storeys: int,
+    along: bool,
+    front: float = 1.0,
+    city: bool = False,
+) -> Soup:
     """A building centred on the origin, standing on the ground, its long side along x.
 
-    along: whether the ridge of a pitched roof runs along x; else gables face +z and -z.
+    along: whether the ridge of a pitched roof runs along x; else gables face +z and -z. front: sign of z of the
+    side with doors and fittings; 0: bare walls, for far away. city: whether it may have a shop or balconies.
     """
     look = style(identifier)
-    height = storeys * look.pattern[1] + 0.5
-    body = box((length_m, height, depth_m), Material.FACADE, look.wall, look.pattern)
-    body.uv[..., 0] += look.offset_m
-    parts = [body]
+    rng = np.random.default_rng([0xB12, identifier, storeys])
+    shop = city and look.shop and storeys > 1 and front != 0
+    height = storeys * look.pattern[1] + 0.5 + (_SHOP_M - 0.5 - look.pattern[1] if shop else 0.0)
+    parts = []
+    for turn in range(4):
+        wide, out = (length_m, depth_m / 2) if turn % 2 == 0 else (depth_m, length_m / 2)
+        faces_street = front != 0 and turn == (0 if front > 0 else 2)
+        wall = _wall(look, wide, height, shop and faces_street)
+        if faces_street:
+            wall += _fittings(look, (wide, height), storeys, shop, city and look.balconies, rng)
+        at = {0: (0.0, 0.0, out), 1: (out, 0.0, 0.0), 2: (0.0, 0.0, -out), 3: (-out, 0.0, 0.0)}[turn]
+        parts.append(placed(join(wall), at, turn * np.pi / 2, (1, 1, 1)))
     if look.pitched:
         parts += _gable(length_m, depth_m, height, look, along)
-        if identifier % 3 == 0:
-            chimney = box((0.7, height + 0.62 * depth_m * 0.5 + 0.8, 0.7), Material.WALL, look.roof * 0.9)
-            parts.append(placed(chimney, (length_m * 0.22, 0.0, 0.0), 0.0, (1, 1, 1)))
+        span = depth_m if along else length_m
+        if identifier % 3 != 1:
+            chimney = box((0.7, height + 0.62 * span * 0.5 + 0.8, 0.6), Material.WALL, look.roof * 0.9)
+            spot = (length_m * 0.22, 0.0, span * 0.08) if along else (span * 0.08, 0.0, depth_m * 0.22)
+            parts.append(placed(chimney, spot, 0.0, (1, 1, 1)))
+        if front:
+            parts += _roof_fittings((length_m, depth_m), height, look, along, front, rng)
     else:
         rim = box((length_m + 0.3, 0.45, depth_m + 0.3), Material.WALL, look.wall * 0.7)
         parts.append(placed(rim, (0, -height + 0.02, 0), 0.0, (1, 1, 1)))
+        hut = box((2.6, 1.7, 2.2), Material.WALL, look.wall * 0.6)
+        parts.append(placed(hut, (length_m * float(rng.uniform(-0.25, 0.25)), -height, 0), 0.0, (1, 1, 1)))
     return join(parts)
+
+
+_PANEL = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _panels(x: np.ndarray, y: np.ndarray, z: float, material: int, albedo: np.ndarray) -> Soup:
+    """Upright rectangles that face +z: x and height y (n, 2) from, to, m; z m."""
+    x, y = np.atleast_2d(x), np.atleast_2d(y)
+    n = len(x)
+    points = np.stack([x[:, [0, 1, 1, 0]], -y[:, [0, 0, 1, 1]], np.full((n, 4), z)], axis=2)
+    uv = np.stack([(x - x[:, :1])[:, [0, 1, 1, 0]], y[:, [0, 0, 1, 1]]], axis=2)
+    normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (2 * n, 3, 3))
+    return make(points[:, _PANEL].reshape(-1, 3, 3), material, albedo, normals, uv[:, _PANEL].reshape(-1, 3, 2))
+
+
+def _panel(x: tuple[float, float], y: tuple[float, float], z: float, material: int, albedo: np.ndarray) -> Soup:
+    """One upright rectangle, as `_panels`."""
+    return _panels(np.array(x), np.array(y), z, material, albedo)
+
+
+def _copies(soup: Soup, at: np.ndarray) -> Soup:
+    """Copies of a soup, moved by each of `at` (n, 3)."""
+    many = soup.take(np.tile(np.arange(len(soup)), len(at)))
+    return replace(many, corners=many.corners + np.repeat(at, len(soup), axis=0)[:, None].astype(np.float32))
+
+
+def _windows(look: BuildingStyle, wide_m: float) -> tuple[int, float, float]:
+    """Number of windows side by side on a wall, their pitch in metres, and their share of it: none is cut off."""
+    number = max(int(wide_m / look.pattern[0] + 0.2), 1)
+    pitch = wide_m / number
+    return number, pitch, min(look.pattern[2] * look.pattern[0] / pitch, 0.62)
+
+
+def _wall(look: BuildingStyle, wide_m: float, height_m: float, shop: bool) -> list[Soup]:
+    """A wall with windows at z = 0 that faces +z, its foot's middle at the origin."""
+    _, pitch, share = _windows(look, wide_m)
+    low = _SHOP_M if shop else 0.0
+    upper = _panel((-wide_m / 2, wide_m / 2), (low, height_m), 0.0, Material.FACADE, look.wall)
+    upper.pattern[:] = (pitch, look.pattern[1], share, look.pattern[3])
+    if not shop:
+        return [upper]
+    upper.uv[..., 1] += 0.5 - _SHOP_M
+    panes = max(round(wide_m / 3.4), 1)
+    lower = _panel((-wide_m / 2, wide_m / 2), (0.0, _SHOP_M), 0.0, Material.FACADE, look.wall * 0.6)
+    lower.pattern[:] = (wide_m / panes, _SHOP_M - 0.5, 0.84, 0.8)
+    return [upper, lower]
+
+
+def _at(soup: Soup, x: float, y: float, z: float) -> Soup:
+    """The soup moved."""
+    return replace(soup, corners=soup.corners + np.array([x, y, z], np.float32))
+
+
+def _fittings(
+    look: BuildingStyle,
+    size_m: tuple[float, float],
+    storeys: int,
+    shop: bool,
+    balconies: bool,
+    rng: np.random.Generator,
+) -> list[Soup]:
+    """What stands out of the wall towards the street: door, sills, shutters, balconies, sign, awning, downpipe."""
+    wide, height = size_m
+    number, pitch, share = _windows(look, wide)
+    storey, tall = look.pattern[1], look.pattern[3]
+    low = _SHOP_M - 0.5 if shop else 0.0
+    middles = (np.arange(number) + 0.5) * pitch - wide / 2
+    window = share * pitch
+    door = int(rng.integers(number))
+    parts = []
+    blind = int(rng.integers(number)) if balconies and storeys > 2 else -1
+    upper = 1 if shop else 0
+    base = low + np.arange(storeys - upper) * storey + 0.5
+    column, row = (g.reshape(-1) for g in np.meshgrid(np.arange(number), np.arange(storeys - upper)))
+    if not shop:
+        keep = (row > 0) | (column != door)
+        column, row = column[keep], row[keep]
+    x, bottom = middles[column], base[row] + storey * (0.5 - tall / 2)
+    if len(x):
+        sill = box((window + 0.24, 0.07, 0.16), Material.FLAT, np.full(3, 0.34))
+        parts.append(_copies(sill, np.stack([x, 0.10 - bottom, np.full(len(x), 0.06)], axis=1)))
+        top = bottom + storey * tall
+        if look.shutters:
+            near, far = window / 2 + 0.12, window / 2 + 0.12 + 0.45 * window
+            spans = np.concatenate([x[:, None] + [near, far], x[:, None] - [far, near]])
+            heights = np.tile(np.stack([bottom, top], axis=1), (2, 1))
+            parts.append(_panels(spans, heights, 0.05, Material.FENCE, look.trim))
+        # roller shutters, let down part of the way
+        shut = rng.random(len(x)) < 0.14
+        drop = rng.uniform(0.25, 1.0, len(x)) * storey * tall
+        if shut.any():
+            spans = x[shut, None] + [-window / 2, window / 2]
+            roller = np.full(3, float(rng.uniform(0.25, 0.5)))
+            parts.append(_panels(spans, np.stack([top - drop, top], 1)[shut], 0.03, Material.WALL, roller))
+    if blind >= 0:
+        one = join(_balcony(max(window + 0.9, 2.2), look))
+        floors = base[1:] if not shop else base
+        spots = np.stack([np.full(len(floors), middles[blind]), -floors, np.zeros(len(floors))], axis=1)
+        parts.append(_copies(one, spots))
+    if not shop:
+        x = float(middles[door])
+        surround = window / 2 + 0.22
+        parts.append(
+            _panel(
+                (x - surround, x + surround),
+                (0.0, 0.55 + storey * (0.5 + tall / 2)),
+                0.03,
+                Material.WALL,
+                look.wall * 0.8,
+            )
+        )
+        parts.append(_panel((x - 0.62, x + 0.62), (0.0, 2.35), 0.05, Material.FLAT, np.full(3, 0.4)))
+        parts.append(_panel((x - 0.52, x + 0.52), (0.1, 2.25), 0.06, Material.FLAT, look.trim))
+        parts.append(_panel((x - 0.3, x + 0.3), (1.2, 2.05), 0.07, Material.GLASS, np.full(3, 0.03)))
+        parts.append(_at(box((1.5, 0.14, 1.1), Material.WALL, np.full(3, 0.2)), x, 0.0, 0.5))
+        if rng.random() < 0.6:
+            parts.append(_at(box((1.8, 0.12, 1.0), Material.FLAT, look.roof), x, -2.6, 0.5))
+    else:
+        parts += _shop(look, wide, rng)
+    pipe = float(rng.choice([-1.0, 1.0])) * (wide / 2 - 0.25)
+    parts.append(stick((pipe, 0, 0.1), (pipe, -height + 0.1, 0.1), (0.05, 0.05), Material.METAL, _STEEL, 4))
+    return parts
+
+
+def _balcony(wide_m: float, look: BuildingStyle) -> list[Soup]:
+    """A slab and a parapet of sheet metal or bars."""
+    slab = _at(box((wide_m, 0.16, 1.3), Material.WALL, look.wall * 0.8), 0.0, 0.05, 0.65)
+    front = _at(box((wide_m, 0.85, 0.05), Material.FENCE, look.trim * 1.3), 0.0, -0.16, 1.25)
+    ends = [
+        _at(box((0.05, 0.85, 1.25), Material.FENCE, look.trim * 1.3), s * wide_m / 2, -0.16, 0.62)
+        for s in (-1.0, 1.0)
+    ]
+    return [slab, front, *ends]
+
+
+def _shop(look: BuildingStyle, wide_m: float, rng: np.random.Generator) -> list[Soup]:
+    """A sign with letters over the panes, perhaps an awning."""
+    board = look.trim * float(rng.uniform(0.8, 2.2))
+    low = _SHOP_M - 0.72
+    parts = [_at(box((wide_m - 0.5, 0.6, 0.1), Material.FLAT, board), 0.0, -low, 0.05)]
+    ink = np.full(3, 0.5) if board.mean() < 0.15 else np.full(3, 0.03)
+    width = rng.uniform(0.12, 0.3, 24)
+    ends = np.cumsum(width + rng.uniform(0.05, 0.1, 24) + 0.3 * (rng.random(24) < 0.12)) - 0.35 * wide_m
+    ends = ends[ends < 0.35 * wide_m]
+    if len(ends):
+        spans = np.stack([ends - width[: len(ends)], ends], axis=1)
+        heights = np.stack([np.full(len(ends), low + 0.15), low + rng.choice([0.36, 0.45], len(ends))], axis=1)
+        parts.append(_panels(spans, heights, 0.115, Material.FLAT, ink))
+    if rng.random() < 0.45:
+        stripes = max(int(wide_m / 0.45), 4)
+        edges = np.linspace(-wide_m / 2 + 0.4, wide_m / 2 - 0.4, stripes + 1)
+        reach = float(rng.uniform(0.9, 1.4))
+        plain = rng.random() < 0.5
+        normal = np.array([0.0, -reach, 0.6]) / np.hypot(reach, 0.6)
+        a, b = edges[:-1], edges[1:]
+        flat = np.full(stripes, 1.0)
+        points = np.stack(
+            [
+                np.stack([x, -low * flat + fall, out * flat], axis=1)
+                for x, fall, out in ((a, 0.0, 0.1), (b, 0.0, 0.1), (b, 0.6, reach), (a, 0.6, reach))
+            ],
+            axis=1,
+        )
+        cloth = make(
+            points[:, _PANEL].reshape(-1, 3, 3),
+            Material.CLOTH,
+            look.trim * 1.8,
+            np.broadcast_to(normal, (2 * stripes, 3, 3)),
+        )
+        if not plain:
+            cloth.albedo[np.arange(2 * stripes) % 4 < 2] = 0.5
+        parts.append(tagged(cloth, Semantic.BUILDING))
+    return parts
+
+
+def _roof_fittings(
+    plan_m: tuple[float, float],
+    height: float,
+    look: BuildingStyle,
+    along: bool,
+    front: float,
+    rng: np.random.Generator,
+) -> list[Soup]:
+    """Gutters along the eaves; dormers or skylights on the slope towards the street; an attic window in gables."""
+    long, short = plan_m if along else plan_m[::-1]
+    rise, eave = 0.42 * short, 0.45
+    slope = rise / (short / 2)
+    drop = eave * slope
+    parts = []
+    for sign in (-1.0, 1.0):
+        gutter = box((long + 2 * eave, 0.13, 0.13), Material.METAL, _STEEL)
+        parts.append(_at(gutter, 0.0, -height + drop + 0.06, sign * (short / 2 + eave + 0.02)))
+    if along:
+        draw = rng.random()
+        spots = np.linspace(-0.5, 0.5, int(rng.integers(2, 4)) + 2)[1:-1] * long
+        at = 0.55
+        z, y = front * at * short / 2, height + (1 - at) * rise
+        for x in spots:
+            if draw < 0.3:
+                dormer = _at(
+                    box((1.5, 1.35, 1.6), Material.WALL, look.wall), float(x), -y + 0.25, z - front * 0.35
+                )
+                lid = _at(box((1.9, 0.12, 2.1), Material.FLAT, look.roof), float(x), -y - 1.1, z - front * 0.35)
+                pane = _panel((-0.5, 0.5), (0.15, 1.0), 0.46, Material.GLASS, np.full(3, 0.03))
+                turned = placed(
+                    pane,
+                    (float(x), -y + 0.25, z - front * 0.35 + front * 0.36),
+                    0.0 if front > 0 else np.pi,
+                    (1, 1, 1),
+                )
+                parts += [dormer, lid, turned]
+            elif draw < 0.6:
+                parts.append(_skylight(float(x), (z, -y), slope, front))
+    else:
+        for sign in (-1.0, 1.0):
+            window = [
+                _panel((-0.75, 0.75), (height + 0.25, height + 1.45), 0.02, Material.FLAT, np.full(3, 0.45)),
+                _panel((-0.65, 0.65), (height + 0.33, height + 1.37), 0.03, Material.GLASS, np.full(3, 0.03)),
+            ]
+            if rise > 2.2:
+                parts.append(placed(join(window), (sign * long / 2, 0, 0), sign * np.pi / 2, (1, 1, 1)))
+    return parts if along else [placed(p, (0, 0, 0), np.pi / 2, (1, 1, 1)) for p in parts]
+
+
+def _skylight(x: float, spot: tuple[float, float], slope: float, front: float) -> Soup:
+    """A window flush with the roof."""
+    z, y = spot
+    up = np.array([0.0, -slope, -front]) / np.hypot(slope, 1.0)
+    out = np.array([0.0, -1.0, front * slope]) / np.hypot(slope, 1.0)
+    middle = np.array([x, y, z]) + out * 0.05
+    corners = [middle + a * np.array([0.45, 0, 0]) + b * 0.6 * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return make(quad(np.array(corners)), Material.GLASS, (0.03, 0.03, 0.03), np.broadcast_to(out, (2, 3, 3)))
 
 
 def _gable(length_m: float, depth_m: float, height: float, look: BuildingStyle, along: bool) -> list[Soup]:
@@ -110,3 +381,17 @@ def garden_wall(length_m: float, height_m: float, material: int, albedo: np.ndar
     """A wall or fence along x, 0.2 m thick (fences 0.06 m)."""
     thickness = 0.06 if material == Material.FENCE else 0.2
     return box((length_m, height_m, thickness), material, albedo)
+
+
+def railing(length_m: float, height_m: float, albedo: np.ndarray) -> Soup:
+    """A fence of iron bars along x."""
+    bars = np.arange(-length_m / 2 + 0.1, length_m / 2, 0.16)
+    parts = [
+        _at(box((length_m, 0.05, 0.04), Material.METAL, albedo), 0.0, -y, 0.0) for y in (0.12, height_m - 0.05)
+    ]
+    n = len(bars)
+    x = np.stack([bars - 0.012, bars + 0.012, bars + 0.012, bars - 0.012], axis=1)
+    y = np.broadcast_to([0.0, 0.0, -height_m, -height_m], (n, 4))
+    faces = np.stack([x, y, np.zeros((n, 4))], axis=2)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+    parts.append(make(faces.reshape(-1, 3, 3), Material.METAL, albedo))
+    return join(parts)

@@ -24,43 +24,72 @@ def leaf_colour(rng: np.random.Generator, autumn: float = 0.05) -> np.ndarray:
 
 
 def leaves(
-    points: np.ndarray, outward: np.ndarray, size_m: float, colour: np.ndarray, rng: np.random.Generator
+    points: np.ndarray,
+    outward: np.ndarray,
+    size_m: float | np.ndarray,
+    colour: np.ndarray,
+    rng: np.random.Generator,
 ) -> Soup:
-    """One leaf-cluster triangle at each of `points` (n, 3) around surface normals `outward` (n, 3)."""
+    """One slender leaf-cluster triangle at each of `points` (n, 3) around surface normals `outward` (n, 3).
+
+    size_m: one for all, or (n, 1).
+    """
     n = points.shape[0]
     facing = outward + rng.normal(0, 0.55, (n, 3))
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     one = np.cross(facing, rng.normal(0, 1, (n, 3)))
     one /= np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-6)
     two = np.cross(facing, one)
-    reach = size_m * rng.uniform(0.55, 1.35, (n, 1))
+    reach = size_m * rng.uniform(0.6, 1.5, (n, 1))
     corners = (
-        points[:, None] + np.stack([one, -0.5 * one + 0.87 * two, -0.5 * one - 0.87 * two], 1) * reach[:, None]
+        points[:, None] + np.stack([one, -0.6 * one + 0.52 * two, -0.45 * one - 0.52 * two], 1) * reach[:, None]
     )
-    shade = outward * 0.75 + facing * 0.45
+    shade = outward * 0.85 + facing * 0.35
     shade /= np.linalg.norm(shade, axis=1, keepdims=True)
     soup = make(corners, Material.LEAF, colour, np.repeat(shade[:, None], 3, axis=1))
-    soup.albedo[:] *= rng.lognormal(0.0, 0.28, (n, 1)).astype(np.float32)
+    soup.albedo[:] *= rng.lognormal(0.0, 0.22, (n, 1)).astype(np.float32)
     return soup
 
 
 def _crown(
     centres: np.ndarray, radii: np.ndarray, count: int, size_m: float, colour: np.ndarray, rng: np.random.Generator
 ) -> list[Soup]:
-    """Blobs (k, 3) with radii (k, 3), covered with `count` leaves that do not lie deep inside another blob."""
+    """Blobs (k, 3) with radii (k, 3), covered with `count` leaves that do not lie deep inside another blob.
+
+    One leaf in seven stands off the blobs, so that the sky shows through the crown's edge; leaves deep inside and
+    on undersides get less light.
+    """
     share = radii.prod(axis=1) ** (2 / 3)
     blob = rng.choice(len(centres), size=count, p=share / share.sum())
     direction = rng.normal(0, 1, (count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    points = centres[blob] + direction * radii[blob] * rng.uniform(0.86, 1.1, (count, 1))
+    depth = np.where(
+        rng.random((count, 1)) < 0.14, rng.uniform(1.1, 1.32, (count, 1)), rng.uniform(0.8, 1.1, (count, 1))
+    )
+    points = centres[blob] + direction * radii[blob] * depth
     inside = np.zeros(count, bool)
     for centre, radius in zip(centres, radii, strict=True):
         inside |= (((points - centre) / radius) ** 2).sum(axis=1) < 0.6
-    outward = direction / radii[blob]
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     keep = ~inside
-    cores = [ball(c, r * 0.86, Material.LEAF, colour * 0.45, 1) for c, r in zip(centres, radii, strict=True)]
-    return [*cores, leaves(points[keep], outward[keep], size_m, colour, rng)]
+    points, depth, direction = points[keep], depth[keep], direction[keep]
+    own = direction / radii[blob[keep]]
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    low, high = (centres - radii).min(axis=0), (centres + radii).max(axis=0)
+    whole = (points - (low + high) / 2) / (high - low)
+    whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-6)
+    outward = 0.6 * own + 0.4 * whole
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-6)
+    fine = 1 if size_m < 0.02 else 0
+    cores = [ball(c, r * 0.8, Material.LEAF, colour * 0.32, fine) for c, r in zip(centres, radii, strict=True)]
+    # single leaves against the sky must not look like shards
+    coat = leaves(points, outward, size_m * np.where(depth > 1.1, 0.55, 1.0), colour, rng)
+    light = (0.75 + 0.5 * (depth - 0.8) / 0.3) * (0.92 - 0.2 * own[:, 1:2]) * (0.95 - 0.2 * whole[:, 1:2])
+    coat.albedo[:] *= np.clip(light, 0.4, 1.5).astype(np.float32)
+    return [*cores, coat]
+
+
+_TREE_LEAVES = ((520, 0.044), (1700, 0.0265), (5200, 0.0155), (16000, 0.0092))
+"""Number and size of a tree's leaf clusters for each level of detail, per metre of height: 3 to 6 px each."""
 
 
 @lru_cache(maxsize=96)
@@ -75,29 +104,37 @@ def tree(identifier: int, detail: int) -> Soup:
     bark = _BARK[rng.integers(len(_BARK))]
     trunk = rng.uniform(0.18, 0.34) * (0.5 if conifer else 1.0)
     lean = rng.normal(0, 0.015, 2)
-    parts = [stick((0, 0.02, 0), (lean[0], -trunk * 1.6, lean[1]), (0.022, 0.014), Material.BARK, bark, 8)]
+    sides = 4 + 2 * detail
+    knee = (lean[0] * 0.2, -trunk * 0.6, lean[1] * 0.2)
+    parts = [
+        stick((0, 0.02, 0), (0, -0.03, 0), (0.028, 0.019), Material.BARK, bark, sides),
+        stick((0, -0.025, 0), knee, (0.019, 0.0165), Material.BARK, bark, sides),
+        stick(knee, (lean[0], -trunk * 1.6, lean[1]), (0.0165, 0.011), Material.BARK, bark, sides),
+    ]
     if conifer:
-        levels = np.linspace(trunk, 0.97, 7)
+        levels = np.linspace(trunk, 0.97, 9)
         width = rng.uniform(0.16, 0.24)
-        centres = np.stack([rng.normal(0, 0.01, 7), -levels, rng.normal(0, 0.01, 7)], axis=1)
+        centres = np.stack([rng.normal(0, 0.01, 9), -levels, rng.normal(0, 0.01, 9)], axis=1)
         flat = width * (1.04 - (levels - trunk) / (1 - trunk)) + 0.012
-        radii = np.stack([flat, np.full(7, 0.10), flat], axis=1)
+        radii = np.stack([flat, np.full(9, 0.07), flat], axis=1)
     else:
-        count = int(rng.integers(7, 13))
+        count = int(rng.integers(11, 20))
         spread = rng.uniform(0.2, 0.34)
         middle = (1 + trunk) / 2
         direction = rng.normal(0, 1, (count, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        reach = rng.uniform(0.35, 0.72, (count, 1))
+        reach = rng.uniform(0.35, 0.85, (count, 1))
         centres = direction * reach * np.array([spread, (1 - trunk) / 2, spread]) + np.array([0, -middle, 0])
-        size = rng.uniform(0.38, 0.62, count) * spread
-        radii = np.stack([size, size * rng.uniform(0.75, 1.1, count), size], axis=1)
+        size = rng.uniform(0.26, 0.54, count) * spread
+        radii = np.stack([size, size * rng.uniform(0.7, 1.05, count), size], axis=1)
         top, low = (centres[:, 1] - radii[:, 1]).min(), trunk * 0.8
         centres[:, 1] *= 0.97 / -top
         centres[:, 1] = np.minimum(centres[:, 1], -low - radii[:, 1] * 0.8)
-        for i in range(3):
-            parts.append(stick((lean[0], -trunk, lean[1]), centres[i], (0.011, 0.004), Material.BARK, bark, 5))
-    number, size_m = ((450, 0.05), (1300, 0.032), (3600, 0.0195), (14000, 0.0105))[detail]
+        for i in range(2 + 2 * detail):
+            parts.append(
+                stick((lean[0], -trunk, lean[1]), centres[i], (0.010, 0.003), Material.BARK, bark, 3 + detail)
+            )
+    number, size_m = _TREE_LEAVES[detail]
     parts += _crown(centres, radii, number, size_m, colour, np.random.default_rng([0x7EF, identifier, detail]))
     return join(parts)
 
@@ -111,20 +148,24 @@ def bush(identifier: int, detail: int) -> Soup:
     size = rng.uniform(0.2, 0.34, count)
     centres = np.stack([rng.uniform(-0.3, 0.3, count), -size * 0.75, rng.uniform(-0.3, 0.3, count)], axis=1)
     centres[0, 1] = -0.6
-    number, size_m = ((140, 0.12), (420, 0.075), (1300, 0.042), (5000, 0.022))[detail]
+    number, size_m = ((140, 0.12), (520, 0.07), (2200, 0.036), (7500, 0.02))[detail]
     radii = np.repeat(size[:, None], 3, axis=1)
     return join(_crown(centres, radii, number, size_m, colour, rng))
 
 
-def hedge(length_m: float, height_m: float, depth_m: float, detail: int, rng: np.random.Generator) -> Soup:
-    """A hedge along x, centred on the origin, standing on the ground; `detail` as for trees."""
+def hedge(size_m: tuple[float, float, float], front: float, detail: int, rng: np.random.Generator) -> Soup:
+    """A hedge of a length, height and depth along x, centred on the origin, standing on the ground.
+
+    front: -1 or 1, the sign of z on the side that is looked at (the other is thinner). detail: as for trees.
+    """
+    length_m, height_m, depth_m = size_m
     colour = leaf_colour(rng, 0.02)
     core = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m / 2 - 0.1, depth_m / 2 - 0.12]
-    density, size_m = ((9.0, 0.3), (30.0, 0.16), (75.0, 0.1), (260.0, 0.05))[detail]
+    density, size_m = ((12.0, 0.26), (40.0, 0.15), (120.0, 0.088), (340.0, 0.05))[detail]
     area_side, area_top = length_m * height_m, length_m * depth_m
     points, outward = [], []
     for sign in (-1.0, 1.0):
-        n = int(area_side * density)
+        n = int(area_side * density * (1.0 if sign == front else 0.3))
         points.append(
             np.stack(
                 [
@@ -176,26 +217,29 @@ def _prism(ring: np.ndarray, height_m: float, colour: np.ndarray) -> Soup:
 
 
 def tree_line(start: np.ndarray, end: np.ndarray, height_m: float, rng: np.random.Generator) -> Soup:
-    """A wood seen from far away: a wall (x, z) start to end with a ragged top and leaf clusters of 1 to 2 m."""
+    """A wood seen from far away: a wall (x, z) start to end whose top follows crowns, under leaf clusters."""
     length = float(np.hypot(*(end - start)))
-    columns = max(int(length / 2.2), 4)
-    along = np.linspace(0, 1, columns + 1)[:, None]
-    foot = start + along * (end - start)
-    steps = np.cumsum(rng.normal(0, 0.22, columns + 1))
-    steps -= np.linspace(steps[0], steps[-1], columns + 1)
-    top = height_m * np.clip(0.8 + 0.25 * steps + rng.normal(0, 0.05, columns + 1), 0.45, 1.3)
+    columns = max(int(length / 1.1), 4)
+    at = np.linspace(0, length, columns + 1)
+    crowns = max(int(length / 4.0), 3)
+    middle, reach = rng.uniform(0, length, crowns), rng.uniform(1.6, 6.5, crowns)
+    rise = height_m * rng.uniform(0.45, 1.1, crowns)
+    round_top = np.sqrt(np.clip(1 - ((at[:, None] - middle) / reach) ** 2, 0, 1)) ** 0.8
+    top = np.maximum((rise * (0.45 + 0.55 * round_top) * (round_top > 0)).max(axis=1), 0.45 * height_m)
+    top = top * (1 + rng.normal(0, 0.035, columns + 1))
+    foot = start + at[:, None] / length * (end - start)
     low = np.stack([foot[:, 0], np.zeros(columns + 1), foot[:, 1]], axis=1)
-    high = low - np.stack([np.zeros(columns + 1), top * 0.93, np.zeros(columns + 1)], axis=1)
+    high = low - np.stack([np.zeros(columns + 1), top * 0.96, np.zeros(columns + 1)], axis=1)
     strip = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
     normal = np.array([end[1] - start[1], 0, -(end[0] - start[0])]) / length
     if float(normal @ np.array([foot.mean(axis=0)[0], 0, foot.mean(axis=0)[1]])) > 0:
         normal = -normal
     colour = leaf_colour(rng, 0.04)
-    wall = make(strip, Material.LEAF, colour * 0.5, np.tile(normal, (2 * columns, 3, 1)))
-    n = int(length * height_m * 0.55)
+    wall = make(strip, Material.LEAF, colour * 0.55, np.tile(normal, (2 * columns, 3, 1)))
+    n = int(length * height_m * 1.3)
     where = rng.uniform(0, columns, n)
     cell = np.minimum(where.astype(int), columns - 1)
-    height = top[cell] * (1 - rng.random(n) ** 1.4)
+    height = top[cell] * (1 - rng.random(n) ** 1.6)
     spots = np.stack(
         [
             np.interp(where, np.arange(columns + 1), foot[:, 0]),
@@ -204,4 +248,7 @@ def tree_line(start: np.ndarray, end: np.ndarray, height_m: float, rng: np.rando
         ],
         axis=1,
     )
-    return join([wall, leaves(spots, normal + rng.normal(0, 0.5, (n, 3)), 1.0, colour, rng)])
+    tilt = normal + rng.normal(0, 0.35, (n, 3)) + np.array([0, -0.6, 0]) * (height / top[cell])[:, None]
+    coat = leaves(spots, tilt / np.linalg.norm(tilt, axis=1, keepdims=True), 0.62, colour, rng)
+    coat.albedo[:] *= (0.6 + 0.4 * height / top[cell])[:, None].astype(np.float32)
+    return join([wall, coat])

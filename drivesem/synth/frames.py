@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from drivesem.data.truth import occlusion_of
 from drivesem.synth.layout import (
     Actor,
+    FittedCamera,
     LayoutSettings,
+    Road,
     place_people,
     place_vehicles,
     plan_road,
@@ -32,7 +36,9 @@ from drivesem.synth.render import (
     render_without_actors,
     see,
 )
+from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed
+from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
@@ -41,24 +47,36 @@ from scene_ir.types import Camera, Crop, Environment, Labels
 SPLITS = ("train", "heldout")
 VARIANTS = {"train": (0, 100), "heldout": (100, 60)}
 """First vehicle shape and their number: held-out scenes share no shape with training scenes."""
-_OCCLUSION_STEPS = (0.8, 0.5, 0.2)
-"""Visible fractions above which an object counts as occlusion 0, 1, 2; below all, 3."""
 _LEAST_VISIBLE = 0.05
 _LEAST_HEIGHT_PX = 10.0
 _LEAST_WIDTH_PX = 3.0
+
+
+GENERATOR_VERSION = 2
+"""Changes whenever the same seed gives another picture or other labels."""
+FRAME_PERIOD_S = 0.1
+"""Between frames of a drive: KITTI and Virtual KITTI have ten a second."""
+BASELINE_M = 0.532725
+"""Between Virtual KITTI 2's cameras."""
+_VIRTUAL_CAMERAS = {
+    "vkitti1": FittedCamera(725.0, (620.5, 187.0), (0.0, 0.0, 0.0), (1242, 375)),
+    "vkitti2": FittedCamera(725.0087, (620.5, 187.0), (0.0, 0.0, 0.0), (1242, 375)),
+}
+"""Of Virtual KITTI 1.3.1 and 2."""
 
 
 @dataclass(frozen=True, slots=True)
 class SynthSettings:
     """What varies between uses of the generator. layout: vehicles and roads. sunny: clear weather only.
     tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None:
-    any.
+    any, by name: Virtual KITTI's. sequence: frames of one drive, that follow each other by a tenth of a second.
     """
 
     layout: LayoutSettings | None = None
     sunny: bool = False
     tilt_rad: float = 0.008
-    camera: int | None = None
+    camera: int | Literal["vkitti1", "vkitti2"] | None = None
+    sequence: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +98,21 @@ class Truth:
     truncation: float
     opacity: Crop
 
+    @property
+    def labelled(self) -> bool:
+        """Whether it is large and visible enough to be an object, not a region to ignore."""
+        width, height = self.box_xyxy[2:] - self.box_xyxy[:2]
+        return bool(self.visible >= _LEAST_VISIBLE and width >= _LEAST_WIDTH_PX and height >= _LEAST_HEIGHT_PX)
+
 
 @dataclass(frozen=True, slots=True)
 class SynthFrame:
     """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels:
-    KITTI's classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky; owner (2H, 2W): what
-    each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background where there
-    is one, of each pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed and shapes
-    used.
+    KITTI's classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky, semantic (H, W)
+    uint8, a `Semantic`, and instance (H, W) uint16, 0 or track + 1: of each pixel's nearest sample; owner (2H,
+    2W): what each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background
+    where there is one, of each pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed
+    and shapes used.
     """
 
     image: np.ndarray
@@ -96,6 +121,8 @@ class SynthFrame:
     labels: Labels
     truths: tuple[Truth, ...]
     depth_m: np.ndarray
+    semantic: np.ndarray
+    instance: np.ndarray
     owner: np.ndarray
     ground_material: np.ndarray
     setting: Setting
@@ -110,8 +137,11 @@ class SynthFrame:
 
 def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
     fitted = statistics()
-    choice = int(rng.integers(len(fitted.cameras))) if settings.camera is None else settings.camera
-    fit = fitted.cameras[choice]
+    drawn = int(rng.integers(len(fitted.cameras)))
+    if isinstance(settings.camera, str):
+        fit = _VIRTUAL_CAMERAS[settings.camera]
+    else:
+        fit = fitted.cameras[drawn if settings.camera is None else settings.camera]
     f, (cx, cy) = fit.focal_px, fit.centre_px
     k = torch.tensor([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
     projection = torch.cat([k, torch.tensor(fit.offset_px_m)[:, None]], dim=1)
@@ -144,7 +174,7 @@ def yaw_in_camera(actor: Actor, view: View) -> float:
 def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
     """An actor in camera axes about the centre of projection, upright as labels know it."""
     spot = _stand(actor, view)
-    soup = actor_soup(actor, owner)
+    soup = actor_soup(actor, owner, float(np.linalg.norm(spot)))
     turn = yaw_matrix(torch.tensor(yaw_in_camera(actor, view), dtype=torch.float64)).numpy().T
     corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
     return replace(soup, corners=corners, normals=(soup.normals @ turn).astype(np.float32))
@@ -205,7 +235,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
                 index=i,
                 visible=visible,
                 screened=screened,
-                occlusion=int(sum(visible <= t for t in _OCCLUSION_STEPS)),
+                occlusion=occlusion_of(visible),
                 truncation=truncation if truncation > 0.005 else 0.0,
                 opacity=Crop(torch.from_numpy(opacity)[None], int(x0) // n, int(y0) // n),
             )
@@ -215,15 +245,12 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
 
 def _labels(truths: list[Truth]) -> Labels:
     """KITTI labels; what is hardly visible or tiny becomes a region to ignore."""
-    kept, ignored = [], []
-    for truth in truths:
-        small = truth.box_xyxy[3] - truth.box_xyxy[1] < _LEAST_HEIGHT_PX
-        wide = truth.box_xyxy[2] - truth.box_xyxy[0] >= _LEAST_WIDTH_PX
-        if truth.visible >= _LEAST_VISIBLE and wide and not small:
-            kept.append(truth)
-        elif truth.visible > 0 and (truth.box_xyxy[2:] > truth.box_xyxy[:2] + 0.5).all():
-            ignored.append(truth.box_xyxy)
-
+    kept = [t for t in truths if t.labelled]
+    ignored = [
+        t.box_xyxy
+        for t in truths
+        if not t.labelled and t.visible > 0 and (t.box_xyxy[2:] > t.box_xyxy[:2] + 0.5).all()
+    ]
     return Labels(
         kind=tuple(t.actor.label for t in kept),
         boxes_xyxy=table([t.box_xyxy for t in kept], 4),
@@ -271,11 +298,18 @@ def stream(seed: int, index: int, split: str, name: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A frame before it is rendered. actors stand on road; setting: camera, light and the rest."""
+    """A frame before it is rendered. actors stand on road; setting: camera, light and the rest. origin: seed,
+    index of the street, attempt. variation: its name; time_s: since the drive began. foliage:
+    codes (3,) of hue, lightness, density.
+    """
 
     actors: tuple[Actor, ...]
     setting: Setting
     split: str
+    origin: tuple[int, int, int]
+    variation: str = MIXED
+    time_s: float = 0.0
+    foliage: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 def plan_frame(
@@ -283,7 +317,8 @@ def plan_frame(
 ) -> Plan:
     """What frame `index` of the stream `seed` will show; see `generate_frame`."""
     settings = settings or SynthSettings()
-    rng = [stream(seed, index, split, 16 * attempt + i) for i in (0, 1, 2, 4)]
+    street = index - index % settings.sequence
+    rng = [stream(seed, street, split, 16 * attempt + i) for i in (0, 1, 2, 4)]
     layout = settings.layout or LayoutSettings(variants=VARIANTS[split])
     view = _camera(rng[0], settings)
     road = plan_road(rng[1], layout.kinds)
@@ -299,7 +334,50 @@ def plan_frame(
         noise=noise_set(SPLITS.index(split)),
         grain_seed=(seed, index, SPLITS.index(split), attempt),
     )
-    return Plan(tuple(actors), setting, split)
+    tracked = tuple(replace(a, track=i) for i, a in enumerate(actors))
+    plan = Plan(tracked, setting, split, (seed, street, attempt))
+    return drive(plan, (index - street) * FRAME_PERIOD_S)
+
+
+def variation_of(plan: Plan, name: str) -> Plan:
+    """The plan in another of Virtual KITTI's variations. RangeError for an unknown name."""
+    seed, street, attempt = plan.origin
+    kind = (MIXED, *VARIATIONS).index(name) if name in (MIXED, *VARIATIONS) else 0
+    setting = vary(plan.setting, name, stream(seed, street, plan.split, 16 * attempt + 5))
+    return replace(plan, setting=replace(setting, grain_seed=(*setting.grain_seed[:4], kind)), variation=name)
+
+
+def drive(plan: Plan, time_s: float) -> Plan:
+    """The plan `time_s` later: the camera's car and all that moves go on along the road."""
+    if time_s == 0:
+        return plan
+    road, view = plan.setting.road, plan.setting.view
+    way = road.ego_speed_mps * time_s
+    x, z = road.point(0.0, way)
+    moved = replace(turned(view, road.curvature * way), position_xz=(float(x), float(z)))
+    actors = tuple(_after(a, road, time_s) for a in plan.actors)
+    setting = replace(plan.setting, view=moved, light=kept_in_world(plan.setting.light, view, moved))
+    return replace(plan, actors=actors, setting=setting, time_s=plan.time_s + time_s)
+
+
+def _after(actor: Actor, road: Road, time_s: float) -> Actor:
+    if actor.lane_ds is None or actor.speed_mps == 0:
+        return actor
+    d, s = actor.lane_ds
+    way = actor.speed_mps * time_s
+    x, z = road.point(d, s + way)
+    return replace(
+        actor, position_xz=(float(x), float(z)), yaw=actor.yaw + road.curvature * way, lane_ds=(d, s + way)
+    )
+
+
+def second_camera(plan: Plan) -> Plan:
+    """The plan as Virtual KITTI 2's right camera sees it."""
+    view = plan.setting.view
+    x, y, z = view.origin + view.rotation.T @ np.array([BASELINE_M, 0.0, 0.0])
+    moved = replace(view, position_xz=(float(x), float(z)), height_m=float(-y))
+    seed = (*plan.setting.grain_seed, 1)
+    return replace(plan, setting=replace(plan.setting, view=moved, grain_seed=seed))
 
 
 def actor_soups(plan: Plan) -> list[Soup]:
@@ -329,9 +407,11 @@ def render_frame(
     `accept` is given and turns the truths down, which is known before anything is shaded.
     """
     setting, view = plan.setting, plan.setting.view
-    seed, index, _, attempt = setting.grain_seed
-    static, used = surroundings(setting.road, POOLS[plan.split], stream(seed, index, plan.split, 16 * attempt + 3))
-    street = _into_camera(static, view)
+    seed, street, attempt = plan.origin
+    static, used = surroundings(
+        setting.road, POOLS[plan.split], stream(seed, street, plan.split, 16 * attempt + 3)
+    )
+    street = _into_camera(leaved(static, plan.foliage), view)
     soups = actor_soups(plan)
     shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
     world = join([street, *soups])
@@ -343,6 +423,8 @@ def render_frame(
     plain = see(street, view) if with_background else None
     empty = None if plain is None else render_without_actors(plain, picture, setting)
     behind = plain or sight
+    nearest = sight.nearest()
+    tracks = np.array([0, *(a.track + 1 for a in plan.actors), 0], np.uint16)  # owner -1, the sky, reads the last
     vehicles = {f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(
         image=picture.image,
@@ -350,18 +432,22 @@ def render_frame(
         background_depth_m=None if plain is None else plain.depth_m,
         labels=_labels(truths),
         truths=tuple(truths),
-        depth_m=sight.depth_m,
+        depth_m=sight.depth.reshape(-1)[nearest],
+        semantic=sight.semantic.reshape(-1)[nearest],
+        instance=tracks[sight.owner.reshape(-1)[nearest]],
         owner=sight.owner,
         ground_material=blocks(behind.material)[0],
         setting=setting,
         environment=_environment(behind, setting),
         manifest={
             "seed": seed,
-            "index": index,
+            "index": setting.grain_seed[1],
             "split": plan.split,
             "attempt": attempt,
             "road": setting.road.kind,
             "weather": setting.light.weather,
+            "variation": plan.variation,
+            "time_s": round(plan.time_s, 6),
             "vehicles": sorted(vehicles),
             **used,
         },

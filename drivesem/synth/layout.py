@@ -7,7 +7,7 @@ coordinates: d metres to the right of the ego lane's middle, s metres along.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.resources import files
 
@@ -16,8 +16,21 @@ import numpy as np
 from drivesem.synth.soup import Material
 
 ROAD_KINDS = ("residential", "city", "arterial", "motorway", "country", "junction")
-_ROAD_SHARE = (0.30, 0.24, 0.13, 0.08, 0.12, 0.13)
+_ROAD_SHARE = (0.28, 0.25, 0.12, 0.07, 0.08, 0.20)
 """KITTI's drives: mostly residential and city streets of Karlsruhe, some rural roads and motorways."""
+_BUSY_TILT = {"residential": 0.9, "city": 0.9, "arterial": 0.2, "motorway": -1.2, "country": -4.0, "junction": 0.6}
+"""How much likelier each kind of road is for frames with many vehicles: exponent per quantile of their number."""
+MOST_VEHICLES = 24
+"""In a frame."""
+_RANGE_M = 85.0
+"""How far along the road vehicles are placed: KITTI labels hardly any beyond."""
+_SPEEDS_KMH = {
+    "residential": (20, 35), "city": (30, 50), "arterial": (45, 70), "motorway": (90, 130), "country": (60, 95),
+    "junction": (25, 50),
+}  # fmt: skip
+_STOPPED_SHARE = {"residential": 0.15, "city": 0.3, "arterial": 0.2, "motorway": 0.05, "country": 0.03, "junction":
+0.6}
+"""How often the ego car's direction stands in a queue."""
 LABEL_OF_KIND = {
     "sedan": "Car", "hatchback": "Car", "estate": "Car", "suv": "Car", "pickup": "Car",
     "van": "Van", "truck": "Truck", "bus": "Truck", "pedestrian": "Pedestrian", "cyclist": "Cyclist",
@@ -39,6 +52,23 @@ white lead).
 """
 MARGIN_M = 0.3
 """Least clearance between two footprints."""
+_CLUSTER = 1.4
+"""Spread of the log weight along a row: how much vehicles stand together."""
+_CHANCE = 0.6
+"""How much chance has to say against weights: 1 draws places as often as their weights are, 0 takes the heaviest."""
+_NEAR_GAIN, _NEAR_M = 0.8, 15.0
+"""Near places are wanted more than their labels are frequent, as vehicles stand together, which favours far ones."""
+_HARDLY_SEEN, _HARDLY_SEEN_DROPPED = 0.3, 0.8
+"""Below which visible share a place is mostly given up: annotators passed over what they could hardly see."""
+_PLAINLY_SEEN, _APART_DEFERRED = 0.85, 0.8
+"""Above which visible share, hiding nothing either, a place mostly has to wait for others."""
+_ALWAYS_M = 5.0
+_EGO = ((0.0, 1.5), -np.pi / 2, (7.0, 2.0, 2.2))
+"""Footprint that stays free for the car that carries the camera."""
+_SIZE_FACTOR_LHW = {"Car": (0.905, 1.015, 0.93), "Van": (1.03, 1.05, 0.99), "Truck": (1.05, 1.01, 1.03)}
+"""From the templates' sizes, of today's cars with mirrors, to the means of KITTI's labels, of 2011's without."""
+_SIZE_SPREAD_LHW = {"Car": (0.045, 0.055, 0.035), "Van": (0.12, 0.1, 0.05), "Truck": (0.2, 0.1, 0.05)}
+"""What is missing to the labels' standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +122,8 @@ def statistics() -> Statistics:
 class Lane:
     """Where vehicles may be. middle_m: d. direction: +1 as the ego car, -1 oncoming, 0 across the road (parked
     nose in). parked: standing. weight: how much more often than average it is chosen. spacing_m: between
-    candidates.
+    candidates. slant_rad: that a parked row is turned by. speed_mps: of all that drives in it, along s. slack_m:
+    how far a vehicle of no width may be off the middle without leaving the lane.
     """
 
     middle_m: float
@@ -100,6 +131,9 @@ class Lane:
     parked: bool = False
     weight: float = 1.0
     spacing_m: float = 8.0
+    slant_rad: float = 0.0
+    speed_mps: float = 0.0
+    slack_m: float = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +164,8 @@ class Marking:
 @dataclass(frozen=True, slots=True)
 class Road:
     """One road. curvature in 1/m; crossing: (s0, s1) of a road across, or None; flank_m: (left, right) d from
-    which on buildings and plants may stand.
+    which on buildings and plants may stand. ego_speed_mps: of the car that carries the camera. busy: in [0, 1],
+    the share of KITTI's frames with fewer vehicles.
     """
 
     kind: str
@@ -141,6 +176,13 @@ class Road:
     flank_m: tuple[float, float]
     pavements: tuple[tuple[float, float], ...]
     crossing: tuple[float, float] | None = None
+    ego_speed_mps: float = 0.0
+    busy: float = 0.5
+
+    @property
+    def stands(self) -> bool:
+        """Whether all traffic along the road waits, so that traffic across may pass."""
+        return self.ego_speed_mps == 0 and all(lane.speed_mps == 0 for lane in self.lanes)
 
     def point(self, d: np.ndarray | float, s: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """World (x, z) of road coordinates; arrays broadcast."""
@@ -158,7 +200,9 @@ class Road:
 @dataclass(frozen=True, slots=True)
 class Actor:
     """A vehicle or person. position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details.
-    lane_ds: road coordinates (d, s) m where it follows the road, speed_mps: along s, below 0 against it.
+    lane_ds: road coordinates (d, s) m where it follows the road, speed_mps: along s, below 0 against it. track:
+    its number within the scene. ffd: lattice offsets (192,) that bend its shape, as fractions of the unit box, or
+    None.
     """
 
     kind: str
@@ -171,6 +215,8 @@ class Actor:
     seed: int
     lane_ds: tuple[float, float] | None = None
     speed_mps: float = 0.0
+    track: int = 0
+    ffd: tuple[float, ...] | None = None
 
     @property
     def label(self) -> str:
@@ -181,7 +227,8 @@ class Actor:
 @dataclass(frozen=True, slots=True)
 class LayoutSettings:
     """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists
-    appear. vehicles: (fewest, most) a frame, or None for KITTI's distribution. max_heavy: most trucks and buses.
+    appear. vehicles: (fewest, most) to be seen a frame, or None for KITTI's distribution. max_heavy: most trucks
+    and buses.
     """
 
     variants: tuple[int, int] = (0, 100)
@@ -192,57 +239,78 @@ class LayoutSettings:
 
 
 def plan_road(rng: np.random.Generator, kinds: tuple[str, ...] = ROAD_KINDS) -> Road:
-    """A random road of one of `kinds`."""
-    share = np.array([_ROAD_SHARE[ROAD_KINDS.index(k)] for k in kinds])
+    """A random road of one of `kinds`, how busy it is, and how fast its lanes go."""
+    busy = float(rng.random())
+    share = np.array([_ROAD_SHARE[ROAD_KINDS.index(k)] * np.exp(_BUSY_TILT[k] * (busy - 0.5)) for k in kinds])
     kind = kinds[int(rng.choice(len(kinds), p=share / share.sum()))]
     if kind in ("residential", "city"):
-        return _street(rng, kind, None)
-    if kind == "junction":
-        start = float(rng.uniform(13, 32))
-        return _street(rng, kind, (start, start + float(rng.uniform(8, 15))))
-    return _open_road(rng, kind)
+        road = _street(rng, kind, None)
+    elif kind == "junction":
+        start = float(rng.uniform(11, 30))
+        road = _street(rng, kind, (start, start + float(rng.uniform(8, 15))))
+    else:
+        road = _open_road(rng, kind)
+    return _with_speeds(rng, replace(road, busy=busy))
+
+
+def _with_speeds(rng: np.random.Generator, road: Road) -> Road:
+    """The road with a common speed for each lane, so that nothing runs into anything."""
+    stopped = rng.random() < _STOPPED_SHARE[road.kind]
+    oncoming_stopped = stopped and (road.kind == "junction" or rng.random() < 0.3)
+    low, high = _SPEEDS_KMH[road.kind]
+    lanes, ego = [], 0.0
+    for lane in road.lanes:
+        if lane.parked:
+            lanes.append(lane)
+            continue
+        stands = stopped if lane.direction > 0 else oncoming_stopped
+        # Lanes further to the right are slower, where there are several.
+        speed = 0.0 if stands else float(rng.uniform(low, high)) / 3.6 * (1 - 0.012 * float(np.clip(lane.middle_m, -8, 8)))
+        spacing = float(rng.uniform(6.3, 8.0)) if stands else 6.5 + 0.35 * speed
+        if lane.middle_m == 0:
+            ego = speed * float(rng.uniform(0.85, 1.0))
+        gaps = [abs(other.middle_m - lane.middle_m) for other in road.lanes if other is not lane and not other.parked]
+        slack = min([3.3, *gaps]) / 2 - MARGIN_M
+        lanes.append(replace(lane, speed_mps=speed * lane.direction, spacing_m=spacing, slack_m=slack))
+    return replace(road, lanes=tuple(lanes), ego_speed_mps=ego)
 
 
 def _street(rng: np.random.Generator, kind: str, crossing: tuple[float, float] | None) -> Road:
-    """Two lanes between parked rows and pavements."""
-    lane = float(rng.uniform(2.7, 3.4) if kind == "residential" else rng.uniform(3.0, 3.6))
-    extra = int(kind == "junction" and rng.random() < 0.5)
-    left, right = -1.5 * lane, (0.5 + extra) * lane
-    lanes = [Lane(0.0, 1, weight=1.2), Lane(-lane, -1, weight=1.2)]
-    if extra:
-        lanes.append(Lane(lane, 1, weight=1.5))
-    busy = kind == "residential"
-    strips = [Strip(left, right, Material.ROAD)]
+    """A street between parked rows, pavements and now and then parking lots."""
+    quiet = kind == "residential"
+    lane = float(rng.uniform(2.9, 3.4) if quiet else rng.uniform(3.0, 3.7))
+    right_lanes = 0 if quiet else int(rng.choice(3, p=(0.6, 0.3, 0.1)))
+    left_lanes = 0 if quiet else int(rng.choice(2, p=(0.8, 0.2)))
+    oncoming = int(rng.random() < 0.8) if quiet else int(rng.choice((1, 2), p=(0.65, 0.35)))
+    median = 0.0 if quiet or rng.random() < 0.6 else float(rng.uniform(1.5, 9.0))
+    inner = -(0.5 + left_lanes) * lane
+    other = inner - median
+    left, right = other - oncoming * lane, (0.5 + right_lanes) * lane
+    lanes = [Lane(i * lane, 1, weight=1.0) for i in range(-left_lanes, right_lanes + 1)]
+    lanes += [Lane(other - (i + 0.5) * lane, -1, weight=1.0) for i in range(oncoming)]
+    strips = [Strip(inner, right, Material.ROAD), Strip(left, other, Material.ROAD)] if median else []
+    strips = strips or [Strip(left, right, Material.ROAD)]
+    if median:
+        strips.append(Strip(other, inner, (Material.GRASS, Material.GRAVEL)[int(rng.integers(2))], 0.1))
     edges, pavements = [], []
     for side, edge in ((-1, left), (1, right)):
-        parked = rng.random() < (0.85 if kind != "junction" else 0.4)
-        nose_in = parked and rng.random() < 0.15
-        width = float(rng.uniform(4.6, 5.2) if nose_in else rng.uniform(1.95, 2.3)) if parked else 0.0
-        if parked:
-            material = Material.PARKING if rng.random() < 0.6 else Material.ROAD
-            strips.append(_strip(edge, edge + side * width, material))
-            direction = 0 if nose_in else side if rng.random() < 0.85 or side < 0 else -side
-            spacing = 2.75 if nose_in else 5.6
-            lanes.append(Lane(edge + side * width / 2, direction, True, 1.9 if busy else 1.5, spacing))
-        outer = edge + side * width
-        walk = outer + side * float(rng.uniform(1.5, 2.6) if busy else rng.uniform(2.0, 4.5))
-        height = float(rng.uniform(0.08, 0.14))
-        strips.append(_strip(outer, outer + side * 0.14, Material.KERB, height))
-        strips.append(_strip(outer + side * 0.14, walk, Material.PAVEMENT, height))
-        pavements.append(tuple(sorted((outer + side * 0.4, walk - side * 0.3))))
-        garden = Material.GRASS if busy or rng.random() < 0.4 else Material.PAVEMENT
-        strips.append(_strip(walk, walk + side * 60, garden, height))
-        edges.append(walk)
+        rows, bands, walk, height = _side(rng, kind, side, edge)
+        lanes += rows
+        strips += bands
+        pavements.append(walk)
+        outer = bands[-1].d0 if side < 0 else bands[-1].d1
+        garden = Material.GRASS if quiet or rng.random() < 0.4 else Material.PAVEMENT
+        strips.append(_strip(outer, outer + side * 60, garden, height))
+        edges.append(outer)
     markings = []
-    middle = -lane / 2
-    if not busy or rng.random() < 0.2:
+    if not median and oncoming and (not quiet or rng.random() < 0.2):
         dash = 3.0 if rng.random() < 0.8 else 6.0
-        markings.append(Marking(middle, 0.12, dash, dash * float(rng.choice([1.0, 2.0, 3.0]))))
-    if extra:
-        markings.append(Marking(lane / 2, 0.12, 3.0, 6.0))
-    if not busy and rng.random() < 0.5:
+        markings.append(Marking(inner, 0.12, dash, dash * float(rng.choice([1.0, 2.0, 3.0]))))
+    markings += [Marking((i + 0.5) * lane, 0.12, 3.0, 6.0) for i in range(-left_lanes, right_lanes)]
+    markings += [Marking(other - i * lane, 0.12, 3.0, 6.0) for i in range(1, oncoming)]
+    if not quiet and rng.random() < 0.5:
         markings += [Marking(left + 0.1, 0.12, 1.0, 1.0), Marking(right - 0.1, 0.12, 1.0, 1.0)]
-    curvature = 0.0 if crossing else float(rng.choice([0.0, 0.0, 0.0, 1.0]) * rng.normal(0, 0.0025))
+    curvature = 0.0 if crossing or rng.random() < 0.6 else float(np.clip(rng.normal(0, 0.004), -0.007, 0.007))
     return Road(
         kind,
         curvature,
@@ -255,13 +323,66 @@ def _street(rng: np.random.Generator, kind: str, crossing: tuple[float, float] |
     )
 
 
+def _side(
+    rng: np.random.Generator, kind: str, side: int, edge: float
+) -> tuple[list[Lane], list[Strip], tuple[float, float], float]:
+    """What lies beside a street: parked rows, strips outwards, where people walk, and the pavement's height."""
+    quiet = kind == "residential"
+    rows: list[Lane] = []
+    strips: list[Strip] = []
+    at = edge
+    if rng.random() < (0.25 if quiet else 0.45):
+        # A cycle lane, or road too wide for its lanes.
+        width = float(rng.uniform(0.8, 2.0))
+        strips.append(_strip(at, at + side * width, Material.ROAD))
+        at += side * width
+    if rng.random() < (0.9 if quiet else 0.6 if kind == "city" else 0.4):
+        draw = rng.random()
+        slant = 0.0 if draw < 0.85 else float(rng.choice((-1, 1)) * rng.uniform(0.6, 1.1))
+        nose_in = draw >= 0.72
+        width = float(rng.uniform(4.6, 5.2) if nose_in else rng.uniform(1.95, 2.3))
+        material = Material.PARKING if rng.random() < 0.6 else Material.ROAD
+        strips.append(_strip(at, at + side * width, material))
+        direction = 0 if nose_in else side if rng.random() < 0.85 or side < 0 else -side
+        spacing = 2.75 / max(np.cos(slant), 0.4) if nose_in else float(rng.uniform(5.2, 6.2))
+        rows.append(Lane(at + side * width / 2, direction, True, 1.5, spacing, slant))
+        at += side * width
+    height = float(rng.uniform(0.08, 0.14))
+    walk = at + side * float(rng.uniform(1.5, 2.6) if quiet else rng.uniform(2.0, 4.5))
+    strips.append(_strip(at, at + side * 0.14, Material.KERB, height))
+    strips.append(_strip(at + side * 0.14, walk, Material.PAVEMENT, height))
+    low, high = sorted((at + side * 0.4, walk - side * 0.3))
+    if rng.random() < 0.3:
+        lot, bands = _lot(rng, side, walk)
+        rows += lot
+        strips += bands
+    return rows, strips, (low, high), height
+
+
+def _lot(rng: np.random.Generator, side: int, edge: float) -> tuple[list[Lane], list[Strip]]:
+    """A parking lot beyond the pavement: one or two rows, and a strip of green that ends it."""
+    rows = 1 + int(rng.random() < 0.6)
+    slant = 0.0 if rng.random() < 0.6 else float(rng.choice((-1, 1)) * rng.uniform(0.4, 1.2))
+    width = 11.5 if rows == 1 else 17.0
+    outer = edge + side * width
+    spacing = 2.7 / max(float(np.cos(slant)), 0.4)
+    lanes = [Lane(edge + side * 3.0, 0, True, 1.0, spacing, slant)]
+    if rows == 2:
+        lanes.append(Lane(edge + side * 14.0, 0, True, 1.0, spacing, slant))
+    strips = [
+        _strip(edge, outer, Material.PARKING),
+        _strip(outer, outer + side * 1.6, Material.GRASS, 0.08),
+    ]
+    return lanes, strips
+
+
 def _open_road(rng: np.random.Generator, kind: str) -> Road:
-    """Roads without parked cars: arterial, motorway, country."""
+    """Roads without parked rows: arterial, motorway, country."""
     lane = float(rng.uniform(3.3, 3.75))
     own = {"arterial": 2, "motorway": int(rng.integers(2, 4)), "country": 1}[kind]
     ego = int(rng.integers(own))
     right = (own - ego - 0.5) * lane
-    median = {"arterial": float(rng.uniform(1.5, 7.0)), "motorway": float(rng.uniform(2.5, 4.0)), "country": 0.0}[
+    median = {"arterial": float(rng.uniform(1.5, 9.0)), "motorway": float(rng.uniform(2.5, 5.0)), "country": 0.0}[
         kind
     ]
     inner = -(ego + 0.5) * lane
@@ -285,6 +406,11 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
             kind_of_bank = Material.PAVEMENT
             bank += side * 1.5
         strips.append(_strip(edge, bank, kind_of_bank, 0.1 if kind_of_bank == Material.PAVEMENT else 0.0))
+        if kind != "motorway" and rng.random() < 0.3:
+            rows, bands = _lot(rng, side, bank)
+            lanes += rows
+            strips += bands
+            bank = bands[-1].d0 if side < 0 else bands[-1].d1
         strips.append(_strip(bank, bank + side * 60, Material.GRASS))
         edges.append(bank)
     solid = Marking(right, 0.15, 1.0, 1.0), Marking(left, 0.15, 1.0, 1.0)
@@ -297,7 +423,7 @@ def _open_road(rng: np.random.Generator, kind: str) -> Road:
         markings += [Marking(inner + 0.2, 0.15, 1.0, 1.0), Marking(other - 0.2, 0.15, 1.0, 1.0)]
     else:
         markings.append(Marking(inner, 0.12, 1.0, 1.0) if rng.random() < 0.3 else Marking(inner, 0.12, *dash))
-    bend = 0.0035 if kind == "country" else 0.0012
+    bend = 0.0035 if kind == "country" else 0.0015
     return Road(
         kind, float(rng.normal(0, bend)), tuple(lanes), tuple(strips), tuple(markings), (edges[0], edges[1]), ()
     )
@@ -326,29 +452,81 @@ def _interpolated_share(value: float, edges: np.ndarray, share: np.ndarray) -> f
     return float(np.interp(value, middle, share))
 
 
-def _candidates(road: Road, rng: np.random.Generator) -> list[tuple[float, float, Lane, float]]:
-    """(d, s, lane, weight) of places a vehicle may take."""
-    fitted = statistics()
+@dataclass(frozen=True, slots=True)
+class _Spot:
+    """A place that a vehicle may take. lane: None for traffic across, which stands at `yaw`. key: the lowest are
+    taken first.
+    """
+
+    d: float
+    s: float
+    yaw: float
+    lane: Lane | None
+    key: float
+
+
+def _candidates(road: Road, rng: np.random.Generator) -> list[_Spot]:
+    """Places that vehicles may take, in the order in which they are taken."""
     found = []
     for lane in road.lanes:
-        s = float(rng.uniform(2.0, 2.0 + lane.spacing_m)) if lane.parked else float(rng.uniform(5, 14))
-        while s < 85:
+        first = lane.spacing_m if lane.middle_m == 0 and not lane.parked else 0.0
+        s = float(rng.uniform(0.0, lane.spacing_m)) + first
+        # Rows are full here and empty there: a slow walk of the log weight.
+        crowd = float(rng.normal(0, _CLUSTER))
+        while s < _RANGE_M:
             keep_off = road.crossing and road.crossing[0] - 5 < s < road.crossing[1] + 5
-            if not (lane.parked and keep_off):
-                d = lane.middle_m + float(rng.normal(0, 0.08 if lane.parked else 0.25))
-                x, z = road.point(d, s)
-                weight = _interpolated_share(float(z), fitted.depth_edges_m, fitted.depth_share)
-                weight *= np.sqrt(_interpolated_share(float(x), fitted.lateral_edges_m, fitted.lateral_share))
-                found.append((d, s, lane, float(weight) * lane.weight * lane.spacing_m))
-            s += lane.spacing_m * float(rng.lognormal(0.06, 0.12 if lane.parked else 0.45))
+            waiting = road.crossing and lane.speed_mps == 0 and road.crossing[0] - 2 < s < road.crossing[1] + 2
+            if not ((lane.parked and keep_off) or (not lane.parked and waiting)):
+                d = lane.middle_m + (float(rng.normal(0, 0.08)) if lane.parked else 0.0)
+                weight = _weight(road, d, s) * lane.weight * lane.spacing_m**0.5
+                key = float(rng.exponential(1.0)) ** _CHANCE / max(weight * float(np.exp(crowd)), 1e-9)
+                found.append(_Spot(d, s, _lane_yaw(rng, road, lane, d, s), lane, key))
+            step = lane.spacing_m * float(rng.lognormal(0.06, 0.12 if lane.parked else 0.35))
+            crowd = 0.8 * crowd + 0.6 * float(rng.normal(0, _CLUSTER))
+            s += step
     if road.crossing:
-        c0, c1 = road.crossing
-        for s, direction in ((c0 * 0.3 + c1 * 0.7, 1), (c0 * 0.72 + c1 * 0.28, -1)):
-            across = float(rng.uniform(-22, -18))
-            while across < 22:
-                weight = _interpolated_share(s, fitted.depth_edges_m, fitted.depth_share) * 6.0
-                found.append((across, s, Lane(across, 2 * direction), weight))
-                across += float(rng.uniform(7, 16))
+        found += _across(road, rng)
+    return sorted(found, key=lambda spot: spot.key)
+
+
+def _weight(road: Road, d: float, s: float) -> float:
+    """How much a place is wanted: as often as KITTI has vehicles at its depth and to its side."""
+    fitted = statistics()
+    x, z = (float(v) for v in road.point(d, s))
+    weight = _interpolated_share(z, fitted.depth_edges_m, fitted.depth_share)
+    weight *= 1 + _NEAR_GAIN * float(np.exp(-z / _NEAR_M))
+    return weight * _interpolated_share(x, fitted.lateral_edges_m, fitted.lateral_share) ** 0.3
+
+
+def _lane_yaw(rng: np.random.Generator, road: Road, lane: Lane, d: float, s: float) -> float:
+    """World yaw of a vehicle in a lane or a row."""
+    if lane.direction == 0:
+        facing = np.sign(d) if rng.random() < 0.7 else -np.sign(d)
+        return road.yaw(s, 0) + (0.0 if facing > 0 else np.pi) + lane.slant_rad + float(rng.normal(0, 0.05))
+    if not lane.parked:
+        return road.yaw(s, lane.direction)
+    flipped = rng.random() < 0.12
+    return road.yaw(s, -lane.direction if flipped else lane.direction)
+
+
+def _across(road: Road, rng: np.random.Generator) -> list[_Spot]:
+    """Traffic on a road across: driving through where all else waits, else waiting at both sides."""
+    assert road.crossing is not None
+    c0, c1 = road.crossing
+    paved = [s for s in road.strips if s.material == Material.ROAD]
+    low, high = min(s.d0 for s in paved), max(s.d1 for s in paved)
+    found = []
+    for s, direction in ((c0 * 0.3 + c1 * 0.7, 1), (c0 * 0.72 + c1 * 0.28, -1)):
+        across = float(rng.uniform(-36, -28))
+        while across < 30:
+            inside = low - 4.5 < across < high + 4.5
+            if road.stands or not inside:
+                yaw = 0.0 if direction > 0 else np.pi
+                turning = inside and rng.random() < 0.35
+                yaw += float(rng.uniform(-0.9, 0.9) if turning else rng.normal(0, 0.05))
+                key = float(rng.exponential(1.0)) / max(_weight(road, across, s) * 5.0, 1e-9)
+                found.append(_Spot(across, s, yaw, None, key))
+            across += float(rng.uniform(5.5, 11))
     return found
 
 
@@ -356,77 +534,154 @@ def _vehicle(rng: np.random.Generator, settings: LayoutSettings, parked: bool, h
     """A body style and a variant."""
     first, count = settings.variants
     draw = rng.random()
-    heavy_share = 0.0 if parked or not heavy else 0.11
+    heavy_share = 0.0 if parked or not heavy else 0.09
     if draw < heavy_share:
         kind = "truck" if rng.random() < 0.6 else "bus"
-    elif draw < heavy_share + 0.11:
+    elif draw < heavy_share + 0.09:
         kind = "van"
     else:
         kind = _CAR_KINDS[int(rng.choice(len(_CAR_KINDS), p=_CAR_SHARE))]
     return kind, first + int(rng.integers(count))
 
 
-def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSettings) -> list[Actor]:
-    """Vehicles on the road's lanes without interpenetration, nearer depths as often as in KITTI's labels."""
+def _size(rng: np.random.Generator, kind: str, variant: int) -> tuple[float, float, float]:
+    """Length, height, width (m) of one vehicle, spread as KITTI's labels are."""
     from scene_ir.meshes.templates import typical_size_lhw
 
+    label = LABEL_OF_KIND[kind]
+    stretch = np.clip(rng.normal(0.0, 1.0, 3), -2.0, 2.0) * _SIZE_SPREAD_LHW[label] + 1.0
+    length, height, width = typical_size_lhw(kind, variant) * np.asarray(_SIZE_FACTOR_LHW[label]) * stretch
+    return float(length), float(height), float(width)
+
+
+def _paint(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
+    """A paint's linear albedo."""
+    paint = _PAINTS[int(rng.choice(len(_PAINTS), p=_PAINT_SHARE / _PAINT_SHARE.sum()))]
+    if kind in ("van", "truck", "bus") and rng.random() < 0.5:
+        paint = _PAINTS[0]
+    paint = np.clip(paint * rng.uniform(0.8, 1.15) * rng.uniform(0.93, 1.07, 3), 0.01, 0.85)
+    return float(paint[0]), float(paint[1]), float(paint[2])
+
+
+_SIGHT_COLUMN_PX = 4
+_SIGHT_NEAR_M = 0.3
+_SIGHT_VISIBLE = 0.05
+_SIGHT_HEIGHT_PX = 10.0
+
+
+def seen_shares(actors: list[Actor]) -> np.ndarray:
+    """Roughly how much (N,) of each vehicle KITTI's camera sees, in [0, 1]; 0 outside the image or where it is too
+    small to be labelled. Vehicles are upright rectangles in the image, the nearer before the farther.
+    """
     fitted = statistics()
+    camera, height_m = fitted.cameras[0], fitted.camera_height_m
+    width, height = camera.size_wh_px
+    f, (cx, cy) = camera.focal_px, camera.centre_px
+    skyline = np.full(width // _SIGHT_COLUMN_PX + 1, float(height))
+    shares = np.zeros(len(actors))
+    order = np.argsort([np.hypot(*a.position_xz) for a in actors], kind="stable")
+    for index in order:
+        actor = actors[index]
+        outline = _before_camera(footprint(actor.position_xz, actor.yaw, actor.size_lhw))
+        if len(outline) == 0:
+            continue
+        x, z = outline[:, 0] + camera.offset_px_m[0] / f, outline[:, 1]
+        u = cx + f * x / z
+        roof = cy + f * (height_m - actor.size_lhw[1]) / z
+        top, bottom = max(float(roof.min()), 0.0), min(float(cy + f * height_m / z.min()), float(height))
+        u0, u1 = max(float(u.min()), 0.0), min(float(u.max()), float(width - 1))
+        if u1 - u0 < 3 or bottom - top < _SIGHT_HEIGHT_PX:
+            continue
+        columns = slice(int(u0) // _SIGHT_COLUMN_PX, int(u1) // _SIGHT_COLUMN_PX + 1)
+        free = np.clip(np.minimum(skyline[columns], bottom) - top, 0, None)
+        shares[index] = float(free.mean()) / (bottom - top)
+        skyline[columns] = np.minimum(skyline[columns], top)
+    return shares
+
+
+def _before_camera(outline: np.ndarray) -> np.ndarray:
+    """The part (K, 2) of a convex outline (4, 2) in front of the camera."""
+    if (outline[:, 1] >= _SIGHT_NEAR_M).all():
+        return outline
+    kept = []
+    for one, two in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if one[1] >= _SIGHT_NEAR_M:
+            kept.append(one)
+        if (one[1] >= _SIGHT_NEAR_M) != (two[1] >= _SIGHT_NEAR_M):
+            kept.append(one + (two - one) * (_SIGHT_NEAR_M - one[1]) / (two[1] - one[1]))
+    return np.array(kept).reshape(-1, 2)
+
+
+def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSettings) -> list[Actor]:
+    """Vehicles on the road without interpenetration: as many as are needed for as many to be seen as KITTI's
+    labels have, at most MOST_VEHICLES.
+    """
     if settings.vehicles is None:
-        share = fitted.vehicles_per_frame.copy()
-        share[0] *= 0.3
-        wanted = int(rng.choice(len(share), p=share / share.sum())) + int(rng.integers(0, 5))
+        wanted = int(np.searchsorted(np.cumsum(statistics().vehicles_per_frame), road.busy, side="right"))
+        wanted = min(wanted, len(statistics().vehicles_per_frame) - 1)
     else:
         wanted = int(rng.integers(settings.vehicles[0], settings.vehicles[1] + 1))
-    candidates = _candidates(road, rng)
-    weights = np.array([c[3] for c in candidates])
-    if not candidates or weights.sum() <= 0:
-        return []
-    keys = rng.exponential(1.0, len(candidates)) / np.maximum(weights, 1e-9)
     actors: list[Actor] = []
-    outlines = [footprint((0.0, 1.5), -np.pi / 2, (7.0, 2.0, 2.2))]
+    shown = np.zeros(0)
+    outlines = [footprint(*_EGO)]
     heavy = 0
-    for index in np.argsort(keys, kind="stable"):
-        if len(actors) >= wanted:
+    queue = [(spot, False) for spot in _candidates(road, rng)]
+    for spot, alone_too in queue:
+        if len(actors) >= MOST_VEHICLES or (shown >= _SIGHT_VISIBLE).sum() >= wanted:
             break
-        d, s, lane, _ = candidates[index]
-        kind, variant = _vehicle(rng, settings, lane.parked, heavy < settings.max_heavy)
-        usual, stretch = typical_size_lhw(kind, variant), rng.normal(1.0, (0.025, 0.02, 0.015)).tolist()
-        size = (usual[0] * stretch[0], usual[1] * stretch[1], usual[2] * stretch[2])
-        if abs(lane.direction) == 2:
-            yaw = 0.0 if lane.direction > 0 else np.pi
-            yaw += float(rng.normal(0, 0.05) if rng.random() < 0.7 else rng.uniform(-0.9, 0.9))
-        elif lane.direction == 0:
-            facing = np.sign(d) if rng.random() < 0.7 else -np.sign(d)
-            yaw = road.yaw(s, 0) + (0.0 if facing > 0 else np.pi) + float(rng.normal(0, 0.05))
-        else:
-            flipped = lane.parked and rng.random() < 0.12
-            yaw = road.yaw(s, -lane.direction if flipped else lane.direction)
-            yaw += float(rng.normal(0, fitted.yaw_spread_rad))
-        x, z = (float(v) for v in road.point(d, s))
-        outline = footprint((x, z), yaw, size)
-        in_view = abs(x) < 0.95 * z + 3.0 and z > 1.5
-        if not in_view or any(clearance(outline, o) < MARGIN_M for o in outlines):
+        actor = _settle(rng, road, settings, spot, heavy < settings.max_heavy)
+        outline = footprint(actor.position_xz, actor.yaw, actor.size_lhw)
+        if seen_shares([actor])[0] == 0 or any(_nearer(outline, o, MARGIN_M) for o in outlines):
             continue
-        paint = _PAINTS[int(rng.choice(len(_PAINTS), p=_PAINT_SHARE / _PAINT_SHARE.sum()))]
-        if kind in ("van", "truck", "bus") and rng.random() < 0.5:
-            paint = _PAINTS[0]
-        paint = np.clip(paint * rng.uniform(0.8, 1.15) * rng.uniform(0.93, 1.07, 3), 0.01, 0.85)
-        yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
-        actors.append(
-            Actor(
-                kind,
-                variant,
-                (x, z),
-                yaw,
-                size,
-                (float(paint[0]), float(paint[1]), float(paint[2])),
-                lane.parked,
-                int(rng.integers(2**31)),
-            )
-        )
+        after = seen_shares([*actors, actor])
+        if (after < _HARDLY_SEEN).any() and rng.random() < _HARDLY_SEEN_DROPPED:
+            continue
+        apart = after[-1] > _PLAINLY_SEEN and (after[:-1] > shown - 0.08).all() and actor.position_xz[1] > _ALWAYS_M
+        if actors and apart and not alone_too and rng.random() < _APART_DEFERRED:
+            queue.append((spot, True))
+            continue
+        actors.append(actor)
         outlines.append(outline)
-        heavy += kind in ("truck", "bus")
+        shown = after
+        heavy += actor.kind in ("truck", "bus")
     return actors
+
+
+def _nearer(one: np.ndarray, two: np.ndarray, gap_m: float) -> bool:
+    """Whether two outlines are closer than `gap_m`."""
+    apart = np.hypot(*(one.mean(axis=0) - two.mean(axis=0)))
+    reach = np.hypot(*(one[0] - one[2])) + np.hypot(*(two[0] - two[2]))
+    return bool(apart < reach / 2 + gap_m and clearance(one, two) < gap_m)
+
+
+def _settle(rng: np.random.Generator, road: Road, settings: LayoutSettings, spot: _Spot, heavy: bool) -> Actor:
+    """A random vehicle at a place. heavy: whether it may be a truck or a bus."""
+    lane = spot.lane
+    parked = lane is not None and lane.parked
+    wide = lane is None or lane.slack_m > 1.25
+    kind, variant = _vehicle(rng, settings, parked, heavy and wide)
+    size = _size(rng, kind, variant)
+    d, yaw = spot.d, spot.yaw
+    turn = float(rng.normal(0, statistics().yaw_spread_rad))
+    if lane is not None and not lane.parked:
+        # Whatever passes in the next lane must find its own free: long vehicles keep straighter.
+        slack = max(lane.slack_m - size[2] / 2, 0.0)
+        d += float(np.clip(rng.normal(0, 0.25), -slack, slack))
+        turn *= min(1.0, 3.0 / size[0])
+    yaw += turn
+    x, z = (float(v) for v in road.point(d, spot.s))
+    return Actor(
+        kind,
+        variant,
+        (x, z),
+        float((yaw + np.pi) % (2 * np.pi) - np.pi),
+        size,
+        _paint(rng, kind),
+        parked,
+        int(rng.integers(2**31)),
+        lane_ds=None if lane is None else (d, spot.s),
+        speed_mps=0.0 if lane is None else lane.speed_mps,
+    )
 
 
 def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor]) -> list[Actor]:
@@ -436,7 +691,7 @@ def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor]) ->
     if road.kind == "motorway":
         wanted = []
     outlines = [footprint(a.position_xz, a.yaw, a.size_lhw) for a in vehicles]
-    outlines.append(footprint((0.0, 1.5), -np.pi / 2, (7.0, 2.0, 2.2)))
+    outlines.append(footprint(*_EGO))
     left, right = (
         min(s.d0 for s in road.strips if s.material == Material.ROAD),
         max(s.d1 for s in road.strips if s.material == Material.ROAD),

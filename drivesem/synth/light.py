@@ -13,10 +13,26 @@ _WEATHER_SHARE = (0.72, 0.15, 0.05, 0.08)
 """Mostly sun, as in KITTI's recordings; 28 % of training frames have other weather, for variety."""
 
 
+PANORAMA_GLARE = 4.0
+"""Polished things mirror no more of a panorama than this: its sun is drawn from `Light.sun`, not twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Panorama:
+    """A photographed sky. pixels (h, w, 3) float32: linear radiance, equirectangular, the zenith in the top row,
+    the horizon in the middle. turn_rad: azimuth (to the right) of the middle column where `Light.heading` is 0.
+    """
+
+    pixels: np.ndarray
+    turn_rad: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Light:
     """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are
     linear radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
+    wet: how much water lies on the ground, in [0, 1]. panorama: the sky, instead of gradient and clouds. heading:
+    rad that the camera is turned to the right of where clouds, skyline and panorama have azimuth 0.
     """
 
     weather: str
@@ -29,12 +45,25 @@ class Light:
     haze_per_m: float
     clouds: float
     cloud_seed: float
+    wet: float = 0.0
+    panorama: Panorama | None = None
+    heading: float = 0.0
+
+    @property
+    def ahead(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors (3,) along the ground at azimuths 90 degrees and 0, float32."""
+        forward = np.array([0.0, 0.0, 1.0]) - self.up[2] * self.up
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, self.up)
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        return (right * cos + forward * sin).astype(np.float32), (forward * cos - right * sin).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
     """The camera. exposure: factor; white_balance (3,); contrast: exponent of the toe; vignette: loss in the
-    corners; blur_px: standard deviation; noise: standard deviation of a mid-grey pixel, of 1.
+    corners; blur_px: standard deviation; noise: standard deviation of a mid-grey pixel, of 1. streaks: rain in
+    the air, in [0, 1]; chromatic_px: how far red and blue miss their place in the image's corners.
     """
 
     exposure: float
@@ -43,6 +72,8 @@ class Response:
     vignette: float
     blur_px: float
     noise: float
+    streaks: float = 0.0
+    chromatic_px: float = 0.0
 
 
 def draw_light(rng: np.random.Generator, up: np.ndarray, sunny: bool) -> Light:
@@ -86,14 +117,41 @@ def draw_response(rng: np.random.Generator, weather: str) -> Response:
     )
 
 
+def _panorama_radiance(light: Light, panorama: Panorama, direction: np.ndarray) -> np.ndarray:
+    """Bilinear samples (n, 3) of a panorama in directions (n, 3); below the horizon, of the horizon."""
+    height, width = panorama.pixels.shape[:2]
+    right, forward = light.ahead
+    azimuth = np.arctan2(direction @ right, direction @ forward) - np.float32(panorama.turn_rad)
+    elevation = np.arcsin(np.clip(direction @ light.up.astype(np.float32), 0, 1))
+    turn = azimuth * np.float32(1 / (2 * np.pi)) + np.float32(0.5)
+    x = (turn - np.floor(turn)) * np.float32(width) - np.float32(0.5)
+    y = np.maximum((np.float32(0.5) - elevation * np.float32(1 / np.pi)) * np.float32(height) - np.float32(0.5), 0)
+    column, row = np.floor(x).astype(np.int32), np.floor(y).astype(np.int32)
+    across, down = (x - column)[:, None], (y - row)[:, None]
+    below = np.minimum(row + 1, height - 1)
+    left, right_side = column % width, (column + 1) % width
+    texels = panorama.pixels
+    upper = texels[row, left] * (1 - across) + texels[row, right_side] * across
+    lower = texels[below, left] * (1 - across) + texels[below, right_side] * across
+    return (upper * (1 - down) + lower * down).astype(np.float32)
+
+
+def _gradient(light: Light, height: np.ndarray) -> np.ndarray:
+    """Radiance (n, 3) of a clear sky at heights (n,), sines of the elevation."""
+    blend = np.sqrt(np.clip(height, 0, 1))[:, None]
+    return light.horizon.astype(np.float32) * (1 - blend) + light.zenith.astype(np.float32) * blend
+
+
 def sky_radiance(light: Light, direction: np.ndarray, noise: NoiseSet) -> np.ndarray:
     """Radiance (n, 3) of the sky in directions (n, 3) (unit, camera axes); below the horizon, of the horizon."""
+    if light.panorama is not None:
+        return _panorama_radiance(light, light.panorama, direction)
     height = np.clip(direction @ light.up.astype(np.float32), 0.0, 1.0)
-    blend = np.power(height, 0.5)[:, None]
-    colour = light.horizon.astype(np.float32) * (1 - blend) + light.zenith.astype(np.float32) * blend
+    colour = _gradient(light, height)
     if light.clouds > 0:
         reach = np.float32(60.0) / np.maximum(height + 0.09, 0.09)
-        field = sample(noise.soft, direction[:, 0] * reach + light.cloud_seed, direction[:, 2] * reach)
+        right, forward = light.ahead
+        field = sample(noise.soft, (direction @ right) * reach + light.cloud_seed, (direction @ forward) * reach)
         cover = np.clip((field - 1.6 + 2.6 * light.clouds) * 0.6, 0, 1) * min(light.clouds * 1.4, 1.0)
         white = light.horizon.astype(np.float32) * (1.15 + 0.1 * np.clip(field, -1.5, 1.5))[:, None]
         colour += (white - colour) * cover[:, None]
@@ -102,16 +160,25 @@ def sky_radiance(light: Light, direction: np.ndarray, noise: NoiseSet) -> np.nda
     return colour
 
 
-def reflected_radiance(light: Light, direction: np.ndarray, noise: NoiseSet, ground: np.ndarray) -> np.ndarray:
-    """What polished surfaces mirror from directions (n, 3): sky, a skyline of dark trees and houses, the road."""
+def reflected_radiance(
+    light: Light, direction: np.ndarray, noise: NoiseSet, ground: np.ndarray, soft: bool = False
+) -> np.ndarray:
+    """What smooth surfaces mirror from directions (n, 3): sky, a skyline of dark trees and houses, the road.
+
+    soft: as water on asphalt does, with a low and blurred skyline.
+    """
     height = direction @ light.up.astype(np.float32)
-    blend = np.sqrt(np.clip(height, 0, 1))[:, None]
-    sky = light.horizon.astype(np.float32) * (1 - blend) + light.zenith.astype(np.float32) * blend
-    azimuth = np.arctan2(direction[:, 0], direction[:, 2])
+    if light.panorama is not None:
+        sky = np.minimum(_panorama_radiance(light, light.panorama, direction), np.float32(PANORAMA_GLARE))
+    else:
+        sky = _gradient(light, height)
+    right, forward = light.ahead
+    azimuth = np.arctan2(direction @ right, direction @ forward)
     ridge = 0.20 + 0.09 * sample(noise.soft, azimuth * 81.4872 + light.cloud_seed, height * 20.0)
+    ridge, sharpness = (ridge * 0.45, 5.0) if soft else (ridge, 12.0)
     town = (light.ambient * 0.22 + light.sun_colour * 0.03).astype(np.float32)
     road = (ground * (light.ambient + 0.6 * light.sun_colour)).astype(np.float32)
-    above = np.clip((height - ridge) * 12.0 + 0.5, 0, 1)[:, None]
+    above = np.clip((height - ridge) * sharpness + 0.5, 0, 1)[:, None]
     below = np.clip(-height * 14.0 + 0.5, 0, 1)[:, None]
     return (sky * above + town * (1 - above)) * (1 - below) + road * below
 

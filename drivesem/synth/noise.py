@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 SIZE = 512
 """Texels along one side of every noise texture; textures tile."""
-_ROW = 4096
-"""Width of the table that samples are folded into: cv2.remap takes at most 32767 columns."""
+BYTE_SUM_SCALE = (4 * (256**2 - 1) / 12) ** -0.5
+"""One over the standard deviation of the sum of four uniform bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +44,34 @@ def noise_set(pool: int) -> NoiseSet:
 
 def sample(texture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Bilinear samples (n,) float32 of a tiling texture at texel coordinates x, y (n,)."""
-    n = x.shape[0]
-    if n == 0:
-        return np.zeros(0, np.float32)
-    rows = -(-n // _ROW)
-    maps = np.zeros((2, rows * _ROW), np.float32)
-    for axis, value in ((0, x), (1, y)):
-        out = maps[axis, :n]
-        np.multiply(value, np.float32(1.0 / SIZE), out=out, casting="unsafe")
-        out -= np.floor(out)
-        out *= np.float32(SIZE)
-        np.minimum(out, np.float32(SIZE - 1e-3), out=out)
-    grid = maps.reshape(2, rows, _ROW)
-    return cv2.remap(texture, grid[0], grid[1], cv2.INTER_LINEAR).reshape(-1)[:n]
+    column, across = _fold(x)
+    row, down = _fold(y)
+    flat = texture.reshape(-1)
+    at = row * np.int32(SIZE + 1) + column
+    upper = flat[at] * (1 - across) + flat[at + 1] * across
+    at += np.int32(SIZE + 1)
+    return upper * (1 - down) + (flat[at] * (1 - across) + flat[at + 1] * across) * down
+
+
+def _fold(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texel (n,) int32 in [0, SIZE) and the share (n,) of the one after it."""
+    turn = np.asarray(value, np.float32) * np.float32(1.0 / SIZE)
+    turn = np.minimum((turn - np.floor(turn)) * np.float32(SIZE), np.float32(SIZE - 1e-3))
+    texel = turn.astype(np.int32)
+    return texel, turn - texel.astype(np.float32)
+
+
+def white_noise(seed: int, count: int) -> np.ndarray:
+    """`count` nearly normal numbers of unit deviation, float32: the sum of four bytes of a hash of each number.
+
+    The hash is lowbias32. Source: C. Wellons 2018, "Prospecting for hash functions".
+    """
+    x = np.arange(count, dtype=np.uint32) * np.uint32(0x9E3779B9) ^ np.uint32(seed)
+    x ^= x >> 16
+    x *= np.uint32(0x7FEB352D)
+    x ^= x >> 15
+    x *= np.uint32(0x846CA68B)
+    x ^= x >> 16
+    pairs = (x & np.uint32(0x00FF00FF)) + ((x >> 8) & np.uint32(0x00FF00FF))
+    total = (pairs & np.uint32(0xFFFF)) + (pairs >> 16)
+    return (total.astype(np.float32) - np.float32(510.0)) * np.float32(BYTE_SUM_SCALE)

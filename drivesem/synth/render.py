@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 
+from drivesem.synth import kernels
 from drivesem.synth.layout import Road
 from drivesem.synth.light import Light, Response, develop, sky_radiance
-from drivesem.synth.noise import NoiseSet
+from drivesem.synth.noise import NoiseSet, white_noise
 from drivesem.synth.shading import Samples, shade, unit
 from drivesem.synth.soup import GROUND, Material, Soup
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
 from scene_ir.types import Camera
 
+Backend = Literal["warp", "reference"]
+"""Kernels, or the plain numpy that defines what they compute."""
 SUPERSAMPLING = 2
 """Samples a pixel along each axis."""
 _SHADOW_TEXELS = 1024
 _SHADOW_VIEWS_M = ((-15.0, 15.0, 1.0, 31.0), (-56.0, 56.0, -2.0, 110.0))
-"""Ground rectangles (x0, x1, z0, z1) that the near and the far shadow map cover."""
+"""Rectangles (x0, x1, z0, z1) of the ground that the near and the far shadow map cover, m to the right and ahead
+of the camera."""
 _SHADOW_DISTANCE_M = 3000.0
 """The sun stands this far away in shadow maps, so that their perspective is below a millimetre."""
 
@@ -87,10 +92,14 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class SunMaps:
-    """Depth along the sun's rays: (views, 2, texels, texels); the second axis is surroundings, actors."""
+    """Shadow maps. rows (3, 4): camera axes about the centre to x, z on the ground, to the right and ahead of the
+    camera, and the distance along the sun's rays; depth (views, 2, texels, texels): the least of it, the second
+    axis is surroundings, actors; areas: the views' (x0, x1, z0, z1), m.
+    """
 
     rows: np.ndarray
     depth: np.ndarray
+    areas: tuple[tuple[float, float, float, float], ...] = _SHADOW_VIEWS_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +117,8 @@ class Picture:
 @dataclass(frozen=True, slots=True)
 class Sight:
     """What the camera sees, at twice the resolution. faces: the triangles in view. face (2H, 2W) index into them,
-    -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32, -1 in the sky.
+    -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32, -1 in the sky;
+    semantic (2H, 2W) uint8, a `Semantic`.
     """
 
     faces: Soup
@@ -116,6 +126,11 @@ class Sight:
     depth: np.ndarray
     material: np.ndarray
     owner: np.ndarray
+    semantic: np.ndarray
+
+    def nearest(self) -> np.ndarray:
+        """(H, W) int64 flat indices into the fine arrays: of each pixel's samples, the nearest to the camera."""
+        return kernels.nearest(self.depth)
 
     @property
     def depth_m(self) -> np.ndarray:
@@ -175,7 +190,7 @@ def rasterise(
     return fragments.face.numpy(), fragments.depth.numpy()
 
 
-def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
+def sun_maps(soup: Soup, setting: Setting, backend: Backend = "warp") -> SunMaps | None:
     """Shadow maps over the ground, or None without sun. soup: camera axes about the centre of projection."""
     light, view = setting.light, setting.view
     if float(light.sun_colour.max()) <= 0.01:
@@ -184,8 +199,14 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
     sun = light.sun @ view.rotation
     slope = np.array([sun[0], sun[2]]) / -sun[1]
     to_ground = np.array([[1.0, slope[0], 0.0], [0.0, slope[1], 1.0], [0.0, 1.0 / -sun[1], 0.0]])
-    rows = to_ground @ view.rotation.T
-    shift = to_ground @ view.to_world(view.centre)
+    # Maps lie before the camera, wherever it stands and looks.
+    cos, sin = np.cos(view.heading), np.sin(view.heading)
+    to_map = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    rows = to_map @ to_ground @ view.rotation.T
+    shift = to_map @ (to_ground @ view.to_world(view.centre) - [*view.position_xz, 0.0])
+    placing = np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32)
+    if backend == "warp":
+        return SunMaps(placing, kernels.sun_depth(soup, placing, _SHADOW_VIEWS_M, _SHADOW_TEXELS))
     ground = np.isin(soup.material, GROUND)
     corners = soup.corners[~ground]
     actor = soup.owner[~ground] > 0
@@ -205,7 +226,7 @@ def _sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
             clip = np.concatenate([pixels * w, w], axis=-1)
             _, found = rasterise(clip, np.eye(3), np.array([[0, 0, size, size]]), np.array([[0, len(points)]]))
             depth[i, j] = found.reshape(size, size) - np.float32(_SHADOW_DISTANCE_M)
-    return SunMaps(np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32), depth)
+    return SunMaps(placing, depth)
 
 
 def _lit(
@@ -306,23 +327,23 @@ def see(soup: Soup, view: View) -> Sight:
     size = (SUPERSAMPLING * view.camera.height, SUPERSAMPLING * view.camera.width)
     rect = np.array([[0, 0, size[1], size[0]]])
     face, depth = rasterise(seen.corners, fine_matrix(view), rect, np.array([[0, len(seen)]]))
-    hit, safe = face >= 0, np.maximum(face, 0)
-    material = np.where(hit, seen.material[safe], np.uint8(Material.SKY))
-    owner = np.where(hit, seen.owner[safe], np.int32(-1))
-    return Sight(seen, face.reshape(size), depth.reshape(size), material.reshape(size), owner.reshape(size))
+    face, depth = face.reshape(size), depth.reshape(size)
+    return Sight(seen, face, depth, *kernels.owners(face, seen))
 
 
-def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
+def render(
+    sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting, backend: Backend = "warp"
+) -> Picture:
     """Photograph a world. sight: of the soup; shadows: of the actors in it."""
-    maps = _sun_maps(soup, setting)
+    maps = sun_maps(soup, setting, backend)
     pixels = setting.view.camera.height * setting.view.camera.width
     blank = np.empty((pixels, 3), np.float32)
-    developed, touched = _develop_pixels(sight, setting, maps, shadows, (blank, np.ones(pixels, bool)))
-    image = _camera(developed.reshape(setting.view.camera.height, -1, 3), setting)
+    developed, touched = _develop_pixels(sight, setting, maps, shadows, (blank, np.ones(pixels, bool)), backend)
+    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting, backend)
     return Picture(image, developed, touched, maps)
 
 
-def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
+def render_without_actors(sight: Sight, full: Picture, setting: Setting, backend: Backend = "warp") -> Picture:
     """The same photograph with no actors. sight: of the surroundings alone; full: with actors. Shades only
     what they touched.
     """
@@ -331,8 +352,9 @@ def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Pict
         depth = maps.depth.copy()
         depth[:, 1] = np.inf
         maps = SunMaps(maps.rows, depth)
-    developed, _ = _develop_pixels(sight, setting, maps, [], (full.developed.copy(), full.touched))
-    image = _camera(developed.reshape(setting.view.camera.height, -1, 3), setting)
+    target = full.developed.copy(), full.touched
+    developed, _ = _develop_pixels(sight, setting, maps, [], target, backend)
+    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting, backend)
     return Picture(image, developed, np.zeros_like(full.touched), maps)
 
 
@@ -342,11 +364,15 @@ def _develop_pixels(
     maps: SunMaps | None,
     shadows: list[Shadow],
     target: tuple[np.ndarray, np.ndarray],
+    backend: Backend,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the
     image and the pixels that actors touch.
     """
     image, wanted = target
+    if backend == "warp":
+        fine = fine_matrix(setting.view)
+        return image, kernels.develop_pixels(sight, setting, maps, shadows, (image, wanted, fine))
     n, width = SUPERSAMPLING, setting.view.camera.width
     once, apart = _shading_sites(sight)
     whole, parts = np.flatnonzero(once & wanted), np.flatnonzero(apart & wanted)
@@ -459,15 +485,66 @@ def _attribute_maps(seen: Soup, used: np.ndarray) -> np.ndarray:
     return np.einsum("mik,mij->mkj", values, rows).astype(np.float32)
 
 
-def _camera(image: np.ndarray, setting: Setting) -> np.ndarray:
-    """Lens and sensor: (H, W, 3) display values to uint8, with vignetting, blur and noise."""
+def take(image: np.ndarray, setting: Setting, backend: Backend = "warp") -> np.ndarray:
+    """Lens and sensor: (H, W, 3) display values to uint8, with chromatic error, blur, rain, vignette and noise."""
     response = setting.response
-    height, width = image.shape[:2]
+    image = _fringed(image, response.chromatic_px) if response.chromatic_px > 0 else image
     out = cv2.GaussianBlur(image, (5, 5), response.blur_px)
+    if response.streaks > 0:
+        _streak(out, response.streaks, np.random.default_rng([*setting.grain_seed, 0x5A1]))
+    seed = int(np.random.SeedSequence(list(setting.grain_seed)).generate_state(1)[0])
+    if backend == "warp":
+        return kernels.expose(out, response, seed)
+    height, width = out.shape[:2]
     x = np.linspace(-1, 1, width, dtype=np.float32)[None]
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None] * np.float32(height / width)
     out *= (1 - np.float32(response.vignette) * (x * x + y * y))[..., None]
-    rng = np.random.default_rng(list(setting.grain_seed))
-    grain = rng.standard_normal((height, width, 3), dtype=np.float32)
-    out += grain * (np.float32(response.noise) * (0.4 + np.sqrt(np.maximum(out, 0))))
+    grain = white_noise(seed, out.size).reshape(out.shape)
+    out += grain * (np.float32(response.noise) * (np.float32(0.4) + np.sqrt(np.maximum(out, 0))))
     return np.clip(np.rint(out * 255), 0, 255).astype(np.uint8)
+
+
+def _fringed(image: np.ndarray, shift_px: float) -> np.ndarray:
+    """Red a little larger and blue a little smaller about the image's centre: by `shift_px` in the corners."""
+    height, width = image.shape[:2]
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    share = shift_px / float(np.hypot(*middle))
+    out = image.copy()
+    for channel, scale in ((0, 1 + share), (2, 1 - share)):
+        to_source = np.concatenate([np.eye(2) / scale, (middle * (1 - 1 / scale))[:, None]], axis=1)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        plane = np.ascontiguousarray(image[..., channel])
+        out[..., channel] = cv2.warpAffine(
+            plane, to_source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+    return out
+
+
+_STREAKS = ((520, (6.0, 18.0), 1, 0.10), (130, (18.0, 46.0), 1, 0.16), (16, (50.0, 110.0), 2, 0.14))
+"""Rain at three distances: streaks in an image of KITTI's size, lengths px, thickness px, opacity."""
+
+
+def _streak(image: np.ndarray, amount: float, rng: np.random.Generator) -> None:
+    """Draw falling drops, blurred by their speed, over display values (H, W, 3), in place: they show the sky."""
+    height, width = image.shape[:2]
+    slant = float(rng.normal(0, 0.12))
+    veil = np.zeros((height, width), np.float32)
+    for number, (shortest, longest), thickness, opacity in _STREAKS:
+        count = round(number * amount * height * width / (375 * 1242))
+        top = rng.uniform((-40, -40), (width + 40, height), (count, 2))
+        length = rng.uniform(shortest, longest, count)
+        lean = slant + rng.normal(0, 0.03, count)
+        ends = top + np.stack([np.sin(lean), np.cos(lean)], axis=1) * length[:, None]
+        layer = np.zeros((height, width), np.uint8)
+        strength = rng.uniform(0.35, 1.0, count)
+        for a, b, value in zip(
+            np.rint(top * 16).astype(int), np.rint(ends * 16).astype(int), strength, strict=True
+        ):
+            cv2.line(layer, a.tolist(), b.tolist(), float(255 * value), thickness, cv2.LINE_AA, 4)
+        veil += layer * np.float32(opacity * (0.5 + 0.5 * amount) / 255)
+    veil = cv2.GaussianBlur(veil, (3, 3), 0.6)[..., None]
+    image += (np.float32(_STREAK_BRIGHTNESS) - image) * veil
+
+
+_STREAK_BRIGHTNESS = 0.85
+"""Display value of a drop: what lies behind, upside down, mostly sky."""

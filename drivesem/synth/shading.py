@@ -14,6 +14,27 @@ from drivesem.synth.soup import GROUND, Material
 _F = np.float32
 
 
+def _soaked() -> np.ndarray:
+    table = np.zeros((len(Material), 3), np.float32)
+    table[Material.ROAD] = 0.42, 0.30, 0.70
+    table[[Material.PARKING, Material.PAVEMENT]] = 0.36, 0.22, 0.55
+    table[Material.KERB] = 0.36, 0.15, 0.0
+    table[Material.GRAVEL] = 0.36, 0.04, 0.60
+    table[Material.ROOF] = 0.30, 0.10, 0.0
+    table[[Material.GRASS, Material.FACADE, Material.WALL, Material.FENCE, Material.BARK], 0] = 0.2
+    table[Material.LEAF, 0] = 0.1
+    return table
+
+
+MIRRORED_GROUND = 0.12
+"""Albedo of the ground as seen in reflections."""
+SOAKED = _soaked()
+"""Of each material: the share of its light that it loses when wet, how much of it mirrors as a film of water, how
+much more in puddles. Wet, porous ground is about half as bright. Source: Lekner and Dorf 1988, "Why some things
+are darker when wet".
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class Samples:
     """n surface samples. point (n, 3): camera axes, from the camera's centre, m; world (n, 3): m, ground at y = 0;
@@ -159,7 +180,10 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     mirror = view + 2 * cosine[:, None] * s.normal
     fresnel = 0.06 + 0.94 * (1 - cosine) ** 5
     tilt = mirror + (0.02 * cell)[:, None] * light.up.astype(_F)
-    glare = reflected_radiance(light, tilt.astype(_F), noise, np.full(3, 0.12)) * (fresnel * pane * 0.8)[:, None]
+    glare = (
+        reflected_radiance(light, tilt.astype(_F), noise, np.full(3, MIRRORED_GROUND))
+        * (fresnel * pane * 0.8)[:, None]
+    )
     return albedo, glare
 
 
@@ -184,7 +208,7 @@ def _polish(
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)
     fresnel = gloss[0] + (1 - gloss[0]) * (1 - cosine) ** 5
-    env = reflected_radiance(light, mirror, noise, np.full(3, 0.12))
+    env = reflected_radiance(light, mirror, noise, np.full(3, MIRRORED_GROUND))
     hidden = 0.35 + 0.65 * s.open_sky
     out = env * (fresnel * gloss[1] * hidden)[:, None]
     glint = np.clip(mirror @ light.sun.astype(_F), 0, 1)
@@ -193,16 +217,23 @@ def _polish(
     return base + out
 
 
+def ground_light(light: Light) -> np.ndarray:
+    """Radiance (3,) that the ground casts on what faces down."""
+    return 0.16 * (light.ambient + 0.6 * light.sun_colour)
+
+
 def shade(s: Samples, road: Road, light: Light, noise: NoiseSet, camera_height_m: float) -> np.ndarray:
     """Linear radiance (n, 3) of the samples as seen by the camera, haze included."""
     out = np.zeros((len(s.material), 3), _F)
-    bounce = 0.16 * (light.ambient + 0.6 * light.sun_colour)
+    bounce = ground_light(light)
     order = np.argsort(s.material, kind="stable")
     bounds = np.searchsorted(s.material[order], np.arange(len(Material) + 1))
     for material in Material:
         index = order[bounds[material] : bounds[material + 1]]
         if len(index):
-            out[index] = _surface(s.take(index), material, road, light, noise, (bounce, camera_height_m))
+            some = s.take(index)
+            colour = _surface(some, material, road, light, noise, (bounce, camera_height_m))
+            out[index] = _wetted(some, material, colour, light, noise) if light.wet > 0 else colour
     distance = np.sqrt(np.einsum("ni,ni->n", s.point, s.point))
     through = np.exp(-light.haze_per_m * distance)[:, None].astype(_F)
     air = light.horizon * 0.6
@@ -254,7 +285,7 @@ def _surface(
         tone = 1 + 0.3 * _noise(noise.rough, (p[:, 0] + p[:, 2]) * 3, p[:, 1], 0.04)
         return s.albedo * np.maximum(tone, 0.3)[:, None] * incoming
     if material == Material.PAINT:
-        return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05, 1.0, 600.0))
+        return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05 + 0.02 * light.wet, 1.0, 600.0))
     if material == Material.GLASS:
         return _polish(s, light, noise, _rgb(0.022, 0.025, 0.026) * incoming, (0.07, 1.0, 900.0))
     if material == Material.LIGHT:
@@ -267,6 +298,22 @@ def _surface(
         tone = 1 + 0.08 * _noise(noise.soft, s.world[:, 0] + s.world[:, 2], s.world[:, 1], 0.03)
         return _polish(s, light, noise, s.albedo * tone[:, None] * incoming, (0.03, 0.4, 60.0))
     return s.albedo * incoming
+
+
+def _wetted(s: Samples, material: Material, dry: np.ndarray, light: Light, noise: NoiseSet) -> np.ndarray:
+    """Radiance (n, 3) after rain of what is `dry` before: darker, mirroring sky and skyline where water lies."""
+    loss, film, more = SOAKED[material]
+    out = dry * (1 - loss * _F(light.wet))
+    if film + more <= 0:
+        return out
+    puddle = np.clip((_noise(noise.soft, s.world[:, 0] + 17, s.world[:, 2], 0.06) - 0.5) * 3.0, 0, 1)
+    cover = _F(light.wet) * (film + more * puddle)
+    view = unit(s.point)
+    cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
+    share = (0.02 + 0.98 * (1 - cosine) ** 5) * cover
+    mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)
+    env = reflected_radiance(light, mirror, noise, np.full(3, MIRRORED_GROUND), soft=True)
+    return out * (1 - share)[:, None] + env * (share * (0.25 + 0.75 * s.open_sky))[:, None]
 
 
 def _dirty(s: Samples, noise: NoiseSet) -> np.ndarray:

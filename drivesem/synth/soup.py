@@ -144,9 +144,12 @@ def placed(
     cos, sin = np.cos(yaw), np.sin(yaw)
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
     size = np.asarray(scale, np.float32)
-    corners = (soup.corners * size) @ turn.T + np.asarray(position, np.float32)
-    normals = (soup.normals / size) @ turn.T
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    # one product of many rows is far quicker than many products of three
+    corners = (soup.corners.reshape(-1, 3) @ (turn * size).T + np.asarray(position, np.float32)).reshape(-1, 3, 3)
+    normals = soup.normals.reshape(-1, 3) @ (turn / size).T
+    if (size != 1).any():
+        normals /= np.sqrt(np.maximum(np.einsum("ni,ni->n", normals, normals), 1e-24))[:, None]
+    normals = normals.reshape(-1, 3, 3)
     return replace(soup, corners=corners, normals=normals)
 
 
@@ -262,3 +265,25 @@ def ball(
     normals = sphere / np.asarray(radii, np.float32)
     normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     return make(sphere * np.asarray(radii, np.float32) + np.asarray(centre, np.float32), material, albedo, normals)
+
+
+def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray:
+    """Corner normals (F, 3, 3): averaged over faces that meet at a point at less than the crease angle."""
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(flat, axis=1, keepdims=True)
+    unit = flat / np.maximum(area, 1e-12)
+    grid = np.round(corners.reshape(-1, 3) * 2000).astype(np.int64) + 2**19
+    _, point = np.unique((grid[:, 0] << 40) | (grid[:, 1] << 20) | grid[:, 2], return_inverse=True)
+    face = np.repeat(np.arange(len(corners)), 3)
+    order = np.argsort(point, kind="stable")
+    starts = np.searchsorted(point[order], np.arange(point.max() + 2))
+    counts = np.diff(starts)
+    summed = np.zeros((len(point), 3))
+    limit = np.cos(crease_rad)
+    for step in range(int(counts.max(initial=0))):
+        has = counts[point] > step
+        other = face[order[np.minimum(starts[point] + step, len(order) - 1)]]
+        close = has & ((unit[face] * unit[other]).sum(axis=1) > limit)
+        summed[close] += flat[other[close]]
+    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
+    return summed.reshape(-1, 3, 3).astype(np.float32)

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 
-from drivesem.synth import buildings, flora, people
+from drivesem.synth import buildings, flora, people, vehicles
 from drivesem.synth.layout import Actor, Road
-from drivesem.synth.soup import Material, Semantic, Soup, ball, box, join, make, placed, quad, stick, tagged
-from scene_ir.meshes.templates import template
-from scene_ir.types import Part
+from drivesem.synth.soup import (
+    Material,
+    Semantic,
+    Soup,
+    ball,
+    box,
+    join,
+    make,
+    placed,
+    quad,
+    stick,
+    tagged,
+)
 
 _STATIONS_M = np.array([-14, -8, -4, 0, 4, 8, 12, 18, 24, 32, 40, 50, 62, 76, 92, 110, 135, 165, 200.0])
 """Where ribbons of ground are cut along s; gentle bends need no more."""
@@ -25,14 +34,11 @@ _GROUND_ALBEDO = {
     Material.GRAVEL: (0.17, 0.15, 0.125),
 }
 """Linear albedo; asphalt 0.08 to 0.15, concrete 0.2 to 0.3, grass about 0.1 in the visible range."""
-_PART_MATERIAL = {
-    Part.PAINT: Material.PAINT,
-    Part.GLASS: Material.GLASS,
-    Part.TYRE: Material.TYRE,
-    Part.LIGHT: Material.LIGHT,
-    Part.OTHER: Material.TRIM,
-}
-
+_LEAVES = 52_000
+"""Triangles of plants on one side of the road; once they are spent, what follows (farther away) is coarse."""
+_FINE_M = 26.0
+"""Nearer vehicles have plates with characters, seams and bars in their grilles: beyond, these are below a
+pixel."""
 _SEMANTIC = {
     "Car": Semantic.CAR,
     "Van": Semantic.VAN,
@@ -63,6 +69,7 @@ class _Builder:
     def __init__(self, road: Road, pool: Pool, rng: np.random.Generator) -> None:
         self.road, self.pool, self.rng = road, pool, rng
         self.parts: list[Soup] = []
+        self.leaves = 0
         self.used: dict[str, set[int]] = {"building": set(), "tree": set(), "bush": set(), "surface": set()}
 
     def draw(self, name: str, count: int) -> int:
@@ -188,7 +195,17 @@ def _ribbon(
 
 
 def _detail(distance_m: float) -> int:
-    return 3 if distance_m < 10 else 2 if distance_m < 19 else 1 if distance_m < 42 else 0
+    return 3 if distance_m < 11 else 2 if distance_m < 24 else 1 if distance_m < 48 else 0
+
+
+def _plant_detail(b: _Builder, spot: tuple[float, float], scale: float, reach_m: float) -> int:
+    """Level of detail of a plant at (x, z) with leaves of 1 / scale the usual size: what the flank affords."""
+    x, z = spot
+    if abs(x) - reach_m > 1.1 * z + 2:
+        # out of sight for a camera that looks along the road: it throws shadows
+        return min(_detail(float(np.hypot(x, z)) * scale), 1)
+    most = 3 if b.leaves < _LEAVES // 2 else 2 if b.leaves < _LEAVES else 0
+    return min(_detail(float(np.hypot(x, max(z, 0.0))) * scale), most)
 
 
 def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
@@ -196,10 +213,12 @@ def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
         return
     identifier = b.draw("tree", b.pool.trees)
     x, z = b.road.point(d, s)
-    detail = _detail(float(np.hypot(x, max(z, 0.0))) * 9.0 / height_m)
+    detail = _plant_detail(b, (float(x), float(z)), 9.0 / height_m, 0.35 * height_m)
     width = height_m * float(b.rng.uniform(0.85, 1.15))
+    soup = flora.tree(identifier, detail)
+    b.leaves += len(soup)
     b.put(
-        tagged(flora.tree(identifier, detail), Semantic.TREE),
+        tagged(soup, Semantic.TREE),
         d,
         s,
         float(b.rng.uniform(0, 6.28)),
@@ -212,8 +231,12 @@ def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
         return
     identifier = b.draw("bush", b.pool.trees)
     wide = size_m * float(b.rng.uniform(0.9, 1.5))
+    x, z = b.road.point(d, s)
+    detail = _plant_detail(b, (float(x), float(z)), 1.4 / size_m, wide)
+    soup = flora.bush(identifier, detail)
+    b.leaves += len(soup)
     b.put(
-        flora.bush(identifier, _detail(float(np.hypot(d, s)) * 1.4 / size_m)),
+        soup,
         d,
         s,
         float(b.rng.uniform(0, 6.28)),
@@ -233,7 +256,15 @@ def _city_row(b: _Builder, side: int, edge: float) -> None:
         if b.free(middle, length / 2) and rng.random() < 0.92:
             levels = max(storeys + int(rng.integers(-1, 2)), 1)
             identifier = b.draw("building", b.pool.buildings)
-            soup = buildings.building(identifier, length, depth, levels, along=bool(rng.random() < 0.8))
+            soup = buildings.building(
+                identifier,
+                length,
+                depth,
+                levels,
+                bool(rng.random() < 0.8),
+                front=float(side) * (middle < 70),
+                city=True,
+            )
             b.put(soup, edge + side * (set_back + depth / 2 + float(rng.uniform(0, 0.4))), middle)
         s += length + (float(rng.uniform(3, 8)) if rng.random() < 0.15 else 0.02)
 
@@ -248,7 +279,14 @@ def _houses(b: _Builder, side: int, edge: float) -> None:
         middle, back = s + length / 2, float(rng.uniform(2.5, 8.0))
         if b.free(middle, length / 2 + 1):
             identifier = b.draw("building", b.pool.buildings)
-            soup = buildings.building(identifier, length, depth, int(rng.integers(1, 4)), bool(rng.random() < 0.6))
+            soup = buildings.building(
+                identifier,
+                length,
+                depth,
+                int(rng.integers(1, 4)),
+                bool(rng.random() < 0.6),
+                front=float(side) * (middle < 70),
+            )
             b.put(soup, edge + side * (back + depth / 2), middle)
             plot = length + gap - 0.6
             _boundary(b, side, edge + side * float(rng.uniform(0.2, 0.5)), middle, plot)
@@ -274,7 +312,7 @@ def _boundary(b: _Builder, side: int, d: float, middle: float, length: float) ->
     height = float(rng.uniform(0.7, 1.7))
     if draw < 0.4:
         b.put(
-            flora.hedge(length, height, 0.7, _detail(float(np.hypot(d, middle - length / 4))), rng),
+            flora.hedge((length, height, 0.7), float(side), _detail(float(np.hypot(d, middle - length / 4))), rng),
             d + side * 0.35,
             middle,
         )
@@ -284,6 +322,9 @@ def _boundary(b: _Builder, side: int, d: float, middle: float, length: float) ->
     elif draw < 0.78:
         colour = np.array([0.17, 0.11, 0.06]) * rng.uniform(0.6, 1.6)
         b.put(buildings.garden_wall(length, height, Material.FENCE, colour), d, middle)
+    elif draw < 0.92:
+        colour = np.full(3, 0.05) * rng.uniform(0.5, 4.0)
+        b.put(tagged(buildings.railing(length, height, colour), Semantic.BUILDING), d, middle)
 
 
 def _tree_row(b: _Builder, d: float, spacing: tuple[float, float], height: tuple[float, float]) -> None:
@@ -436,6 +477,7 @@ def surroundings(road: Road, pool: Pool, rng: np.random.Generator) -> tuple[Soup
 def _flank(b: _Builder, side: int, edge: float) -> None:
     """What stands beside the road on one side."""
     rng, kind = b.rng, b.road.kind
+    b.leaves = 0
     if kind in ("residential", "city", "junction"):
         draw = rng.random()
         if draw < (0.75 if kind == "residential" else 0.25):
@@ -494,58 +536,16 @@ def _hill(b: _Builder) -> None:
     )
 
 
-@lru_cache(maxsize=96)
-def _vehicle_soup(kind: str, variant: int) -> Soup:
-    """A template in its unit box with its parts' materials; painted faces keep their own tint (light grey)."""
-    mesh = template(kind, variant)
-    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    corners = vertices[faces]
-    colours = (
-        mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
-    )
-    part = mesh.part.numpy()
-    material = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)[part]
-    soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5))
-    soup.material[:] = material
-    soup.albedo[:] = np.power(np.clip(colours, 0, 1), 2.2)
-    soup.normals[:] = creased_normals(corners * np.array([4.0, 1.5, 1.7], np.float32))
-    return soup
+def actor_soup(actor: Actor, owner: int, distance_m: float = 0.0) -> Soup:
+    """An actor's triangles in its own axes (front +x, bottom at y = 0), in metres, painted.
 
-
-def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray:
-    """Corner normals (F, 3, 3): averaged over faces that meet at a point at less than the crease angle."""
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(flat, axis=1, keepdims=True)
-    unit = flat / np.maximum(area, 1e-12)
-    grid = np.round(corners.reshape(-1, 3) * 2000).astype(np.int64) + 2**19
-    _, point = np.unique((grid[:, 0] << 40) | (grid[:, 1] << 20) | grid[:, 2], return_inverse=True)
-    face = np.repeat(np.arange(len(corners)), 3)
-    order = np.argsort(point, kind="stable")
-    starts = np.searchsorted(point[order], np.arange(point.max() + 2))
-    counts = np.diff(starts)
-    summed = np.zeros((len(point), 3))
-    limit = np.cos(crease_rad)
-    for step in range(int(counts.max(initial=0))):
-        has = counts[point] > step
-        other = face[order[np.minimum(starts[point] + step, len(order) - 1)]]
-        close = has & ((unit[face] * unit[other]).sum(axis=1) > limit)
-        summed[close] += flat[other[close]]
-    summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
-    return summed.reshape(-1, 3, 3).astype(np.float32)
-
-
-def actor_soup(actor: Actor, owner: int) -> Soup:
-    """An actor's triangles in its own axes (front +x, bottom at y = 0), in metres, painted."""
+    distance_m: from the camera; what is far away gets fewer details inside the same outline.
+    """
     if actor.label in ("Pedestrian", "Cyclist"):
         rng = np.random.default_rng([0x9E0, actor.seed])
         figure = people.pedestrian(rng) if actor.kind == "pedestrian" else people.cyclist(rng)
         scale = actor.size_lhw[1] / 1.75
         soup = placed(figure, (0, 0, 0), 0.0, (scale, scale, scale))
     else:
-        soup = placed(_vehicle_soup(actor.kind, actor.variant), (0, 0, 0), 0.0, actor.size_lhw)
-        albedo = soup.albedo.copy()
-        paint = soup.material == Material.PAINT
-        tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
-        albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
-        soup = replace(soup, albedo=albedo)
+        soup = placed(vehicles.vehicle(actor, distance_m < _FINE_M), (0, 0, 0), 0.0, actor.size_lhw)
     return replace(tagged(soup, _SEMANTIC[actor.label]), owner=np.full(len(soup), owner, np.int32))

@@ -1,107 +1,253 @@
-"""Synthetic frames as a KITTI folder: images, labels, calibration, and a manifest of what was used."""
+"""Generated frames as a data set on disk: in parallel, gone on with where a run stopped, the same bytes each
+time."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import multiprocessing
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
-import cv2
-
-from drivesem.data.kitti import format_calib, write_labels
-from drivesem.synth.frames import SPLITS, SynthFrame, SynthSettings, generate_frame
+from drivesem.data.registry import WRITERS, Writer
+from drivesem.data.truth import Place
+from drivesem.data.vkitti2 import Vkitti2Writer
+from drivesem.synth.edits import Edits, apply_edits, read_edits
+from drivesem.synth.exposure import expose
+from drivesem.synth.frames import (
+    GENERATOR_VERSION,
+    SPLITS,
+    VARIANTS,
+    Plan,
+    SynthFrame,
+    SynthSettings,
+    plan_frame,
+    render_frame,
+    second_camera,
+    variation_of,
+)
+from drivesem.synth.layout import LayoutSettings
+from drivesem.synth.variations import MIXED, parse_variations
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
-MANIFEST_VERSION = 1
-_PNG_COMPRESSION = 1
-"""Fast and about 15 % larger than zlib's best."""
+MANIFEST_VERSION = 2
+_STATE = ".drivesem"
+"""Hidden folder for what a run needs to go on: readers of the layouts never look into it."""
+_FIRST_WORLDS = (1, 2, 6, 18, 20)
+"""Virtual KITTI's; further scenes take the numbers between and after."""
+_STREETS_A_SCENE = 10
+"""Single streets that share one of Virtual KITTI's scenes: their tracks stay below the 254 that its 8-bit instance
+images can tell apart."""
+TRACKS_A_STREET = 25
+"""Track numbers set apart for each of those."""
+Engine = Callable[["Callable[[Job], int]", "Sequence[Job]"], Iterator[int]]
+"""Runs a function over independent jobs and yields the numbers of those done, in any order: processes here, and
+room for a cluster's scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class Order:
+    """What to make. out: folder; frames: how many streets' frames, each in every one of `variations` (Virtual
+    KITTI's names, or "mixed": weather of its own). layout: of `drivesem.data.registry.WRITERS`. split: pool of
+    shapes, "train" or "heldout". sequence: frames of one drive. people: pedestrians and cyclists too. cameras: 2
+    for Virtual KITTI 2's stereo. validation: share of the frames that belong to part "val", made of held-out
+    shapes. edits: a YAML file of `drivesem.synth.edits`. meshes, assets: folders of vehicles, of the optional
+    pack.
+    """
+
     out: Path
+    frames: int
+    seed: int = 0
+    layout: str = "kitti"
+    split: str = "train"
+    variations: tuple[str, ...] = (MIXED,)
+    sequence: int = 1
+    people: bool = True
+    cameras: int = 1
+    validation: float = 0.0
+    edits: Path | None = None
+    meshes: Path | None = None
+    assets: Path | None = None
+    resume: bool = True
+
+    def __post_init__(self) -> None:
+        for name, value in (("frames", self.frames), ("sequence", self.sequence)):
+            if value < 1:
+                raise RangeError(f"synth {name}", "at least 1", value)
+        if self.split not in SPLITS:
+            raise RangeError("synth split", " or ".join(SPLITS), self.split)
+        if self.layout not in WRITERS:
+            raise RangeError("synth layout", f"one of {', '.join(WRITERS)}", self.layout)
+        if not 0 <= self.validation < 1:
+            raise RangeError("synth validation", "a share in [0, 1)", self.validation)
+        if self.cameras not in (1, 2) or (self.cameras == 2 and self.layout != "vkitti2"):
+            raise RangeError("synth cameras", "1, or 2 in layout vkitti2", self.cameras)
+        if self.people and self.layout.startswith("vkitti"):
+            raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
+        parse_variations(",".join(self.variations))
+
+    def recipe(self) -> dict[str, object]:
+        """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""
+        told = {k: v for k, v in asdict(self).items() if k not in ("out", "frames", "resume")}
+        told["variations"] = list(self.variations)
+        if self.edits is not None:
+            told["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
+        for name in ("meshes", "assets"):
+            folder = getattr(self, name)
+            told[name] = None if folder is None else folder.name
+        return {"generator": GENERATOR_VERSION, "version": MANIFEST_VERSION, **told}
+
+    def places(self) -> list[Place]:
+        """The frames of the data set, in order: frame by frame, each in all its variations."""
+        found = []
+        for index in range(self.frames):
+            street, time = divmod(index, self.sequence)
+            per_scene = 1 if self.sequence > 1 else _STREETS_A_SCENE
+            scene, inside = divmod(street, per_scene)
+            for variation in self.variations:
+                place = Place(
+                    number=len(found),
+                    scene=_scene_name(scene),
+                    variation="clone" if variation == MIXED else variation,
+                    frame=inside * self.sequence + time,
+                    part=self._part(street),
+                )
+                found.append(place)
+        return found
+
+    def _part(self, street: int) -> str:
+        """Which part a street's frames belong to: every so-and-so-many-th is for validation, evenly spread."""
+        share = self.validation
+        return "val" if int((street + 1) * share + 1e-9) > int(street * share + 1e-9) else "train"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One frame to make."""
+
+    order: Order
+    place: Place
     index: int
-    seed: int
-    split: str
-    settings: SynthSettings
-    keep: bool
+    variation: str
 
 
-def _paths(out: Path, index: int) -> tuple[Path, Path, Path, Path]:
-    """Image, labels, calibration and manifest entry of a frame."""
-    root, name = out / "training", f"{index:06d}"
-    return (
-        root / "image_2" / f"{name}.png",
-        root / "label_2" / f"{name}.txt",
-        root / "calib" / f"{name}.txt",
-        out / "entries" / f"{name}.json",
+def _scene_name(scene: int) -> str:
+    others = (n for n in range(1, scene + len(_FIRST_WORLDS) + 1) if n not in _FIRST_WORLDS)
+    return f"{[*_FIRST_WORLDS, *others][scene]:02d}"
+
+
+def _entry_path(out: Path, number: int) -> Path:
+    return out / _STATE / f"{number // 1000:03d}" / f"{number:06d}.json"
+
+
+@lru_cache(maxsize=2)
+def _edits_of(path: Path | None) -> Edits:
+    return {} if path is None else read_edits(path)
+
+
+def _writer(order: Order) -> Writer:
+    return Vkitti2Writer(order.out, 2) if order.cameras == 2 else WRITERS[order.layout](order.out)
+
+
+def _rendered(plan: Plan) -> SynthFrame:
+    frame = render_frame(plan)
+    assert frame is not None
+    return frame
+
+
+def make_frame(job: Job) -> int:
+    """Make one frame, with all its files, and leave its entry; the frame's number. Done before: nothing to do."""
+    order, place = job.order, job.place
+    writer = _writer(order)
+    entry_path = _entry_path(order.out, place.number)
+    if order.resume and entry_path.exists() and writer.exists(place):
+        return place.number
+    split = "heldout" if place.part == "val" else order.split
+    virtual = order.layout.startswith("vkitti")
+    settings = SynthSettings(
+        layout=LayoutSettings(variants=VARIANTS[split], people=order.people),
+        sunny=job.variation != MIXED,
+        camera=order.layout if order.layout in ("vkitti1", "vkitti2") else None,
+        sequence=order.sequence,
     )
-
-
-def write_frame(out: Path, index: int, frame: SynthFrame) -> None:
-    """Write one frame into a KITTI folder, each file atomically; where the image is, the frame is whole."""
-    image, labels, calib, entry = _paths(out, index)
-    for path in (image, labels, calib, entry):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_labels(labels, frame.labels)
-    files.write_text(calib, format_calib(frame.camera.matrix))
-    files.write_json(entry, frame.manifest)
-    _, data = cv2.imencode(".png", frame.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION])
-    files.write_bytes(image, data.tobytes())
-
-
-def _work(job: _Job) -> int:
-    image = _paths(job.out, job.index)[0]
-    if not (job.keep and image.exists()):
-        write_frame(job.out, job.index, generate_frame(job.seed, job.index, job.split, job.settings))
-    return job.index
+    plan = variation_of(plan_frame(order.seed, job.index, split, settings), job.variation)
+    plan = apply_edits(plan, _edits_of(order.edits), job.index)
+    first_track = 0
+    if virtual and order.sequence == 1:
+        first_track = TRACKS_A_STREET * (job.index % _STREETS_A_SCENE)
+    exposure = expose(_rendered(plan), first_track)
+    written = []
+    if isinstance(writer, Vkitti2Writer) and order.cameras == 2:
+        # The left camera last: where its photograph is, the frame is whole.
+        written.append(writer.write(place, expose(_rendered(second_camera(plan)), first_track), camera=1))
+    written.append(writer.write(place, exposure))
+    objects = [
+        {"track": o.track, "kind": o.kind, "model": o.model, "labelled": o.labelled} for o in exposure.objects
+    ]
+    told = {**asdict(place), **exposure.manifest, "objects": objects}
+    entry = {"written": written, "manifest": told}
+    files.write_text(entry_path, json.dumps(entry, allow_nan=False))
+    return place.number
 
 
 def _one_thread() -> None:
     """Each worker keeps to one core: the work is parallel over frames already."""
+    import cv2
     import torch
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
 
-def synthesise(
-    out: Path,
-    frames: int,
-    seed: int = 0,
-    split: str = "train",
-    workers: int = 1,
-    settings: SynthSettings | None = None,
-    resume: bool = True,
-) -> Iterator[int]:
-    """Write `frames` frames under `out`/training, yielding each index as it is done.
+def in_processes(workers: int, apart: bool = False) -> Engine:
+    """An engine of so many processes; a single one is this process, unless `apart`. RangeError for none."""
+    if workers < 1:
+        raise RangeError("synth workers", "at least 1", workers)
 
-    split: "train" or "heldout". workers: processes. resume: whether frames that exist are kept. At the end
-    `manifest.json` lists every frame's seed and shapes.
-    Raises RangeError for bad counts or an unknown split, FormatError where `out` holds frames of other settings.
-    """
-    for name, value in (("frames", frames), ("workers", workers)):
-        if value < 1:
-            raise RangeError(f"synth {name}", "at least 1", value)
-    if split not in SPLITS:
-        raise RangeError("synth split", " or ".join(SPLITS), split)
-    settings = settings or SynthSettings()
-    origin = {"version": MANIFEST_VERSION, "seed": seed, "split": split, "settings": repr(settings)}
-    out.mkdir(parents=True, exist_ok=True)
-    stamp = out / "origin.json"
-    if resume and stamp.exists() and (found := files.read_json(stamp)) != origin:
-        raise FormatError(str(stamp), f"seed {seed}, split {split}, the same settings", found)
-    files.write_json(stamp, origin)
-    jobs = [_Job(out, index, seed, split, settings, resume) for index in range(frames)]
-    if workers == 1:
-        yield from map(_work, jobs)
-    else:
+    def run(work: Callable[[Job], int], jobs: Sequence[Job]) -> Iterator[int]:
+        if workers == 1 and not apart:
+            yield from map(work, jobs)
+            return
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         context = multiprocessing.get_context("spawn")
         with context.Pool(workers, initializer=_one_thread) as pool:
-            yield from pool.imap(_work, jobs)
-    entries = [files.read_json(_paths(out, index)[3]) for index in range(frames)]
-    files.write_json(out / "manifest.json", {**origin, "frames": entries})
+            yield from pool.imap(work, jobs)
+
+    return run
+
+
+def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
+    """Make the data set that `order` asks for, yielding each frame's number as it is done.
+
+    At the end come the files that frames share, and `manifest.json`: recipe, and each frame's seed, shapes and
+    objects. A frame's bytes depend on its seed, index and settings alone, not on order, engine or number of
+    frames. Raises FormatError where the folder holds frames of another recipe.
+    """
+    engine = engine or in_processes(1)
+    stamp = order.out / _STATE / "recipe.json"
+    recipe = order.recipe()
+    if order.resume and stamp.exists() and (found := files.read_json(stamp)) != recipe:
+        differing = sorted(k for k in {*found, *recipe} if found.get(k) != recipe.get(k))
+        key = differing[0]
+        raise FormatError(f"{stamp}: {key}", repr(recipe.get(key)), repr(found.get(key)))
+    if not order.resume or not stamp.exists():
+        files.write_json(stamp, recipe)
+    variations = order.variations
+    jobs = [
+        Job(order, place, place.number // len(variations), variations[place.number % len(variations)])
+        for place in order.places()
+    ]
+    yield from engine(make_frame, jobs)
+    _finish(order, jobs)
+
+
+def _finish(order: Order, jobs: Sequence[Job]) -> None:
+    entries = [files.read_json(_entry_path(order.out, job.place.number)) for job in jobs]
+    written = [rows for entry in entries for rows in entry["written"]]
+    _writer(order).finish(written)
+    frames = [entry["manifest"] for entry in entries]
+    files.write_json(order.out / "manifest.json", {**order.recipe(), "frames": frames})

@@ -94,10 +94,10 @@ def test_frame_store_reads_on_where_it_stopped(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     images = [generator.integers(0, 255, (80, 120, 3), dtype=np.uint8) for _ in range(3)]
     rows = labels(("Car",), [[10.0, 10.0, 60.0, 40.0]], [0], [0.0])
-    writer.write("000000", images[0], rows, projection)
+    writer.write_photograph("000000", images[0], rows, projection)
     assert len(training.FrameStore(tmp_path / "data", tmp_path / "cache")) == 1
     for i in (1, 2):
-        writer.write(f"{i:06d}", images[i], rows, projection)
+        writer.write_photograph(f"{i:06d}", images[i], rows, projection)
     store = training.FrameStore(tmp_path / "data", tmp_path / "cache")
     assert len(store) == 3
     for i in range(3):

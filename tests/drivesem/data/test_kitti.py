@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from hypothesis import strategies as st
 
 from drivesem.data import kitti
 from drivesem.data.classes import KITTI, VEHICLES, ClassMap, vehicle_count
-from drivesem.data.registry import open_dataset
+from drivesem.data.registry import WRITERS, open_dataset
+from drivesem.data.truth import SKY_CM, Exposure, Place
+from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import project_boxes
 from scene_ir.types import Category, Labels
@@ -421,7 +424,7 @@ def test_unknown_identifier_and_dataset(folder: Path) -> None:
 def test_what_the_writer_writes_the_reader_reads(tmp_path: Path) -> None:
     labels = labels_of(CAR, DONT_CARE, folder=tmp_path)
     writer = kitti.KittiWriter(tmp_path / "out")
-    writer.write("000123", image(5), labels, PROJECTION)
+    writer.write_photograph("000123", image(5), labels, PROJECTION)
     frame = kitti.KittiDataset(tmp_path / "out").frame("000123")
     assert torch.equal(frame.photograph, torch.from_numpy(image(5)).permute(2, 0, 1).float() / 255)
     assert torch.equal(frame.camera.matrix, PROJECTION)
@@ -429,6 +432,123 @@ def test_what_the_writer_writes_the_reader_reads(tmp_path: Path) -> None:
     for name in ("boxes_xyxy", "translation", "yaw", "size_lhw", "truncation", "ignore_xyxy"):
         assert torch.equal(getattr(frame.labels, name), getattr(labels, name)), name
     assert len([p for p in (tmp_path / "out").rglob("*") if p.is_file()]) == 3
+
+
+@pytest.fixture
+def written(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
+    """A folder of two exposures, the second without objects and to validate."""
+    writer = WRITERS["kitti"](tmp_path / "out")
+    assert not writer.exists(Place(0, "01", "clone", 0, "train"))
+    entries = [
+        writer.write(Place(0, "01", "clone", 0, "train"), make_exposure(0)),
+        writer.write(Place(1, "01", "fog", 0, "val"), make_exposure(1, things=(), empty_box=False)),
+    ]
+    assert writer.exists(Place(0, "01", "clone", 0, "train"))
+    writer.finish(entries)
+    return tmp_path / "out"
+
+
+def test_an_exposure_reads_back(written: Path, make_exposure: Callable[..., Exposure]) -> None:
+    made, frame = make_exposure(0), kitti.KittiDataset(written).frame("000000")
+    assert torch.equal((frame.photograph * 255).round().byte(), torch.from_numpy(made.image).permute(2, 0, 1))
+    assert torch.equal(frame.camera.matrix, made.camera.matrix)
+    assert frame.labels is not None
+    assert frame.labels.kind == made.labels.kind
+    for name in ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw", "ignore_xyxy"):
+        torch.testing.assert_close(getattr(frame.labels, name), getattr(made.labels, name), atol=6e-4, rtol=0)
+    assert frame.masks is not None
+    for mask, thing in zip(frame.masks, (o for o in made.objects if o.labelled), strict=True):
+        assert np.array_equal(mask.numpy(), made.instances == thing.track + 1)
+    assert frame.depth is not None
+    sky = made.depth_cm == SKY_CM
+    assert np.array_equal(np.isinf(frame.depth.numpy()), sky)
+    assert np.array_equal((frame.depth.numpy()[~sky] * 100).round(), made.depth_cm[~sky])
+    assert frame.classes is not None
+    same = {"Tree": "Vegetation", "Van": "Car", "Cyclist": "Rider"}
+    for i, name in enumerate(made.class_names):
+        assert {frame.class_names[c] for c in frame.classes.numpy()[made.classes == i]} <= {same.get(name, name)}
+    empty = kitti.KittiDataset(written).frame("000001")
+    assert empty.masks is not None
+    assert empty.masks.shape == (0, H, W)
+
+
+def test_layout_of_exposures(written: Path) -> None:
+    names = ("calib", "depth_2", "image_2", "instance_2", "label_2")
+    assert sorted(p.name for p in (written / "training").iterdir()) == list(names)
+    sets = {p.name: p.read_text() for p in (written / "ImageSets").iterdir()}
+    assert sets == {"train.txt": "000000\n", "val.txt": "000001\n", "trainval.txt": "000000\n000001\n"}
+    # the higher byte is Cityscapes' car, the lower one the label's line; the truck has no line and comes after
+    values = files.read_uint16(written / "training/instance_2/000000.png")
+    assert int(values[13, 6]) == 26 * 256 + 1
+    assert int(values[20, 30]) == 26 * 256 + 2
+    assert int(values[20, 62]) == 24 * 256 + 3
+    assert int(values[11, 42]) == 27 * 256 + 4
+
+
+def test_labels_keep_to_the_ranges_of_the_development_kit(
+    tmp_path: Path, make_exposure: Callable[..., Exposure]
+) -> None:
+    writer = kitti.KittiWriter(tmp_path, extras=False)
+    for i in range(20):
+        made = make_exposure(i)
+        yaw = [math.pi, -math.pi, 3.5 * (-1) ** i]
+        made = replace(made, labels=replace(made.labels, yaw=torch.tensor(yaw)))
+        writer.write(Place(i, "01", "clone", i, "train"), made)
+        lines = (tmp_path / f"training/label_2/{i:06d}.txt").read_text().splitlines()
+        assert len(lines) == 5
+        for line in lines:
+            kind, truncated, occluded, alpha, *rest = line.split()
+            left, top, right, bottom, *sizes, _, _, z, turn = map(float, rest)
+            assert len(rest) == 11
+            assert kind in kitti.TYPES
+            assert -1 <= left < right <= W
+            assert -1 <= top < bottom <= H
+            if kind == "DontCare":
+                assert line.split()[1:4] == ["-1", "-1", "-10"]
+                assert line.split()[8:] == ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
+                continue
+            assert 0 <= float(truncated) <= 1
+            assert occluded in ("0", "1", "2", "3")
+            assert abs(float(alpha)) <= math.pi
+            assert abs(turn) <= math.pi
+            assert min(sizes) > 0
+            assert z > 0
+        turns = [float(line.split()[14]) for line in lines[:3]]
+        assert all(abs(math.remainder(a - b, 2 * math.pi)) < 1e-3 for a, b in zip(turns, yaw, strict=True))
+    assert sorted(p.name for p in (tmp_path / "training").iterdir()) == ["calib", "image_2", "label_2"]
+    frame = kitti.KittiDataset(tmp_path).frame("000000")
+    assert (frame.masks, frame.depth, frame.classes) == (None, None, None)
+
+
+@given(st.integers(1, SKY_CM))
+def test_depth_is_exact_to_the_centimetre_up_to_where_it_ends(depth_cm: int) -> None:
+    value = int(kitti._depth_map(np.array([[depth_cm]], np.uint16))[0, 0])
+    assert value == 0 if depth_cm > 25_599 else round(value / kitti.DEPTH_SCALE * 100) == depth_cm
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("depth_2", np.zeros((H, W), np.uint8), "expected 16 bits and 1 channel, found 8 bits and 1"),
+        ("depth_2", np.zeros((H, W - 1), np.uint16), "expected 80x40 px, found 79x40 px"),
+        ("instance_2", np.zeros((H, W, 3), np.uint8), "expected 16 bits and 1 channel, found 8 bits and 3"),
+        ("instance_2", np.full((H, W), 34 << 8, np.uint16), "semantic id: expected 0 to 33, found 34"),
+    ],
+)
+def test_bad_maps(name: str, values: np.ndarray, message: str, written: Path) -> None:
+    files.write_png(written / "training" / name / "000000.png", values)
+    with pytest.raises(FormatError, match=rf"{name}/000000\.png: {message}"):
+        kitti.KittiDataset(written).frame("000000")
+
+
+def test_classes_and_their_ids() -> None:
+    # ids as cityscapesScripts lists them
+    names = ("Road", "Building", "GuardRail", "Pole", "Sky", "Car")
+    assert kitti.semantic_ids(names).tolist() == [7, 11, 14, 17, 23, 26]
+    assert kitti.semantic_ids(("Tree", "Vegetation", "Van", "Cyclist")).tolist() == [21, 21, 26, 25]
+    assert len(kitti.SEMANTIC_NAMES) == 34
+    with pytest.raises(FormatError, match=r"class: expected one of Undefined, .*found 'Boat'"):
+        kitti.semantic_ids(("Boat",))
 
 
 def test_kitti_classes_as_targets(tmp_path: Path) -> None:

@@ -1,79 +1,233 @@
-"""Frames on disk: a KITTI folder that can be gone on with."""
+"""Data sets on disk, in every layout: what comes back, going on after a stop, and the same bytes each time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from drivesem.data.kitti import KittiDataset
+from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.synth import write
-from drivesem.synth.frames import generate_frame
-from drivesem.synth.write import synthesise
+from drivesem.synth.exposure import CLASS_NAMES, expose
+from drivesem.synth.frames import VARIANTS, SynthSettings, boxes_alone, plan_frame, render_frame, variation_of
+from drivesem.synth.layout import LayoutSettings
+from drivesem.synth.write import Order, in_processes, synthesise
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    out = tmp_path_factory.mktemp("synth")
-    assert list(synthesise(out, 2, seed=4)) == [0, 1]
-    return out
+FRAMES = 2
 
 
-def test_the_folder_reads_back_as_kitti(folder):
-    data = KittiDataset(folder)
-    assert list(data.identifiers) == ["000000", "000001"]
-    frame, made = data.frame("000001"), generate_frame(4, 1)
-    assert np.array_equal((frame.photograph.numpy() * 255).round().astype(np.uint8), made.image.transpose(2, 0, 1))
+def settings_of(layout: str, people: bool) -> SynthSettings:
+    virtual = layout.startswith("vkitti")
+    layouts = LayoutSettings(variants=VARIANTS["train"], people=people)
+    camera = layout if layout in ("vkitti1", "vkitti2") else None
+    return SynthSettings(layouts, sunny=virtual, camera=camera, sequence=2 if virtual else 1)
+
+
+def shows_vehicles(seed: int) -> bool:
+    """Whether both frames of a seed show some vehicles, in both kinds of layout."""
+    plans = [
+        plan_frame(seed, i, settings=settings_of(layout, False)) for layout in ("kitti", "vkitti2") for i in (0, 1)
+    ]
+    return all(sum(t.labelled and t.visible > 0.5 for t in boxes_alone(plan)) >= 2 for plan in plans)
+
+
+SEED = next(seed for seed in range(50) if shows_vehicles(seed))
+
+
+def order_for(out: Path, layout: str, **changes: object) -> Order:
+    virtual = layout.startswith("vkitti")
+    order = Order(
+        out,
+        FRAMES,
+        SEED,
+        layout,
+        variations=("clone",) if virtual else ("mixed",),
+        people=not virtual,
+        sequence=2 if virtual else 1,
+    )
+    return replace(order, **changes)
+
+
+def exposed(order: Order, index: int):
+    """The ground truth that frame `index` was written from."""
+    settings = settings_of(order.layout, order.people)
+    frame = render_frame(variation_of(plan_frame(order.seed, index, settings=settings), order.variations[0]))
+    assert frame is not None
+    return expose(frame)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module", params=WRITERS)
+def made(request, tmp_path_factory):
+    order = order_for(tmp_path_factory.mktemp(request.param) / "data", request.param)
+    assert list(synthesise(order)) == [0, 1]
+    return order
+
+
+def test_every_layout_reads_back_what_was_made(made):
+    data = open_dataset(made.layout, made.out)
+    assert len(data.identifiers) == FRAMES
+    truth, frame = exposed(made, 1), data.frame(data.identifiers[1])
+    lossless = made.layout != "vkitti2"
+    photograph = frame.photograph.numpy().transpose(1, 2, 0) * 255
+    difference = np.abs(photograph - truth.image)
+    assert difference.max() <= (0.51 if lossless else 90)
+    assert difference.mean() <= (0.01 if lossless else 4)
+    assert (frame.camera.matrix - truth.camera.matrix).abs().max() < 1e-3
     assert frame.labels is not None
-    assert frame.labels.kind == made.labels.kind
-    assert (frame.labels.boxes_xyxy - made.labels.boxes_xyxy).abs().max() < 0.01
-    assert (frame.camera.matrix - made.camera.matrix).abs().max() < 1e-3
+    if made.layout.startswith("vkitti"):
+        shown = [o for o in truth.objects if o.pixels > 0]
+        boxes = torch.tensor([o.box_ltrb for o in shown], dtype=torch.float32)
+        kinds = tuple(o.kind for o in shown)
+        poses = torch.tensor([[*o.translation, o.yaw] for o in shown])
+    else:
+        boxes, kinds = truth.labels.boxes_xyxy, truth.labels.kind
+        poses = torch.cat([truth.labels.translation, truth.labels.yaw[:, None]], dim=1)
+    assert kinds
+    assert frame.labels.kind == kinds
+    assert (frame.labels.boxes_xyxy - boxes).abs().max() < 0.02
+    if made.layout != "yolo":
+        found = torch.cat([frame.labels.translation, frame.labels.yaw[:, None]], dim=1)
+        assert (found - poses).abs().max() < 1e-3
+    if made.layout.startswith("vkitti"):
+        assert frame.depth is not None
+        assert frame.classes is not None
+        assert frame.masks is not None
+        depth = np.where(truth.depth_cm == 65535, np.inf, truth.depth_cm / np.float32(100))
+        assert np.array_equal(frame.depth.numpy(), depth.astype(np.float32))
+        names = np.array([frame.class_names.index(n) if n in frame.class_names else -1 for n in CLASS_NAMES])
+        seen = np.unique(truth.classes)
+        assert (names[seen] >= 0).all()
+        assert np.array_equal(frame.classes.numpy(), names[truth.classes])
+        for mask, found in zip(frame.masks.numpy(), shown, strict=True):
+            assert np.array_equal(mask > 0.5, truth.instances == found.track + 1)
 
 
-def test_the_manifest_lists_every_frame(folder):
-    manifest = files.read_json(folder / "manifest.json")
-    assert [entry["index"] for entry in manifest["frames"]] == [0, 1]
-    assert manifest["seed"] == 4
-    assert manifest["split"] == "train"
+def test_the_manifest_says_where_every_frame_comes_from(made):
+    manifest = files.read_json(made.out / "manifest.json")
+    assert [f["index"] for f in manifest["frames"]] == [0, 1]
+    assert manifest["seed"] == SEED
+    assert manifest["generator"] == write.GENERATOR_VERSION
+    assert all(f["objects"] and f["vehicles"] and f["split"] == "train" for f in manifest["frames"])
 
 
-def test_frames_that_exist_are_kept_and_missing_ones_made_again(folder, monkeypatch):
-    images = sorted((folder / "training" / "image_2").glob("*.png"))
-    before = [p.read_bytes() for p in images]
-    images[1].unlink()
-    made = []
-    original = write.generate_frame
+def test_a_run_goes_on_with_what_is_missing_and_ends_the_same(made, monkeypatch):
+    before = tree(made.out)
+    entry = made.out / ".drivesem" / "000" / "000001.json"
+    entry.unlink()
+    (made.out / "manifest.json").unlink()
+    rendered = []
+    original = write.render_frame
 
-    def counted(seed, index, *rest):
-        made.append(index)
-        return original(seed, index, *rest)
+    def counted(plan):
+        rendered.append(plan.setting.grain_seed[1])
+        return original(plan)
 
-    monkeypatch.setattr(write, "generate_frame", counted)
-    assert list(synthesise(folder, 2, seed=4)) == [0, 1]
-    assert made == [1]
-    assert [p.read_bytes() for p in images] == before
+    monkeypatch.setattr(write, "render_frame", counted)
+    assert list(synthesise(made)) == [0, 1]
+    assert rendered == [1]
+    assert tree(made.out) == before
 
 
-def test_another_seed_in_the_same_folder_is_an_error(folder):
-    with pytest.raises(FormatError, match=r"origin\.json: expected seed 5"):
-        list(synthesise(folder, 2, seed=5))
+def test_a_lost_image_is_made_again(made, monkeypatch):
+    before = tree(made.out)
+    photographs = ("images", "image_2", "rgb", "vkitti_1.3.1_rgb")
+    image = next(p for p in sorted(made.out.rglob("*.[pj]*g")) if any(name in p.parts for name in photographs))
+    image.unlink()
+    list(synthesise(made))
+    assert tree(made.out) == before
+
+
+def test_another_recipe_in_the_same_folder_is_an_error(made):
+    with pytest.raises(FormatError, match=rf"recipe\.json: seed: expected {SEED + 1}, found {SEED}"):
+        list(synthesise(replace(made, seed=SEED + 1)))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"frames": 0}, "synth frames: expected at least 1, found 0"),
-        ({"frames": 1, "workers": 0}, "synth workers: expected at least 1, found 0"),
-        ({"frames": 1, "split": "test"}, "synth split: expected train or heldout, found test"),
+        ({"split": "test"}, "synth split: expected train or heldout, found test"),
+        ({"layout": "voc"}, "synth layout: expected one of vkitti2, vkitti1, kitti, coco, yolo, found voc"),
+        ({"validation": 1.0}, r"synth validation: expected a share in \[0, 1\), found 1.0"),
+        ({"cameras": 2}, "synth cameras: expected 1, or 2 in layout vkitti2, found 2"),
+        ({"layout": "vkitti2"}, "synth people: expected none in layout vkitti2"),
+        ({"variations": ("night",)}, "variations: expected all, or names among"),
     ],
 )
 def test_bad_requests_are_errors(tmp_path, changes, message):
     with pytest.raises(RangeError, match=message):
-        list(synthesise(tmp_path / "out", **changes))
-    assert not (tmp_path / "out").exists()
+        Order(**{"out": tmp_path / "out", "frames": 1, **changes})
+
+
+def test_no_processes_is_an_error():
+    with pytest.raises(RangeError, match="synth workers: expected at least 1, found 0"):
+        in_processes(0)
+
+
+def test_places_fill_the_scenes_of_virtual_kitti_with_tracks_that_eight_bits_hold(tmp_path):
+    single = Order(tmp_path, 65, layout="vkitti2", people=False, variations=("clone", "fog")).places()
+    assert [p.number for p in single] == list(range(130))
+    assert [p.scene for p in single[::20]] == ["01", "02", "06", "18", "20", "03", "04"]
+    assert [(p.variation, p.frame) for p in single[:4]] == [("clone", 0), ("fog", 0), ("clone", 1), ("fog", 1)]
+    assert 10 * write.TRACKS_A_STREET <= 254
+    drives = Order(tmp_path, 20, layout="vkitti2", people=False, sequence=8).places()
+    assert [(p.scene, p.frame) for p in drives[7:10]] == [("01", 7), ("02", 0), ("02", 1)]
+
+
+def test_validation_frames_are_spread_and_do_not_depend_on_the_number(tmp_path):
+    parts = [p.part for p in Order(tmp_path, 40, validation=0.25).places()]
+    assert parts.count("val") == 10
+    assert parts[:20] == [p.part for p in Order(tmp_path, 20, validation=0.25).places()]
+    assert {p.part for p in Order(tmp_path, 40).places()} == {"train"}
+
+
+def test_validation_frames_show_held_out_shapes(tmp_path):
+    order = Order(tmp_path / "out", 2, validation=0.5)
+    list(synthesise(order))
+    frames = files.read_json(order.out / "manifest.json")["frames"]
+    assert [(f["part"], f["split"]) for f in frames] == [("train", "train"), ("val", "heldout")]
+    for kind in ("vehicles", "building", "tree", "surface"):
+        assert not set(frames[0][kind]) & set(frames[1][kind])
+
+
+def test_edits_reach_the_files(tmp_path):
+    list(synthesise(order_for(tmp_path / "plain", "kitti", frames=1)))
+    track = files.read_json(tmp_path / "plain" / "manifest.json")["frames"][0]["objects"][0]["track"]
+    path = tmp_path / "edits.yaml"
+    path.write_text(f"frames: {{0: {{objects: {{{track}: {{remove: true}}}}}}}}\n")
+    list(synthesise(order_for(tmp_path / "edited", "kitti", frames=1, edits=path)))
+    objects = [
+        [o["track"] for o in files.read_json(tmp_path / name / "manifest.json")["frames"][0]["objects"]]
+        for name in ("plain", "edited")
+    ]
+    assert track in objects[0]
+    assert set(objects[0]) - {track} <= set(objects[1])
+    assert track not in objects[1]
+
+
+def test_the_right_camera_is_written_beside_the_left(tmp_path):
+    order = order_for(tmp_path / "out", "vkitti2", frames=1, cameras=2)
+    list(synthesise(order))
+    left, right = (
+        files.read_image(order.out / "Scene01/clone/frames/rgb" / f"Camera_{i}" / "rgb_00000.jpg") for i in (0, 1)
+    )
+    assert left.shape == right.shape
+    assert (left != right).any()
 
 
 @pytest.mark.slow
-def test_workers_change_nothing(tmp_path, folder):
-    list(synthesise(tmp_path, 2, seed=4, workers=2))
-    for path in sorted((folder / "training").rglob("*.*")):
-        assert (tmp_path / "training" / path.relative_to(folder / "training")).read_bytes() == path.read_bytes()
+@pytest.mark.parametrize("layout", ["kitti", "vkitti2"])
+def test_workers_change_nothing(tmp_path, layout):
+    one, two = (order_for(tmp_path / str(n), layout, frames=4) for n in (1, 2))
+    list(synthesise(one))
+    list(synthesise(two, in_processes(2)))
+    assert tree(two.out) == tree(one.out)

@@ -1,0 +1,1173 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
+# ruff: noqa: E501, UP018, SIM102, SIM109, RUF046 - the line above; Warp needs int(0) to declare what a loop changes, and evaluates
+# both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
+"""Shadow maps, shading, camera as Warp kernels: what `render`, `shading`, `light` and `noise` define in numpy.
+
+Each function here follows the numpy function of the same name, with the same constants in the same order; a test
+holds both together. Rows and pixels are dealt out to the threads, so the result does not depend on their number.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from drivesem.synth.layout import Road
+from drivesem.synth.light import PANORAMA_GLARE, Light, Response
+from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
+from drivesem.synth.shading import MIRRORED_GROUND, SOAKED, ground_light
+from drivesem.synth.soup import GROUND, Material, Semantic, Soup
+from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
+from scene_ir.raster.launch import halves, launch, start_warp, threads
+
+if TYPE_CHECKING:
+    from drivesem.synth.render import Setting, Shadow, Sight, SunMaps
+
+start_warp()
+# Functions take structures by value: only where LLVM inlines them, which it thinks too much by itself, are the copies
+# saved, half of the time.
+_INLINE = f"{OPTIONS['cpu_compiler_flags']} -mllvm=-inline-threshold=20000"
+wp.set_module_options({**OPTIONS, "cpu_compiler_flags": _INLINE})
+
+FOLD, UNFOLD = wp.constant(wp.float32(1.0 / SIZE)), wp.constant(wp.float32(SIZE))
+LAST = wp.constant(wp.float32(SIZE - 1e-3))
+STRIDE = wp.constant(SIZE + 1)
+BYTES = wp.constant(wp.float32(BYTE_SUM_SCALE))
+GLARE = wp.constant(wp.float32(PANORAMA_GLARE))
+PI = wp.constant(wp.float32(np.pi))
+INFINITE = wp.constant(wp.float32(np.inf))
+TABLE = 22
+"""Numbers a face in `Scene.table`: three rows for the normal, two for the surface coordinates, albedo, pattern."""
+COLUMNS = wp.constant(TABLE)
+SLIVER = wp.constant(wp.float64(1e-9))
+"""Triangles of a shadow map smaller than this, texels squared, are seen edge-on; and slack of its rows, texels."""
+
+M_SKY, M_ROAD, M_PARKING, M_PAVEMENT, M_KERB, M_GRASS, M_GRAVEL = (wp.constant(int(m)) for m in list(Material)[:7])
+M_FACADE, M_ROOF, M_WALL, M_FENCE, M_LEAF, M_BARK, M_METAL = (wp.constant(int(m)) for m in list(Material)[7:14])
+M_FLAT, M_PAINT, M_GLASS, M_TYRE, M_LIGHT, M_TRIM = (wp.constant(int(m)) for m in list(Material)[14:20])
+S_SKY = wp.constant(wp.uint8(Semantic.SKY))
+
+vec22 = wp.types.vector(length=TABLE, dtype=wp.float32)
+
+
+@wp.struct
+class Noise:
+    """The textures of `NoiseSet`, flat."""
+
+    soft: wp.array(dtype=wp.float32)
+    rough: wp.array(dtype=wp.float32)
+    grain: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Air:
+    """`Light`, and what follows from it. right, forward: azimuths 90 degrees and 0."""
+
+    sun: wp.vec3f
+    up: wp.vec3f
+    right: wp.vec3f
+    forward: wp.vec3f
+    sun_colour: wp.vec3f
+    zenith: wp.vec3f
+    horizon: wp.vec3f
+    ambient: wp.vec3f
+    bounce: wp.vec3f
+    town: wp.vec3f
+    tarmac: wp.vec3f
+    haze: wp.float32
+    clouds: wp.float32
+    cloud_seed: wp.float32
+    wet: wp.float32
+    fog: wp.int32
+    panorama: wp.array(dtype=wp.float32)
+    panorama_height: wp.int32
+    panorama_width: wp.int32
+    panorama_turn: wp.float32
+
+
+@wp.struct
+class Street:
+    """Markings (middle, width, dash, period), the crossing (from, to; from > to: none), d from which on its stop line
+    lies, and `SOAKED` by material."""
+
+    markings: wp.array(dtype=wp.vec4f)
+    count: wp.int32
+    crossing: wp.vec2f
+    own_side: wp.float32
+    soaked: wp.array(dtype=wp.vec3f)
+
+
+@wp.struct
+class Lens:
+    """The view. ray (3 x 3): fine pixels to rays. axes (3 x 3), origin: camera to world. develop: exposure and white
+    balance; power: of the display values."""
+
+    ray: wp.mat33f
+    axes: wp.mat33f
+    origin: wp.vec3f
+    centre: wp.vec3f
+    focal: wp.float32
+    height_m: wp.float32
+    width: wp.int32
+    develop: wp.vec3f
+    power: wp.float32
+
+
+@wp.struct
+class Scene:
+    """What each fine pixel shows, flat, and the faces' numbers."""
+
+    table: wp.array(dtype=wp.float32)
+    face: wp.array(dtype=wp.int32)
+    depth: wp.array(dtype=wp.float32)
+    material: wp.array(dtype=wp.uint8)
+    owner: wp.array(dtype=wp.int32)
+    ground: wp.array(dtype=wp.uint8)
+
+
+@wp.struct
+class Shade:
+    """Shadow maps, flat, and footprints that hide the sky: rows of x, z, reach in all, cos, sin, half sizes, reach."""
+
+    rows: wp.mat33f
+    shift: wp.vec3f
+    depth: wp.array(dtype=wp.float32)
+    near: wp.vec4f
+    far: wp.vec4f
+    texels: wp.int32
+    sunny: wp.int32
+    prints: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class Spot:
+    """One sample: `shading.Samples`."""
+
+    point: wp.vec3f
+    world: wp.vec3f
+    normal: wp.vec3f
+    u: wp.float32
+    v: wp.float32
+    albedo: wp.vec3f
+    pattern: wp.vec4f
+    lit: wp.float32
+    open_sky: wp.float32
+    pixel_m: wp.float32
+    along_px: wp.float32
+
+
+@wp.struct
+class Result:
+    """A colour, and whether actors change it."""
+
+    colour: wp.vec3f
+    changed: wp.int32
+
+
+# ------------------------------------------------------------------------------------------------------- noise, light
+
+
+@wp.func
+def saturate(x: float):
+    return wp.min(wp.max(x, 0.0), 1.0)
+
+
+@wp.func
+def power(x: float, exponent: float):
+    """x ** exponent of x >= 0."""
+    return wp.where(x > 1e-30, exp_(log_(wp.max(x, 1e-30)) * exponent), 0.0)
+
+
+@wp.func
+def noise(texture: wp.array(dtype=wp.float32), u: float, v: float, per_m: float):
+    x = u * per_m * FOLD
+    y = v * per_m * FOLD
+    x = wp.min((x - wp.floor(x)) * UNFOLD, LAST)
+    y = wp.min((y - wp.floor(y)) * UNFOLD, LAST)
+    column = wp.int32(x)
+    row = wp.int32(y)
+    across = x - float(column)
+    down = y - float(row)
+    at = row * STRIDE + column
+    upper = load(texture, at) * (1.0 - across) + load(texture, at + 1) * across
+    lower = load(texture, at + STRIDE) * (1.0 - across) + load(texture, at + STRIDE + 1) * across
+    return upper * (1.0 - down) + lower * down
+
+
+@wp.func
+def texel(pixels: wp.array(dtype=wp.float32), i: int):
+    return wp.vec3f(load(pixels, 3 * i), load(pixels, 3 * i + 1), load(pixels, 3 * i + 2))
+
+
+@wp.func
+def panorama_radiance(air: Air, direction: wp.vec3f):
+    azimuth = wp.atan2(wp.dot(direction, air.right), wp.dot(direction, air.forward)) - air.panorama_turn
+    elevation = wp.asin(saturate(wp.dot(direction, air.up)))
+    turn = azimuth * (0.5 / PI) + 0.5
+    x = (turn - wp.floor(turn)) * float(air.panorama_width) - 0.5
+    y = wp.max((0.5 - elevation * (1.0 / PI)) * float(air.panorama_height) - 0.5, 0.0)
+    column = wp.int32(wp.floor(x))
+    row = wp.int32(wp.floor(y))
+    across = x - float(column)
+    down = y - float(row)
+    left = wp.where(column < 0, air.panorama_width - 1, column)
+    right = wp.where(column + 1 >= air.panorama_width, 0, column + 1)
+    first = row * air.panorama_width
+    second = wp.min(row + 1, air.panorama_height - 1) * air.panorama_width
+    upper = texel(air.panorama, first + left) * (1.0 - across) + texel(air.panorama, first + right) * across
+    lower = texel(air.panorama, second + left) * (1.0 - across) + texel(air.panorama, second + right) * across
+    return upper * (1.0 - down) + lower * down
+
+
+@wp.func
+def gradient(air: Air, height: float):
+    blend = wp.sqrt(saturate(height))
+    return air.horizon * (1.0 - blend) + air.zenith * blend
+
+
+@wp.func
+def sky_radiance(air: Air, textures: Noise, direction: wp.vec3f):
+    if air.panorama_width > 0:
+        return panorama_radiance(air, direction)
+    height = saturate(wp.dot(direction, air.up))
+    colour = gradient(air, height)
+    if air.clouds > 0.0:
+        reach = 60.0 / wp.max(height + 0.09, 0.09)
+        x = wp.dot(direction, air.right) * reach + air.cloud_seed
+        field = noise(textures.soft, x, wp.dot(direction, air.forward) * reach, 1.0)
+        cover = saturate((field - 1.6 + 2.6 * air.clouds) * 0.6) * wp.min(air.clouds * 1.4, 1.0)
+        white = air.horizon * (1.15 + 0.1 * wp.clamp(field, -1.5, 1.5))
+        colour += (white - colour) * cover
+    glow = saturate(wp.dot(direction, air.sun))
+    glow *= glow
+    glow *= glow
+    glow *= glow
+    return colour + air.sun_colour * (0.9 * glow * glow * glow)
+
+
+@wp.func
+def reflected_radiance(air: Air, textures: Noise, direction: wp.vec3f, soft: bool):
+    height = wp.dot(direction, air.up)
+    sky = wp.vec3f()
+    if air.panorama_width > 0:
+        seen = panorama_radiance(air, direction)
+        sky = wp.vec3f(wp.min(seen[0], GLARE), wp.min(seen[1], GLARE), wp.min(seen[2], GLARE))
+    else:
+        sky = gradient(air, height)
+    azimuth = wp.atan2(wp.dot(direction, air.right), wp.dot(direction, air.forward))
+    ridge = 0.20 + 0.09 * noise(textures.soft, azimuth * 81.4872 + air.cloud_seed, height * 20.0, 1.0)
+    sharpness = float(12.0)
+    if soft:
+        ridge *= 0.45
+        sharpness = 5.0
+    above = saturate((height - ridge) * sharpness + 0.5)
+    below = saturate(-height * 14.0 + 0.5)
+    return (sky * above + air.town * (1.0 - above)) * (1.0 - below) + air.tarmac * below
+
+
+@wp.func
+def developed(radiance: wp.vec3f, lens: Lens):
+    out = wp.vec3f()
+    for axis in range(3):
+        x = wp.max(radiance[axis] * lens.develop[axis], 0.0)
+        square = x * x
+        out[axis] = power(x / wp.sqrt(wp.sqrt(1.0 + square * square)), lens.power)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------- materials
+
+
+@wp.func
+def fade(pixel_m: float, per_detail: float):
+    return saturate(1.4 - pixel_m * per_detail)
+
+
+@wp.func
+def fraction(x: float):
+    return x - wp.floor(x)
+
+
+@wp.func
+def pulse(x: float, period: float, share: float, blur: float):
+    phase = wp.abs(fraction(x / period) - 0.5) * period
+    soft = wp.max(blur, 1e-4)
+    sharp = saturate((share * period * 0.5 - phase) / soft + 0.5)
+    melt = saturate(soft / period * 2.0 - 0.5)
+    return sharp * (1.0 - melt) + share * melt
+
+
+@wp.func
+def paint_road(s: Spot, street: Street, textures: Noise):
+    d = s.u
+    q = s.v
+    x = d + s.pattern[0]
+    tone = 1.0 + 0.09 * noise(textures.soft, x, q * 0.4, 1.0 / 0.08)
+    near = fade(s.pixel_m, 1.0 / 0.15)
+    if near > 0.0:
+        tone += 0.06 * noise(textures.rough, x * 1.5, q * 0.12 + s.pattern[0], 1.0 / 0.03) * near
+    near = fade(s.along_px, 1.0 / 0.05)
+    if near > 0.0:
+        tone += 0.17 * noise(textures.grain, x, q, 1.0 / 0.012) * near
+    near = fade(s.along_px, 1.0 / 0.2)
+    if near > 0.0:
+        tone += 0.10 * noise(textures.grain, x, q, 1.0 / 0.05) * near
+    patch = noise(textures.soft, x * 0.7 + 91.0, q * 0.25 + 37.0, 1.0 / 0.05)
+    tone *= 1.0 - 0.22 * saturate((patch - 1.35) * 6.0)
+    near = fade(s.along_px, 1.0 / 0.12)
+    if near > 0.0:
+        crack = wp.abs(noise(textures.soft, x + 13.0, q * 0.8 + 7.0, 1.0 / 0.035))
+        tone *= 1.0 - 0.35 * saturate(1.0 - crack * 26.0) * near
+    tone *= 1.0 + 0.035 * wp.cos(d * (2.0 * PI / 1.7))
+    albedo = s.albedo * wp.max(tone, 0.2)
+    cover = float(0.0)
+    for i in range(street.count):
+        line = street.markings[i]
+        away = wp.abs(d - line[0])
+        if away < line[1] + 0.3:
+            across = saturate((line[1] / 2.0 - away) / s.pixel_m + 0.5) * wp.min(line[1] / s.pixel_m, 1.0)
+            if across > 0.0:
+                if line[2] < line[3]:
+                    across *= pulse(q, line[3], line[2] / line[3], s.along_px)
+                cover = wp.max(cover, across)
+    if street.crossing[0] < street.crossing[1]:
+        if d < 200.0:
+            if q > street.crossing[0] - 1.2:
+                if q < street.crossing[1] + 1.2:
+                    cover = 0.0
+            if d > street.own_side:
+                thick = wp.max(s.along_px, 1e-3)
+                bar = saturate((0.25 - wp.abs(q - (street.crossing[0] - 1.6))) / thick + 0.5)
+                cover = wp.max(cover, bar * wp.min(0.5 / thick, 1.0))
+    if cover > 0.0:
+        cover *= wp.clamp(0.75 + 0.28 * noise(textures.rough, x, q, 1.0 / 0.02), 0.25, 1.0)
+        albedo += (wp.vec3f(0.62, 0.62, 0.60) - albedo) * cover
+    return albedo
+
+
+@wp.func
+def paint_slabs(s: Spot, textures: Noise, size_m: float, joint_m: float):
+    u = s.u + fraction(s.pattern[0])
+    v = s.v
+    tone = 1.0 + 0.10 * noise(textures.soft, u, v, 1.0 / 0.06)
+    near = fade(s.along_px, 1.0 / 0.08)
+    if near > 0.0:
+        tone += 0.12 * noise(textures.grain, u, v, 1.0 / 0.02) * near
+    near = fade(s.along_px, 1.0 / size_m)
+    if near > 0.0:
+        tone += 0.07 * near * noise(textures.grain, wp.floor(u / size_m) * 3.7, wp.floor(v / size_m) * 5.3, 1.0)
+    near = fade(s.along_px, 1.0 / (size_m * 0.7))
+    if near > 0.0:
+        share = 1.0 - joint_m / size_m
+        joints = 1.0 - pulse(u, size_m, share, wp.max(s.pixel_m, 0.008)) * pulse(v, size_m, share, s.along_px)
+        tone *= 1.0 - 0.45 * joints * near
+    return s.albedo * wp.max(tone, 0.2)
+
+
+@wp.func
+def paint_grass(s: Spot, textures: Noise):
+    u = s.world[0] + s.pattern[0]
+    v = s.world[2]
+    tone = 1.0 + 0.16 * noise(textures.soft, u, v, 1.0 / 0.08)
+    near = fade(s.along_px, 1.0 / 0.3)
+    if near > 0.0:
+        tone += 0.30 * noise(textures.rough, u, v * 0.6, 1.0 / 0.035) * near
+    near = fade(s.along_px, 1.0 / 0.08)
+    if near > 0.0:
+        tone += 0.30 * noise(textures.grain, u, v * 0.5, 1.0 / 0.02) * near
+    dry = wp.clamp(0.25 + 0.3 * noise(textures.soft, u + 50.0, v, 1.0 / 0.05), 0.0, 0.8)
+    albedo = s.albedo * (1.0 - dry) + wp.vec3f(0.16, 0.135, 0.07) * dry
+    return albedo * wp.max(tone, 0.25)
+
+
+@wp.func
+def fifth(x: float):
+    return x * x * x * x * x
+
+
+@wp.func
+def facade(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
+    """Radiance of a wall with windows: `shading._facade`, lit."""
+    pitch = s.pattern[0]
+    storey = s.pattern[1]
+    wide = s.pattern[2]
+    tall = s.pattern[3]
+    u = s.u
+    v = s.v
+    blur = wp.max(s.pixel_m, 0.01)
+    tone = 1.0 + 0.05 * noise(textures.soft, u, v, 1.0 / 0.05)
+    tone += 0.05 * noise(textures.rough, u * 3.0, v * 0.6, 1.0 / 0.04)
+    near = fade(s.pixel_m, 1.0 / 0.06)
+    if near > 0.0:
+        tone += 0.05 * noise(textures.grain, u, v, 1.0 / 0.02) * near
+    if v < 0.6:
+        tone *= 0.62
+    albedo = s.albedo * wp.max(tone, 0.3)
+    row = v - 0.5
+    if row <= 0.0:
+        return wp.cw_mul(albedo, incoming)
+    frame = pulse(u, pitch, wp.min(wide + 0.20 / pitch, 0.9), blur)
+    frame *= pulse(row, storey, wp.min(tall + 0.20 / storey, 0.92), blur)
+    albedo += (wp.vec3f(0.62, 0.61, 0.58) - albedo) * (frame * 0.85)
+    pane = pulse(u, pitch, wide, blur) * pulse(row, storey, tall, blur)
+    if pane <= 0.0:
+        return wp.cw_mul(albedo, incoming)
+    bar = wp.abs(fraction(u / pitch) - 0.5) * pitch
+    pane *= 1.0 - saturate((0.035 - bar) / blur + 0.5) * wp.min(0.07 / blur, 1.0)
+    cell = noise(
+        textures.grain,
+        wp.floor(u / pitch) * 7.1 + pitch * 99.0,
+        wp.floor(row / storey) * 9.7 + storey * 55.0,
+        1.0,
+    )
+    inside = 0.02 + 0.22 * saturate(cell * 0.5)
+    sill = fraction(row / storey) - 0.5
+    inside *= wp.clamp(1.0 - 1.4 * sill / wp.max(tall, 0.1), 0.3, 1.0)
+    albedo += (wp.vec3f(1.0, 0.97, 0.92) * inside - albedo) * pane
+    view = wp.normalize(s.point)
+    cosine = saturate(-wp.dot(view, s.normal))
+    mirror = view + s.normal * (2.0 * cosine) + air.up * (0.02 * cell)
+    fresnel = 0.06 + 0.94 * fifth(1.0 - cosine)
+    glare = reflected_radiance(air, textures, mirror, False) * (fresnel * pane * 0.8)
+    return wp.cw_mul(albedo, incoming) + glare
+
+
+@wp.func
+def irradiance(s: Spot, air: Air):
+    facing = wp.dot(s.normal, air.up)
+    slope = saturate(wp.dot(s.normal, air.sun)) * s.lit
+    sky = (0.5 + 0.5 * facing) * s.open_sky
+    ground = (0.5 - 0.5 * facing) * s.open_sky
+    return air.sun_colour * slope + air.ambient * sky + air.bounce * ground
+
+
+@wp.func
+def polish(s: Spot, air: Air, textures: Noise, base: wp.vec3f, gloss: wp.vec3f):
+    view = wp.normalize(s.point)
+    cosine = saturate(-wp.dot(view, s.normal))
+    mirror = view + s.normal * (2.0 * cosine)
+    fresnel = gloss[0] + (1.0 - gloss[0]) * fifth(1.0 - cosine)
+    out = reflected_radiance(air, textures, mirror, False) * (fresnel * gloss[1] * (0.35 + 0.65 * s.open_sky))
+    glint = saturate(wp.dot(mirror, air.sun))
+    if glint * s.lit > 0.0:
+        square = glint * glint
+        fourth = square * square
+        sharp = power(glint, gloss[2]) * 14.0 + fourth * fourth * fourth * 0.25
+        out += air.sun_colour * (sharp * fresnel * s.lit)
+    return base + out
+
+
+@wp.func
+def dirty(s: Spot, textures: Noise):
+    height = -s.world[1]
+    stain = 0.08 * noise(textures.rough, s.world[0] + s.world[2], height, 1.0 / 0.02)
+    dust = wp.clamp((0.55 - height) * 0.9 + stain, 0.0, 0.35)
+    return s.albedo + (wp.vec3f(0.13, 0.115, 0.095) - s.albedo) * dust
+
+
+@wp.func
+def leaf(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
+    p = s.world
+    tone = 0.22 * noise(textures.soft, p[0] + 0.5 * p[2], p[1] - 0.3 * p[0], 1.0 / 0.06)
+    near = fade(s.pixel_m, 1.0 / 0.09)
+    if near > 0.0:
+        tone += 0.32 * near * noise(textures.grain, p[0] + 0.6 * p[2], p[1] + 0.5 * p[2], 1.0 / 0.035)
+    through = saturate(-wp.dot(s.normal, air.sun)) * s.lit * 0.35
+    total = incoming + wp.cw_mul(air.sun_colour, wp.vec3f(1.0, 1.15, 0.5)) * through
+    return wp.cw_mul(s.albedo * exp_(tone), total)
+
+
+@wp.func
+def surface(s: Spot, material: int, air: Air, street: Street, textures: Noise):
+    incoming = irradiance(s, air)
+    tone = float(1.0)
+    if material == M_LEAF:
+        return leaf(s, air, textures, incoming)
+    if material == M_ROAD:
+        return wp.cw_mul(paint_road(s, street, textures), incoming)
+    if material == M_FACADE:
+        return facade(s, air, textures, incoming)
+    if material == M_PAVEMENT or material == M_PARKING:
+        size_m = wp.where(material == M_PARKING, 0.2, 0.42)
+        joint_m = wp.where(material == M_PARKING, 0.02, 0.016)
+        return wp.cw_mul(paint_slabs(s, textures, size_m, joint_m), incoming)
+    if material == M_GRASS:
+        return wp.cw_mul(paint_grass(s, textures), incoming)
+    if material >= M_METAL and material <= M_TRIM:
+        base = s.albedo
+        gloss = wp.vec3f(0.03, 0.5, 60.0)
+        if material == M_PAINT:
+            base = dirty(s, textures)
+            gloss = wp.vec3f(0.05 + 0.02 * air.wet, 1.0, 600.0)
+        elif material == M_GLASS:
+            base = wp.vec3f(0.022, 0.025, 0.026)
+            gloss = wp.vec3f(0.07, 1.0, 900.0)
+        elif material == M_LIGHT:
+            base *= 0.8
+            gloss = wp.vec3f(0.08, 0.9, 500.0)
+        elif material == M_METAL:
+            gloss = wp.vec3f(0.10, 0.5, 40.0)
+        elif material == M_FLAT:
+            base *= 1.0 + 0.08 * noise(textures.soft, s.world[0] + s.world[2], s.world[1], 1.0 / 0.03)
+            gloss = wp.vec3f(0.03, 0.4, 60.0)
+        else:
+            base *= 0.9
+        return polish(s, air, textures, wp.cw_mul(base, incoming), gloss)
+    if material == M_KERB:
+        tone += 0.12 * noise(textures.soft, s.u, s.v, 1.0 / 0.05) - 0.35 * (
+            1.0 - pulse(s.v, 1.0, 0.98, s.along_px)
+        )
+    elif material == M_GRAVEL:
+        tone += 0.2 * noise(textures.rough, s.u, s.v, 1.0 / 0.03) * fade(s.along_px, 1.0 / 0.2)
+        tone += 0.3 * noise(textures.grain, s.u, s.v, 1.0 / 0.03) * fade(s.along_px, 1.0 / 0.1)
+        tone = wp.max(tone, 0.3)
+    elif material == M_ROOF:
+        tone += 0.12 * noise(textures.soft, s.u, s.v, 1.0 / 0.06) + 0.1 * noise(
+            textures.grain, s.u, s.v, 1.0 / 0.1
+        )
+        tone *= 1.0 - 0.3 * (1.0 - pulse(s.v, 0.34, 0.8, s.pixel_m)) * fade(s.pixel_m, 1.0 / 0.25)
+        tone = wp.max(tone, 0.3)
+    elif material == M_WALL:
+        tone += 0.10 * noise(textures.soft, s.u, s.v, 1.0 / 0.04)
+        tone += 0.12 * noise(textures.rough, s.u * 2.0, s.v * 0.7, 1.0 / 0.03)
+        tone = wp.max(tone, 0.3)
+    elif material == M_FENCE:
+        board = noise(textures.grain, wp.floor(s.u / 0.13) * 3.3, 0.0, 1.0)
+        tone = (0.25 + 0.75 * pulse(s.u, 0.13, 0.86, s.pixel_m)) * (
+            1.0 + 0.15 * board * fade(s.pixel_m, 1.0 / 0.13)
+        )
+        tone *= 1.0 + 0.12 * noise(textures.rough, s.u * 6.0, s.v, 1.0 / 0.05)
+        tone = wp.max(tone, 0.2)
+    elif material == M_BARK:
+        tone += 0.3 * noise(textures.rough, (s.world[0] + s.world[2]) * 3.0, s.world[1], 1.0 / 0.04)
+        tone = wp.max(tone, 0.3)
+    return wp.cw_mul(s.albedo, incoming) * tone
+
+
+@wp.func
+def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: Street, textures: Noise):
+    soaked = street.soaked[material]
+    out = dry * (1.0 - soaked[0] * air.wet)
+    if soaked[1] + soaked[2] > 0.0:
+        puddle = saturate((noise(textures.soft, s.world[0] + 17.0, s.world[2], 1.0 / 0.06) - 0.5) * 3.0)
+        film = air.wet * (soaked[1] + soaked[2] * puddle)
+        view = wp.normalize(s.point)
+        cosine = saturate(-wp.dot(view, s.normal))
+        share = (0.02 + 0.98 * fifth(1.0 - cosine)) * film
+        hidden = 0.25 + 0.75 * s.open_sky
+        mirror = view + s.normal * (2.0 * cosine)
+        out = out * (1.0 - share) + reflected_radiance(air, textures, mirror, True) * (share * hidden)
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------------- shadows
+
+
+@wp.func
+def soft_compare(maps: wp.array(dtype=wp.float32), base: int, texels: int, u: float, v: float, depth: float):
+    u0 = wp.floor(u)
+    v0 = wp.floor(v)
+    fu = u - u0
+    fv = v - v0
+    at = base + (int(v0) - 1) * texels + int(u0) - 1
+    total = float(0.0)
+    for i in range(4):
+        part = wp.where(load(maps, at) >= depth, 1.0 - fu, 0.0)
+        part += wp.where(load(maps, at + 1) >= depth, 1.0, 0.0)
+        part += wp.where(load(maps, at + 2) >= depth, 1.0, 0.0)
+        part += wp.where(load(maps, at + 3) >= depth, fu, 0.0)
+        if i == 0:
+            part *= 1.0 - fv
+        if i == 3:
+            part *= fv
+        total += part
+        at += texels
+    return total * (1.0 / 9.0)
+
+
+@wp.func
+def lit_share(s: Spot, material: int, by_actor: bool, air: Air, shade: Shade):
+    """Share of the sun that arrives, and 1 where actors take some."""
+    if shade.sunny == 0:
+        return wp.vec2f(0.0, 0.0)
+    away = air.sun
+    offset = float(0.25)
+    if material != M_LEAF:
+        if wp.dot(s.normal, air.sun) <= 0.0:
+            return wp.vec2f(0.0, 0.0)
+        away = s.normal
+        offset = 0.03 + 0.0006 * s.point[2]
+    place = shade.rows * (s.point + away * offset) + shade.shift
+    size = float(shade.texels)
+    square = shade.texels * shade.texels
+    for i in range(2):
+        area = shade.near
+        if i == 1:
+            area = shade.far
+        u = (place[0] - area[0]) * (size / (area[1] - area[0])) - 0.5
+        v = (place[1] - area[2]) * (size / (area[3] - area[2])) - 0.5
+        if wp.min(u, v) > 2.0:
+            if wp.max(u, v) < size - 4.0:
+                depth = place[2] - 0.02
+                share = soft_compare(shade.depth, 2 * i * square, shade.texels, u, v, depth)
+                shaded = float(0.0)
+                if by_actor:
+                    open_share = soft_compare(shade.depth, (2 * i + 1) * square, shade.texels, u, v, depth)
+                    share *= open_share
+                    if open_share < 1.0:
+                        shaded = 1.0
+                return wp.vec2f(share, shaded)
+    return wp.vec2f(1.0, 0.0)
+
+
+@wp.func
+def open_sky(world: wp.vec3f, on_ground: bool, actor: bool, shade: Shade):
+    """Share of the sky that lights a sample, and 1 where vehicles hide some."""
+    height = -world[1]
+    if actor:
+        return wp.vec2f(0.3 + 0.7 * saturate((height - 0.12) / 0.6), 0.0)
+    if not on_ground:
+        return wp.vec2f(0.5 + 0.5 * saturate(height / 1.2), 0.0)
+    share = float(1.0)
+    hemmed = float(0.0)
+    for i in range(shade.prints.shape[0]):
+        x = world[0] - shade.prints[i, 0]
+        z = world[2] - shade.prints[i, 1]
+        if wp.max(wp.abs(x), wp.abs(z)) < shade.prints[i, 2]:
+            cos = shade.prints[i, 3]
+            sin = shade.prints[i, 4]
+            along = wp.abs(x * cos - z * sin) - shade.prints[i, 5]
+            across = wp.abs(x * sin + z * cos) - shade.prints[i, 6]
+            over = wp.max(along, 0.0)
+            beside = wp.max(across, 0.0)
+            outside = wp.sqrt(over * over + beside * beside)
+            inside = wp.min(wp.max(along, across), 0.0)
+            dark = 0.62 * exp_(-outside / (0.32 * shade.prints[i, 7])) + 0.36 * saturate(-inside / 0.25)
+            if dark >= 0.004:
+                share *= 1.0 - wp.min(dark, 0.97)
+                hemmed = 1.0
+    return wp.vec2f(share, hemmed)
+
+
+# --------------------------------------------------------------------------------------------------------------- pixels
+
+
+@wp.func
+def sample_colour(
+    at: int, x: int, y: int, scene: Scene, air: Air, street: Street, textures: Noise, lens: Lens, shade: Shade
+):
+    """Display value of one fine pixel."""
+    out = Result()
+    ray = lens.ray * wp.vec3f(float(x), float(y), 1.0)
+    f = scene.face[at]
+    if f < 0:
+        if air.fog != 0:
+            out.colour = developed(air.horizon * 0.8, lens)
+        else:
+            out.colour = developed(sky_radiance(air, textures, wp.normalize(ray)), lens)
+        return out
+    s = Spot()
+    s.point = ray * scene.depth[at]
+    n = vec22()
+    for k in range(22):
+        n[k] = load(scene.table, f * COLUMNS + k)
+    normal = wp.vec3f(
+        n[0] * s.point[0] + n[1] * s.point[1] + n[2] * s.point[2],
+        n[3] * s.point[0] + n[4] * s.point[1] + n[5] * s.point[2],
+        n[6] * s.point[0] + n[7] * s.point[1] + n[8] * s.point[2],
+    )
+    normal = wp.normalize(normal)
+    if wp.dot(normal, s.point) > 0.0:
+        normal = -normal
+    s.normal = normal
+    s.u = n[9] * s.point[0] + n[10] * s.point[1] + n[11] * s.point[2]
+    s.v = n[12] * s.point[0] + n[13] * s.point[1] + n[14] * s.point[2]
+    s.albedo = wp.vec3f(n[15], n[16], n[17])
+    s.pattern = wp.vec4f(n[18], n[19], n[20], n[21])
+    s.world = lens.axes * (s.point + lens.centre) + lens.origin
+    material = wp.int32(scene.material[at])
+    actor = scene.owner[at] > 0
+    on_ground = scene.ground[material] != wp.uint8(0)
+    lit = lit_share(s, material, on_ground or actor, air, shade)
+    sky = open_sky(s.world, on_ground, actor, shade)
+    if lit[1] + sky[1] > 0.0:
+        out.changed = 1
+    s.lit = lit[0]
+    s.open_sky = sky[0]
+    s.pixel_m = s.point[2] / lens.focal
+    s.along_px = s.pixel_m
+    if on_ground:
+        s.along_px *= wp.max(s.point[2] / lens.height_m, 1.0)
+    colour = surface(s, material, air, street, textures)
+    if air.wet > 0.0:
+        colour = wetted(s, material, colour, air, street, textures)
+    through = exp_(-air.haze * wp.length(s.point))
+    out.colour = developed(colour * through + air.horizon * (0.6 * (1.0 - through)), lens)
+    return out
+
+
+@wp.kernel
+def pixel_kernel(
+    start: int,
+    scene: Scene,
+    air: Air,
+    street: Street,
+    textures: Noise,
+    lens: Lens,
+    shade: Shade,
+    wanted: wp.array(dtype=wp.uint8),
+    out: wp.array(dtype=wp.vec3f),
+    touched: wp.array(dtype=wp.uint8),
+):
+    i = start + wp.tid()
+    y = 2 * (i // lens.width)
+    x = 2 * (i - (y // 2) * lens.width)
+    a = y * (2 * lens.width) + x
+    c = a + 2 * lens.width
+    actors = wp.max(wp.max(scene.owner[a], scene.owner[a + 1]), wp.max(scene.owner[c], scene.owner[c + 1]))
+    changed = wp.where(actors > 0, 1, 0)
+    if wanted[i] != wp.uint8(0):
+        f = scene.face[a]
+        once = scene.face[a + 1] == f and scene.face[c] == f and scene.face[c + 1] == f
+        if not once:
+            m = scene.material[a]
+            o = scene.owner[a]
+            alike = scene.material[a + 1] == m and scene.material[c] == m and scene.material[c + 1] == m
+            if alike and scene.owner[a + 1] == o and scene.owner[c] == o and scene.owner[c + 1] == o:
+                if wp.int32(m) == M_LEAF:
+                    once = True
+                else:
+                    first = wp.vec4f(scene.depth[a], scene.depth[a + 1], scene.depth[c], scene.depth[c + 1])
+                    once = wp.max(first) < wp.min(first) * 1.03
+        count = wp.where(once, 1, 4)
+        total = wp.vec3f()
+        for k in range(count):
+            dy = k // 2
+            dx = k - 2 * dy
+            at = a + dy * 2 * lens.width + dx
+            found = sample_colour(at, x + dx, y + dy, scene, air, street, textures, lens, shade)
+            total += found.colour
+            changed = wp.max(changed, found.changed)
+        out[i] = total * (1.0 / float(count))
+    touched[i] = wp.uint8(changed)
+
+
+@wp.kernel
+def table_kernel(
+    start: int,
+    corners: wp.array(dtype=wp.vec3f),
+    normals: wp.array(dtype=wp.vec3f),
+    uv: wp.array(dtype=wp.vec2f),
+    albedo: wp.array(dtype=wp.vec3f),
+    pattern: wp.array(dtype=wp.vec4f),
+    table: wp.array(dtype=wp.float32),
+):
+    """`render._attribute_maps`: barycentric coordinates are linear in the point, in camera axes about the centre."""
+    f = start + wp.tid()
+    a = wp.vec3d(corners[3 * f])
+    b = wp.vec3d(corners[3 * f + 1])
+    c = wp.vec3d(corners[3 * f + 2])
+    first = wp.cross(b, c)
+    volume = wp.dot(a, first)
+    if wp.abs(volume) < wp.float64(1e-12):
+        volume = wp.float64(1e-12)
+    scale = wp.float64(1.0) / volume
+    r0 = first * scale
+    r1 = wp.cross(c, a) * scale
+    r2 = wp.cross(a, b) * scale
+    n0 = wp.vec3d(normals[3 * f])
+    n1 = wp.vec3d(normals[3 * f + 1])
+    n2 = wp.vec3d(normals[3 * f + 2])
+    to = f * COLUMNS
+    for k in range(3):
+        row = r0 * n0[k] + r1 * n1[k] + r2 * n2[k]
+        for j in range(3):
+            table[to + 3 * k + j] = wp.float32(row[j])
+    t0 = uv[3 * f]
+    t1 = uv[3 * f + 1]
+    t2 = uv[3 * f + 2]
+    for k in range(2):
+        row = r0 * wp.float64(t0[k]) + r1 * wp.float64(t1[k]) + r2 * wp.float64(t2[k])
+        for j in range(3):
+            table[to + 9 + 3 * k + j] = wp.float32(row[j])
+    for k in range(3):
+        table[to + 15 + k] = albedo[f][k]
+    for k in range(4):
+        table[to + 18 + k] = pattern[f][k]
+
+
+@wp.kernel
+def owner_kernel(
+    start: int,
+    face: wp.array(dtype=wp.int32),
+    materials: wp.array(dtype=wp.uint8),
+    owners: wp.array(dtype=wp.int32),
+    semantics: wp.array(dtype=wp.uint8),
+    material: wp.array(dtype=wp.uint8),
+    owner: wp.array(dtype=wp.int32),
+    semantic: wp.array(dtype=wp.uint8),
+):
+    i = start + wp.tid()
+    f = face[i]
+    if f >= 0:
+        material[i] = materials[f]
+        owner[i] = owners[f]
+        semantic[i] = semantics[f]
+    else:
+        material[i] = wp.uint8(M_SKY)
+        owner[i] = -1
+        semantic[i] = S_SKY
+
+
+@wp.kernel
+def nearest_kernel(start: int, width: int, depth: wp.array(dtype=wp.float32), nearest: wp.array(dtype=wp.int64)):
+    """The nearest of the four samples of a pixel; width: of the image."""
+    i = start + wp.tid()
+    y = i // width
+    a = 4 * width * y + 2 * (i - y * width)
+    best = int(a)
+    least = depth[a]
+    for k in range(1, 4):
+        at = a + (k // 2) * 2 * width + (k % 2)
+        if depth[at] < least:
+            best = at
+            least = depth[at]
+    nearest[i] = wp.int64(best)
+
+
+# ---------------------------------------------------------------------------------------------------------- shadow maps
+
+
+@wp.func
+def fill_map(
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    base: int,
+    texels: int,
+    first: int,
+    end: int,
+    depth: wp.array(dtype=wp.float32),
+):
+    """Offers a triangle (x, y texels, depth m) to rows [first, end) of a map."""
+    y0 = wp.max(int(wp.ceil(wp.max(wp.min(wp.min(a[1], b[1]), c[1]), wp.float64(first)))), first)
+    y1 = wp.min(int(wp.floor(wp.min(wp.max(wp.max(a[1], b[1]), c[1]), wp.float64(end)))), end - 1)
+    left = wp.min(wp.min(a[0], b[0]), c[0])
+    right = wp.max(wp.max(a[0], b[0]), c[0])
+    if y0 <= y1 and left < wp.float64(texels - 1) and right > wp.float64(0.0):
+        ux = b[0] - a[0]
+        uy = b[1] - a[1]
+        vx = c[0] - a[0]
+        vy = c[1] - a[1]
+        area = ux * vy - uy * vx
+        if wp.abs(area) > SLIVER:
+            uz = b[2] - a[2]
+            vz = c[2] - a[2]
+            slope_x = (uz * vy - vz * uy) / area
+            slope_y = (vz * ux - uz * vx) / area
+            lowest = wp.float32(wp.min(wp.min(a[2], b[2]), c[2]))
+            highest = wp.float32(wp.max(wp.max(a[2], b[2]), c[2]))
+            for y in range(y0, y1 + 1):
+                v = wp.float64(y)
+                low = right
+                high = left
+                # where the row crosses the sides that it lies between
+                if (a[1] <= v) != (b[1] <= v):
+                    x = a[0] + (v - a[1]) * ux / uy
+                    low = wp.min(low, x)
+                    high = wp.max(high, x)
+                if (b[1] <= v) != (c[1] <= v):
+                    x = b[0] + (v - b[1]) * (c[0] - b[0]) / (c[1] - b[1])
+                    low = wp.min(low, x)
+                    high = wp.max(high, x)
+                if (c[1] <= v) != (a[1] <= v):
+                    x = a[0] + (v - a[1]) * vx / vy
+                    low = wp.min(low, x)
+                    high = wp.max(high, x)
+                x0 = int(wp.ceil(wp.max(low - SLIVER, wp.float64(0.0))))
+                x1 = int(wp.floor(wp.min(high + SLIVER, wp.float64(texels - 1))))
+                row = base + y * texels
+                begin = wp.float32(a[2] + slope_y * (v - a[1]) - slope_x * a[0])
+                step = wp.float32(slope_x)
+                for x in range(x0, x1 + 1):
+                    z = wp.min(wp.max(begin + step * float(x), lowest), highest)
+                    if z < depth[row + x]:
+                        depth[row + x] = z
+
+
+@wp.func
+def to_texels(p: wp.vec3d, area: wp.vec4f, texels: int):
+    size = wp.float64(texels)
+    half = wp.float64(0.5)
+    x = (p[0] - wp.float64(area[0])) * (size / wp.float64(area[1] - area[0])) - half
+    y = (p[1] - wp.float64(area[2])) * (size / wp.float64(area[3] - area[2])) - half
+    return wp.vec3d(x, y, p[2])
+
+
+@wp.kernel
+def sun_kernel(
+    start: int,
+    bands: int,
+    corners: wp.array(dtype=wp.vec3f),
+    material: wp.array(dtype=wp.uint8),
+    owner: wp.array(dtype=wp.int32),
+    shade: Shade,
+    ground: wp.array(dtype=wp.uint8),
+):
+    """Fills the rows of one band of all maps."""
+    band = start + wp.tid()
+    texels = shade.texels
+    first = texels * band // bands
+    end = texels * (band + 1) // bands
+    for k in range(4):
+        for i in range(first * texels, end * texels):
+            shade.depth[k * texels * texels + i] = INFINITE
+    for f in range(material.shape[0]):
+        if ground[wp.int32(material[f])] == wp.uint8(0):
+            a = shade.rows * corners[3 * f] + shade.shift
+            b = shade.rows * corners[3 * f + 1] + shade.shift
+            c = shade.rows * corners[3 * f + 2] + shade.shift
+            left = wp.min(wp.min(a[0], b[0]), c[0])
+            right = wp.max(wp.max(a[0], b[0]), c[0])
+            near = wp.min(wp.min(a[1], b[1]), c[1])
+            far = wp.max(wp.max(a[1], b[1]), c[1])
+            layer = int(0)
+            if owner[f] > 0:
+                layer = 1
+            for i in range(2):
+                area = shade.near
+                if i == 1:
+                    area = shade.far
+                if right > area[0] and left < area[1] and far > area[2] and near < area[3]:
+                    fill_map(
+                        to_texels(wp.vec3d(a), area, texels),
+                        to_texels(wp.vec3d(b), area, texels),
+                        to_texels(wp.vec3d(c), area, texels),
+                        (2 * i + layer) * texels * texels,
+                        texels,
+                        first,
+                        end,
+                        shade.depth,
+                    )
+
+
+# --------------------------------------------------------------------------------------------------------------- camera
+
+
+@wp.func_native("""
+    // One row of the picture: vignette, grain, rounding. The loop is plain so that the compiler widens it.
+    const float* from = (const float*)image.data + row * length;
+    const float* off = (const float*)across.data;
+    unsigned char* to = (unsigned char*)out.data + row * length;
+    for (int i = 0; i < length; ++i) {
+        unsigned int x = ((unsigned int)(row * length + i) * 0x9E3779B9u) ^ (unsigned int)seed;
+        x ^= x >> 16; x *= 0x7FEB352Du; x ^= x >> 15; x *= 0x846CA68Bu; x ^= x >> 16;
+        unsigned int pairs = (x & 0x00FF00FFu) + ((x >> 8) & 0x00FF00FFu);
+        float grain = ((float)(int)((pairs & 0xFFFFu) + (pairs >> 16)) - 510.0f) * scale;
+        float value = from[i] * (1.0f - vignette * (off[i] + down));
+        float bright = value > 0.0f ? value : 0.0f;
+        value += grain * (noise * (0.4f + __builtin_sqrtf(bright)));
+        value = value * 255.0f;
+        value = value > 0.0f ? value : 0.0f;
+        value = value < 255.0f ? value : 255.0f;
+        to[i] = (unsigned char)(int)__builtin_rintf(value);
+    }
+""")
+def expose_row(
+    image: wp.array(dtype=wp.float32),
+    across: wp.array(dtype=wp.float32),
+    out: wp.array(dtype=wp.uint8),
+    row: int,
+    length: int,
+    down: float,
+    vignette: float,
+    noise: float,
+    scale: float,
+    seed: wp.uint32,
+): ...
+
+
+@wp.kernel
+def camera_kernel(
+    start: int,
+    image: wp.array(dtype=wp.float32),
+    across: wp.array(dtype=wp.float32),
+    down: wp.array(dtype=wp.float32),
+    vignette: float,
+    noise: float,
+    seed: wp.uint32,
+    out: wp.array(dtype=wp.uint8),
+):
+    row = start + wp.tid()
+    expose_row(image, across, out, row, across.shape[0], down[row], vignette, noise, BYTES, seed)
+
+
+# ----------------------------------------------------------------------------------------------------------------- host
+
+
+_KINDS = {np.float32: wp.float32, np.int32: wp.int32, np.int64: wp.int64, np.uint8: wp.uint8, np.bool_: wp.uint8}
+_WIDTHS = {wp.vec2f: 2, wp.vec3f: 3, wp.vec4f: 4}
+
+
+def _flat(values: np.ndarray, dtype: Any = None) -> wp.array:
+    """The values as one row, without a copy where they are contiguous. dtype: of Warp's vectors."""
+    kind = dtype or _KINDS[values.dtype.type]
+    if values.dtype == np.bool_:
+        values = values.view(np.uint8)
+    shape = (-1, _WIDTHS[kind]) if kind in _WIDTHS else (-1,)
+    return wp.array(np.ascontiguousarray(values).reshape(shape), dtype=kind, copy=False, device="cpu")
+
+
+def _vec(values: np.ndarray) -> Any:
+    return wp.vec3f(*np.asarray(values, np.float32).tolist())
+
+
+def _mat(values: np.ndarray) -> Any:
+    return wp.mat33f(*np.asarray(values, np.float32).reshape(-1).tolist())
+
+
+_GROUND = np.isin(np.arange(len(Material)), GROUND).astype(np.uint8)
+
+
+def owners(face: np.ndarray, seen: Soup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Material uint8, owner int32 and semantic uint8, shaped as face, int32, -1: sky. See `Sight`."""
+    out = np.empty(face.shape, np.uint8), np.empty(face.shape, np.int32), np.empty(face.shape, np.uint8)
+    inputs = [_flat(face), _flat(seen.material), _flat(seen.owner), _flat(seen.semantic), *(_flat(o) for o in out)]
+    launch(owner_kernel, halves(face.size), inputs)
+    return out
+
+
+def nearest(depth: np.ndarray) -> np.ndarray:
+    """See `Sight.nearest`. depth (2H, 2W) -> (H, W) int64."""
+    height, width = depth.shape[0] // 2, depth.shape[1] // 2
+    out = np.empty((height, width), np.int64)
+    launch(nearest_kernel, halves(out.size), [width, _flat(depth), _flat(out)])
+    return out
+
+
+def _shade(
+    rows: np.ndarray, depth: np.ndarray, areas: tuple[tuple[float, ...], ...], prints: np.ndarray | None = None
+) -> Shade:
+    shade = Shade()
+    shade.rows, shade.shift = _mat(rows[:, :3]), _vec(rows[:, 3])
+    shade.depth = _flat(depth)
+    shade.near, shade.far = (wp.vec4f(*area) for area in areas)
+    shade.texels, shade.sunny = depth.shape[-1], 1
+    if prints is not None and len(prints):
+        shade.prints = wp.array(prints, dtype=wp.float32, copy=False, device="cpu")
+    return shade
+
+
+def sun_depth(soup: Soup, rows: np.ndarray, areas: tuple[tuple[float, ...], ...], texels: int) -> np.ndarray:
+    """`SunMaps.depth`. rows (3, 4): camera axes to a map's x, y, depth; areas: two of (x0, x1, y0, y1), m."""
+    depth = np.empty((2, 2, texels, texels), np.float32)
+    bands = threads()
+    inputs = [bands, _flat(soup.corners, wp.vec3f), _flat(soup.material), _flat(soup.owner)]
+    launch(sun_kernel, range(bands + 1), [*inputs, _shade(rows, depth, areas), _flat(_GROUND)])
+    return depth
+
+
+def _noise(textures: NoiseSet) -> Noise:
+    out = Noise()
+    out.soft, out.rough, out.grain = _flat(textures.soft), _flat(textures.rough), _flat(textures.grain)
+    return out
+
+
+def _air(light: Light) -> Air:
+    air = Air()
+    right, forward = light.ahead
+    air.sun, air.up, air.right, air.forward = _vec(light.sun), _vec(light.up), _vec(right), _vec(forward)
+    air.sun_colour, air.zenith, air.horizon = _vec(light.sun_colour), _vec(light.zenith), _vec(light.horizon)
+    air.ambient, air.bounce = _vec(light.ambient), _vec(ground_light(light))
+    air.town = _vec(light.ambient * 0.22 + light.sun_colour * 0.03)
+    air.tarmac = _vec(MIRRORED_GROUND * (light.ambient + 0.6 * light.sun_colour))
+    air.haze, air.clouds, air.cloud_seed = light.haze_per_m, light.clouds, light.cloud_seed
+    air.wet, air.fog = light.wet, int(light.weather == "fog")
+    if light.panorama is not None:
+        pixels = light.panorama.pixels
+        air.panorama = _flat(pixels)
+        air.panorama_height, air.panorama_width = pixels.shape[:2]
+        air.panorama_turn = light.panorama.turn_rad
+    return air
+
+
+def _street(road: Road) -> Street:
+    street = Street()
+    lines = [(m.middle_m, m.width_m, m.dash_m, m.period_m) for m in road.markings]
+    street.markings = _flat(np.array(lines or [(0.0,) * 4], np.float32), wp.vec4f)
+    street.count = len(lines)
+    street.crossing = wp.vec2f(*(road.crossing or (1.0, 0.0)))
+    street.own_side = road.markings[0].middle_m if road.markings else -1.7
+    street.soaked = _flat(SOAKED, wp.vec3f)
+    return street
+
+
+def _prints(shadows: list[Shadow]) -> np.ndarray:
+    """Rows of `Shade.prints`."""
+    rows = np.zeros((len(shadows), 8), np.float32)
+    for row, shadow in zip(rows, shadows, strict=True):
+        length, height, width = shadow.size_lhw
+        reach = 0.75 * height
+        radius = 0.5 * float(np.hypot(length, width)) + reach
+        turn = np.cos(shadow.yaw), np.sin(shadow.yaw)
+        row[:] = (*shadow.position_xz, radius, *turn, length / 2, width / 2, reach)
+    return rows
+
+
+def develop_pixels(
+    sight: Sight,
+    setting: Setting,
+    maps: SunMaps | None,
+    shadows: list[Shadow],
+    target: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """`render._develop_pixels`, in place. target: image (H * W, 3) float32, wanted (H * W,) bool, and `fine_matrix`.
+    Returns the pixels (H * W,) bool that actors touch.
+    """
+    image, wanted, fine = target
+    seen, view = sight.faces, setting.view
+    scene = Scene()
+    table = np.empty((max(len(seen), 1), TABLE), np.float32)
+    scene.table = _flat(table)
+    scene.face, scene.depth, scene.owner = _flat(sight.face), _flat(sight.depth), _flat(sight.owner)
+    scene.material, scene.ground = _flat(sight.material), _flat(_GROUND)
+    soup = [_flat(seen.corners, wp.vec3f), _flat(seen.normals, wp.vec3f), _flat(seen.uv, wp.vec2f)]
+    paint = [_flat(seen.albedo, wp.vec3f), _flat(seen.pattern, wp.vec4f)]
+    launch(table_kernel, halves(len(seen)), [*soup, *paint, scene.table])
+    lens = Lens()
+    lens.ray, lens.axes = _mat(np.linalg.inv(fine)), _mat(view.rotation.T)
+    lens.origin, lens.centre = _vec(view.origin), _vec(view.centre)
+    lens.focal, lens.height_m, lens.width = float(view.camera.intrinsics[0, 0]), view.height_m, view.camera.width
+    lens.develop = _vec(setting.response.exposure * setting.response.white_balance)
+    lens.power = setting.response.contrast / 2.2
+    prints = _prints(shadows)
+    if maps is None:
+        shade = _shade(np.zeros((3, 4)), np.zeros((2, 2, 1, 1), np.float32), ((0.0,) * 4,) * 2, prints)
+        shade.sunny = 0
+    else:
+        shade = _shade(maps.rows, maps.depth, maps.areas, prints)
+    touched = np.empty(len(image), bool)
+    inputs = [scene, _air(setting.light), _street(setting.road), _noise(setting.noise), lens, shade]
+    launch(
+        pixel_kernel,
+        halves(len(image)),
+        [*inputs, _flat(wanted), _flat(image, wp.vec3f), _flat(touched)],
+        device=torch.device("cpu"),
+    )
+    return touched
+
+
+def expose(image: np.ndarray, response: Response, seed: int) -> np.ndarray:
+    """Vignette, grain and rounding: (H, W, 3) float32 display values to uint8; see `render.expose`."""
+    height, width = image.shape[:2]
+    across = np.repeat(np.square(np.linspace(-1, 1, width, dtype=np.float32)), 3)
+    down = np.square(np.linspace(-1, 1, height, dtype=np.float32) * np.float32(height / width))
+    out = np.empty(image.shape, np.uint8)
+    parts = threads()
+    edges = [height * i // parts for i in range(parts + 1)]
+    inputs = [_flat(image), _flat(across), _flat(down), response.vignette, response.noise, wp.uint32(seed)]
+    launch(camera_kernel, edges, [*inputs, _flat(out)])
+    return out
