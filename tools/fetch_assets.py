@@ -42,18 +42,24 @@ from scene_ir.types import Mesh, Part
 DEBIAN_PACKAGE = "sweethome3d-furniture"
 NPM_PACKAGE = "@pmndrs/assets@1.7.0"
 _CATALOGUE = "PluginFurnitureCatalog.properties"
-_MOST_FACES = 12_000
+_MOST_FACES = 20_000
 """A vehicle of the pack has no more triangles: enough for one 700 px high."""
-_TEXEL_SHARE = 1 / 170
-"""Textured triangles are cut to edges of this share of the length, 3 cm of a car, and coloured face by face."""
+_CUTS = ((1 / 170, 0.2), (1 / 100, 0.3), (1 / 70, 0.35), (1 / 45, 0.45))
+"""Textured triangles are coloured face by face. They are cut to edges of this share of the length, 3 cm of a car,
+unless their texture varies by less than the second number of a channel's range; the finest of these is taken that
+gives at most `_MOST_TEXTURED` triangles."""
+_MOST_TEXTURED = 15_000
 _COLOUR_STEPS = 16
 """Levels a channel of texture colours, so that even areas stay even and simplify well."""
-_EVEN = 0.2
-"""A triangle whose texture varies by less than this share of a channel stays whole, in its middle colour."""
+_BRIGHTEST_METAL = 0.55
+"""Most sRGB value of chrome and aluminium, which the generator shades as trim: what they mirror it adds."""
 _DARKEST = 0.2
 """Least sRGB value of trim: black plastic reflects about 3 %; some models give 0."""
-SKIES = ("city", "dawn", "night", "park", "sky", "sunrise", "sunset", "venice")
-"""Outdoor skies with a free horizon; the others are rooms, a bridge and a dense forest."""
+SKIES = {"dawn": 5.0, "night": 14.0, "park": 7.0, "sky": 1.5, "sunrise": 11.0, "venice": 20.0}
+"""Outdoor skies, and how many degrees their trees and hills rise above the horizon: at 512x256 they are a blur, so
+the sky above is drawn down over them. The other skies are rooms, a forest, and towns whose towers are too high."""
+_FREE_DEG = 50.0
+"""From here upwards a sky stays as it is."""
 
 
 @dataclass(frozen=True)
@@ -207,17 +213,12 @@ def vehicle(
     everything = np.concatenate([points for _, _, points in shapes])
     low, high = everything.min(axis=0), everything.max(axis=0)
     metres = np.array(entry.size_lhw_m) / np.maximum(high - low, 1e-9)
-    corners, colours, parts = [], [], []
-    for key, shape, points in shapes:
-        part = _part(model, str(getattr(shape.visual.material, "name", "") or key))
-        placed = (points - [low[0], high[1], low[2]]) * metres
-        triangles, tint = _coloured(
-            placed, np.asarray(shape.faces), shape.visual, entry.size_lhw_m[0] * _TEXEL_SHARE
-        )
-        corners.append(triangles)
-        colours.append(tint)
-        parts.append(np.full(len(triangles), int(part)))
-    solid, tints, kinds = np.concatenate(corners), np.concatenate(colours), np.concatenate(parts)
+    placed = [(points - [low[0], high[1], low[2]]) * metres for _, _, points in shapes]
+    solid, tints, counts = _cut([(points, s) for points, (_, s, _) in zip(placed, shapes, strict=True)], entry)
+    names = [str(getattr(shape.visual.material, "name", "") or key) for key, shape, _ in shapes]
+    kinds = np.repeat([int(_part(model, name)) for name in names], counts)
+    metal = np.repeat([re.search("chrome|alumin|metal", name.lower()) is not None for name in names], counts)
+    tints[metal] = np.minimum(tints[metal], _BRIGHTEST_METAL)
     if model.roof_m is not None:
         below = solid[..., 1].max(axis=1) > -model.roof_m
         solid, tints, kinds = solid[below], tints[below], kinds[below]
@@ -238,10 +239,32 @@ def _part(model: Model, material: str) -> Part:
     return Part.OTHER
 
 
+def _cut(
+    shapes: list[tuple[np.ndarray, trimesh.Trimesh]], entry: Entry
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """All triangles (F, 3, 3) with their colours (F, 3), and how many each shape gave, as `_CUTS` says."""
+    pieces: list[tuple[np.ndarray, np.ndarray]] = []
+    for share, even in _CUTS:
+        limits = (share * entry.size_lhw_m[0], even)
+        pieces = [_coloured(points, np.asarray(s.faces), s.visual, limits) for points, s in shapes]
+        cut = sum(len(p[0]) for p, (_, s) in zip(pieces, shapes, strict=True) if len(p[0]) > len(s.faces))
+        if cut <= _MOST_TEXTURED:
+            break
+    return (
+        np.concatenate([p[0] for p in pieces]),
+        np.concatenate([p[1] for p in pieces]),
+        [len(p[0]) for p in pieces],
+    )
+
+
 def _coloured(
-    points: np.ndarray, faces: np.ndarray, visual: object, longest: float
+    points: np.ndarray, faces: np.ndarray, visual: object, limits: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3, 3) and their colours (F, 3); textured ones are cut small enough to show their texture."""
+    """Triangles (F, 3, 3) and their colours (F, 3); textured ones are cut, see `_CUTS`.
+
+    limits: longest edge, and how much a texture may vary where a triangle stays whole.
+    """
+    longest, variation = limits
     material, uv = getattr(visual, "material", None), getattr(visual, "uv", None)
     if not isinstance(material, SimpleMaterial):
         return points[faces], np.full((len(faces), 3), 0.5)
@@ -252,7 +275,9 @@ def _coloured(
     # Texture coordinates ride along as two more, tiny, coordinates: edges are as long as before.
     small = 1e-7 * longest
     joint = np.hstack([points, np.asarray(uv)[:, :2] * small])
-    cut_points, cut, source = subdivide_to_size(joint, faces, longest, max_iter=14, return_index=True)
+    divided = subdivide_to_size(joint, faces, longest, max_iter=14, return_index=True)
+    assert len(divided) == 3
+    cut_points, cut, source = divided
     centre = cut_points[cut][..., 3:].mean(axis=1) / small
     pixels = np.asarray(image.convert("RGB"), float) / 255
     height, width = pixels.shape[:2]
@@ -262,7 +287,7 @@ def _coloured(
     low, high = np.full((len(faces), 3), np.inf), np.full((len(faces), 3), -np.inf)
     np.minimum.at(low, source, colour)
     np.maximum.at(high, source, colour)
-    even = (high - low).max(axis=1) < _EVEN
+    even = (high - low).max(axis=1) < variation
     rest = ~even[source]
     tint = np.round(np.concatenate([(low + high)[even] / 2, colour[rest]]) * _COLOUR_STEPS) / _COLOUR_STEPS
     return np.concatenate([points[faces[even]], cut_points[cut[rest]][..., :3]]), tint
@@ -346,7 +371,7 @@ def _lamps(mesh: Mesh) -> Mesh:
 
 
 @dataclass
-class _Pack:
+class Pack:
     """The folder that is written, and what is in it so far."""
 
     root: Path
@@ -367,7 +392,7 @@ class _Pack:
         files.write_text(self.root / "vehicles" / "vehicles.yaml", text)
 
 
-def add_vehicles(library: zipfile.ZipFile, pack: _Pack, models: Mapping[str, Model] = MODELS) -> Iterator[str]:
+def add_vehicles(library: zipfile.ZipFile, pack: Pack, models: Mapping[str, Model] = MODELS) -> Iterator[str]:
     """Convert a furniture library's vehicles into the pack; yields a line for each that was made."""
     for entry in catalogue(library):
         model = models.get(entry.folder)
@@ -395,7 +420,7 @@ def add_vehicles(library: zipfile.ZipFile, pack: _Pack, models: Mapping[str, Mod
 
 def add_skies(package: tarfile.TarFile, root: Path) -> Iterator[str]:
     """Convert the outdoor skies of the npm package; yields a line for each that was made."""
-    for name in SKIES:
+    for name, skyline in SKIES.items():
         target = root / "skies" / f"{name}.npz"
         if target.is_file():
             continue
@@ -405,7 +430,7 @@ def add_skies(package: tarfile.TarFile, root: Path) -> Iterator[str]:
             member = None
         if member is None:
             raise FormatError(str(package.name), f"package/hdri/{name}.exr.js", "no such member")
-        pixels = equirectangular(member.read().decode("ascii", "replace"), name)
+        pixels = without_skyline(equirectangular(member.read().decode("ascii", "replace"), name), skyline)
         files.write_npz(target, {"pixels": pixels.astype(np.float16)})
         yield f"{target.name}: {pixels.shape[1]}x{pixels.shape[0]}"
 
@@ -428,6 +453,20 @@ def equirectangular(module: str, name: str) -> np.ndarray:
             pixels = np.array(planes, np.float32)
     pixels = pixels if pixels.shape[-1] == 3 else np.moveaxis(pixels, 0, -1)
     return np.clip(np.nan_to_num(pixels, posinf=65504.0), 0.0, 65504.0)
+
+
+def without_skyline(pixels: np.ndarray, skyline_deg: float) -> np.ndarray:
+    """The panorama (h, w, 3) with the sky above `skyline_deg` drawn down to the horizon; the ground stays."""
+    height = pixels.shape[0]
+    elevation = 90 - (np.arange(height) + 0.5) * 180 / height
+    source = np.where(
+        elevation < _FREE_DEG, skyline_deg + elevation * (_FREE_DEG - skyline_deg) / _FREE_DEG, elevation
+    )
+    row = np.where(elevation > 0, (90 - source) * height / 180 - 0.5, np.arange(height))
+    upper = np.floor(row).astype(int).clip(0, height - 1)
+    share = np.clip(row - upper, 0, 1)[:, None, None]
+    lower = (upper + 1).clip(0, height - 1)
+    return (pixels[upper] * (1 - share) + pixels[lower] * share).astype(np.float32)
 
 
 def members(deb: Path) -> Iterator[tuple[str, bytes]]:
@@ -467,7 +506,7 @@ def run(command: list[str], folder: Path, otherwise: str) -> None:
         )
 
 
-def licences(pack: _Pack, skies: list[str]) -> str:
+def licences(pack: Pack, skies: list[str]) -> str:
     """The text of LICENCES.md: who made what, and under which licence."""
     lines = [
         "# Licences of this folder",
@@ -485,7 +524,7 @@ def licences(pack: _Pack, skies: list[str]) -> str:
 
 def fetch(out: Path, deb: Path | None, tarball: Path | None) -> Iterator[str]:
     """Make or complete the pack at `out`; yields a line for each file."""
-    pack = _Pack(out)
+    pack = Pack(out)
     wanted = [re.sub(r"[^a-z0-9]+", "-", key.rpartition("/")[2].lower()) + ".glb" for key in MODELS]
     with tempfile.TemporaryDirectory() as scratch:
         if not all(pack.has(name) for name in wanted):

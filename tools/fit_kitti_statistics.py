@@ -9,6 +9,7 @@ can be read back from them. The same input gives the same bytes.
 from __future__ import annotations
 
 import argparse
+import lzma
 import sys
 import tarfile
 import tempfile
@@ -66,8 +67,8 @@ def fit(folder: Path) -> dict[str, Any]:
     per_kind = {kind: size[kinds == kind][:, [1, 2, 0]] for kind in SIZED}
     per_kind = {kind: rows for kind, rows in per_kind.items() if len(rows)}
     return {
-        "source": "Fitted to the label and calibration files of the KITTI object training set (Geiger et al. 2012; "
-        f"{len(frames):,} frames); summary figures only, no label is contained.",
+        "source": "Fitted to the label and calibration files of the KITTI object training set (Geiger et al. "
+        f"2012; {len(frames):,} frames); summary figures only, no label is contained.",
         "vehicles_per_frame": _shares(np.bincount(np.minimum(counts, MOST_VEHICLES), minlength=MOST_VEHICLES + 1)),
         "depth_edges_m": depth_edges.tolist(),
         "depth_share": _shares(np.histogram(spot[vehicle, 2], depth_edges)[0]),
@@ -128,8 +129,8 @@ def fit_source(source: Path) -> dict[str, Any]:
         try:
             with tarfile.open(source) as archive:
                 archive.extractall(folder, filter="data")
-        except (tarfile.TarError, EOFError, OSError) as error:
-            raise FormatError(str(source), "a tar archive", error) from None
+        except (tarfile.TarError, lzma.LZMAError, EOFError, OSError) as error:
+            raise FormatError(str(source), "a whole tar archive", type(error).__name__) from None
         return fit(folder_of(Path(folder)))
 
 

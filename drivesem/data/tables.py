@@ -14,6 +14,10 @@ from scene_ir.errors import FormatError
 
 T = TypeVar("T")
 
+_LARGEST = 3.4028234e38
+"""Of float32, which tensors have."""
+_LARGEST_WHOLE = 2**31 - 1
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -36,7 +40,7 @@ class Row:
             value = float(text)
         except ValueError:
             raise FormatError(where, "a number", repr(text)) from None
-        if not math.isfinite(value):
+        if not abs(value) <= _LARGEST:
             raise FormatError(where, "a finite number", text)
         if not low <= value <= high:
             limits = f"at least {low:g}" if math.isinf(high) else f"a number in [{low:g}, {high:g}]"
@@ -55,6 +59,8 @@ class Row:
         value = _integer(f"{self.where}: {column}", self.fields[column])
         if value < low:
             raise FormatError(f"{self.where}: {column}", f"at least {low}", value)
+        if value > _LARGEST_WHOLE:
+            raise FormatError(f"{self.where}: {column}", f"at most {_LARGEST_WHOLE}", value)
         return value
 
 

@@ -50,13 +50,13 @@ FOCAL_PX, CENTRE_PX, SIZE_HW = 725.0, (620.5, 187.0), (375, 1242)
 """The one camera of the data set; no file says so."""
 COLOURS_1: Mapping[str, tuple[int, int, int]] = {**COLOURS, "GuardRail": (255, 100, 255)}
 """Colours of the categories; those of objects are free."""
-_CAMERA_TOLERANCE_PX = 0.01
-"""Virtual KITTI 2's focal length is 725.0087: over the width of the image that is 0.0075 px."""
+_CAMERA_TOLERANCE_PX = 1e-3
+"""Rounding; Virtual KITTI 2's focal length, 725.0087 px, is another camera's."""
 _HEAVY_TRUNCATION = 0.5
 """Share outside the image from which on truncation counts as heavy: what KITTI still counts as hard."""
 _STRIDE = 0x61C885
 """Odd, so that multiples of it are different 24-bit colours; spreads them over the cube (golden ratio)."""
-_MAX_TRACK = 9999
+MAX_TRACK = 9999
 """Far above what a world has; up to it no object's colour is a category's (checked by a test)."""
 _PREFIX = "vkitti_1.3.1_"
 _CACHED = 8
@@ -109,8 +109,8 @@ class Vkitti1Writer:
         check_tracks(exposure)
         things = sorted(exposure.objects, key=lambda thing: thing.track)
         for thing in things:
-            if thing.track > _MAX_TRACK:
-                raise RangeError("exposure.objects: track", f"at most {_MAX_TRACK}", thing.track)
+            if thing.track > MAX_TRACK:
+                raise RangeError("exposure.objects: track", f"at most {MAX_TRACK}", thing.track)
         colours = np.array([COLOURS_1[category(name)] for name in exposure.class_names], np.uint8)
         scene = colours[exposure.classes]
         left = exposure.instances > 0

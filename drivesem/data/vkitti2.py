@@ -346,7 +346,7 @@ class Vkitti2Dataset:
             clips = [v for s in sorted(base.glob("Scene*")) if s.is_dir() for v in sorted(s.iterdir())]
             for clip in clips:
                 rgb = _child(clip / "frames", "rgb")
-                for folder in sorted(rgb.glob("Camera_[0-9]")) if rgb else ():
+                for folder in sorted(f for f in rgb.glob("Camera_[0-9]") if f.is_dir()) if rgb else ():
                     camera = int(folder.name.removeprefix("Camera_"))
                     for path in sorted(folder.iterdir()):
                         if match := _IMAGE_NAME.match(path.name):

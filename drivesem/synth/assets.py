@@ -25,6 +25,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import cast
 
+import cv2
 import numpy as np
 import torch
 import yaml
@@ -43,6 +44,8 @@ _SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 VEHICLE_KINDS = tuple(kind for kind, label in LABEL_OF_KIND.items() if label in ("Car", "Van", "Truck"))
 _MOST_FACES = 20_000
 """Heavier meshes are simplified when read: a car 500 px high shows no more."""
+_FAR_FACES = 2500
+"""Enough for 90 px and less, with wheels and mirrors."""
 _KEYS = frozenset(
     ("kind", "up", "front", "size_lhw_m", "metres_per_unit", "use", "author", "licence", "source", "name")
 )
@@ -348,6 +351,13 @@ def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: floa
     return soup
 
 
+@lru_cache(maxsize=64)
+def vehicle_soup(vehicle: VehicleMesh, fine: bool = True) -> Soup:
+    """`mesh_soup` of a vehicle at its usual size, kept; fine: with the triangles that are seen from near only."""
+    mesh = vehicle.mesh
+    return mesh_soup(mesh if fine else simplify(mesh, _FAR_FACES), vehicle.size_lhw)
+
+
 def _tint(albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Paint (n, 3) against the main paint, in [0, 2]: hue is kept where the main paint is grey, else dropped."""
     order = np.argsort(albedo.sum(axis=1), kind="stable")
@@ -360,8 +370,15 @@ def _tint(albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_LEAST_SUN_RAD = 0.12
-"""The sun stands at least this high (7 degrees): the road must get its light."""
+_LEAST_SUN_RAD = 0.2
+"""The sun stands at least this high (11 degrees): the road must get its light."""
+_MOST_SUN = 1.4
+"""Most the sun gives a surface that faces it, where a level one in the open has about 1 at noon."""
+_BALANCE = 0.75
+"""How far white balance takes the colour of the light out, of 1."""
+_LEAST_HORIZON = 0.7
+"""Luminance of the sky near the horizon, where a sunlit white surface has 1: skies of driving photographs are all
+but overexposed."""
 _SUN_LOBE = 4.0
 """Pixels of a panorama this many times as bright as its brightest clouds belong to the sun."""
 
@@ -422,11 +439,32 @@ def measured(name: str, pixels: np.ndarray) -> Sky:
         y = (weight * np.sin(elevation)[:, None]).sum()
         sun_azimuth, sun_elevation = float(np.arctan2(x, z)), float(np.arctan2(y, np.hypot(x, z)))
         shade = rest * (limit / np.maximum(value, 1e-9))[..., None]
-        sun_colour = ((rest - shade) * (disc * solid)[..., None]).sum(axis=(0, 1)) / np.pi
-        rest[disc] = shade[disc]
+        # Compressed panoramas keep the disc's strength but not its colour, which its height tells well enough.
+        strength = float((((rest - shade) * (disc * solid)[..., None]).sum(axis=(0, 1)) / np.pi).max())
+        low = float(np.clip(1 - sun_elevation / np.deg2rad(30), 0, 1))
+        sun_colour = strength * np.array([1.0, 0.95 - 0.2 * low, 0.86 - 0.42 * low])
+        rest = _mended(rest, disc)
     fall = (np.clip(np.sin(elevation), 0, None)[:, None] * solid)[..., None]
     ambient = (rest * fall).sum(axis=(0, 1)) / np.pi
     return Sky(name, rest.astype(np.float32), sun_azimuth, sun_elevation, sun_colour, ambient)
+
+
+def _mended(pixels: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """The panorama (h, w, 3) with a hole (h, w) and its rim filled from around; the left edge meets the right."""
+    height, width = hole.shape
+    reach = max(width // 64, 2)
+    pad = 4 * reach
+    wide = np.pad(hole, ((0, 0), (pad, pad)), mode="wrap").astype(np.uint8)
+    rim = cv2.dilate(wide, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).astype(bool)
+    around = np.pad(pixels, ((0, 0), (pad, pad), (0, 0)), mode="wrap")
+    weight = (~rim).astype(np.float64)
+    # Only the sky fills the sky.
+    weight[height // 2 :] = 0
+    blurred = cv2.GaussianBlur(around * weight[..., None], (0, 0), 1.5 * reach)
+    share = cv2.GaussianBlur(weight, (0, 0), 1.5 * reach)
+    fill = rim & (share > 1e-4)
+    around[fill] = blurred[fill] / share[fill][:, None]
+    return around[:, pad : pad + width]
 
 
 def skies_in(folder: str | Path) -> tuple[Sky, ...]:
@@ -460,8 +498,8 @@ def _skies(found: tuple[tuple[Path, int], ...]) -> tuple[Sky, ...]:
 def with_sky(light: Light, sky: Sky, rng: np.random.Generator) -> Light:
     """The light under a photographed sky, turned at random about the vertical.
 
-    The whole is scaled so that a level surface in the open is as bright as it was, so the camera's exposure
-    still fits. Fog stays as it is, for it hides the sky.
+    A level surface in the open stays as bright as it was and nearly of its colour, as a camera's exposure and
+    white balance see to. Fog stays as it is, for it hides the sky.
     """
     turn = float(rng.uniform(-np.pi, np.pi))
     if light.weather == "fog":
@@ -470,28 +508,39 @@ def with_sky(light: Light, sky: Sky, rng: np.random.Generator) -> Light:
     elevation = max(sky.sun_elevation, _LEAST_SUN_RAD)
     azimuth = sky.sun_azimuth + turn
     sun = np.cos(elevation) * (np.sin(azimuth) * right + np.cos(azimuth) * forward) + np.sin(elevation) * light.up
-    before = _level(light.ambient, light.sun_colour, float(light.sun @ light.up))
-    now = _level(sky.ambient, sky.sun_colour, float(np.sin(elevation)))
-    scale = before / max(now, 1e-9)
-    pixels = sky.pixels * np.float32(scale)
-    rows = pixels.shape[0] // 2
-    zenith = pixels[: max(rows // 3, 1)].mean(axis=(0, 1))
-    horizon = pixels[rows - max(rows // 6, 1) : rows].mean(axis=(0, 1))
+    before = light.ambient + light.sun_colour * max(float(light.sun @ light.up), 0.0)
+    shining = sky.sun_colour * _dimming(sky, float(before @ _LUMINANCE), float(np.sin(elevation)))
+    now = np.maximum(sky.ambient + shining * np.sin(elevation), 1e-9)
+    whole = float(before @ _LUMINANCE) / float(now @ _LUMINANCE)
+    gain = whole ** (1 - _BALANCE) * (before / now) ** _BALANCE
+    gain *= float(before @ _LUMINANCE) / float((gain * now) @ _LUMINANCE)
+    rows = sky.pixels.shape[0] // 2
+    horizon = sky.pixels[rows - max(rows // 6, 1) : rows].mean(axis=(0, 1)) * gain
+    shown = max(_LEAST_HORIZON / max(float(horizon @ _LUMINANCE), 1e-9), 1.0)
+    pixels = sky.pixels * (gain * shown).astype(np.float32)
     return replace(
         light,
         weather=("dusk" if elevation < 0.26 else "sun") if sky.sunny else "overcast",
         sun=sun,
-        sun_colour=sky.sun_colour * scale,
-        zenith=zenith.astype(np.float64),
-        horizon=horizon.astype(np.float64),
-        ambient=sky.ambient * scale,
+        sun_colour=shining * gain,
+        zenith=pixels[: max(rows // 3, 1)].mean(axis=(0, 1)).astype(np.float64),
+        horizon=horizon * shown,
+        ambient=sky.ambient * gain,
         panorama=Panorama(pixels, turn),
     )
 
 
-def _level(ambient: np.ndarray, sun_colour: np.ndarray, height: float) -> float:
-    """Luminance of the light on a level surface in the open."""
-    return float((ambient + sun_colour * max(height, 0.0)) @ _LUMINANCE)
+def _dimming(sky: Sky, level: float, height: float) -> float:
+    """What the sun is multiplied by so that it gives at most `_MOST_SUN`, once a level surface gets `level`.
+
+    A low sun is so much stronger than its sky that no photograph shows both. height: sine of its elevation.
+    """
+    sun, ambient = float(sky.sun_colour @ _LUMINANCE), float(sky.ambient @ _LUMINANCE)
+    room = level - _MOST_SUN * height
+    if sun <= 0 or room <= 0:
+        return 1.0
+    # level * sun / (ambient + sun * height) <= _MOST_SUN, solved for the sun
+    return min(1.0, _MOST_SUN * ambient / room / sun)
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,12 +100,14 @@ _PANELS = ("vehicles_per_frame", "box_height_px", "depth_m", "lateral_m", "yaw_r
 
 @dataclass(frozen=True, slots=True)
 class Histograms:
-    """Shares (B,) and mean of every quantity over a number of frames."""
+    """Shares (B,) of every quantity over a number of frames, zeros where nothing was counted; means, None there and
+    for angles, which have none.
+    """
 
     frames: int
     vehicles: int
     shares: Mapping[str, np.ndarray]
-    means: Mapping[str, float]
+    means: Mapping[str, float | None]
 
     def summary(self) -> dict[str, Any]:
         """JSON's form: shares to 1e-5, means to 1e-4."""
@@ -116,12 +118,21 @@ class Histograms:
                 name: {
                     "unit": QUANTITIES[name].unit,
                     "edges": [round(float(e), 6) for e in QUANTITIES[name].edges],
-                    "mean": round(self.means[name], 4),
+                    "mean": _rounded(self.means[name]),
                     "share": [round(float(s), 5) for s in self.shares[name]],
                 }
                 for name in QUANTITIES
             },
         }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
+def _shown(value: float | None, decimals: int) -> str:
+    """A figure for people, a dash where there is none."""
+    return "-" if value is None else f"{value:.{decimals}f}"
 
 
 def _values(labels: Labels) -> dict[str, np.ndarray]:
@@ -159,13 +170,10 @@ def histograms(frames: Iterable[Labels]) -> Histograms:
         for name, values in _values(labels).items():
             found[name].append(values)
     values = {name: np.concatenate(parts) if parts else np.zeros(0) for name, parts in found.items()}
-    means = {}
-    for name, quantity in QUANTITIES.items():
-        if quantity.angle:
-            turn = np.exp(1j * values[name]).sum()
-            means[name] = float(np.angle(turn)) if len(values[name]) else 0.0
-        else:
-            means[name] = float(values[name].mean()) if len(values[name]) else 0.0
+    means = {
+        name: None if quantity.angle or not len(values[name]) else float(values[name].mean())
+        for name, quantity in QUANTITIES.items()
+    }
     return Histograms(
         frames=len(values["vehicles_per_frame"]),
         vehicles=len(values["box_height_px"]),
@@ -192,13 +200,15 @@ def reference() -> Histograms:
 
 @dataclass(frozen=True, slots=True)
 class Distance:
-    """How far one quantity is from KITTI's. wasserstein in `unit`; total_variation in [0, 1]."""
+    """How far one quantity is from KITTI's. wasserstein in `unit`; total_variation in [0, 1]; None where nothing
+    was counted.
+    """
 
     unit: str
-    mean: float
-    kitti_mean: float
-    wasserstein: float
-    total_variation: float
+    mean: float | None
+    kitti_mean: float | None
+    wasserstein: float | None
+    total_variation: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,21 +221,23 @@ class Comparison:
     @property
     def distances(self) -> dict[str, Distance]:
         """The distance of every quantity."""
-        return {
-            name: Distance(
+        found = {}
+        for name, quantity in QUANTITIES.items():
+            own, kitti = self.own.shares[name], self.kitti.shares[name]
+            counted = own.any() and kitti.any()
+            found[name] = Distance(
                 unit=quantity.unit,
                 mean=self.own.means[name],
                 kitti_mean=self.kitti.means[name],
-                wasserstein=quantity.wasserstein(self.own.shares[name], self.kitti.shares[name]),
-                total_variation=float(np.abs(self.own.shares[name] - self.kitti.shares[name]).sum() / 2),
+                wasserstein=quantity.wasserstein(own, kitti) if counted else None,
+                total_variation=float(np.abs(own - kitti).sum() / 2) if counted else None,
             )
-            for name, quantity in QUANTITIES.items()
-        }
+        return found
 
     @property
     def truncated(self) -> tuple[float, float]:
         """Share of vehicles that the image border cuts: here, and in KITTI."""
-        return (1 - float(self.own.shares["truncation"][0]), 1 - float(self.kitti.shares["truncation"][0]))
+        return float(self.own.shares["truncation"][1:].sum()), float(self.kitti.shares["truncation"][1:].sum())
 
     def summary(self) -> dict[str, Any]:
         """JSON's form of the distances and of both sides' histograms."""
@@ -233,10 +245,10 @@ class Comparison:
             "distances": {
                 name: {
                     "unit": d.unit,
-                    "mean": round(d.mean, 4),
-                    "kitti_mean": round(d.kitti_mean, 4),
-                    "wasserstein": round(d.wasserstein, 4),
-                    "total_variation": round(d.total_variation, 4),
+                    "mean": _rounded(d.mean),
+                    "kitti_mean": _rounded(d.kitti_mean),
+                    "wasserstein": _rounded(d.wasserstein),
+                    "total_variation": _rounded(d.total_variation),
                 }
                 for name, d in self.distances.items()
             },
@@ -253,8 +265,9 @@ class Comparison:
         rows = ["| quantity | unit | mean | KITTI's mean | Wasserstein-1 | total variation |"]
         rows.append("|---|---|---:|---:|---:|---:|")
         for name, d in self.distances.items():
-            figures = f"{d.mean:.2f} | {d.kitti_mean:.2f} | {d.wasserstein:.2f} | {d.total_variation:.3f}"
-            rows.append(f"| {QUANTITIES[name].title.lower()} | {d.unit} | {figures} |")
+            figures = " | ".join(_shown(v, 2) for v in (d.mean, d.kitti_mean, d.wasserstein))
+            title = QUANTITIES[name].title.lower()
+            rows.append(f"| {title} | {d.unit} | {figures} | {_shown(d.total_variation, 3)} |")
         mine, theirs = self.truncated
         rows.append(
             f"| truncated vehicles | % | {100 * mine:.1f} | {100 * theirs:.1f} | | {abs(mine - theirs):.3f} |"
@@ -290,9 +303,8 @@ class Comparison:
         axes.set_ylabel("share" if whole else f"share per {quantity.unit}")
         if quantity.unit == "level":
             axes.set_xticks(quantity.middles)
-        axes.set_title(
-            f"W1 {distance.wasserstein:.2f} {distance.unit}, TV {distance.total_variation:.3f}", fontsize=10
-        )
+        cost, variation = _shown(distance.wasserstein, 2), _shown(distance.total_variation, 3)
+        axes.set_title(f"W1 {cost} {distance.unit}, TV {variation}", fontsize=10)
 
 
 def compare(dataset: Dataset) -> Comparison:

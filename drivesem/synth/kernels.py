@@ -9,6 +9,7 @@ holds both together. Rows and pixels are dealt out to the threads, so the result
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,21 +17,19 @@ import torch
 import warp as wp
 
 from drivesem.synth.layout import Road
-from drivesem.synth.light import PANORAMA_GLARE, Light, Response
+from drivesem.synth.light import PANORAMA_GLARE, Light, Response, develop
 from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
 from drivesem.synth.shading import MIRRORED_GROUND, SOAKED, ground_light
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
 from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
 from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.raster.verbs import NEAR_M
 
 if TYPE_CHECKING:
     from drivesem.synth.render import Setting, Shadow, Sight, SunMaps
 
 start_warp()
-# Functions take structures by value: only where LLVM inlines them, which it thinks too much by itself, are the copies
-# saved, half of the time.
-_INLINE = f"{OPTIONS['cpu_compiler_flags']} -mllvm=-inline-threshold=20000"
-wp.set_module_options({**OPTIONS, "cpu_compiler_flags": _INLINE})
+wp.set_module_options(OPTIONS)
 
 FOLD, UNFOLD = wp.constant(wp.float32(1.0 / SIZE)), wp.constant(wp.float32(SIZE))
 LAST = wp.constant(wp.float32(SIZE - 1e-3))
@@ -39,11 +38,17 @@ BYTES = wp.constant(wp.float32(BYTE_SUM_SCALE))
 GLARE = wp.constant(wp.float32(PANORAMA_GLARE))
 PI = wp.constant(wp.float32(np.pi))
 INFINITE = wp.constant(wp.float32(np.inf))
+CURVE, BRIGHTEST = 2048, 16.0
+"""Steps of the table of display values, and the radiance at its end: all above is white."""
+WHITE, PER_ROOT = wp.constant(wp.float32(BRIGHTEST)), wp.constant(wp.float32(CURVE / BRIGHTEST**0.5))
 TABLE = 22
 """Numbers a face in `Scene.table`: three rows for the normal, two for the surface coordinates, albedo, pattern."""
 COLUMNS = wp.constant(TABLE)
 SLIVER = wp.constant(wp.float64(1e-9))
-"""Triangles of a shadow map smaller than this, texels squared, are seen edge-on; and slack of its rows, texels."""
+"""Triangles smaller than this, px squared, are seen edge-on."""
+NEAR = wp.constant(wp.float64(NEAR_M))
+RIM = wp.constant(wp.float32(0.5))
+"""So far from the border of the near shadow map, m, nobody looks into the far one: more than its soft edges reach."""
 
 M_SKY, M_ROAD, M_PARKING, M_PAVEMENT, M_KERB, M_GRASS, M_GRAVEL = (wp.constant(int(m)) for m in list(Material)[:7])
 M_FACADE, M_ROOF, M_WALL, M_FENCE, M_LEAF, M_BARK, M_METAL = (wp.constant(int(m)) for m in list(Material)[7:14])
@@ -103,7 +108,7 @@ class Street:
 @wp.struct
 class Lens:
     """The view. ray (3 x 3): fine pixels to rays. axes (3 x 3), origin: camera to world. develop: exposure and white
-    balance; power: of the display values."""
+    balance; curve: see `shown`."""
 
     ray: wp.mat33f
     axes: wp.mat33f
@@ -113,7 +118,7 @@ class Lens:
     height_m: wp.float32
     width: wp.int32
     develop: wp.vec3f
-    power: wp.float32
+    curve: wp.array(dtype=wp.float32)
 
 
 @wp.struct
@@ -157,14 +162,6 @@ class Spot:
     open_sky: wp.float32
     pixel_m: wp.float32
     along_px: wp.float32
-
-
-@wp.struct
-class Result:
-    """A colour, and whether actors change it."""
-
-    colour: wp.vec3f
-    changed: wp.int32
 
 
 # ------------------------------------------------------------------------------------------------------- noise, light
@@ -269,13 +266,12 @@ def reflected_radiance(air: Air, textures: Noise, direction: wp.vec3f, soft: boo
 
 
 @wp.func
-def developed(radiance: wp.vec3f, lens: Lens):
-    out = wp.vec3f()
-    for axis in range(3):
-        x = wp.max(radiance[axis] * lens.develop[axis], 0.0)
-        square = x * x
-        out[axis] = power(x / wp.sqrt(wp.sqrt(1.0 + square * square)), lens.power)
-    return out
+def shown(x: float, curve: wp.array(dtype=wp.float32)):
+    """`light.develop` of a radiance x, exposed and white, by a table over the root of x."""
+    place = wp.sqrt(wp.min(wp.max(x, 0.0), WHITE)) * PER_ROOT
+    i = wp.int32(place)
+    share = place - float(i)
+    return load(curve, i) * (1.0 - share) + load(curve, i + 1) * share
 
 
 # ---------------------------------------------------------------------------------------------------------- materials
@@ -655,60 +651,6 @@ def open_sky(world: wp.vec3f, on_ground: bool, actor: bool, shade: Shade):
 # --------------------------------------------------------------------------------------------------------------- pixels
 
 
-@wp.func
-def sample_colour(
-    at: int, x: int, y: int, scene: Scene, air: Air, street: Street, textures: Noise, lens: Lens, shade: Shade
-):
-    """Display value of one fine pixel."""
-    out = Result()
-    ray = lens.ray * wp.vec3f(float(x), float(y), 1.0)
-    f = scene.face[at]
-    if f < 0:
-        if air.fog != 0:
-            out.colour = developed(air.horizon * 0.8, lens)
-        else:
-            out.colour = developed(sky_radiance(air, textures, wp.normalize(ray)), lens)
-        return out
-    s = Spot()
-    s.point = ray * scene.depth[at]
-    n = vec22()
-    for k in range(22):
-        n[k] = load(scene.table, f * COLUMNS + k)
-    normal = wp.vec3f(
-        n[0] * s.point[0] + n[1] * s.point[1] + n[2] * s.point[2],
-        n[3] * s.point[0] + n[4] * s.point[1] + n[5] * s.point[2],
-        n[6] * s.point[0] + n[7] * s.point[1] + n[8] * s.point[2],
-    )
-    normal = wp.normalize(normal)
-    if wp.dot(normal, s.point) > 0.0:
-        normal = -normal
-    s.normal = normal
-    s.u = n[9] * s.point[0] + n[10] * s.point[1] + n[11] * s.point[2]
-    s.v = n[12] * s.point[0] + n[13] * s.point[1] + n[14] * s.point[2]
-    s.albedo = wp.vec3f(n[15], n[16], n[17])
-    s.pattern = wp.vec4f(n[18], n[19], n[20], n[21])
-    s.world = lens.axes * (s.point + lens.centre) + lens.origin
-    material = wp.int32(scene.material[at])
-    actor = scene.owner[at] > 0
-    on_ground = scene.ground[material] != wp.uint8(0)
-    lit = lit_share(s, material, on_ground or actor, air, shade)
-    sky = open_sky(s.world, on_ground, actor, shade)
-    if lit[1] + sky[1] > 0.0:
-        out.changed = 1
-    s.lit = lit[0]
-    s.open_sky = sky[0]
-    s.pixel_m = s.point[2] / lens.focal
-    s.along_px = s.pixel_m
-    if on_ground:
-        s.along_px *= wp.max(s.point[2] / lens.height_m, 1.0)
-    colour = surface(s, material, air, street, textures)
-    if air.wet > 0.0:
-        colour = wetted(s, material, colour, air, street, textures)
-    through = exp_(-air.haze * wp.length(s.point))
-    out.colour = developed(colour * through + air.horizon * (0.6 * (1.0 - through)), lens)
-    return out
-
-
 @wp.kernel
 def pixel_kernel(
     start: int,
@@ -722,42 +664,97 @@ def pixel_kernel(
     out: wp.array(dtype=wp.vec3f),
     touched: wp.array(dtype=wp.uint8),
 ):
+    # A row a thread: structures are copied once a row.
+    row = start + wp.tid()
+    for column in range(lens.width):
+        i = row * lens.width + column
+        y = 2 * row
+        x = 2 * column
+        a = y * (2 * lens.width) + x
+        c = a + 2 * lens.width
+        actors = wp.max(wp.max(scene.owner[a], scene.owner[a + 1]), wp.max(scene.owner[c], scene.owner[c + 1]))
+        changed = wp.where(actors > 0, 1, 0)
+        if wanted[i] != wp.uint8(0):
+            f = scene.face[a]
+            once = scene.face[a + 1] == f and scene.face[c] == f and scene.face[c + 1] == f
+            if not once:
+                m = scene.material[a]
+                o = scene.owner[a]
+                alike = scene.material[a + 1] == m and scene.material[c] == m and scene.material[c + 1] == m
+                if alike and scene.owner[a + 1] == o and scene.owner[c] == o and scene.owner[c + 1] == o:
+                    if wp.int32(m) == M_LEAF:
+                        once = True
+                    else:
+                        first = wp.vec4f(scene.depth[a], scene.depth[a + 1], scene.depth[c], scene.depth[c + 1])
+                        once = wp.max(first) < wp.min(first) * 1.03
+            count = wp.where(once, 1, 4)
+            total = wp.vec3f()
+            for k in range(count):
+                dy = k // 2
+                dx = k - 2 * dy
+                at = a + dy * 2 * lens.width + dx
+                ray = lens.ray * wp.vec3f(float(x + dx), float(y + dy), 1.0)
+                f = scene.face[at]
+                colour = air.horizon * 0.8
+                if f >= 0:
+                    s = Spot()
+                    s.point = ray * scene.depth[at]
+                    n = vec22()
+                    for j in range(22):
+                        n[j] = load(scene.table, f * COLUMNS + j)
+                    normal = wp.vec3f(
+                        n[0] * s.point[0] + n[1] * s.point[1] + n[2] * s.point[2],
+                        n[3] * s.point[0] + n[4] * s.point[1] + n[5] * s.point[2],
+                        n[6] * s.point[0] + n[7] * s.point[1] + n[8] * s.point[2],
+                    )
+                    normal = wp.normalize(normal)
+                    if wp.dot(normal, s.point) > 0.0:
+                        normal = -normal
+                    s.normal = normal
+                    s.u = n[9] * s.point[0] + n[10] * s.point[1] + n[11] * s.point[2]
+                    s.v = n[12] * s.point[0] + n[13] * s.point[1] + n[14] * s.point[2]
+                    s.albedo = wp.vec3f(n[15], n[16], n[17])
+                    s.pattern = wp.vec4f(n[18], n[19], n[20], n[21])
+                    s.world = lens.axes * (s.point + lens.centre) + lens.origin
+                    material = wp.int32(scene.material[at])
+                    actor = scene.owner[at] > 0
+                    on_ground = scene.ground[material] != wp.uint8(0)
+                    lit = lit_share(s, material, on_ground or actor, air, shade)
+                    sky = open_sky(s.world, on_ground, actor, shade)
+                    if lit[1] + sky[1] > 0.0:
+                        changed = 1
+                    s.lit = lit[0]
+                    s.open_sky = sky[0]
+                    s.pixel_m = s.point[2] / lens.focal
+                    s.along_px = s.pixel_m
+                    if on_ground:
+                        s.along_px *= wp.max(s.point[2] / lens.height_m, 1.0)
+                    colour = surface(s, material, air, street, textures)
+                    if air.wet > 0.0:
+                        colour = wetted(s, material, colour, air, street, textures)
+                    through = exp_(-air.haze * wp.length(s.point))
+                    colour = colour * through + air.horizon * (0.6 * (1.0 - through))
+                elif air.fog == 0:
+                    colour = sky_radiance(air, textures, wp.normalize(ray))
+                for axis in range(3):
+                    total[axis] += shown(colour[axis] * lens.develop[axis], lens.curve)
+            out[i] = total * (1.0 / float(count))
+        touched[i] = wp.uint8(changed)
+
+
+@wp.kernel
+def mark_kernel(start: int, face: wp.array(dtype=wp.int32), used: wp.array(dtype=wp.uint8)):
+    """Marks the faces that a pixel shows; threads may write the same mark at once."""
     i = start + wp.tid()
-    y = 2 * (i // lens.width)
-    x = 2 * (i - (y // 2) * lens.width)
-    a = y * (2 * lens.width) + x
-    c = a + 2 * lens.width
-    actors = wp.max(wp.max(scene.owner[a], scene.owner[a + 1]), wp.max(scene.owner[c], scene.owner[c + 1]))
-    changed = wp.where(actors > 0, 1, 0)
-    if wanted[i] != wp.uint8(0):
-        f = scene.face[a]
-        once = scene.face[a + 1] == f and scene.face[c] == f and scene.face[c + 1] == f
-        if not once:
-            m = scene.material[a]
-            o = scene.owner[a]
-            alike = scene.material[a + 1] == m and scene.material[c] == m and scene.material[c + 1] == m
-            if alike and scene.owner[a + 1] == o and scene.owner[c] == o and scene.owner[c + 1] == o:
-                if wp.int32(m) == M_LEAF:
-                    once = True
-                else:
-                    first = wp.vec4f(scene.depth[a], scene.depth[a + 1], scene.depth[c], scene.depth[c + 1])
-                    once = wp.max(first) < wp.min(first) * 1.03
-        count = wp.where(once, 1, 4)
-        total = wp.vec3f()
-        for k in range(count):
-            dy = k // 2
-            dx = k - 2 * dy
-            at = a + dy * 2 * lens.width + dx
-            found = sample_colour(at, x + dx, y + dy, scene, air, street, textures, lens, shade)
-            total += found.colour
-            changed = wp.max(changed, found.changed)
-        out[i] = total * (1.0 / float(count))
-    touched[i] = wp.uint8(changed)
+    f = face[i]
+    if f >= 0:
+        used[f] = wp.uint8(1)
 
 
 @wp.kernel
 def table_kernel(
     start: int,
+    used: wp.array(dtype=wp.uint8),
     corners: wp.array(dtype=wp.vec3f),
     normals: wp.array(dtype=wp.vec3f),
     uv: wp.array(dtype=wp.vec2f),
@@ -767,36 +764,37 @@ def table_kernel(
 ):
     """`render._attribute_maps`: barycentric coordinates are linear in the point, in camera axes about the centre."""
     f = start + wp.tid()
-    a = wp.vec3d(corners[3 * f])
-    b = wp.vec3d(corners[3 * f + 1])
-    c = wp.vec3d(corners[3 * f + 2])
-    first = wp.cross(b, c)
-    volume = wp.dot(a, first)
-    if wp.abs(volume) < wp.float64(1e-12):
-        volume = wp.float64(1e-12)
-    scale = wp.float64(1.0) / volume
-    r0 = first * scale
-    r1 = wp.cross(c, a) * scale
-    r2 = wp.cross(a, b) * scale
-    n0 = wp.vec3d(normals[3 * f])
-    n1 = wp.vec3d(normals[3 * f + 1])
-    n2 = wp.vec3d(normals[3 * f + 2])
-    to = f * COLUMNS
-    for k in range(3):
-        row = r0 * n0[k] + r1 * n1[k] + r2 * n2[k]
-        for j in range(3):
-            table[to + 3 * k + j] = wp.float32(row[j])
-    t0 = uv[3 * f]
-    t1 = uv[3 * f + 1]
-    t2 = uv[3 * f + 2]
-    for k in range(2):
-        row = r0 * wp.float64(t0[k]) + r1 * wp.float64(t1[k]) + r2 * wp.float64(t2[k])
-        for j in range(3):
-            table[to + 9 + 3 * k + j] = wp.float32(row[j])
-    for k in range(3):
-        table[to + 15 + k] = albedo[f][k]
-    for k in range(4):
-        table[to + 18 + k] = pattern[f][k]
+    if used[f] != wp.uint8(0):
+        a = wp.vec3d(corners[3 * f])
+        b = wp.vec3d(corners[3 * f + 1])
+        c = wp.vec3d(corners[3 * f + 2])
+        first = wp.cross(b, c)
+        volume = wp.dot(a, first)
+        if wp.abs(volume) < wp.float64(1e-12):
+            volume = wp.float64(1e-12)
+        scale = wp.float64(1.0) / volume
+        r0 = first * scale
+        r1 = wp.cross(c, a) * scale
+        r2 = wp.cross(a, b) * scale
+        n0 = wp.vec3d(normals[3 * f])
+        n1 = wp.vec3d(normals[3 * f + 1])
+        n2 = wp.vec3d(normals[3 * f + 2])
+        to = f * COLUMNS
+        for k in range(3):
+            row = r0 * n0[k] + r1 * n1[k] + r2 * n2[k]
+            for j in range(3):
+                table[to + 3 * k + j] = wp.float32(row[j])
+        t0 = uv[3 * f]
+        t1 = uv[3 * f + 1]
+        t2 = uv[3 * f + 2]
+        for k in range(2):
+            row = r0 * wp.float64(t0[k]) + r1 * wp.float64(t1[k]) + r2 * wp.float64(t2[k])
+            for j in range(3):
+                table[to + 9 + 3 * k + j] = wp.float32(row[j])
+        for k in range(3):
+            table[to + 15 + k] = albedo[f][k]
+        for k in range(4):
+            table[to + 18 + k] = pattern[f][k]
 
 
 @wp.kernel
@@ -806,6 +804,7 @@ def owner_kernel(
     materials: wp.array(dtype=wp.uint8),
     owners: wp.array(dtype=wp.int32),
     semantics: wp.array(dtype=wp.uint8),
+    depth: wp.array(dtype=wp.float32),
     material: wp.array(dtype=wp.uint8),
     owner: wp.array(dtype=wp.int32),
     semantic: wp.array(dtype=wp.uint8),
@@ -816,7 +815,9 @@ def owner_kernel(
         material[i] = materials[f]
         owner[i] = owners[f]
         semantic[i] = semantics[f]
+        depth[i] = -1.0 / depth[i]
     else:
+        depth[i] = INFINITE
         material[i] = wp.uint8(M_SKY)
         owner[i] = -1
         semantic[i] = S_SKY
@@ -842,60 +843,72 @@ def nearest_kernel(start: int, width: int, depth: wp.array(dtype=wp.float32), ne
 
 
 @wp.func
-def fill_map(
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
+def fill(
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
     base: int,
-    texels: int,
+    width: int,
     first: int,
     end: int,
     depth: wp.array(dtype=wp.float32),
+    face: int,
+    faces: wp.array(dtype=wp.int32),
 ):
-    """Offers a triangle (x, y texels, depth m) to rows [first, end) of a map."""
-    y0 = wp.max(int(wp.ceil(wp.max(wp.min(wp.min(a[1], b[1]), c[1]), wp.float64(first)))), first)
-    y1 = wp.min(int(wp.floor(wp.min(wp.max(wp.max(a[1], b[1]), c[1]), wp.float64(end)))), end - 1)
+    """Offers a triangle of corners (x, y pixels, depth) to rows [first, end) of an image that starts at `base`.
+
+    Less depth wins, then the triangle that came first. face: noted in `faces`, unless below 0.
+    """
+    a = p
+    b = q
+    c = r
+    if b[1] < a[1]:
+        a = q
+        b = p
+    if c[1] < b[1]:
+        c = b
+        b = r
+        if b[1] < a[1]:
+            b = a
+            a = r
+    y0 = int(wp.ceil(wp.max(a[1], wp.float64(first))))
+    y1 = int(wp.ceil(wp.min(c[1], wp.float64(end)))) - 1
     left = wp.min(wp.min(a[0], b[0]), c[0])
     right = wp.max(wp.max(a[0], b[0]), c[0])
-    if y0 <= y1 and left < wp.float64(texels - 1) and right > wp.float64(0.0):
+    if y0 <= y1 and left <= wp.float64(width - 1) and right >= wp.float64(0.0):
         ux = b[0] - a[0]
         uy = b[1] - a[1]
         vx = c[0] - a[0]
         vy = c[1] - a[1]
         area = ux * vy - uy * vx
         if wp.abs(area) > SLIVER:
+            scale = wp.float64(1.0) / area
             uz = b[2] - a[2]
             vz = c[2] - a[2]
-            slope_x = (uz * vy - vz * uy) / area
-            slope_y = (vz * ux - uz * vx) / area
+            slope_x = (uz * vy - vz * uy) * scale
+            slope_y = (vz * ux - uz * vx) * scale
             lowest = wp.float32(wp.min(wp.min(a[2], b[2]), c[2]))
             highest = wp.float32(wp.max(wp.max(a[2], b[2]), c[2]))
+            across = vx / vy
+            upper = ux / wp.max(uy, SLIVER)
+            lower = (c[0] - b[0]) / wp.max(c[1] - b[1], SLIVER)
+            step = wp.float32(slope_x)
             for y in range(y0, y1 + 1):
-                v = wp.float64(y)
-                low = right
-                high = left
-                # where the row crosses the sides that it lies between
-                if (a[1] <= v) != (b[1] <= v):
-                    x = a[0] + (v - a[1]) * ux / uy
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-                if (b[1] <= v) != (c[1] <= v):
-                    x = b[0] + (v - b[1]) * (c[0] - b[0]) / (c[1] - b[1])
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-                if (c[1] <= v) != (a[1] <= v):
-                    x = a[0] + (v - a[1]) * vx / vy
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-                x0 = int(wp.ceil(wp.max(low - SLIVER, wp.float64(0.0))))
-                x1 = int(wp.floor(wp.min(high + SLIVER, wp.float64(texels - 1))))
-                row = base + y * texels
-                begin = wp.float32(a[2] + slope_y * (v - a[1]) - slope_x * a[0])
-                step = wp.float32(slope_x)
+                v = wp.float64(y) - a[1]
+                one = a[0] + v * across
+                two = b[0] + (wp.float64(y) - b[1]) * lower
+                if wp.float64(y) < b[1]:
+                    two = a[0] + v * upper
+                x0 = int(wp.ceil(wp.max(wp.min(one, two), wp.float64(0.0))))
+                x1 = int(wp.ceil(wp.min(wp.max(one, two), wp.float64(width)))) - 1
+                begin = wp.float32(a[2] + slope_y * v + slope_x * (wp.float64(x0) - a[0]))
+                row = base + y * width
                 for x in range(x0, x1 + 1):
-                    z = wp.min(wp.max(begin + step * float(x), lowest), highest)
+                    z = wp.min(wp.max(begin + step * float(x - x0), lowest), highest)
                     if z < depth[row + x]:
                         depth[row + x] = z
+                        if face >= 0:
+                            faces[row + x] = face
 
 
 @wp.func
@@ -941,8 +954,18 @@ def sun_kernel(
                 area = shade.near
                 if i == 1:
                     area = shade.far
-                if right > area[0] and left < area[1] and far > area[2] and near < area[3]:
-                    fill_map(
+                seen = right > area[0] and left < area[1] and far > area[2] and near < area[3]
+                if i == 1:
+                    inner = shade.near  # nobody looks up there in the far map
+                    if (
+                        left > inner[0] + RIM
+                        and right < inner[1] - RIM
+                        and near > inner[2] + RIM
+                        and far < inner[3] - RIM
+                    ):
+                        seen = False
+                if seen:
+                    fill(
                         to_texels(wp.vec3d(a), area, texels),
                         to_texels(wp.vec3d(b), area, texels),
                         to_texels(wp.vec3d(c), area, texels),
@@ -951,7 +974,75 @@ def sun_kernel(
                         first,
                         end,
                         shade.depth,
+                        -1,
+                        owner,
                     )
+
+
+@wp.func
+def to_pixel(p: wp.vec3d):
+    """Pixel, and a depth that is linear over the image: less is nearer, 0 is infinitely far."""
+    inverse = wp.float64(1.0) / p[2]
+    return wp.vec3d(p[0] * inverse, p[1] * inverse, -inverse)
+
+
+@wp.func
+def cut(a: wp.vec3d, b: wp.vec3d):
+    """Where the side from a to b passes the near plane."""
+    return a + (b - a) * ((NEAR - a[2]) / (b[2] - a[2]))
+
+
+@wp.kernel
+def sight_kernel(
+    start: int,
+    bands: int,
+    width: int,
+    height: int,
+    matrix: wp.mat33d,
+    corners: wp.array(dtype=wp.vec3f),
+    depth: wp.array(dtype=wp.float32),
+    faces: wp.array(dtype=wp.int32),
+):
+    """Fills the rows of one band: the nearest face of each pixel and minus its inverse depth."""
+    band = start + wp.tid()
+    first = height * band // bands
+    end = height * (band + 1) // bands
+    for i in range(first * width, end * width):
+        depth[i] = 0.0
+        faces[i] = -1
+    for f in range(corners.shape[0] // 3):
+        a = matrix * wp.vec3d(corners[3 * f])
+        b = matrix * wp.vec3d(corners[3 * f + 1])
+        c = matrix * wp.vec3d(corners[3 * f + 2])
+        ahead = int(0)
+        if a[2] >= NEAR:
+            ahead += 1
+        if b[2] >= NEAR:
+            ahead += 1
+        if c[2] >= NEAR:
+            ahead += 1
+        if ahead == 3:
+            fill(to_pixel(a), to_pixel(b), to_pixel(c), 0, width, first, end, depth, f, faces)
+        elif ahead > 0:
+            # turned so that a is alone on its side of the near plane
+            alone = ahead == 1
+            if (b[2] >= NEAR) == alone:
+                kept = a
+                a = b
+                b = c
+                c = kept
+            elif (c[2] >= NEAR) == alone:
+                kept = a
+                a = c
+                c = b
+                b = kept
+            d = to_pixel(cut(a, b))
+            e = to_pixel(cut(a, c))
+            if alone:
+                fill(to_pixel(a), d, e, 0, width, first, end, depth, f, faces)
+            else:
+                fill(d, to_pixel(b), to_pixel(c), 0, width, first, end, depth, f, faces)
+                fill(d, to_pixel(c), e, 0, width, first, end, depth, f, faces)
 
 
 # --------------------------------------------------------------------------------------------------------------- camera
@@ -1032,12 +1123,25 @@ def _mat(values: np.ndarray) -> Any:
 _GROUND = np.isin(np.arange(len(Material)), GROUND).astype(np.uint8)
 
 
-def owners(face: np.ndarray, seen: Soup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Material uint8, owner int32 and semantic uint8, shaped as face, int32, -1: sky. See `Sight`."""
-    out = np.empty(face.shape, np.uint8), np.empty(face.shape, np.int32), np.empty(face.shape, np.uint8)
-    inputs = [_flat(face), _flat(seen.material), _flat(seen.owner), _flat(seen.semantic), *(_flat(o) for o in out)]
-    launch(owner_kernel, halves(face.size), inputs)
-    return out
+def _rows(height: int) -> list[int]:
+    """Edges of about equal ranges of an image's rows, one a thread."""
+    return [height * i // threads() for i in range(threads() + 1)]
+
+
+def see(soup: Soup, matrix: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """Face int32, depth float32 m, material uint8, owner int32 and semantic uint8 of each pixel, of shape `size`.
+
+    matrix (3, 3): the soup's corners to homogeneous pixels. See `Sight`.
+    """
+    face, depth = np.empty(size, np.int32), np.empty(size, np.float32)
+    rest = np.empty(size, np.uint8), np.empty(size, np.int32), np.empty(size, np.uint8)
+    bands, corners = threads(), _flat(soup.corners, wp.vec3f)
+    to_pixels = wp.mat33d(*matrix.reshape(-1).tolist())
+    inputs = [bands, size[1], size[0], to_pixels, corners, _flat(depth), _flat(face)]
+    launch(sight_kernel, range(bands + 1), inputs)
+    tables = [_flat(soup.material), _flat(soup.owner), _flat(soup.semantic)]
+    launch(owner_kernel, halves(face.size), [_flat(face), *tables, _flat(depth), *(_flat(o) for o in rest)])
+    return face, depth, *rest
 
 
 def nearest(depth: np.ndarray) -> np.ndarray:
@@ -1136,13 +1240,17 @@ def develop_pixels(
     scene.material, scene.ground = _flat(sight.material), _flat(_GROUND)
     soup = [_flat(seen.corners, wp.vec3f), _flat(seen.normals, wp.vec3f), _flat(seen.uv, wp.vec2f)]
     paint = [_flat(seen.albedo, wp.vec3f), _flat(seen.pattern, wp.vec4f)]
-    launch(table_kernel, halves(len(seen)), [*soup, *paint, scene.table])
+    used = _flat(np.zeros(max(len(seen), 1), np.uint8))
+    launch(mark_kernel, halves(sight.face.size), [scene.face, used])
+    launch(table_kernel, halves(len(seen)), [used, *soup, *paint, scene.table])
     lens = Lens()
     lens.ray, lens.axes = _mat(np.linalg.inv(fine)), _mat(view.rotation.T)
     lens.origin, lens.centre = _vec(view.origin), _vec(view.centre)
     lens.focal, lens.height_m, lens.width = float(view.camera.intrinsics[0, 0]), view.height_m, view.camera.width
     lens.develop = _vec(setting.response.exposure * setting.response.white_balance)
-    lens.power = setting.response.contrast / 2.2
+    root = np.arange(CURVE + 2, dtype=np.float32) * np.float32(BRIGHTEST**0.5 / CURVE)
+    plain = replace(setting.response, exposure=1.0, white_balance=np.ones(1))
+    lens.curve = _flat(develop(np.square(root)[:, None], plain)[:, 0])
     prints = _prints(shadows)
     if maps is None:
         shade = _shade(np.zeros((3, 4)), np.zeros((2, 2, 1, 1), np.float32), ((0.0,) * 4,) * 2, prints)
@@ -1153,7 +1261,7 @@ def develop_pixels(
     inputs = [scene, _air(setting.light), _street(setting.road), _noise(setting.noise), lens, shade]
     launch(
         pixel_kernel,
-        halves(len(image)),
+        _rows(view.camera.height),
         [*inputs, _flat(wanted), _flat(image, wp.vec3f), _flat(touched)],
         device=torch.device("cpu"),
     )
@@ -1166,8 +1274,6 @@ def expose(image: np.ndarray, response: Response, seed: int) -> np.ndarray:
     across = np.repeat(np.square(np.linspace(-1, 1, width, dtype=np.float32)), 3)
     down = np.square(np.linspace(-1, 1, height, dtype=np.float32) * np.float32(height / width))
     out = np.empty(image.shape, np.uint8)
-    parts = threads()
-    edges = [height * i // parts for i in range(parts + 1)]
     inputs = [_flat(image), _flat(across), _flat(down), response.vignette, response.noise, wp.uint32(seed)]
-    launch(camera_kernel, edges, [*inputs, _flat(out)])
+    launch(camera_kernel, _rows(height), [*inputs, _flat(out)])
     return out

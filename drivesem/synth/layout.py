@@ -22,14 +22,20 @@ _BUSY_TILT = {"residential": 0.9, "city": 0.9, "arterial": 0.2, "motorway": -1.2
 """How much likelier each kind of road is for frames with many vehicles: exponent per quantile of their number."""
 MOST_VEHICLES = 24
 """In a frame."""
-_RANGE_M = 85.0
+_RANGE_M = 76.0
 """How far along the road vehicles are placed: KITTI labels hardly any beyond."""
 _SPEEDS_KMH = {
     "residential": (20, 35), "city": (30, 50), "arterial": (45, 70), "motorway": (90, 130), "country": (60, 95),
     "junction": (25, 50),
 }  # fmt: skip
-_STOPPED_SHARE = {"residential": 0.15, "city": 0.3, "arterial": 0.2, "motorway": 0.05, "country": 0.03, "junction":
-0.6}
+_STOPPED_SHARE = {
+    "residential": 0.15,
+    "city": 0.3,
+    "arterial": 0.2,
+    "motorway": 0.05,
+    "country": 0.03,
+    "junction": 0.6,
+}
 """How often the ego car's direction stands in a queue."""
 LABEL_OF_KIND = {
     "sedan": "Car", "hatchback": "Car", "estate": "Car", "suv": "Car", "pickup": "Car",
@@ -55,14 +61,20 @@ MARGIN_M = 0.3
 _CLUSTER = 1.4
 """Spread of the log weight along a row: how much vehicles stand together."""
 _CHANCE = 0.6
-"""How much chance has to say against weights: 1 draws places as often as their weights are, 0 takes the heaviest."""
-_NEAR_GAIN, _NEAR_M = 0.8, 15.0
-"""Near places are wanted more than their labels are frequent, as vehicles stand together, which favours far ones."""
-_HARDLY_SEEN, _HARDLY_SEEN_DROPPED = 0.3, 0.8
-"""Below which visible share a place is mostly given up: annotators passed over what they could hardly see."""
-_PLAINLY_SEEN, _APART_DEFERRED = 0.85, 0.8
-"""Above which visible share, hiding nothing either, a place mostly has to wait for others."""
+"""How much chance has to say against weights: 1 draws places as often as they weigh, 0 takes the heaviest."""
+_NEAR_GAIN, _NEAR_M = 0.6, 11.0
+"""Near places weigh more by this factor around this depth: standing together favours the far ones."""
+_HARDLY_SEEN, _HARDLY_SEEN_DEFERRED = 0.25, 0.9
+"""Below which visible share, and how often, a place waits for others: labels leave out what is hardly seen."""
+_PLAINLY_SEEN, _APART_DEFERRED = 0.75, 0.9
+"""Above which visible share, and how often, a place where nothing hides anything waits for others."""
 _ALWAYS_M = 5.0
+"""Up to this depth vehicles do not wait: the image's border cuts them."""
+_COLUMN_PX = 4
+"""Width of the columns in which roofs are compared."""
+_NEAR_PLANE_M = 0.3
+_LEAST_VISIBLE, _LEAST_HEIGHT_PX, _LEAST_WIDTH_PX = 0.02, 10.0, 3.0
+"""What a vehicle must show of itself to count: bodies hide a little less than the rectangles around them."""
 _EGO = ((0.0, 1.5), -np.pi / 2, (7.0, 2.0, 2.2))
 """Footprint that stays free for the car that carries the camera."""
 _SIZE_FACTOR_LHW = {"Car": (0.905, 1.015, 0.93), "Van": (1.03, 1.05, 0.99), "Truck": (1.05, 1.01, 1.03)}
@@ -265,11 +277,17 @@ def _with_speeds(rng: np.random.Generator, road: Road) -> Road:
             continue
         stands = stopped if lane.direction > 0 else oncoming_stopped
         # Lanes further to the right are slower, where there are several.
-        speed = 0.0 if stands else float(rng.uniform(low, high)) / 3.6 * (1 - 0.012 * float(np.clip(lane.middle_m, -8, 8)))
+        speed = (
+            0.0
+            if stands
+            else float(rng.uniform(low, high)) / 3.6 * (1 - 0.012 * float(np.clip(lane.middle_m, -8, 8)))
+        )
         spacing = float(rng.uniform(6.3, 8.0)) if stands else 6.5 + 0.35 * speed
         if lane.middle_m == 0:
             ego = speed * float(rng.uniform(0.85, 1.0))
-        gaps = [abs(other.middle_m - lane.middle_m) for other in road.lanes if other is not lane and not other.parked]
+        gaps = [
+            abs(other.middle_m - lane.middle_m) for other in road.lanes if other is not lane and not other.parked
+        ]
         slack = min([3.3, *gaps]) / 2 - MARGIN_M
         lanes.append(replace(lane, speed_mps=speed * lane.direction, spacing_m=spacing, slack_m=slack))
     return replace(road, lanes=tuple(lanes), ego_speed_mps=ego)
@@ -344,8 +362,8 @@ def _side(
         material = Material.PARKING if rng.random() < 0.6 else Material.ROAD
         strips.append(_strip(at, at + side * width, material))
         direction = 0 if nose_in else side if rng.random() < 0.85 or side < 0 else -side
-        spacing = 2.75 / max(np.cos(slant), 0.4) if nose_in else float(rng.uniform(5.2, 6.2))
-        rows.append(Lane(at + side * width / 2, direction, True, 1.5, spacing, slant))
+        spacing = 2.5 / max(float(np.cos(slant)), 0.4) if nose_in else float(rng.uniform(4.7, 5.8))
+        rows.append(Lane(at + side * width / 2, direction, True, 2.2 if side < 0 else 1.3, spacing, slant))
         at += side * width
     height = float(rng.uniform(0.08, 0.14))
     walk = at + side * float(rng.uniform(1.5, 2.6) if quiet else rng.uniform(2.0, 4.5))
@@ -365,7 +383,7 @@ def _lot(rng: np.random.Generator, side: int, edge: float) -> tuple[list[Lane], 
     slant = 0.0 if rng.random() < 0.6 else float(rng.choice((-1, 1)) * rng.uniform(0.4, 1.2))
     width = 11.5 if rows == 1 else 17.0
     outer = edge + side * width
-    spacing = 2.7 / max(float(np.cos(slant)), 0.4)
+    spacing = 2.5 / max(float(np.cos(slant)), 0.4)
     lanes = [Lane(edge + side * 3.0, 0, True, 1.0, spacing, slant)]
     if rows == 2:
         lanes.append(Lane(edge + side * 14.0, 0, True, 1.0, spacing, slant))
@@ -481,7 +499,7 @@ def _candidates(road: Road, rng: np.random.Generator) -> list[_Spot]:
                 weight = _weight(road, d, s) * lane.weight * lane.spacing_m**0.5
                 key = float(rng.exponential(1.0)) ** _CHANCE / max(weight * float(np.exp(crowd)), 1e-9)
                 found.append(_Spot(d, s, _lane_yaw(rng, road, lane, d, s), lane, key))
-            step = lane.spacing_m * float(rng.lognormal(0.06, 0.12 if lane.parked else 0.35))
+            step = lane.spacing_m * float(rng.lognormal(0.03, 0.08 if lane.parked else 0.35))
             crowd = 0.8 * crowd + 0.6 * float(rng.normal(0, _CLUSTER))
             s += step
     if road.crossing:
@@ -494,8 +512,8 @@ def _weight(road: Road, d: float, s: float) -> float:
     fitted = statistics()
     x, z = (float(v) for v in road.point(d, s))
     weight = _interpolated_share(z, fitted.depth_edges_m, fitted.depth_share)
-    weight *= 1 + _NEAR_GAIN * float(np.exp(-z / _NEAR_M))
-    return weight * _interpolated_share(x, fitted.lateral_edges_m, fitted.lateral_share) ** 0.3
+    weight *= 1 + _NEAR_GAIN * float(np.exp(-np.square(z / _NEAR_M - 1)))
+    return weight * float(np.sqrt(_interpolated_share(x, fitted.lateral_edges_m, fitted.lateral_share)))
 
 
 def _lane_yaw(rng: np.random.Generator, road: Road, lane: Lane, d: float, s: float) -> float:
@@ -563,52 +581,63 @@ def _paint(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
     return float(paint[0]), float(paint[1]), float(paint[2])
 
 
-_SIGHT_COLUMN_PX = 4
-_SIGHT_NEAR_M = 0.3
-_SIGHT_VISIBLE = 0.05
-_SIGHT_HEIGHT_PX = 10.0
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """A vehicle as an upright rectangle in KITTI's image. distance_m orders vehicles; left to bottom: px."""
+
+    distance_m: float
+    left: float
+    top: float
+    right: float
+    bottom: float
 
 
-def seen_shares(actors: list[Actor]) -> np.ndarray:
-    """Roughly how much (N,) of each vehicle KITTI's camera sees, in [0, 1]; 0 outside the image or where it is too
-    small to be labelled. Vehicles are upright rectangles in the image, the nearer before the farther.
-    """
+def _sight(actor: Actor) -> _Sight | None:
+    """How KITTI's camera sees a vehicle with nothing before it; None where it is too small or out of sight."""
     fitted = statistics()
     camera, height_m = fitted.cameras[0], fitted.camera_height_m
     width, height = camera.size_wh_px
     f, (cx, cy) = camera.focal_px, camera.centre_px
-    skyline = np.full(width // _SIGHT_COLUMN_PX + 1, float(height))
-    shares = np.zeros(len(actors))
-    order = np.argsort([np.hypot(*a.position_xz) for a in actors], kind="stable")
-    for index in order:
-        actor = actors[index]
-        outline = _before_camera(footprint(actor.position_xz, actor.yaw, actor.size_lhw))
-        if len(outline) == 0:
-            continue
-        x, z = outline[:, 0] + camera.offset_px_m[0] / f, outline[:, 1]
-        u = cx + f * x / z
-        roof = cy + f * (height_m - actor.size_lhw[1]) / z
-        top, bottom = max(float(roof.min()), 0.0), min(float(cy + f * height_m / z.min()), float(height))
-        u0, u1 = max(float(u.min()), 0.0), min(float(u.max()), float(width - 1))
-        if u1 - u0 < 3 or bottom - top < _SIGHT_HEIGHT_PX:
-            continue
-        columns = slice(int(u0) // _SIGHT_COLUMN_PX, int(u1) // _SIGHT_COLUMN_PX + 1)
-        free = np.clip(np.minimum(skyline[columns], bottom) - top, 0, None)
-        shares[index] = float(free.mean()) / (bottom - top)
-        skyline[columns] = np.minimum(skyline[columns], top)
+    outline = _before_camera(footprint(actor.position_xz, actor.yaw, actor.size_lhw))
+    if len(outline) == 0:
+        return None
+    u = cx + f * (outline[:, 0] + camera.offset_px_m[0] / f) / outline[:, 1]
+    left, right = max(float(u.min()), 0.0), min(float(u.max()), float(width - 1))
+    near, far = float(outline[:, 1].min()), float(outline[:, 1].max())
+    above = height_m - actor.size_lhw[1]
+    top = max(cy + f * above / (far if above > 0 else near), 0.0)
+    bottom = min(cy + f * height_m / near, float(height - 1))
+    if right - left < _LEAST_WIDTH_PX or bottom - top < _LEAST_HEIGHT_PX:
+        return None
+    return _Sight(float(np.hypot(*actor.position_xz)), left, top, right, bottom)
+
+
+def _shares(sights: list[_Sight]) -> np.ndarray:
+    """Roughly how much (N,) of each rectangle those nearer leave free. All stand on the ground, so that what is
+    free of a farther one lies above the highest roof before it.
+    """
+    width, height = statistics().cameras[0].size_wh_px
+    roofs = np.full(width // _COLUMN_PX + 1, float(height))
+    shares = np.zeros(len(sights))
+    for index in sorted(range(len(sights)), key=lambda i: sights[i].distance_m):
+        one = sights[index]
+        before = roofs[int(one.left) // _COLUMN_PX : int(one.right) // _COLUMN_PX + 1]
+        free = np.clip(before, one.top, one.bottom).mean() - one.top
+        shares[index] = free / (one.bottom - one.top)
+        np.minimum(before, one.top, out=before)
     return shares
 
 
 def _before_camera(outline: np.ndarray) -> np.ndarray:
     """The part (K, 2) of a convex outline (4, 2) in front of the camera."""
-    if (outline[:, 1] >= _SIGHT_NEAR_M).all():
+    if (outline[:, 1] >= _NEAR_PLANE_M).all():
         return outline
     kept = []
     for one, two in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        if one[1] >= _SIGHT_NEAR_M:
+        if one[1] >= _NEAR_PLANE_M:
             kept.append(one)
-        if (one[1] >= _SIGHT_NEAR_M) != (two[1] >= _SIGHT_NEAR_M):
-            kept.append(one + (two - one) * (_SIGHT_NEAR_M - one[1]) / (two[1] - one[1]))
+        if (one[1] >= _NEAR_PLANE_M) != (two[1] >= _NEAR_PLANE_M):
+            kept.append(one + (two - one) * (_NEAR_PLANE_M - one[1]) / (two[1] - one[1]))
     return np.array(kept).reshape(-1, 2)
 
 
@@ -622,25 +651,29 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
     else:
         wanted = int(rng.integers(settings.vehicles[0], settings.vehicles[1] + 1))
     actors: list[Actor] = []
+    sights: list[_Sight] = []
     shown = np.zeros(0)
     outlines = [footprint(*_EGO)]
     heavy = 0
     queue = [(spot, False) for spot in _candidates(road, rng)]
-    for spot, alone_too in queue:
-        if len(actors) >= MOST_VEHICLES or (shown >= _SIGHT_VISIBLE).sum() >= wanted:
+    for spot, patient in queue:
+        if len(actors) >= MOST_VEHICLES or (shown >= _LEAST_VISIBLE).sum() >= wanted:
             break
         actor = _settle(rng, road, settings, spot, heavy < settings.max_heavy)
         outline = footprint(actor.position_xz, actor.yaw, actor.size_lhw)
-        if seen_shares([actor])[0] == 0 or any(_nearer(outline, o, MARGIN_M) for o in outlines):
+        sight = _sight(actor)
+        if sight is None or any(_nearer(outline, o, MARGIN_M) for o in outlines):
             continue
-        after = seen_shares([*actors, actor])
-        if (after < _HARDLY_SEEN).any() and rng.random() < _HARDLY_SEEN_DROPPED:
-            continue
-        apart = after[-1] > _PLAINLY_SEEN and (after[:-1] > shown - 0.08).all() and actor.position_xz[1] > _ALWAYS_M
-        if actors and apart and not alone_too and rng.random() < _APART_DEFERRED:
+        after = _shares([*sights, sight])
+        hidden = (after < _HARDLY_SEEN).any() and rng.random() < _HARDLY_SEEN_DEFERRED
+        apart = (
+            after[-1] > _PLAINLY_SEEN and (after[:-1] > shown - 0.08).all() and actor.position_xz[1] > _ALWAYS_M
+        )
+        if not patient and (hidden or (bool(actors) and apart and rng.random() < _APART_DEFERRED)):
             queue.append((spot, True))
             continue
         actors.append(actor)
+        sights.append(sight)
         outlines.append(outline)
         shown = after
         heavy += actor.kind in ("truck", "bus")

@@ -1,4 +1,4 @@
-"""A contact sheet of a data set: a row a frame, photograph with boxes, depth, classes, objects.
+"""A contact sheet of a data set: a row a frame, photograph with boxes, depth, classes, objects' masks.
 
 `sheet` shows exposures as they were made, `sheet_of` a folder as this project's readers see it.
 """
@@ -29,7 +29,7 @@ MOST_FRAMES = 12
 WIDTH_PX = 2000
 _MARGIN_PX = 12
 _PHOTO_PX = 1160
-"""Width of the photograph; the three maps share the rest, in a column and a half."""
+"""Width of the photograph; right of it three maps and a legend, two by two."""
 _TEXT_PX = 15
 _BACKGROUND = (250, 250, 250)
 _INK = (30, 30, 30)
@@ -119,13 +119,15 @@ def _of_exposure(exposure: Exposure, place: Place) -> _Row:
 
 
 def _of_frame(frame: Frame) -> _Row:
-    """A reader's frame. It says of occlusion what KITTI says, 0 to 3, and of objects only the labelled ones."""
+    """A reader's frame: occlusion is KITTI's 0 to 3 where truncation is known, masks are those of labels."""
     boxes, ignored, instances = [], [], None
     labels = frame.labels
     if labels is not None:
         ignored = labels.ignore_xyxy.tolist()
         for i, kind in enumerate(labels.kind):
-            text = f"{kind}{_distance(labels.translation[i].tolist())} occ {int(labels.occlusion[i])}"
+            known = math.isfinite(float(labels.truncation[i]))
+            occlusion = f" occ {int(labels.occlusion[i])}" if known else ""
+            text = f"{kind}{_distance(labels.translation[i].tolist())}{occlusion}"
             boxes.append((labels.boxes_xyxy[i].tolist(), BOX_COLOURS.get(kind, _OTHER_COLOUR), text))
     if frame.masks is not None:
         instances = np.zeros((frame.camera.height, frame.camera.width), np.int64)
@@ -152,7 +154,7 @@ def _compose(rows: Sequence[_Row]) -> np.ndarray:
 
 
 def _strip(row: _Row) -> np.ndarray:
-    """One frame: a title, the photograph left, and right of it depth and classes over objects and a legend."""
+    """One frame: a title, the photograph, and right of it depth and classes over masks and a legend."""
     height, width = row.image.shape[:2]
     tall = max(round(_PHOTO_PX * height / width), 2 * _TEXT_PX)
     small = ((WIDTH_PX - _PHOTO_PX - 4 * _MARGIN_PX) // 2, tall // 2 - _MARGIN_PX // 2)
@@ -165,7 +167,7 @@ def _strip(row: _Row) -> np.ndarray:
     panels = (
         ("depth", None if row.depth_m is None else _depth_colours(row.depth_m)),
         ("classes", None if row.classes is None else _class_colours(row.classes, row.class_names)),
-        ("objects", None if row.instances is None else _instance_colours(row.instances, row.image)),
+        ("masks", None if row.instances is None else _instance_colours(row.instances, row.image)),
     )
     for (name, picture), x, y in zip(panels, (*columns, columns[0]), (lines[0], *lines), strict=True):
         if picture is None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 import torch
 
 from drivesem.synth.layout import Actor
-from drivesem.synth.soup import Material, Soup, creased_normals, join, make
+from drivesem.synth.soup import Material, Soup, creased_normals, make
 from scene_ir import ffd
 from scene_ir.meshes import solids
 from scene_ir.meshes.templates import KINDS, template, typical_size_lhw
@@ -29,20 +29,102 @@ _PLATE_BLUE = np.array([0.02, 0.05, 0.28], np.float32)
 _RED, _DEEP_RED = np.array([0.26, 0.012, 0.012], np.float32), np.array([0.12, 0.008, 0.008], np.float32)
 _AMBER, _CLEAR = np.array([0.42, 0.15, 0.015], np.float32), np.array([0.42, 0.42, 0.40], np.float32)
 _CHROME, _HOUSING = np.array([0.30, 0.30, 0.31], np.float32), np.array([0.10, 0.10, 0.105], np.float32)
-_SIGNS = 8
+_SIGNS = 7
 """Characters on a number plate."""
+_SEAT_M = 0.37
+"""How far to the side of the middle the front seats stand."""
 _GREY_TO_LINEAR = 2.2
+
+Plane = tuple[tuple[float, float, float], float]
+"""Normal and offset: points with normal . x = offset."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Base:
+    """The mesh's own faces at their size in metres: corners and unit normals (F, 3, 3)."""
+
+    corners: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class _Pieces:
+    """n triangles that lie in the faces of a mesh. parent (n,): their face; share (n, 3, 3): barycentric coordinates
+    of each corner in it; material (n,) uint8; albedo (n, 3) float32; cell (n,): 1 + stroke of a plate's character, or
+    0.
+    """
+
+    parent: np.ndarray
+    share: np.ndarray
+    material: np.ndarray
+    albedo: np.ndarray
+    cell: np.ndarray
+
+    def take(self, keep: np.ndarray) -> _Pieces:
+        """Those selected by a mask or by indices."""
+        return _Pieces(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    def middle(self, base: _Base) -> np.ndarray:
+        """Centroids (n, 3) m."""
+        return np.einsum("ni,nij->nj", self.share.mean(axis=1), base.corners[self.parent])
+
+    def facing(self, base: _Base) -> np.ndarray:
+        """Outward directions (n, 3) of the faces."""
+        return base.normals[self.parent].mean(axis=1)
+
+
+def _joined(pieces: list[_Pieces]) -> _Pieces:
+    return _Pieces(*(np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(_Pieces)))
+
+
+def _extent(base: _Base, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
+    corners = base.corners[pieces.parent].reshape(-1, 3)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
+    """The same surface, its triangles cut in two or three where they cross a plane."""
+    parent, share = pieces.parent, pieces.share
+    source = np.arange(len(parent))
+    for normal, offset in planes:
+        reach = base.corners @ np.asarray(normal, np.float32) - np.float32(offset)
+        side = np.einsum("nij,nj->ni", share, reach[parent])
+        # a tenth of a millimetre: thinner slivers are not worth a triangle
+        crossing = np.flatnonzero((side.max(axis=1) > 1e-4) & (side.min(axis=1) < -1e-4))
+        if not len(crossing):
+            continue
+        side, whole = side[crossing], np.ones(len(parent), bool)
+        whole[crossing] = False
+        above = side > 0
+        lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
+        order = (lone[:, None] + np.arange(3)) % 3
+        rows = np.arange(len(crossing))[:, None]
+        side, corner = side[rows, order], share[crossing][rows, order]
+        a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+        p = a + (side[:, 0] / (side[:, 0] - side[:, 1]))[:, None] * (b - a)
+        q = a + (side[:, 0] / (side[:, 0] - side[:, 2]))[:, None] * (c - a)
+        split = np.concatenate([np.stack(t, axis=1) for t in ((a, p, q), (p, b, c), (p, c, q))])
+        share = np.concatenate([share[whole], split])
+        source = np.concatenate([source[whole], np.tile(source[crossing], 3)])
+        parent = np.concatenate([parent[whole], np.tile(parent[crossing], 3)])
+    part = np.abs(np.linalg.det(share)) > 1e-7
+    found = pieces.take(source[part])
+    return replace(found, parent=parent[part], share=share[part])
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleShape:
-    """A vehicle in the unit box. soup: its triangles, paint in a neutral tint; points (P, 3): their distinct
-    corners; index (F, 3) into them. Plate faces that a character may darken have pattern[:, 3] >= 1.
+    """A vehicle in the unit box. soup: its triangles, paint in a neutral tint, pattern[:, 3] >= 1 where a character
+    of the plate may darken a face; vertices (V, 3), faces (F, 3): of the mesh they lie in; normals (F, 3, 3): of its
+    corners; parent, share: as in `_Pieces`.
     """
 
     soup: Soup
-    points: np.ndarray
-    index: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    parent: np.ndarray
+    share: np.ndarray
 
 
 def vehicle_mesh(kind: str, variant: int) -> Mesh:
@@ -75,8 +157,8 @@ def instance_ffd(actor: Actor) -> np.ndarray:
 
 
 def deformed(shape: VehicleShape, offsets: np.ndarray) -> Soup:
-    """The vehicle's triangles after a free-form deformation: offsets (64, 3)."""
-    points = torch.from_numpy(shape.points)
+    """The vehicle's triangles after a free-form deformation of its mesh: offsets (64, 3)."""
+    points = torch.from_numpy(shape.vertices)
     lattice = torch.from_numpy(np.ascontiguousarray(offsets, np.float32).reshape(LATTICE_POINTS, 3))
     moved = ffd.deform(points, ffd.lattice_weights(points), lattice).numpy()
     slope = ffd.jacobian(points, lattice).numpy()
@@ -84,118 +166,49 @@ def deformed(shape: VehicleShape, offsets: np.ndarray) -> Soup:
     cofactor = np.stack(
         [np.cross(slope[..., (i + 1) % 3], slope[..., (i + 2) % 3]) for i in range(3)], axis=-1
     ).astype(np.float32)
-    normals = np.matmul(cofactor[shape.index], shape.soup.normals[..., None])[..., 0]
-    return replace(shape.soup, corners=moved[shape.index], normals=normals)
+    normals = np.matmul(cofactor[shape.faces], shape.normals[..., None])[..., 0]
+    corners = np.matmul(shape.share, moved[shape.faces][shape.parent])
+    return replace(shape.soup, corners=corners, normals=np.matmul(shape.share, normals[shape.parent]))
 
 
-def cut(soup: Soup, normal: tuple[float, float, float], offset: float) -> Soup:
-    """The same surface, its triangles divided where they cross the plane normal . x = offset."""
-    side = soup.corners @ np.asarray(normal, np.float32) - np.float32(offset)
-    tolerance = 1e-4
-    crossing = (side.max(axis=1) > tolerance) & (side.min(axis=1) < -tolerance)
-    if not crossing.any():
-        return soup
-    whole, split = soup.take(~crossing), soup.take(crossing)
-    side = side[crossing]
-    above = side > 0
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
-    order = (lone[:, None] + np.arange(3)) % 3
-    side = np.take_along_axis(side, order, axis=1)
-    share = [(side[:, 0] / (side[:, 0] - side[:, i]))[:, None] for i in (1, 2)]
-
-    def pieces(values: np.ndarray) -> np.ndarray:
-        a, b, c = np.moveaxis(np.take_along_axis(values, order[..., None], axis=1), 1, 0)
-        p, q = a + share[0] * (b - a), a + share[1] * (c - a)
-        return np.concatenate([np.stack(t, axis=1) for t in ((a, p, q), (p, b, c), (p, c, q))])
-
-    parts = split.take(np.tile(np.arange(len(split)), 3))
-    corners = pieces(split.corners)
-    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    parts = replace(parts, corners=corners, normals=pieces(split.normals), uv=pieces(split.uv))
-    return join([whole, parts.take(double_area > 1e-8)])
-
-
-def _cuts(soup: Soup, normal: tuple[float, float, float], offsets: np.ndarray) -> Soup:
-    for offset in offsets:
-        soup = cut(soup, normal, float(offset))
-    return soup
-
-
-class _Body:
-    """A vehicle's soup in metres while details are painted on it."""
-
-    def __init__(self, soup: Soup, source: np.ndarray, rng: np.random.Generator) -> None:
-        # the template's material travels in a pattern slot until the vehicle is done
-        soup.pattern[:, 0] = source
-        self.soup, self.rng = soup, rng
-
-    def middle(self) -> np.ndarray:
-        """Centroids (F, 3)."""
-        return self.soup.corners.mean(axis=1)
-
-    def facing(self) -> np.ndarray:
-        """Unit normals (F, 3) of the faces, outwards."""
-        return self.soup.normals.mean(axis=1)
-
-    def of(self, source: solids.Material) -> np.ndarray:
-        """Mask of the faces that the template made of this."""
-        return self.soup.pattern[:, 0] == int(source)
-
-    def divide(self, mask: np.ndarray, planes: list[tuple[tuple[float, float, float], float]]) -> None:
-        """Cut the faces of a mask along planes (normal, offset)."""
-        part = self.soup.take(mask)
-        for normal, offset in planes:
-            part = cut(part, normal, offset)
-        self.soup = join([self.soup.take(~mask), part])
-
-    def paint(self, mask: np.ndarray, material: Material, albedo: np.ndarray) -> None:
-        """Make the faces of a mask of a material."""
-        self.soup.material[mask] = material
-        self.soup.albedo[mask] = albedo
-
-
-def _extent(body: _Body, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    corners = body.soup.corners[mask].reshape(-1, 3)
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def _plates(body: _Body, fine: bool) -> None:
+def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
     """Number plates: a blue band at the left, a row of signs whose strokes each vehicle fills itself."""
-    colour = _PLATE_YELLOW if body.rng.random() < 0.2 else _PLATE_WHITE
+    colour = _PLATE_YELLOW if yellow else _PLATE_WHITE
+    # the mean of the ground and the characters
+    pieces.albedo[:] = colour * 0.72
+    if not fine:
+        return pieces
+    facing, middle = pieces.facing(base)[:, 0], pieces.middle(base)[:, 0]
+    found = [pieces.take(np.abs(facing) <= 0.5)]
+    edges = 0.13 + 0.84 * (np.arange(_SIGNS)[:, None] + np.array([0.0, 0.36, 0.72])).reshape(-1) / _SIGNS
+    rows = np.array([0.18, 0.5, 0.82])
     for end in (1.0, -1.0):
-        mask = body.of(solids.Material.PLATE) & (body.middle()[:, 0] * end > 0) & (body.facing()[:, 0] * end > 0.5)
-        if not mask.any():
+        part = pieces.take((facing * end > 0.5) & (middle * end > 0))
+        if not len(part.parent):
             continue
-        if not fine:
-            # the mean of the ground and the characters
-            body.soup.albedo[mask] = colour * 0.72
-            continue
-        low, high = _extent(body, mask)
+        low, high = _extent(base, part)
         span = high - low
         left = low[2] if end > 0 else high[2]
         across = end * span[2]
-        edges = 0.13 + 0.84 * (np.arange(_SIGNS)[:, None] + np.array([0.0, 0.36, 0.72])).reshape(-1) / _SIGNS
-        rows = np.array([0.17, 0.40, 0.62, 0.85])
-        planes = [((0.0, 0.0, 1.0), left + across * e) for e in (0.02, 0.1, *edges, 0.98)]
-        planes += [((0.0, 1.0, 0.0), low[1] + span[1] * r) for r in (0.05, *rows, 0.95)]
-        body.divide(mask, planes)
-        mask = body.of(solids.Material.PLATE) & (body.middle()[:, 0] * end > 0) & (body.facing()[:, 0] * end > 0.5)
-        spot = body.middle()[mask]
+        planes: list[Plane] = [((0.0, 0.0, 1.0), float(left + across * e)) for e in (0.02, 0.1, *edges, 0.98)]
+        planes += [((0.0, 1.0, 0.0), float(low[1] + span[1] * r)) for r in (0.05, *rows, 0.95)]
+        part = divided(base, part, planes)
+        spot = part.middle(base)
         u, v = (spot[:, 2] - left) / across, (spot[:, 1] - low[1]) / span[1]
-        albedo = np.broadcast_to(colour, (len(spot), 3)).copy()
-        albedo[(u > 0.02) & (u < 0.1)] = _PLATE_BLUE
-        albedo[(u < 0.02) | (u > 0.98) | (v < 0.05) | (v > 0.95)] = _DARK * 3
+        part.albedo[:] = colour
+        part.albedo[(u > 0.02) & (u < 0.1)] = _PLATE_BLUE
+        part.albedo[(u < 0.02) | (u > 0.98) | (v < 0.05) | (v > 0.95)] = _DARK * 3
         column, row = np.searchsorted(edges, u) - 1, np.searchsorted(rows, v) - 1
         sign, half = np.divmod(column, 3)
-        stroke = (column >= 0) & (half < 2) & (row >= 0) & (row < 3)
-        cell = np.where(stroke, 1 + (2 * sign + half) * 3 + row, 0)
-        body.soup.albedo[mask] = albedo
-        body.soup.pattern[mask, 3] = cell
+        stroke = (column >= 0) & (half < 2) & (row >= 0) & (row < 2)
+        part.cell[:] = np.where(stroke, 1 + (2 * sign + half) * 2 + row, 0)
+        found.append(part)
+    return _joined(found)
 
 
 def _lamp_outline(
     style: int, low: np.ndarray, high: np.ndarray, side: float, rng: np.random.Generator
-) -> list[tuple[tuple[float, float, float], float]]:
+) -> list[Plane]:
     """Planes (normal, offset) whose outer side, in a lamp's rectangle (z, y), is sheet metal: corners cut off."""
     wide, tall = high[2] - low[2], high[1] - low[1]
     inner, outer = (low[2], high[2]) if side > 0 else (high[2], low[2])
@@ -221,38 +234,37 @@ def _lamp_outline(
     return planes
 
 
-def _lamps(body: _Body, source: solids.Material, fine: bool) -> None:
-    """Shape and structure of head or tail lamps."""
-    rng = body.rng
-    style = int(rng.integers(6))
-    seed = int(rng.integers(2**31))
-    tint = body.soup.albedo[body.of(solids.Material.PAINT)][:1]
+def _lamps(
+    base: _Base, pieces: _Pieces, head: bool, sheet: np.ndarray, rng: np.random.Generator, fine: bool
+) -> _Pieces:
+    """Shape and structure of head or tail lamps; sheet (3,): albedo of the metal around them."""
+    style, seed = int(rng.integers(6)), int(rng.integers(2**31))
+    middle = pieces.middle(base)[:, 2]
+    found = []
     for side in (1.0, -1.0):
-        mask = body.of(source) & (body.middle()[:, 2] * side > 0)
-        if not mask.any() or not len(tint):
+        part = pieces.take(middle * side > 0)
+        if not len(part.parent):
             continue
-        low, high = _extent(body, mask)
+        low, high = _extent(base, part)
         span = high - low
         own = np.random.default_rng([0x1A3, seed])
         outline = _lamp_outline(style, low, high, side, own)
         inner = low[2] if side > 0 else high[2]
         columns, rows = own.uniform(0.28, 0.42), own.uniform(0.3, 0.45)
-        planes = list(outline)
-        z_edges = (0.05, columns, 0.5, 0.62, 0.8, 0.93) if fine else (columns, 0.5, 0.8)
-        y_edges = (0.1, rows, 0.7, 0.9) if fine else (rows, 0.7)
-        planes += [((0.0, 0.0, 1.0), inner + side * span[2] * e) for e in z_edges]
-        planes += [((0.0, 1.0, 0.0), low[1] + span[1] * e) for e in y_edges]
-        body.divide(mask, planes)
-        index = np.flatnonzero(body.of(source) & (body.middle()[:, 2] * side > 0))
-        spot = body.middle()[index]
+        z_edges = (0.05, columns, 0.5, 0.62, 0.8, 0.93) if fine else (columns, 0.62)
+        y_edges = (0.1, rows, 0.7, 0.9) if fine else (rows,)
+        planes: list[Plane] = list(outline)
+        planes += [((0.0, 0.0, 1.0), float(inner + side * span[2] * e)) for e in z_edges]
+        planes += [((0.0, 1.0, 0.0), float(low[1] + span[1] * e)) for e in y_edges]
+        part = divided(base, part, planes)
+        spot = part.middle(base)
         u, v = (spot[:, 2] - inner) / (side * span[2]), (spot[:, 1] - low[1]) / span[1]
-        outside = np.zeros(len(index), bool)
+        part.albedo[:] = (_head_lamp if head else _tail_lamp)(u, v, columns, rows, own)
         for normal, offset in outline:
-            outside |= spot @ np.array(normal) > offset
-        albedo = (_head_lamp if source == solids.Material.HEADLIGHT else _tail_lamp)(u, v, columns, rows, own)
-        body.soup.albedo[index] = albedo
-        sheet = index[outside]
-        body.paint(sheet, Material.PAINT, tint[0])
+            outside = spot @ np.array(normal) > offset
+            part.material[outside], part.albedo[outside] = Material.PAINT, sheet
+        found.append(part)
+    return _joined(found)
 
 
 def _head_lamp(u: np.ndarray, v: np.ndarray, columns: float, rows: float, rng: np.random.Generator) -> np.ndarray:
@@ -287,100 +299,109 @@ def _tail_lamp(u: np.ndarray, v: np.ndarray, columns: float, rows: float, rng: n
     return albedo
 
 
-def _grille(body: _Body) -> None:
+def _grille(base: _Base, pieces: _Pieces, rng: np.random.Generator) -> _Pieces:
     """Bars across grille and air intake, and a badge."""
-    rng = body.rng
-    front = body.middle()[:, 0] > 0.36 * np.ptp(body.soup.corners[..., 0])
-    mask = (body.of(solids.Material.TRIM) | body.of(solids.Material.CHROME)) & front & (body.facing()[:, 0] > 0.6)
-    if not mask.any():
-        return
-    low, high = _extent(body, mask)
-    pitch = float(rng.uniform(0.035, 0.07))
-    start = float(low[1]) + pitch * 0.3
-    edges = np.arange(start, high[1], pitch / 2)[:24]
-    planes = [((0.0, 1.0, 0.0), float(e)) for e in edges]
-    planes += [((0.0, 0.0, 1.0), z) for z in (-0.04, 0.04)]
-    body.divide(mask, planes)
-    front = body.middle()[:, 0] > 0.36 * np.ptp(body.soup.corners[..., 0])
-    index = np.flatnonzero(
-        (body.of(solids.Material.TRIM) | body.of(solids.Material.CHROME)) & front & (body.facing()[:, 0] > 0.6)
-    )
-    spot = body.middle()[index]
+    length = np.ptp(base.corners[..., 0])
+    ahead = (pieces.middle(base)[:, 0] > 0.36 * length) & (pieces.facing(base)[:, 0] > 0.6)
+    if not ahead.any():
+        return pieces
+    part = pieces.take(ahead)
+    low, high = _extent(base, part)
+    edges = np.linspace(low[1], high[1], int(rng.integers(5, 10)) * 2)[1:-1]
+    planes: list[Plane] = [((0.0, 1.0, 0.0), float(e)) for e in edges]
+    part = divided(base, part, [*planes, ((0.0, 0.0, 1.0), -0.04), ((0.0, 0.0, 1.0), 0.04)])
+    spot = part.middle(base)
     bar = (np.searchsorted(edges, spot[:, 1]) % 2).astype(bool)
     upper = spot[:, 1] < (low[1] + high[1]) / 2
     shiny = _CHROME * 0.8 if rng.random() < 0.35 else _DARK * 5
-    body.soup.albedo[index] = np.where(
-        bar[:, None] & upper[:, None], shiny, _DARK * np.where(bar, 2.5, 0.9)[:, None]
-    )
+    part.albedo[:] = np.where((bar & upper)[:, None], shiny, _DARK * np.where(bar, 2.5, 0.9)[:, None])
     badge = upper & (np.abs(spot[:, 2]) < 0.04) & (spot[:, 1] > low[1] + 0.01) & (spot[:, 1] < low[1] + 0.10)
-    body.paint(index[badge], Material.METAL, _CHROME * 0.7)
+    part.material[badge], part.albedo[badge] = Material.METAL, _CHROME * 0.7
+    return _joined([pieces.take(~ahead), part])
 
 
-def _seam(body: _Body, mask: np.ndarray, normal: tuple[float, float, float], offset: float, width: float) -> None:
-    """A dark gap along a plane over the painted faces of a mask."""
-    reach = body.soup.corners @ np.asarray(normal, np.float32) - np.float32(offset)
-    near = mask & (reach.max(axis=1) > -width / 2) & (reach.min(axis=1) < width / 2)
+def _seam(base: _Base, pieces: _Pieces, mask: np.ndarray, plane: Plane, width_m: float) -> _Pieces:
+    """A dark gap along a plane over the faces of a mask."""
+    normal, offset = plane
+    reach = (base.corners @ np.asarray(normal, np.float32) - np.float32(offset))[pieces.parent]
+    near = mask & (reach.max(axis=1) > -width_m / 2) & (reach.min(axis=1) < width_m / 2)
     if not near.any():
-        return
-    part = body.soup.take(near)
-    for edge in (-width / 2, width / 2):
-        part = cut(part, normal, offset + edge)
-    inside = np.abs(part.corners.mean(axis=1) @ np.asarray(normal) - offset) < width / 2
+        return pieces
+    part = divided(base, pieces.take(near), [(normal, offset - width_m / 2), (normal, offset + width_m / 2)])
+    inside = np.abs(part.middle(base) @ np.asarray(normal) - offset) < width_m / 2
     part.material[inside], part.albedo[inside] = Material.TRIM, _DARK
-    part.pattern[inside, 0] = int(solids.Material.TRIM)
-    body.soup = join([body.soup.take(~near), part])
+    return _joined([pieces.take(~near), part])
 
 
-def _seams(body: _Body) -> None:
-    """Gaps between bonnet, wings, bumpers and boot lid; a rub strip along the doors."""
-    rng = body.rng
-    half = body.soup.corners[..., 0].max()
-    wide = body.soup.corners[..., 2].max()
-    glass = body.of(solids.Material.GLASS)
-    lamps = body.of(solids.Material.HEADLIGHT), body.of(solids.Material.TAIL_LIGHT)
-    if not (glass.any() and lamps[0].any() and lamps[1].any()):
-        return
-    screen_x, belt = float(body.soup.corners[glass][..., 0].max()), float(body.soup.corners[glass][..., 1].max())
-    heights = [float(body.soup.corners[m][..., 1].max()) for m in lamps]
-    for end, height in zip((1.0, -1.0), heights, strict=True):
-        middle, facing = body.middle(), body.facing()
-        sheet = body.of(solids.Material.PAINT) & (middle[:, 0] * end > half - rng.uniform(0.45, 0.6))
-        _seam(body, sheet & (np.abs(facing[:, 1]) < 0.7), (0, 1, 0), height + 0.015, 0.012)
-    lid = float(rng.uniform(0.70, 0.78)) * wide
+def _seams(
+    base: _Base, pieces: _Pieces, edges: tuple[float, float, float, float], rng: np.random.Generator
+) -> _Pieces:
+    """Gaps between bonnet, wings, bumpers and boot lid; perhaps a rub strip along the doors.
+
+    edges: foremost point x of the windows, height y of the window line, lower edges y of head and tail lamps.
+    """
+    screen_x, belt, head_y, tail_y = edges
+    half, wide = base.corners[..., 0].max(), base.corners[..., 2].max()
+    for end, height in ((1.0, head_y), (-1.0, tail_y)):
+        middle, facing = pieces.middle(base), pieces.facing(base)
+        sheet = (middle[:, 0] * end > half - rng.uniform(0.45, 0.6)) & (np.abs(facing[:, 1]) < 0.7)
+        pieces = _seam(base, pieces, sheet, ((0.0, 1.0, 0.0), height + 0.015), 0.012)
+    lid = float(rng.uniform(0.70, 0.78) * wide)
     for z in (lid, -lid):
-        middle, facing = body.middle(), body.facing()
-        sheet = body.of(solids.Material.PAINT)
-        bonnet = sheet & (middle[:, 0] > screen_x - 0.05) & (facing[:, 1] < -0.6)
-        _seam(body, bonnet, (0, 0, 1), z, 0.012)
-        middle, facing = body.middle(), body.facing()
-        rear = (
-            body.of(solids.Material.PAINT)
-            & (facing[:, 0] < -0.6)
-            & (middle[:, 1] < heights[1])
-            & (middle[:, 1] > belt)
-        )
-        _seam(body, rear, (0, 0, 1), z, 0.012)
+        middle, facing = pieces.middle(base), pieces.facing(base)
+        bonnet = (middle[:, 0] > screen_x - 0.05) & (facing[:, 1] < -0.6)
+        boot = (facing[:, 0] < -0.6) & (middle[:, 1] < tail_y) & (middle[:, 1] > belt)
+        pieces = _seam(base, pieces, bonnet | boot, ((0.0, 0.0, 1.0), z), 0.012)
     if rng.random() < 0.35:
-        middle, facing = body.middle(), body.facing()
-        doors = (
-            body.of(solids.Material.PAINT) & (np.abs(facing[:, 2]) > 0.75) & (np.abs(middle[:, 0]) < 0.55 * half)
-        )
-        _seam(body, doors & (middle[:, 1] > belt), (0, 1, 0), 0.55 * belt, 0.045)
+        middle, facing = pieces.middle(base), pieces.facing(base)
+        doors = (np.abs(facing[:, 2]) > 0.75) & (np.abs(middle[:, 0]) < 0.55 * half) & (middle[:, 1] > belt)
+        pieces = _seam(base, pieces, doors, ((0.0, 1.0, 0.0), 0.55 * belt), 0.045)
+    return pieces
 
 
-def _panes(body: _Body) -> None:
-    """Rubber along the upper and lower edges of the windows, of chrome below in some cars."""
-    mask = body.of(solids.Material.GLASS)
-    if not mask.any():
-        return
-    low, high = _extent(body, mask)
-    body.divide(mask, [((0.0, 1.0, 0.0), float(high[1] - 0.03)), ((0.0, 1.0, 0.0), float(low[1] + 0.025))])
-    mask = body.of(solids.Material.GLASS)
-    height = body.middle()[:, 1]
-    below = mask & (height > high[1] - 0.03)
-    chrome = body.rng.random() < 0.2
-    body.paint(below, Material.TRIM, _CHROME if chrome else _DARK)
-    body.paint(mask & (height < low[1] + 0.025), Material.TRIM, _DARK)
+def _panes(base: _Base, pieces: _Pieces, rng: np.random.Generator, fine: bool) -> _Pieces:
+    """Windows: rubber or chrome along their edges; behind them a dashboard, seats, the light of the other side."""
+    low, high = _extent(base, pieces)
+    below, above = float(high[1] - 0.03), float(low[1] + 0.025)
+    pieces = divided(base, pieces, [((0.0, 1.0, 0.0), below), ((0.0, 1.0, 0.0), above)])
+    height, facing = pieces.middle(base)[:, 1], pieces.facing(base)
+    pieces.albedo[:] = 0.03 * float(rng.uniform(0.6, 1.3))
+    seal = (height > below) | (height < above)
+    pieces.material[seal], pieces.albedo[seal] = Material.TRIM, _DARK
+    if rng.random() < 0.2:
+        pieces.albedo[height > below] = _CHROME
+    tinted, light, cloth = rng.random() < 0.15, float(rng.uniform(0.06, 0.12)), float(rng.uniform(0.010, 0.03))
+    if not fine:
+        return pieces
+    screens = ~seal & (np.abs(facing[:, 0]) > 0.3)
+    sides = ~seal & ~screens & (np.abs(facing[:, 2]) > 0.7)
+    found = [pieces.take(~screens & ~sides)]
+    for end in (1.0, -1.0):
+        part = pieces.take(screens & (facing[:, 0] * end > 0))
+        if not len(part.parent):
+            continue
+        low, high = _extent(base, part)
+        rows = low[1] + (high[1] - low[1]) * np.array([0.28, 0.8])
+        columns = np.array([_SEAT_M - 0.16, _SEAT_M + 0.16])
+        planes: list[Plane] = [((0.0, 1.0, 0.0), float(y)) for y in rows]
+        planes += [((0.0, 0.0, 1.0), float(z)) for z in (*columns, *-columns)]
+        part = divided(base, part, planes)
+        spot = part.middle(base)
+        row, seat = np.searchsorted(rows, spot[:, 1]), np.abs(np.abs(spot[:, 2]) - _SEAT_M) < 0.16
+        shade = np.where(row == 2, 0.016, np.where((row == 1) & seat, cloth, light))
+        part.albedo[:] = shade[:, None] if end > 0 or not tinted else 0.012
+        found.append(part)
+    part = pieces.take(sides)
+    if len(part.parent):
+        low, high = _extent(base, part)
+        row = float(low[1] + (high[1] - low[1]) * 0.4)
+        columns = (low[0] + high[0]) / 2 + np.array([-0.95, -0.65, -0.05, 0.3])
+        part = divided(base, part, [((0.0, 1.0, 0.0), row), *(((1.0, 0.0, 0.0), float(x)) for x in columns)])
+        spot = part.middle(base)
+        seat = (spot[:, 1] > row) & (np.searchsorted(columns, spot[:, 0]) % 2 == 1)
+        part.albedo[:] = np.where(seat, cloth, 0.012 if tinted else light)[:, None]
+        found.append(part)
+    return _joined(found)
 
 
 def _sources(mesh: Mesh) -> np.ndarray:
@@ -394,47 +415,79 @@ def _sources(mesh: Mesh) -> np.ndarray:
     return np.where(distance.min(axis=1) < 2e-3, distance.argmin(axis=1), -1)
 
 
-@lru_cache(maxsize=96)
+def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed: int, fine: bool) -> _Pieces:
+    """Details painted on the faces that the templates' builder made of known materials."""
+    rng = np.random.default_rng([0xCA2, KINDS.index(kind), seed])
+    groups = {m: pieces.take(source == int(m)) for m in solids.Material}
+    found = [pieces.take(source < 0)]
+    sheet, car = groups[solids.Material.PAINT].albedo[:1], kind not in ("bus", "truck")
+    trim = _joined([groups.pop(solids.Material.TRIM), groups.pop(solids.Material.CHROME)])
+    glass, paint = groups.pop(solids.Material.GLASS), groups.pop(solids.Material.PAINT)
+    plates = groups.pop(solids.Material.PLATE)
+    head, tail = groups.pop(solids.Material.HEADLIGHT), groups.pop(solids.Material.TAIL_LIGHT)
+    whole = all(len(g.parent) for g in (glass, paint, head, tail))
+    if fine and whole and car:
+        glass_high = _extent(base, glass)[1]
+        edges = (
+            float(glass_high[0]),
+            float(glass_high[1]),
+            float(_extent(base, head)[1][1]),
+            float(_extent(base, tail)[1][1]),
+        )
+        paint = _seams(base, paint, edges, rng)
+    found += [_panes(base, glass, rng, fine and car) if len(glass.parent) else glass, paint]
+    for lamps, ahead in ((head, True), (tail, False)):
+        found.append(
+            _lamps(base, lamps, ahead, sheet[0], rng, fine) if len(lamps.parent) and len(sheet) else lamps
+        )
+    yellow = bool(rng.random() < 0.1)
+    found.append(_plates(base, plates, yellow, fine) if len(plates.parent) else plates)
+    found.append(_grille(base, trim, rng) if fine else trim)
+    return _joined([*found, *groups.values()])
+
+
+@lru_cache(maxsize=128)
 def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
     """A vehicle's mesh as triangles with details painted on; fine: with those seen from near only."""
     mesh, size = vehicle_mesh(kind, variant), np.array(typical_size_lhw(kind, variant), np.float32)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    corners = vertices[faces] * size
     colours = (
         mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
     )
-    soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5), creased_normals(corners))
+    corners = vertices[faces] * size
+    base = _Base(corners, creased_normals(corners))
     table = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)
-    soup.material[:] = table[mesh.part.numpy()]
-    soup.albedo[:] = np.power(np.clip(colours, 0, 1), _GREY_TO_LINEAR)
-    body = _Body(soup, _sources(mesh), np.random.default_rng([0xCA2, KINDS.index(kind), variant]))
-    if kind not in ("bus", "truck"):
-        _panes(body)
-    _lamps(body, solids.Material.HEADLIGHT, fine)
-    _lamps(body, solids.Material.TAIL_LIGHT, fine)
-    _plates(body, fine)
-    if fine:
-        _grille(body)
-        if kind not in ("bus", "truck"):
-            _seams(body)
-    done = body.soup
-    done.pattern[:, 0] = 0
-    # covectors of the unit box: `placed` divides them by the size again
-    done = replace(done, corners=done.corners / size, normals=done.normals * size)
-    points, index = np.unique(done.corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return VehicleShape(done, points, index.reshape(-1, 3))
+    pieces = _Pieces(
+        parent=np.arange(len(faces)),
+        share=np.broadcast_to(np.eye(3, dtype=np.float32), (len(faces), 3, 3)).copy(),
+        material=table[mesh.part.numpy()],
+        albedo=np.power(np.clip(colours, 0, 1), _GREY_TO_LINEAR).astype(np.float32),
+        cell=np.zeros(len(faces), np.int64),
+    )
+    pieces = _detailed(kind, base, pieces, _sources(mesh), variant, fine)
+    # covectors of the unit box: placing a soup divides them by its size again
+    normals = base.normals * size
+    share = pieces.share.astype(np.float32)
+    soup = make(np.matmul(share, vertices[faces][pieces.parent]), Material.PAINT, (0.5, 0.5, 0.5))
+    soup = replace(
+        soup,
+        normals=np.matmul(share, normals[pieces.parent]),
+        material=pieces.material,
+        albedo=pieces.albedo,
+    )
+    soup.pattern[:, 3] = pieces.cell
+    return VehicleShape(soup, vertices, faces, normals, pieces.parent, share)
 
 
 @lru_cache(maxsize=512)
 def _strokes(seed: int) -> np.ndarray:
-    """Whether each cell of a plate's characters is dark, (1 + 3 rows * 2 * signs,) bool; cell 0 never."""
+    """Whether each cell of a plate's characters is dark, (1 + 4 * signs,) bool; cell 0 never."""
     rng = np.random.default_rng([0x91A, seed])
-    dark = rng.random(1 + 6 * _SIGNS) < 0.6
+    dark = rng.random(1 + 4 * _SIGNS) < 0.72
     dark[0] = False
-    # a space between the town, the letters and the number
-    for sign in (2, 4):
-        if rng.random() < 0.6:
-            dark[1 + 6 * sign : 7 + 6 * sign] = False
+    # spaces between the town, the letters and the number
+    sign = int(rng.integers(1, 4))
+    dark[1 + 4 * sign : 5 + 4 * sign] = False
     return dark
 
 
@@ -450,5 +503,5 @@ def vehicle(actor: Actor, fine: bool = True) -> Soup:
     tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
     albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
     cell = soup.pattern[:, 3].astype(np.int64)
-    albedo[_strokes(actor.seed)[np.minimum(cell, 6 * _SIGNS)] & (cell > 0)] = _DARK * 2
+    albedo[_strokes(actor.seed)[cell]] = _DARK * 2
     return replace(soup, albedo=albedo)

@@ -7,13 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivesem.synth import buildings, flora, people, vehicles
+from drivesem.synth import buildings, flora, furniture, people, vehicles
 from drivesem.synth.layout import Actor, Road
 from drivesem.synth.soup import (
     Material,
     Semantic,
     Soup,
-    ball,
     box,
     join,
     make,
@@ -34,6 +33,8 @@ _GROUND_ALBEDO = {
     Material.GRAVEL: (0.17, 0.15, 0.125),
 }
 """Linear albedo; asphalt 0.08 to 0.15, concrete 0.2 to 0.3, grass about 0.1 in the visible range."""
+_LAYER_M = 0.004
+"""Height of patches and paint above the road: nothing to see, enough for the depth test."""
 _LEAVES = 52_000
 """Triangles of plants on one side of the road; once they are spent, what follows (farther away) is coarse."""
 _FINE_M = 26.0
@@ -350,111 +351,212 @@ def _guard_rail(b: _Builder, d: float) -> None:
         b.put(post, d + np.sign(d) * 0.08, float(at))
 
 
+def _edge(b: _Builder, side: int) -> float:
+    return b.road.flank_m[0] if side < 0 else b.road.flank_m[1]
+
+
 def _street_furniture(b: _Builder) -> None:
-    """Lamps, signs, bins, boxes, bollards along the pavements or verges."""
+    """Lamps, signs, bins, boxes, shelters along the pavements or verges."""
     rng, road = b.rng, b.road
-    grey = np.array([0.20, 0.21, 0.22])
     lamp_side = int(rng.choice([-1, 1]))
-    edge = road.flank_m[0] if lamp_side < 0 else road.flank_m[1]
     s, height = float(rng.uniform(3, 25)), float(rng.uniform(5.5, 10))
+    post = furniture.lamp(height, lamp_side)
     while s < 120:
         if b.free(s, 0.3):
-            pole = stick((0, 0, 0), (0, -height, 0), (0.09, 0.05), Material.METAL, grey, 8)
-            arm = stick(
-                (0, -height, 0), (0, -height - 0.35, -lamp_side * 1.8), (0.04, 0.03), Material.METAL, grey, 5
-            )
-            head = ball((0, -height - 0.38, -lamp_side * 2.0), (0.14, 0.07, 0.35), Material.METAL, grey * 1.3, 1)
-            b.put(join([pole, arm, head]), edge - lamp_side * 0.3, s)
+            b.put(post, _edge(b, lamp_side) - lamp_side * 0.3, s)
         s += float(rng.uniform(22, 38))
     for _ in range(int(rng.integers(1, 6))):
         side = int(rng.choice([-1, 1]))
-        edge = road.flank_m[0] if side < 0 else road.flank_m[1]
         where = float(rng.uniform(7, 60))
         if b.free(where, 1.0):
-            b.put(_sign(rng), edge - side * float(rng.uniform(0.0, 0.5)), where)
-    for _ in range(int(rng.integers(0, 4))):
-        side = int(rng.choice([-1, 1]))
-        edge = road.flank_m[0] if side < 0 else road.flank_m[1]
-        where = float(rng.uniform(6, 50))
-        if b.free(where, 2.0):
-            b.put(_clutter(rng), edge + side * float(rng.uniform(0.6, 1.6)), where, float(rng.normal(0, 0.2)))
-
-
-def _sign(rng: np.random.Generator) -> Soup:
-    """A traffic sign on its pole, facing oncoming traffic (towards -x)."""
-    height = float(rng.uniform(2.1, 3.0))
-    grey = np.array([0.3, 0.31, 0.32])
-    parts = [stick((0, 0, 0), (0, -height, 0), (0.035, 0.035), Material.METAL, grey, 7)]
-    colours = np.array([[0.5, 0.03, 0.03], [0.7, 0.7, 0.68], [0.03, 0.09, 0.4], [0.7, 0.5, 0.03], [0.3, 0.3, 0.3]])
-    pick = rng.permutation(len(colours))
-    size = float(rng.uniform(0.3, 0.42))
-    sides = int(rng.choice([3, 4, 24]))
-    angle = np.arange(sides + 1) * 2 * np.pi / sides + {3: np.pi / 2, 4: np.pi / 4, 24: 0.0}[sides]
-    for scale, colour, out in ((1.0, colours[pick[0]], -0.05), (0.72, colours[pick[1]], -0.055)):
-        rim = np.stack(
-            [
-                np.full_like(angle, out),
-                -height + size - np.sin(angle) * size * scale,
-                np.cos(angle) * size * scale,
-            ],
-            axis=1,
-        )
-        middle = np.broadcast_to([out, -height + size, 0.0], rim[:-1].shape)
-        corners = np.stack([middle, rim[:-1], rim[1:]], axis=1)
-        face = make(corners, Material.FLAT, colour, np.broadcast_to([-1.0, 0, 0], corners.shape))
-        parts.append(tagged(face, Semantic.TRAFFIC_SIGN))
-    return join(parts)
-
-
-def _clutter(rng: np.random.Generator) -> Soup:
-    """Bins, cabinets, containers, billboards: what a detector might take for a car."""
-    pool = np.array(
-        [
-            [0.05, 0.05, 0.055],
-            [0.12, 0.16, 0.1],
-            [0.3, 0.3, 0.29],
-            [0.35, 0.2, 0.05],
-            [0.03, 0.06, 0.15],
-            [0.3, 0.04, 0.04],
-            [0.02, 0.02, 0.02],
-        ]
-    )
-    colour = pool[rng.integers(len(pool))] * rng.uniform(0.7, 1.3)
-    shape = int(rng.integers(5))
-    if shape == 0:
-        bins = [
-            placed(
-                box((0.55, 1.05, 0.6), Material.FLAT, colour * rng.uniform(0.7, 1.2)),
-                (0.68 * i, 0, 0),
-                float(rng.normal(0, 0.1)),
-                (1, 1, 1),
+            # those of the other side of the road face the other way
+            turn = np.pi if side < 0 and rng.random() < 0.7 else 0.0
+            b.put(
+                furniture.sign(rng),
+                _edge(b, side) - side * float(rng.uniform(0.0, 0.5)),
+                where,
+                turn + rng.normal(0, 0.06),
             )
-            for i in range(int(rng.integers(1, 4)))
-        ]
-        return join(bins)
-    if shape == 1:
-        return box((float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.9, 1.5)), 0.45), Material.FLAT, colour)
-    if shape == 2:
-        return box(
-            (float(rng.uniform(2.5, 5.0)), float(rng.uniform(1.4, 2.4)), float(rng.uniform(1.4, 2.2))),
-            Material.FLAT,
-            colour,
+    for _ in range(int(rng.integers(0, 5))):
+        side = int(rng.choice([-1, 1]))
+        where = float(rng.uniform(6, 55))
+        if b.free(where, 3.0):
+            b.put(
+                furniture.clutter(rng),
+                _edge(b, side) + side * float(rng.uniform(0.8, 2.2)),
+                where,
+                float(rng.normal(0, 0.2)) + (np.pi if rng.random() < 0.5 else 0.0),
+            )
+    if road.pavements and rng.random() < 0.3:
+        side = int(rng.choice([-1, 1]))
+        where = float(rng.uniform(10, 45))
+        if b.free(where, 3.0):
+            b.put(furniture.bus_stop(rng), _edge(b, side) - side * 0.9, where, 0.0 if side < 0 else np.pi)
+    if road.crossing:
+        for at, side, turn in ((road.crossing[0] - 1.0, 1, 0.0), (road.crossing[1] + 1.0, -1, np.pi)):
+            reach = float(rng.uniform(2.5, 4.5)) if rng.random() < 0.5 else 0.0
+            b.put(furniture.traffic_light(rng, reach), _edge(b, side) - side * 0.6, at, turn)
+    if road.kind in ("country", "residential") and rng.random() < 0.4:
+        _wires(b, int(rng.choice([-1, 1])))
+
+
+def _wires(b: _Builder, side: int) -> None:
+    """Poles with overhead lines along the road."""
+    rng = b.rng
+    d, height = _edge(b, side) + side * float(rng.uniform(0.3, 3.0)), float(rng.uniform(7, 9))
+    stations = np.arange(float(rng.uniform(-20, 0)), 170.0, float(rng.uniform(32, 45)))
+    pole = furniture.wire_pole(height)
+    for s in stations:
+        if b.free(float(s), 0.4):
+            b.put(pole, d, float(s))
+    for out in (-0.8, 0.0, 0.8):
+        for s0, s1 in pairwise(stations):
+            steps = np.linspace(s0, s1, 5)
+            x, z = b.road.point(d + out, steps)
+            sag = 0.9 * (1 - (2 * (steps - s0) / (s1 - s0) - 1) ** 2)
+            points = np.stack([x, -height + 0.5 + sag, z], axis=1)
+            b.parts += [
+                tagged(stick(p, q, (0.014, 0.014), Material.TRIM, (0.02, 0.02, 0.02), 3), Semantic.POLE)
+                for p, q in pairwise(points)
+            ]
+
+
+_PAINTED = (0.50, 0.50, 0.48)
+"""Linear albedo of worn road paint."""
+
+
+def _decal(
+    b: _Builder, d: tuple[float, float], s: tuple[float, float], material: Material, albedo: np.ndarray
+) -> None:
+    """A thin layer on the road between two offsets and two stations."""
+    steps = np.linspace(s[0], s[1], max(int((s[1] - s[0]) / 8), 1) + 1)
+    layer = _ribbon(b.road, d, steps, (_LAYER_M, _LAYER_M), material, albedo, float(b.rng.integers(1000)))
+    b.parts.append(tagged(layer, Semantic.ROAD))
+
+
+def _road_details(b: _Builder) -> None:
+    """Mended patches, manholes, gutters, marks of parking places, arrows, crossings for people."""
+    rng, road = b.rng, b.road
+    lanes = [s for s in road.strips if s.material == Material.ROAD and s.d1 - s.d0 > 1.5]
+    tar = np.array(_GROUND_ALBEDO[Material.ROAD])
+    for _ in range(int(rng.integers(0, 7))):
+        strip = lanes[int(rng.integers(len(lanes)))]
+        s0 = float(rng.uniform(5, 60))
+        wide = min(float(rng.uniform(0.5, 2.6)), strip.d1 - strip.d0 - 0.4)
+        long = float(rng.choice([rng.uniform(0.6, 3.0), rng.uniform(6, 30)]))
+        d0 = float(rng.uniform(strip.d0 + 0.1, strip.d1 - wide - 0.1))
+        if wide > 0.3 and b.free(s0 + long / 2, long / 2):
+            _decal(b, (d0, d0 + wide), (s0, s0 + long), Material.ROAD, tar * rng.uniform(0.62, 1.3))
+    kerbs = [s for s in road.strips if s.material == Material.KERB]
+    spans = [(-8.0, 90.0)]
+    if road.crossing:
+        spans = [(-8.0, road.crossing[0]), (road.crossing[1], 90.0)]
+    for kerb in kerbs:
+        sign = 1.0 if kerb.d0 < 0 else -1.0
+        edge = kerb.d1 if sign > 0 else kerb.d0
+        d = tuple(sorted((edge, edge + sign * 0.3)))
+        for span in spans:
+            _decal(b, (d[0], d[1]), span, Material.PARKING, tar * 1.25)
+        for s in np.arange(float(rng.uniform(6, 14)), 60, 17.0):
+            if b.free(float(s), 0.5):
+                x = edge + sign * 0.16
+                _decal(b, (x - 0.14, x + 0.14), (float(s), float(s) + 0.5), Material.CLOTH, np.full(3, 0.03))
+    for _ in range(int(rng.integers(1, 5))):
+        strip = lanes[0]
+        d, s = float(rng.uniform(strip.d0 + 0.6, strip.d1 - 0.6)), float(rng.uniform(6, 40))
+        angle = np.linspace(0, 2 * np.pi, 15)
+        for radius, grey, up in ((0.40, 0.07, 1.0), (0.32, 0.045, 1.5)):
+            x, z = road.point(d + radius * np.cos(angle), s + radius * np.sin(angle))
+            middle = np.broadcast_to(np.array([*road.point(d, s)]), (14, 2))
+            flat = np.stack([middle, np.stack([x, z], 1)[:-1], np.stack([x, z], 1)[1:]], axis=1)
+            corners = np.stack([flat[..., 0], np.full((14, 3), -_LAYER_M * up), flat[..., 1]], axis=2)
+            lid = make(corners, Material.CLOTH, np.full(3, grey), np.broadcast_to([0.0, -1.0, 0.0], corners.shape))
+            b.parts.append(tagged(lid, Semantic.ROAD))
+    for strip in road.strips:
+        if strip.material == Material.PARKING and rng.random() < 0.6:
+            pitch = 2.6 if strip.d1 - strip.d0 > 3 else 5.8
+            for s in np.arange(float(rng.uniform(0, pitch)), 70, pitch):
+                if b.free(float(s), 5.0):
+                    _decal(b, (strip.d0, strip.d1), (float(s), float(s) + 0.12), Material.ROAD, np.array(_PAINTED))
+    if road.kind in ("city", "junction", "residential") and rng.random() < 0.35:
+        s0 = road.crossing[0] - 5.2 if road.crossing else float(rng.uniform(9, 40))
+        for lane in lanes:
+            for d0 in np.arange(lane.d0 + 0.3, lane.d1 - 0.5, 1.0):
+                _decal(b, (float(d0), float(d0) + 0.5), (s0, s0 + 3.2), Material.ROAD, np.array(_PAINTED))
+    if road.crossing or (road.kind == "arterial" and rng.random() < 0.5):
+        end = road.crossing[0] - 8 if road.crossing else float(rng.uniform(20, 40))
+        for lane in road.lanes:
+            if lane.direction == 1 and not lane.parked and end > 7:
+                _arrow(b, lane.middle_m, end, int(rng.integers(3)) - 1)
+
+
+def _arrow(b: _Builder, d: float, tip: float, turn: int) -> None:
+    """An arrow painted on a lane, its tip at s = tip, 4 m long; turn: -1 left, 0 ahead, 1 right."""
+    if turn == 0:
+        outline = [[(-0.08, -4.0), (0.08, -4.0), (0.08, -1.4)], [(-0.08, -4.0), (0.08, -1.4), (-0.08, -1.4)]]
+        outline.append([(-0.32, -1.4), (0.32, -1.4), (0.0, 0.0)])
+    else:
+        outline = [[(-0.08, -4.0), (0.08, -4.0), (0.08, -1.6)], [(-0.08, -4.0), (0.08, -1.6), (-0.08, -1.6)]]
+        outline += [[(0.0, -2.1), (0.5, -1.3), (0.5, -1.0)], [(0.0, -2.1), (0.5, -1.0), (0.0, -1.6)]]
+        outline.append([(0.4, -1.9), (0.45, -0.5), (0.95, -0.9)])
+    shape = np.array(outline) * [float(turn or 1), 1.0]
+    offset, station = d + shape[..., 0], tip + shape[..., 1]
+    x, z = b.road.point(offset, station)
+    corners = np.stack([x, np.full_like(x, -_LAYER_M), z], axis=2)
+    normals = np.broadcast_to([0.0, -1.0, 0.0], corners.shape)
+    paint = make(corners, Material.ROAD, _PAINTED, normals, np.stack([offset, station], axis=2))
+    b.parts.append(tagged(paint, Semantic.ROAD))
+
+
+def _fields(b: _Builder, side: int, edge: float) -> None:
+    """Fields of different crops, a fence along the road, hedges between them, bales."""
+    rng = b.rng
+    s = -10.0
+    crops = np.array(
+        [[0.20, 0.16, 0.06], [0.10, 0.075, 0.05], [0.07, 0.12, 0.03], [0.12, 0.15, 0.04], [0.22, 0.20, 0.09]]
+    )
+    while s < 190:
+        long = float(rng.uniform(25, 90))
+        near, far = edge + side * float(rng.uniform(2, 7)), edge + side * 58
+        d = tuple(sorted((near, far)))
+        albedo = crops[int(rng.integers(len(crops)))] * rng.uniform(0.8, 1.2)
+        steps = np.linspace(s, s + long, 5)
+        layer = _ribbon(
+            b.road, (d[0], d[1]), steps, (0.02, 0.02), Material.GRASS, albedo, float(rng.integers(1000))
         )
-    if shape == 3:
-        legs = [stick((x, 0, 0), (x, -1.0, 0), (0.05, 0.05), Material.METAL, np.full(3, 0.2)) for x in (-1.2, 1.2)]
-        board = placed(box((3.0, 1.6, 0.12), Material.FLAT, colour * 2.0), (0, -0.9, 0), 0.0, (1, 1, 1))
-        return placed(join([*legs, board]), (0, 0, 0), float(rng.uniform(0, 1.57)), (1, 1, 1))
-    posts = [
-        placed(box((0.15, 0.9, 0.15), Material.FLAT, np.full(3, 0.35)), (1.5 * i, 0, 0), 0.0, (1, 1, 1))
-        for i in range(4)
-    ]
-    return join(posts)
+        b.parts.append(layer)
+        if rng.random() < 0.5:
+            for out in np.arange(4.0, 50.0, 6.0):
+                if rng.random() < 0.6:
+                    spot = edge + side * float(out), s + long
+                    if rng.random() < 0.35:
+                        _tree(b, *spot, float(rng.uniform(5, 10)))
+                    else:
+                        _bush(b, *spot, float(rng.uniform(1.2, 3.0)))
+        if albedo[0] > 0.15 and rng.random() < 0.6:
+            for _ in range(int(rng.integers(2, 7))):
+                where = s + float(rng.uniform(0.1, 0.9)) * long
+                b.put(furniture.bale(), edge + side * float(rng.uniform(10, 50)), where, float(rng.uniform(0, 3)))
+        s += long
+    if rng.random() < 0.6:
+        post = tagged(
+            stick((0, 0, 0), (0, -1.15, 0), (0.05, 0.045), Material.BARK, (0.13, 0.10, 0.07), 5), Semantic.POLE
+        )
+        stations, d = np.arange(-4.0, 90.0, 3.0), edge + side * 1.4
+        for at in stations:
+            b.put(post, d, float(at))
+        for height in (0.5, 1.05):
+            x, z = b.road.point(d, stations)
+            for low, high in pairwise(np.stack([x, np.full_like(x, -height), z], axis=1)):
+                wire = stick(low, high, (0.012, 0.012), Material.METAL, (0.2, 0.2, 0.2), 3)
+                b.parts.append(tagged(wire, Semantic.POLE))
 
 
 def surroundings(road: Road, pool: Pool, rng: np.random.Generator) -> tuple[Soup, dict[str, list[int]]]:
     """Everything that does not move, and the ids of the shapes used, by kind."""
     b = _Builder(road, pool, rng)
     _ground(b)
+    _road_details(b)
     left, right = road.flank_m
     for side, edge in ((-1, left), (1, right)):
         _flank(b, side, edge)
@@ -490,17 +592,23 @@ def _flank(b: _Builder, side: int, edge: float) -> None:
             _tree_row(b, edge - side * float(rng.uniform(0.4, 0.9)), (8, 15), (6, 11))
         return
     draw = rng.random()
-    if draw < 0.5:
+    if draw < 0.4:
         _wood(b, side, edge)
+    elif draw < 0.55 and kind != "motorway":
+        _fields(b, side, edge)
     elif draw < 0.75:
         _tree_row(b, edge + side * float(rng.uniform(1.5, 5)), (6, 16), (7, 13))
         if rng.random() < 0.5:
             _wood(b, side, edge + side * 14)
+        else:
+            _fields(b, side, edge + side * 6)
     elif kind != "country" and draw < 0.9:
         _city_row(b, side, edge + side * float(rng.uniform(4, 12)))
         _tree_row(b, edge + side * float(rng.uniform(1.5, 3)), (10, 20), (6, 10))
     else:
         _houses(b, side, edge + side * float(rng.uniform(15, 35)))
+        if rng.random() < 0.5:
+            _tree_row(b, edge + side * float(rng.uniform(1.5, 4)), (9, 25), (5, 10))
 
 
 def _wood(b: _Builder, side: int, edge: float) -> None:

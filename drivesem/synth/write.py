@@ -89,6 +89,7 @@ class Order:
         if self.people and self.layout.startswith("vkitti"):
             raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
         parse_variations(",".join(self.variations))
+        _edits_of(self.edits)
 
     def recipe(self) -> dict[str, object]:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""

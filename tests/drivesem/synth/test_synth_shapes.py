@@ -7,8 +7,7 @@ import torch
 from drivesem.synth import buildings, flora, people
 from drivesem.synth.light import develop, draw_light, draw_response, sky_radiance
 from drivesem.synth.noise import SIZE, noise_set, sample
-from drivesem.synth.soup import Material, Soup, ball, box, join, make, placed, stick, unit_sphere
-from drivesem.synth.world import creased_normals
+from drivesem.synth.soup import Material, Soup, ball, box, creased_normals, join, make, placed, stick, unit_sphere
 from scene_ir.geometry import place
 
 

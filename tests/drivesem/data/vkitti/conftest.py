@@ -87,13 +87,13 @@ def _exposure(height: int = 40, width: int = 80, camera: Camera | None = None, s
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_thing() -> Callable[..., TrackedObject]:
     """The factory of objects, by track, kind and whatever else is to differ."""
     return _thing
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_shot() -> Callable[..., Exposure]:
     """The factory of exposures, by height, width, camera and seed."""
     return _exposure
