@@ -5,20 +5,17 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import os
 import shlex
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -26,11 +23,13 @@ from rich.table import Table
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.attacks.si_fgsm import SiFGSM
-from drivesem.config import DEFAULT_COMBO, Attack, UsageError, processes, to_yaml
+from drivesem.config import DEFAULT_COMBO, Attack, UsageError
 from drivesem.evaluation import coco
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
+from drivesem.pool import outcomes
 from drivesem.report.html import render_report
 from drivesem.results import FrameResult, RunSummary, load_frame
+from drivesem.run_folder import claim
 from drivesem.sources import SceneSource, open_source
 from drivesem.space import Parameter, combo, parse_params
 from scene_ir import files
@@ -40,8 +39,6 @@ from scene_ir.errors import SceneError
 HEADLINE = "Car"
 """The class that the paper reports."""
 
-_PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
-"""Settings that change no frame's result: a run may be continued with others."""
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -61,7 +58,7 @@ def run(config: Attack) -> int:
     _check_device(config.device)
     worker = _Worker(config, params)
     out = Path(config.out) if config.out else Path("runs") / _name(config, params)
-    _claim(out, config)
+    claim(out, config, _clear)
     names, without_vehicles, failed = _select(worker.source, config)
     todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
     console = Console(stderr=True)
@@ -109,18 +106,8 @@ class _Worker:
         return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
 
 
-_process_worker: _Worker | None = None
-
-
-def _start_process(config: Attack, params: tuple[Parameter, ...], threads: int) -> None:
-    global _process_worker
-    torch.set_num_threads(threads)
-    _process_worker = _Worker(config, params)
-
-
-def _attack_in_process(identifier: str, out: Path) -> None:
-    assert _process_worker is not None
-    _process_worker.attack(identifier, out)
+def _in_process(config: Attack, params: tuple[Parameter, ...], out: Path) -> Callable[[str], FrameResult]:
+    return partial(_Worker(config, params).attack, out=out)
 
 
 def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console) -> None:
@@ -128,7 +115,8 @@ def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[st
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not todo) as progress:
         task = progress.add_task("attacking frames", total=len(todo))
-        for identifier, outcome in _outcomes(worker, todo, out):
+        build = partial(_in_process, worker.config, worker.params, out)
+        for identifier, outcome in outcomes(partial(worker.attack, out=out), build, todo, worker.config):
             try:
                 outcome()
             except SceneError as error:
@@ -136,31 +124,6 @@ def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[st
                     raise
                 failed[identifier] = str(error)
             progress.advance(task)
-
-
-def _outcomes(worker: _Worker, todo: Sequence[str], out: Path) -> Iterator[tuple[str, Callable[[], object]]]:
-    config = worker.config
-    # The number of threads follows from the settings, not from the frames left: a resumed run adds up alike.
-    threads = max((os.cpu_count() or 1) // processes(config), 1)
-    torch.set_num_threads(threads)
-    if min(processes(config), len(todo)) <= 1:
-        for identifier in todo:
-            yield identifier, lambda identifier=identifier: worker.attack(identifier, out)
-        return
-    pool = ProcessPoolExecutor(
-        min(processes(config), len(todo)),
-        get_context("spawn"),
-        initializer=_start_process,
-        initargs=(config, worker.params, threads),
-    )
-    with pool:
-        pending = {pool.submit(_attack_in_process, identifier, out): identifier for identifier in todo}
-        try:
-            for future in as_completed(pending):
-                yield pending[future], future.result
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def _select(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
@@ -187,33 +150,6 @@ def _select(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[s
 
 def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
     return f"{config.dataset}-{'-'.join(params)}-seed{config.seed}"
-
-
-def _identity(config: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in config.items() if key not in _PRESENTATION}
-
-
-def _claim(out: Path, config: Attack) -> None:
-    """Make `out` this run's folder: new, or one with the same settings to go on in."""
-    path = out / "config.yaml"
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
-    if path.exists():
-        if config.resume:
-            before = yaml.safe_load(files.read_text(path))
-            if not isinstance(before, dict) or _identity(before) != _identity(asdict(config)):
-                known = before if isinstance(before, dict) else {}
-                changed = [k for k, v in _identity(asdict(config)).items() if known.get(k) != v]
-                raise UsageError(
-                    str(path),
-                    "the settings of this run (else another --out, or --no-resume)",
-                    "other values of " + ", ".join(changed),
-                )
-        else:
-            _clear(out)
-    elif out.is_dir() and any(out.iterdir()):
-        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
-    files.write_text(path, to_yaml(config))
 
 
 def _clear(out: Path) -> None:

@@ -14,8 +14,11 @@ from drivesem.config import (
     COMMANDS,
     Attack,
     Bench,
-    Common,
+    Command,
+    Derender,
+    Edit,
     Gradcheck,
+    Render,
     Synth,
     UsageError,
     validate,
@@ -27,7 +30,7 @@ _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
 
 
-def parse(argv: Sequence[str]) -> Common:
+def parse(argv: Sequence[str]) -> Command:
     """The configuration that `argv` asks for. Raises UsageError; SystemExit(0) after `--help`."""
     words = list(argv)
     if words and words[0] in COMMANDS:
@@ -35,7 +38,7 @@ def parse(argv: Sequence[str]) -> Common:
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
-            config: Common = tyro.extras.subcommand_cli_from_dict(  # pyright: ignore[reportAssignmentType]
+            config: Command = tyro.extras.subcommand_cli_from_dict(  # pyright: ignore[reportAssignmentType]
                 COMMANDS, prog="drivesem", description=_DESCRIPTION, args=words
             )
     except SystemExit as stop:
@@ -103,11 +106,23 @@ def _is_bad_input(error: Exception) -> bool:
     return isinstance(error, tuple(kinds)) if kinds else False
 
 
-def _run(config: Common) -> int:
+def _run(config: Command) -> int:
     if isinstance(config, Attack):
         from drivesem import attack_command
 
         return attack_command.run(config)
+    if isinstance(config, Derender):
+        from drivesem import derender_command
+
+        return derender_command.run(config)
+    if isinstance(config, Render):
+        from drivesem import render_command
+
+        return render_command.run(config)
+    if isinstance(config, Edit):
+        from drivesem import edit_command
+
+        return edit_command.run(config)
     if isinstance(config, Synth):
         from drivesem.synth import command
 

@@ -16,9 +16,13 @@ import tyro
 import yaml
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 COMBO_NUMBERS = (1, 2, 3, 4)
 DEFAULT_COMBO = 2
+DEMO = "demo"
+DATASETS = (DEMO, "kitti", "vkitti1", "vkitti2", "coco", "yolo")
+"""What --dataset takes: the embedded scenes, and the readers of `drivesem.data.registry`."""
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
 
@@ -31,8 +35,16 @@ class UsageError(ValueError):
 
 
 @dataclass(frozen=True)
-class Common:
-    """Options that mean the same in every command."""
+class Command:
+    """The option that every command has."""
+
+    json: Flag = False
+    """Print one JSON object on standard output; everything else goes to standard error."""
+
+
+@dataclass(frozen=True)
+class Common(Command):
+    """Options that mean the same in every command that works through frames."""
 
     out: str | None = None
     """Folder for the results; a second run with the same folder goes on where it stopped."""
@@ -48,18 +60,16 @@ class Common:
     """List a frame that cannot be used in the results and go on with the rest."""
     resume: bool = True
     """Keep the frames that are already there."""
-    json: Flag = False
-    """Print one JSON object on standard output; everything else goes to standard error."""
 
 
 @dataclass(frozen=True)
 class Attack(Common):
     """Find feasible changes of driving scenes that a detector gets wrong."""
 
-    dataset: str = "demo"
-    """demo (generated scenes, needs no data) or kitti."""
+    dataset: str = DEMO
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
-    """Folder of the data set: KITTI's folder with training/image_2, label_2 and calib."""
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
     combo: int | None = None
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
@@ -81,6 +91,55 @@ class Attack(Common):
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
+
+
+@dataclass(frozen=True)
+class Derender(Common):
+    """Take labelled photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
+
+    dataset: str = DEMO
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str | None = None
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
+    velodyne: Flag = False
+    """Read the laser's points too (KITTI, where a frame has them)."""
+    fit: bool = True
+    """Fit template, pose and shape to the photograph's silhouettes."""
+    fast: Flag = False
+    """No fit: templates stay where the labels put them. The same as --no-fit."""
+    sheet: Flag = False
+    """Also draw sheet.jpg into each scene's folder: photograph, mattes, normals, depth, maps, shadows, background,
+    re-render and difference."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Command):
+    """Render a scene folder as it stands."""
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    """The scene's folder, as `drivesem derender` writes it."""
+    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """PNG to write; by default render.png in the scene's folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit(Command):
+    """Change a scene folder by physical units, and render it."""
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    """The scene's folder, as `drivesem derender` writes it; objects are numbered by row, from 0."""
+    set: Repeated = ()
+    """A change, as often as needed: 'objects[2].translate=0.5m,0m' (along the heading, to the left),
+    'objects[2].rotate=10deg', 'objects[1].color=0.3,0,0,0,0', 'objects[all].rotate=2deg', weather=fog (or rain,
+    sunset, overcast, night), weather.rain=0.4, foliage.hue=0.5."""
+    remove: Repeated = ()
+    """Rows of vehicles to take out, with their shadows; or all."""
+    edits: str | None = None
+    """A YAML file of changes; what --set says of the same thing wins."""
+    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """PNG to write; by default edit.png in the scene's folder, or nothing where there is --save."""
+    save: str | None = None
+    """Folder to write the changed scene to."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +180,12 @@ class Synth(Common):
 
 @dataclass(frozen=True)
 class Bench(Common):
-    """Measure speed and memory: one attack step, the renderer, peak memory, or the scene generator."""
+    """Measure: one attack step, the renderer, peak memory, the scene generator, or de-rendering."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth", "derender"]] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
-    memory above the detector's own; synth: the scene generator."""
+    memory above the detector's own; synth: the scene generator; derender: de-rendered generated frames beside the
+    generator's truth."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
@@ -133,7 +193,10 @@ class Bench(Common):
     triangles: str = "2000,5000"
     """Triangles a car, with commas."""
     frames: int | None = None
-    """Frames that bench synth makes in each row; by default 200, with --quick 40."""
+    """Frames that bench synth makes in each row, by default 200, with --quick 40; or that bench derender takes
+    apart, by default 100, with --quick 12."""
+    ablate: Flag = False
+    """Bench derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: int | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
@@ -146,10 +209,10 @@ class Bench(Common):
 class Gradcheck(Common):
     """Compare gradients with central differences; exit code 1 where they disagree. One scene without --limit."""
 
-    dataset: str = "demo"
-    """demo (generated scenes, needs no data) or kitti."""
+    dataset: str = DEMO
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
-    """Folder of the data set: KITTI's folder with training/image_2, label_2 and calib."""
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
     detector: str = "squeezedet"
     """Name of a shipped detector, or a .safetensors file of one."""
     directions: int = 2
@@ -162,8 +225,11 @@ class Gradcheck(Common):
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
 
 
-COMMANDS: dict[str, type[Common]] = {
+COMMANDS: dict[str, type[Command]] = {
     "attack": Attack,
+    "derender": Derender,
+    "render": Render,
+    "edit": Edit,
     "synth": Synth,
     "bench": Bench,
     "gradcheck": Gradcheck,
@@ -175,19 +241,27 @@ def processes(config: Common) -> int:
     return config.workers or min(os.cpu_count() or 1, _MOST_PROCESSES)
 
 
-def validate(config: Common) -> None:
+def validate(config: Command) -> None:
     """Raise UsageError for values that no command accepts."""
-    if config.workers is not None and config.workers < 1:
-        raise UsageError("--workers", "at least 1", config.workers)
-    if config.limit is not None and config.limit < 1:
-        raise UsageError("--limit", "at least 1", config.limit)
-    if isinstance(config, Attack | Gradcheck):
-        if config.dataset != "demo" and config.root is None:
+    if isinstance(config, Common):
+        if config.workers is not None and config.workers < 1:
+            raise UsageError("--workers", "at least 1", config.workers)
+        if config.limit is not None and config.limit < 1:
+            raise UsageError("--limit", "at least 1", config.limit)
+    if isinstance(config, Attack | Derender | Gradcheck):
+        if config.dataset not in DATASETS:
+            raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(config.dataset))
+        if config.dataset != DEMO and config.root is None:
             raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
-        if config.dataset == "demo" and config.root is not None:
+        if config.dataset == DEMO and config.root is not None:
             raise UsageError(
                 "--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root
             )
+    if isinstance(config, Derender):
+        if config.velodyne and config.dataset != "kitti":
+            raise UsageError("--velodyne", "--dataset kitti beside it", f"--dataset {config.dataset}")
+        if config.device != "cpu":
+            raise UsageError("--device", "cpu", config.device)
     if isinstance(config, Gradcheck):
         if config.directions < 1:
             raise UsageError("--directions", "at least 1", config.directions)
@@ -235,7 +309,7 @@ def numbers(setting: str, text: str, least: int = 1) -> list[int]:
     return found
 
 
-def yaml_arguments(path: str, command: type[Common]) -> list[str]:
+def yaml_arguments(path: str, command: type[Command]) -> list[str]:
     """The settings of a YAML preset as command-line words, so that both are checked by one parser.
 
     Raises UsageError naming the file, and the key where there is one.
@@ -271,6 +345,8 @@ def _words(path: str, field: dataclasses.Field[Any], value: Any) -> list[str]:
         if value:
             return [f"--{flag}"]
         return [f"--no-{flag}"] if kind == "bool" else []
+    if kind == "Repeated" and isinstance(value, list):
+        return [f"--{flag}={item}" for item in value]
     if isinstance(value, list | tuple):
         value = ",".join(str(item) for item in value)
     if isinstance(value, dict) or (isinstance(value, float) and not math.isfinite(value)):
@@ -279,6 +355,6 @@ def _words(path: str, field: dataclasses.Field[Any], value: Any) -> list[str]:
     return [f"--{flag}={value}"]
 
 
-def to_yaml(config: Common) -> str:
+def to_yaml(config: Command) -> str:
     """The resolved configuration, as it is written beside the results."""
     return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)

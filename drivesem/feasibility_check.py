@@ -8,6 +8,7 @@ may differ.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 
 import cv2
 import numpy as np
@@ -49,9 +50,24 @@ def check_scene(base: SceneIR, perturbed: SceneIR) -> list[str]:
     for i, (old, new) in enumerate(zip(before, after, strict=True)):
         lines = _pose(base, old, new) + _shape(old, new) + _road(base, road, old, new)
         found += [f"objects[{i}]: {line}" for line in lines + _frame(base, old, new)]
-    found += _collisions(before, after)
+    found += _collisions(dict(enumerate(before)), dict(enumerate(after)))
     found += _hidden(base, before, after)
     return found
+
+
+def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list[str]:
+    """Which of the objects `rows` left the ground or the road, or stand in one another; lines as of `check_scene`.
+
+    What only an attack is bound to, how far a car may go and turn, is not looked at.
+    """
+    before = {i: _Car(base, i) for i in rows}
+    after = {i: _Car(perturbed, i) for i in before}
+    road = base.environment.road.numpy().astype(np.float64)
+    found = []
+    for i, old in before.items():
+        lines = _height(base, old, after[i]) + _road(base, road, old, after[i])
+        found += [f"objects[{i}]: {line}" for line in lines]
+    return found + _collisions(before, after)
 
 
 class _Car:
@@ -150,12 +166,14 @@ def _codes(scene: SceneIR) -> list[str]:
     ]
 
 
-def _pose(base: SceneIR, old: _Car, new: _Car) -> list[str]:
-    found = []
+def _height(base: SceneIR, old: _Car, new: _Car) -> list[str]:
     plane = base.environment.ground.double().numpy()
     rise = float(plane[:3] @ (new.position - old.position)) / float(np.linalg.norm(plane[:3]))
-    if abs(rise) > HEIGHT_TOLERANCE_M:
-        found.append(f"off the ground by {rise:.3f} m")
+    return [f"off the ground by {rise:.3f} m"] if abs(rise) > HEIGHT_TOLERANCE_M else []
+
+
+def _pose(base: SceneIR, old: _Car, new: _Car) -> list[str]:
+    found = _height(base, old, new)
     moved = old.axes @ (new.position - old.position) / old.size[0]
     if max(abs(moved[0]), abs(moved[2])) > TRANSLATION_LENGTHS + 1e-3:
         found.append(f"moved by {moved[0]:.3f}, {moved[2]:.3f} own lengths")
@@ -253,10 +271,10 @@ def _frame(base: SceneIR, old: _Car, new: _Car) -> list[str]:
     return found
 
 
-def _collisions(before: list[_Car], after: list[_Car]) -> list[str]:
+def _collisions(before: Mapping[int, _Car], after: Mapping[int, _Car]) -> list[str]:
     found = []
-    for i in range(len(after)):
-        for j in range(i):
+    for i in after:
+        for j in (k for k in after if k < i):
             now = overlap_area(after[i].footprint, after[j].footprint)
             then = overlap_area(before[i].footprint, before[j].footprint)
             if now > then + OVERLAP_TOLERANCE_M2:

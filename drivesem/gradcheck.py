@@ -18,13 +18,11 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -44,6 +42,7 @@ from detectors.squeezedet import Assignment, SqueezeDet
 from drivesem.config import Attack, Gradcheck, UsageError, processes
 from drivesem.feasible import FeasibleSet
 from drivesem.labels import Labeller
+from drivesem.pool import outcomes
 from drivesem.sources import SceneSource, open_source
 from drivesem.space import COMBOS, Parameter, ParameterSpace
 from scene_ir import files
@@ -478,20 +477,16 @@ class _Worker:
         check = self._current[1]
         return check.gradients(task.at) if task.parameter is None else check.differences(task.at, task.parameter)
 
+    def do_all(self, tasks: Sequence[_Task]) -> _Results:
+        """Several tasks, each with its result."""
+        return [(task, self.do(task)) for task in tasks]
+
 
 _Results = list[tuple[_Task, Gradients | Differences]]
-_process_worker: _Worker | None = None
 
 
-def _start_process(config: Gradcheck, threads: int) -> None:
-    global _process_worker
-    torch.set_num_threads(threads)
-    _process_worker = _Worker(config)
-
-
-def _do_in_process(tasks: Sequence[_Task]) -> _Results:
-    assert _process_worker is not None
-    return [(task, _process_worker.do(task)) for task in tasks]
+def _in_process(config: Gradcheck) -> Callable[[list[_Task]], _Results]:
+    return _Worker(config).do_all
 
 
 def _check_all(worker: _Worker, names: Sequence[str], failed: dict[str, str]) -> dict[str, tuple[Row, ...]]:
@@ -507,7 +502,7 @@ def _check_all(worker: _Worker, names: Sequence[str], failed: dict[str, str]) ->
     differences: dict[tuple[str, Point], dict[Parameter, Differences]] = {}
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task("checking gradients", total=len(names) * len(POINTS) * len(parts))
-        for job, outcome in _outcomes(worker, jobs):
+        for job, outcome in outcomes(worker.do_all, partial(_in_process, worker.config), jobs, worker.config):
             try:
                 results = outcome()
             except SceneError as error:
@@ -534,29 +529,6 @@ def _check_all(worker: _Worker, names: Sequence[str], failed: dict[str, str]) ->
             rows += rows_of(name, at, gradients[name, at], {p: found[p] for p in Parameter})
         scenes[name] = tuple(rows)
     return scenes
-
-
-def _outcomes(
-    worker: _Worker, jobs: Sequence[list[_Task]]
-) -> Iterator[tuple[list[_Task], Callable[[], _Results]]]:
-    """Each job with a call that gives its results or raises what went wrong, in this process or in several."""
-    config = worker.config
-    count = min(processes(config), len(jobs))
-    threads = max((os.cpu_count() or 1) // processes(config), 1)
-    torch.set_num_threads(threads)
-    if count <= 1:
-        for job in jobs:
-            yield job, lambda job=job: [(task, worker.do(task)) for task in job]
-        return
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_start_process, initargs=(config, threads))
-    with pool:
-        pending = {pool.submit(_do_in_process, job): job for job in jobs}
-        try:
-            for future in as_completed(pending):
-                yield pending[future], future.result
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def _select(source: SceneSource, config: Gradcheck, failed: dict[str, str]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-from drivesem.config import Attack
+from drivesem.config import DEMO, Attack, Derender
 from scene_ir.types import SceneIR
 
 DEMO_SCENES = 10
@@ -50,11 +50,12 @@ class DemoSource:
 class PhotographSource:
     """Frames of a labelled data set of photographs, de-rendered by their labels."""
 
-    def __init__(self, config: Attack) -> None:
+    def __init__(self, config: Attack | Derender) -> None:
         from drivesem.data.registry import open_dataset
         from scene_ir.derender.derender import DerenderSettings
 
-        self._dataset = open_dataset(config.dataset, Path(config.root or ""))
+        points = isinstance(config, Derender) and config.velodyne
+        self._dataset = open_dataset(config.dataset, Path(config.root or ""), with_points=points)
         self._settings = DerenderSettings(fit=config.fit)
 
     def identifiers(self) -> Iterator[str]:
@@ -71,8 +72,8 @@ class PhotographSource:
         return derender(self._dataset.frame(identifier), self._settings)
 
 
-def open_source(config: Attack) -> SceneSource:
+def open_source(config: Attack | Derender) -> SceneSource:
     """The source that the configuration names. Raises SceneError for an unknown or unreadable data set."""
-    if config.dataset == "demo":
+    if config.dataset == DEMO:
         return DemoSource(config.seed, config.limit or DEMO_SCENES)
     return PhotographSource(config)

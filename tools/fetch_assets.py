@@ -65,7 +65,8 @@ _FREE_DEG = 50.0
 @dataclass(frozen=True)
 class Model:
     """How to read one model. kind: body; paint, glass, tyre, light: names of materials, all others are trim.
-    front: the axis that it looks along; roof_m: what lies wholly above this is left out (aerials).
+    front: the axis that it looks along; plain: materials whose texture is too fine to keep; roof_m: what lies
+    wholly above this is left out (aerials).
     """
 
     kind: str
@@ -74,6 +75,7 @@ class Model:
     tyre: tuple[str, ...] = ("tires",)
     light: tuple[str, ...] = ()
     front: str = "+z"
+    plain: tuple[str, ...] = ()
     roof_m: float | None = None
 
 
@@ -142,7 +144,7 @@ MODELS: Mapping[str, Model] = {
     "blendswap-cc-by/fordFocus": Model(
         "hatchback", ("carPaint",), tyre=("black_rubber",), light=("glass_red", "white", "yellow_chrome")
     ),
-    "blendswap-cc-by/dafTruck": Model("truck", ("Cabin", "Payload"), ("Glass",), ()),
+    "blendswap-cc-by/dafTruck": Model("truck", ("Cabin", "Payload"), ("Glass",), (), plain=("Payload", "Trailer")),
     "blendswap-cc-0/peterbilt": Model(
         "truck", ("body", "bodyTrailer"), tyre=("tires", "tiresTrailer"), light=("reflector", "reflectorTrailer")
     ),
@@ -214,8 +216,9 @@ def vehicle(
     low, high = everything.min(axis=0), everything.max(axis=0)
     metres = np.array(entry.size_lhw_m) / np.maximum(high - low, 1e-9)
     placed = [(points - [low[0], high[1], low[2]]) * metres for _, _, points in shapes]
-    solid, tints, counts = _cut([(points, s) for points, (_, s, _) in zip(placed, shapes, strict=True)], entry)
     names = [str(getattr(shape.visual.material, "name", "") or key) for key, shape, _ in shapes]
+    pieces = [(p, s, name in model.plain) for p, (_, s, _), name in zip(placed, shapes, names, strict=True)]
+    solid, tints, counts = _cut(pieces, entry)
     kinds = np.repeat([int(_part(model, name)) for name in names], counts)
     metal = np.repeat([re.search("chrome|alumin|metal", name.lower()) is not None for name in names], counts)
     tints[metal] = np.minimum(tints[metal], _BRIGHTEST_METAL)
@@ -240,14 +243,18 @@ def _part(model: Model, material: str) -> Part:
 
 
 def _cut(
-    shapes: list[tuple[np.ndarray, trimesh.Trimesh]], entry: Entry
+    shapes: list[tuple[np.ndarray, trimesh.Trimesh, bool]], entry: Entry
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """All triangles (F, 3, 3) with their colours (F, 3), and how many each shape gave, as `_CUTS` says."""
+    """All triangles (F, 3, 3) with their colours (F, 3), and how many each shape gave, as `_CUTS` says.
+
+    shapes: points in m, faces and texture, and whether they stay whole.
+    """
     pieces: list[tuple[np.ndarray, np.ndarray]] = []
     for share, even in _CUTS:
-        limits = (share * entry.size_lhw_m[0], even)
-        pieces = [_coloured(points, np.asarray(s.faces), s.visual, limits) for points, s in shapes]
-        cut = sum(len(p[0]) for p, (_, s) in zip(pieces, shapes, strict=True) if len(p[0]) > len(s.faces))
+        length = entry.size_lhw_m[0]
+        limits = {False: (share * length, even), True: (9.0 * length, 1.1)}
+        pieces = [_coloured(points, np.asarray(s.faces), s.visual, limits[whole]) for points, s, whole in shapes]
+        cut = sum(len(p[0]) for p, (_, s, _) in zip(pieces, shapes, strict=True) if len(p[0]) > len(s.faces))
         if cut <= _MOST_TEXTURED:
             break
     return (

@@ -1,4 +1,4 @@
-"""`drivesem bench step|render|memory|synth`: figures with method, machine and versions."""
+"""`drivesem bench step|render|memory|synth|derender`: figures with method, machine and versions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from detectors.base import DetectorError
 from detectors.registry import load_detector
-from drivesem.bench import memory, render, step, synth, tables
+from drivesem.bench import derender, memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
 from drivesem.config import Bench, UsageError, numbers, processes
@@ -45,6 +45,7 @@ def run(config: Bench) -> int:
         "render": _render,
         "memory": _memory,
         "synth": _synth,
+        "derender": _derender,
     }
     console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
     found = measure[config.what](config, cars, triangles, console)
@@ -128,6 +129,24 @@ def _synth(config: Bench, cars: list[int], triangles: list[int], console: Consol
     }
 
 
+def _derender(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+    frames = config.frames
+    if frames is None:
+        frames = derender.QUICK_FRAMES if config.quick else derender.FULL_FRAMES
+    targets = _targets(config)
+    sheets = None if targets is None else targets[0].with_suffix("")
+    rows = list(
+        _watched(derender.measure(frames, config.seed, processes(config), config.ablate, sheets), frames, console)
+    )
+    return {
+        "rows": [asdict(row) for row in rows],
+        "summary": derender.summary(rows),
+        "method": derender.METHOD,
+    }
+
+
 def _watched(rows: Iterator[T], total: int, console: Console) -> Iterator[T]:
     """The same rows; says how far it has come."""
     with console.status("measuring") as status:
@@ -167,6 +186,7 @@ def _command(config: Bench) -> str:
     """The command line that measures this again."""
     default = Bench(what=config.what)
     words = ["drivesem", "bench", config.what, *(["--quick"] if config.quick else [])]
+    words += ["--ablate"] if config.ablate else []
     for name in ("cars", "triangles", "frames", "workers", "threads", "detector", "device", "seed"):
         value = getattr(config, name)
         if value != getattr(default, name):

@@ -50,6 +50,10 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
         "frames_per_second": ("frames a second", "frames/s"), "start_s": ("start, s", "start s"),
         "peak_rss_mb": ("peak of all processes, MB", "peak MB"), "growth_kb": ("growth, KB a frame", "KB/frame"),
     },
+    "derender": {
+        "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
+        "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
+    },
 }  # fmt: skip
 """Field of a row, its heading in the documentation, and the short one for terminals, where it is shown there."""
 TITLES = {
@@ -59,6 +63,7 @@ TITLES = {
     "verbs": "The four verbs",
     "memory": "Memory",
     "synth": "The scene generator",
+    "derender": "De-rendering beside the generator's truth",
 }
 
 
@@ -74,7 +79,7 @@ class Section:
 def sections(result: dict[str, Any]) -> list[Section]:
     """The tables of one benchmark's result."""
     what = result["what"]
-    found = [Section(TITLES[what], what, result["rows"])]
+    found = [Section(TITLES[what], what, result.get("summary", result["rows"]))]
     if result.get("beside"):
         found.append(Section(TITLES["beside"], what, result["beside"]))
     if result.get("verbs"):

@@ -67,8 +67,15 @@ WRITERS: dict[str, Callable[[Path], Writer]] = {
 """Writers by the name of their layout."""
 
 
-def open_dataset(name: str, root: Path | str) -> Dataset:
-    """The data set `name` under `root`. RangeError for an unknown name, FormatError for a bad folder."""
+def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
+    """The data set `name` under `root`. with_points: read laser points too, which only KITTI has.
+
+    RangeError for an unknown name, or one without points; FormatError for a bad folder.
+    """
     if name not in DATASETS:
         raise RangeError("dataset", f"one of {', '.join(sorted(DATASETS))}", name)
+    if with_points:
+        if name != "kitti":
+            raise RangeError("dataset with points", "kitti", name)
+        return KittiDataset(Path(root), with_points=True)
     return DATASETS[name](Path(root))

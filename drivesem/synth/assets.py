@@ -5,7 +5,7 @@ files do not. It maps file names to entries; all keys of an entry may be left ou
 
     taxi.glb:
       kind: sedan               # sedan, hatchback, estate, suv, pickup, van, truck or bus; else guessed
-      up: z                     # the file's axis that points up: y (the default), z or -y
+      up: z                     # the file's axis that points up: y, z or -y, or auto (the default)
       front: -x                 # the file's axis that the vehicle looks along: +x ... -z, or auto (the default)
       size_lhw_m: [4.6, 1.5, 1.8]   # length, height, width in metres; else the file's own, where plausible
       metres_per_unit: 0.01     # of the file's coordinates, used where size_lhw_m is absent
@@ -44,6 +44,8 @@ _SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 VEHICLE_KINDS = tuple(kind for kind, label in LABEL_OF_KIND.items() if label in ("Car", "Van", "Truck"))
 _MOST_FACES = 20_000
 """Heavier meshes are simplified when read: a car 500 px high shows no more."""
+_PANE = (0.022, 0.025, 0.026)
+"""Linear albedo of windows: what is seen of a car's inside from the street."""
 _FAR_FACES = 2500
 """Enough for 90 px and less, with wheels and mirrors."""
 _KEYS = frozenset(
@@ -86,7 +88,7 @@ class _Entry:
     """One line of the sidecar, checked."""
 
     kind: str | None = None
-    up: str = "y"
+    up: str = "auto"
     front: str = "auto"
     size_lhw_m: tuple[float, float, float] | None = None
     metres_per_unit: float = 1.0
@@ -204,11 +206,16 @@ def _entry(field: str, raw: object) -> _Entry:
     kind = raw.get("kind")
     if kind is not None and kind not in VEHICLE_KINDS:
         raise FormatError(f"{field}: kind", " or ".join(VEHICLE_KINDS), kind)
-    up, front = str(raw.get("up", "y")), str(raw.get("front", "auto"))
-    if up not in ("y", "z", "-y"):
-        raise FormatError(f"{field}: up", "y, z or -y", up)
-    if front != "auto" and not (re.fullmatch(r"[+-][xyz]", front) and front[1] != up[-1]):
-        raise FormatError(f"{field}: front", f"auto or an axis such as +x other than {up[-1]}", front)
+    up, front = str(raw.get("up", "auto")), str(raw.get("front", "auto"))
+    if up not in ("auto", "y", "z", "-y"):
+        raise FormatError(f"{field}: up", "auto, y, z or -y", up)
+    if front != "auto" and not re.fullmatch(r"[+-][xyz]", front):
+        raise FormatError(f"{field}: front", "auto or an axis such as +x", front)
+    if front != "auto" and up == "auto":
+        # What looks along y can only stand on z.
+        up = "z" if front[1] == "y" else "y"
+    if front[1] == up[-1]:
+        raise FormatError(f"{field}: front", f"an axis other than up, {up}", front)
     size = raw.get("size_lhw_m")
     if size is not None and not (isinstance(size, list) and len(size) == 3 and all(_positive(v) for v in size)):
         raise FormatError(f"{field}: size_lhw_m", "three positive numbers", size)
@@ -233,11 +240,23 @@ def _positive(value: object) -> bool:
 
 
 def _vehicle(path: Path, entry: _Entry) -> VehicleMesh:
-    imported = _read(path, entry.up, entry.front)
-    length, height, width = (e * entry.metres_per_unit for e in imported.size_lhw)
+    up = entry.up if entry.up != "auto" else _up(path)
+    length, height, width = (e * entry.metres_per_unit for e in _read(path, up, entry.front).size_lhw)
     kind = entry.kind or kind_of(path.stem, (length, height, width))
     size = entry.size_lhw_m or usual_size(kind, (length, height, width))
-    return VehicleMesh(path.name, kind, size, path, entry.up, entry.front)
+    return VehicleMesh(path.name, kind, size, path, up, entry.front)
+
+
+def _up(path: Path) -> str:
+    """Which of y and z points up in a file: the tyres lie low; without tyres, no vehicle is higher than long."""
+    for up in ("y", "z"):
+        imported = _read(path, up, "auto")
+        mesh, (length, height, _) = imported.mesh, imported.size_lhw
+        tyres = mesh.faces[mesh.part == Part.TYRE]
+        low = float(mesh.vertices[tyres][..., 1].mean()) > -0.4 if len(tyres) else height < 0.95 * length
+        if low and height < length:
+            return up
+    return "y"
 
 
 def kind_of(name: str, size_lhw: tuple[float, float, float]) -> str:
@@ -328,8 +347,8 @@ def with_parts(mesh: Mesh) -> Mesh:
 def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: float = 0.65) -> Soup:
     """A vehicle's triangles in the unit box with its parts' materials; normals are smooth at the given size.
 
-    albedo: of paint, 0.5 times its tint against the main paint, so that it can be painted anew; of the rest, its
-    own.
+    albedo: of paint, 0.5 times its tint against the main paint, so that it can be painted anew; of windows, dark;
+    of the rest, its own.
     """
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     corners = vertices[faces]
@@ -341,6 +360,7 @@ def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: floa
     if paint.any():
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         albedo[paint] = 0.5 * _tint(albedo[paint], np.linalg.norm(flat[paint], axis=1))
+    albedo[part == Part.GLASS] = _PANE
     soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5))
     soup.material[:] = _PART_MATERIAL[part]
     soup.albedo[:] = albedo
@@ -351,7 +371,7 @@ def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: floa
     return soup
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=48)
 def vehicle_soup(vehicle: VehicleMesh, fine: bool = True) -> Soup:
     """`mesh_soup` of a vehicle at its usual size, kept; fine: with the triangles that are seen from near only."""
     mesh = vehicle.mesh

@@ -83,13 +83,14 @@ def run(config: Synth) -> int:
 def _sheet(order: Order) -> Path:
     """A contact sheet of what was written, read back by the layout's reader."""
     from drivesem.data.registry import open_dataset
-    from drivesem.synth.sheet import sheet_of, write_sheet
+    from drivesem.drawing import write_picture
+    from drivesem.synth.sheet import sheet_of
 
     dataset = open_dataset(order.layout, order.out)
     names = dataset.identifiers
     step = max(len(names) // _SHEET_FRAMES, 1)
     path = order.out / "sheet.jpg"
-    write_sheet(path, sheet_of(dataset, names[::step][:_SHEET_FRAMES]))
+    write_picture(path, sheet_of(dataset, names[::step][:_SHEET_FRAMES]))
     return path
 
 

@@ -100,8 +100,8 @@ _PANELS = ("vehicles_per_frame", "box_height_px", "depth_m", "lateral_m", "yaw_r
 
 @dataclass(frozen=True, slots=True)
 class Histograms:
-    """Shares (B,) of every quantity over a number of frames, zeros where nothing was counted; means, None there and
-    for angles, which have none.
+    """Shares (B,) of every quantity over a number of frames, zeros where nothing was counted; means, None there
+    and for angles, which have none.
     """
 
     frames: int

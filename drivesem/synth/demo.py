@@ -139,7 +139,9 @@ def take_apart(frame: SynthFrame, name: str, shape: Callable[[str, int], Mesh] =
         translation=table([t.translation for t in truths], 3),
         yaw=torch.tensor([t.yaw for t in truths], dtype=torch.float32),
         size_lhw=table([a.size_lhw for a in vehicles], 3),
-        ffd=torch.zeros(count, LATTICE_POINTS, 3),
+        ffd=torch.tensor([a.ffd or (0.0,) * (LATTICE_POINTS * 3) for a in vehicles], dtype=torch.float32).reshape(
+            count, LATTICE_POINTS, 3
+        ),
         texture_code=torch.zeros(count, TEXTURE_DIM),
         category=torch.tensor([int(Category.TRUCK if a.label == "Truck" else Category.CAR) for a in vehicles]),
         box2d=table([t.box_xyxy for t in truths], 4),

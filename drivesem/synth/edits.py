@@ -1,82 +1,37 @@
 """Edits of generated scenes: vehicles moved, turned, bent, painted, removed; other weather and foliage.
 
 The generator renders the edited world itself, so that what de-rendering and attacks make of an edit can be held
-against the truth. A file of edits is YAML:
+against the truth. A file of edits is YAML, each frame's entry as `drivesem.edits` has it:
 
     frames:
       all:                              # every frame, or a frame's number
-        weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast
-        foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
+        weather: {fog: 0.5}
       3:
         objects:
           2: {translate: [0.5m, 0m], rotate: 10deg}
-          4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
           5: {remove: true}
-          all: {rotate: 0.05}
 
-Objects are numbered by their track (`manifest.json`). translate is along the vehicle's length and across to its
-left, in metres or in own lengths (a bare number); rotate in degrees or rad; both on the ground.
+Objects are numbered by their track (`manifest.json`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
-import yaml
 
+from drivesem.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
 from drivesem.synth.frames import Plan
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
-from scene_ir import files
 from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M
-from scene_ir.errors import FormatError, RangeError
-from scene_ir.ffd import SYMMETRIC_DIM, from_symmetric
+from scene_ir.errors import RangeError
+from scene_ir.ffd import from_symmetric
 from scene_ir.texture import apply_texture_code
-from scene_ir.types import TEXTURE_DIM
 
-ALL = "all"
-WEATHER_NAMES = ("fog", "rain", "time", "overcast")
-FOLIAGE_NAMES = ("hue", "lightness", "density")
-_ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectEdit:
-    """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
-    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none.
-    """
-
-    translate: tuple[float, float] = (0.0, 0.0)
-    translate_m: tuple[float, float] = (0.0, 0.0)
-    rotate: float = 0.0
-    color: tuple[float, ...] = (0.0,) * TEXTURE_DIM
-    mesh: tuple[float, ...] = ()
-    remove: bool = False
-
-    def __post_init__(self) -> None:
-        if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
-            raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
-        if len(self.mesh) not in (0, SYMMETRIC_DIM):
-            raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
-
-
-@dataclass(frozen=True, slots=True)
-class FrameEdit:
-    """What happens to one frame. objects: by track, or "all"; weather (4,) in [0, 1]; foliage (3,) in [-1, 1]."""
-
-    objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
-    weather: tuple[float, ...] = (0.0,) * len(WEATHER_NAMES)
-    foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_NAMES)
-
-
-Edits = Mapping[int | str, FrameEdit]
-"""Edits by frame number, or "all"."""
+__all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
 
 
 def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
@@ -169,105 +124,3 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
         haze_per_m=light.haze_per_m + FOG_EXTINCTION_PER_M * fog + RAIN_EXTINCTION_PER_M * rain,
         wet=max(light.wet, rain),
     )
-
-
-def read_edits(path: Path) -> Edits:
-    """The edits in a YAML file. FormatError naming the file and the place in it."""
-    try:
-        loaded: Any = yaml.safe_load(files.read_text(path))
-    except yaml.YAMLError as error:
-        raise FormatError(str(path), "YAML", " ".join(str(error).split())) from error
-    frames = _mapping(f"{path}", loaded, ("frames",)).get("frames", {})
-    found: dict[int | str, FrameEdit] = {}
-    for key, value in _mapping(f"{path}: frames", frames).items():
-        number = _number_or_all(f"{path}: frames", key)
-        where = f"{path}: frame {number}"
-        entry = _mapping(where, value, ("objects", "weather", "foliage"))
-        objects = _mapping(f"{where}: objects", entry.get("objects") or {})
-        found[number] = FrameEdit(
-            objects={
-                _number_or_all(f"{where}: objects", track): _object_edit(f"{where}: object {track}", edit)
-                for track, edit in objects.items()
-            },
-            weather=_codes(f"{where}: weather", entry.get("weather"), WEATHER_NAMES, 0.0),
-            foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_NAMES, -1.0),
-        )
-    return found
-
-
-def _object_edit(where: str, value: Any) -> ObjectEdit:
-    entry = _mapping(where, value, ("translate", "rotate", "color", "mesh", "remove"))
-    own, metres = [0.0, 0.0], [0.0, 0.0]
-    translate = _list(f"{where}: translate", entry.get("translate", [0, 0]), 2)
-    for i, item in enumerate(translate):
-        if isinstance(item, str) and item.strip().endswith("m"):
-            metres[i] = _float(f"{where}: translate", item.strip().removesuffix("m"))
-        else:
-            own[i] = _float(f"{where}: translate", item)
-    remove = entry.get("remove", False)
-    if not isinstance(remove, bool):
-        raise FormatError(f"{where}: remove", "true or false", repr(remove))
-    try:
-        return ObjectEdit(
-            translate=(own[0], own[1]),
-            translate_m=(metres[0], metres[1]),
-            rotate=_angle(f"{where}: rotate", entry.get("rotate", 0)),
-            color=tuple(
-                _float(f"{where}: color", v) for v in _list(f"{where}: color", entry.get("color", [0] * 5), 5)
-            ),
-            mesh=tuple(
-                _float(f"{where}: mesh", v)
-                for v in _list(f"{where}: mesh", entry.get("mesh", []), SYMMETRIC_DIM, empty=True)
-            ),
-            remove=remove,
-        )
-    except RangeError as error:
-        raise FormatError(where, error.expected, error.actual) from error
-
-
-def _mapping(where: str, value: Any, known: tuple[str, ...] | None = None) -> dict[Any, Any]:
-    if not isinstance(value, dict):
-        raise FormatError(where, "a mapping", type(value).__name__)
-    for key in value:
-        if known is not None and key not in known:
-            raise FormatError(f"{where}: {key}", f"one of {', '.join(known)}", "an unknown key")
-    return value
-
-
-def _list(where: str, value: Any, length: int, empty: bool = False) -> list[Any]:
-    if not isinstance(value, list) or (len(value) != length and not (empty and not value)):
-        raise FormatError(where, f"a list of {length}", repr(value))
-    return value
-
-
-def _float(where: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, bool) or not math.isfinite(number):
-        raise FormatError(where, "a finite number", repr(value))
-    return number
-
-
-def _angle(where: str, value: Any) -> float:
-    if isinstance(value, str):
-        for unit, factor in _ANGLE_UNITS.items():
-            if value.strip().endswith(unit):
-                return _float(where, value.strip().removesuffix(unit)) * factor
-    return _float(where, value)
-
-
-def _number_or_all(where: str, key: Any) -> int | str:
-    if key == ALL or (isinstance(key, int) and not isinstance(key, bool) and key >= 0):
-        return key
-    raise FormatError(where, "a number from 0, or all", repr(key))
-
-
-def _codes(where: str, value: Any, names: tuple[str, ...], low: float) -> tuple[float, ...]:
-    entry = _mapping(where, value or {}, names)
-    codes = tuple(_float(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
-    for name, code in zip(names, codes, strict=True):
-        if not low <= code <= 1:
-            raise FormatError(f"{where}.{name}", f"a code in [{low:g}, 1]", code)
-    return codes

@@ -42,7 +42,7 @@ def leaves(
     two = np.cross(facing, one)
     reach = size_m * rng.uniform(0.6, 1.5, (n, 1))
     corners = (
-        points[:, None] + np.stack([one, -0.6 * one + 0.52 * two, -0.45 * one - 0.52 * two], 1) * reach[:, None]
+        points[:, None] + np.stack([one, -0.6 * one + 0.45 * two, -0.45 * one - 0.45 * two], 1) * reach[:, None]
     )
     shade = outward * 0.85 + facing * 0.35
     shade /= np.linalg.norm(shade, axis=1, keepdims=True)
@@ -88,7 +88,7 @@ def _crown(
     return [*cores, coat]
 
 
-_TREE_LEAVES = ((520, 0.044), (1700, 0.0265), (5200, 0.0155), (16000, 0.0092))
+_TREE_LEAVES = ((520, 0.044), (1700, 0.0265), (5200, 0.0155), (22000, 0.0078))
 """Number and size of a tree's leaf clusters for each level of detail, per metre of height: 3 to 6 px each."""
 
 
@@ -161,7 +161,7 @@ def hedge(size_m: tuple[float, float, float], front: float, detail: int, rng: np
     length_m, height_m, depth_m = size_m
     colour = leaf_colour(rng, 0.02)
     core = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m / 2 - 0.1, depth_m / 2 - 0.12]
-    density, size_m = ((12.0, 0.26), (40.0, 0.15), (120.0, 0.088), (340.0, 0.05))[detail]
+    density, leaf_m = ((12.0, 0.26), (40.0, 0.15), (120.0, 0.088), (340.0, 0.05))[detail]
     area_side, area_top = length_m * height_m, length_m * depth_m
     points, outward = [], []
     for sign in (-1.0, 1.0):
@@ -200,7 +200,7 @@ def hedge(size_m: tuple[float, float, float], front: float, detail: int, rng: np
     spots = np.concatenate(points)
     spots += rng.normal(0, 0.05, spots.shape)
     block = _prism(core, height_m - 0.1, colour * 0.4)
-    return join([block, leaves(spots, np.concatenate(outward), size_m, colour, rng)])
+    return join([block, leaves(spots, np.concatenate(outward), leaf_m, colour, rng)])
 
 
 def _prism(ring: np.ndarray, height_m: float, colour: np.ndarray) -> Soup:
@@ -234,7 +234,7 @@ def tree_line(start: np.ndarray, end: np.ndarray, height_m: float, rng: np.rando
     normal = np.array([end[1] - start[1], 0, -(end[0] - start[0])]) / length
     if float(normal @ np.array([foot.mean(axis=0)[0], 0, foot.mean(axis=0)[1]])) > 0:
         normal = -normal
-    colour = leaf_colour(rng, 0.04)
+    colour = leaf_colour(rng, 0.0)
     wall = make(strip, Material.LEAF, colour * 0.55, np.tile(normal, (2 * columns, 3, 1)))
     n = int(length * height_m * 1.3)
     where = rng.uniform(0, columns, n)

@@ -39,6 +39,7 @@ from drivesem.synth.render import (
 from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed
 from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
+from drivesem.synth.vehicles import instance_ffd
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
@@ -70,6 +71,7 @@ class SynthSettings:
     """What varies between uses of the generator. layout: vehicles and roads. sunny: clear weather only.
     tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None:
     any, by name: Virtual KITTI's. sequence: frames of one drive, that follow each other by a tenth of a second.
+    bent: each vehicle's shape is bent in a way of its own, so that no two are alike.
     """
 
     layout: LayoutSettings | None = None
@@ -77,6 +79,7 @@ class SynthSettings:
     tilt_rad: float = 0.008
     camera: int | Literal["vkitti1", "vkitti2"] | None = None
     sequence: int = 1
+    bent: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,9 +337,15 @@ def plan_frame(
         noise=noise_set(SPLITS.index(split)),
         grain_seed=(seed, index, SPLITS.index(split), attempt),
     )
-    tracked = tuple(replace(a, track=i) for i, a in enumerate(actors))
+    tracked = tuple(replace(_own_shape(a, settings.bent), track=i) for i, a in enumerate(actors))
     plan = Plan(tracked, setting, split, (seed, street, attempt))
     return drive(plan, (index - street) * FRAME_PERIOD_S)
+
+
+def _own_shape(actor: Actor, bent: bool) -> Actor:
+    if not bent or actor.label not in ("Car", "Van", "Truck"):
+        return actor
+    return replace(actor, ffd=tuple(instance_ffd(actor).reshape(-1).tolist()))
 
 
 def variation_of(plan: Plan, name: str) -> Plan:

@@ -207,38 +207,46 @@ def bicycles(rng: np.random.Generator) -> Soup:
     return tagged(join(found), Semantic.MISC)
 
 
-def clutter(rng: np.random.Generator) -> Soup:
-    """Bins, cabinets, sheds, skips, trailers, billboards: what one may take for a car. Long side along x."""
+def clutter(rng: np.random.Generator, small: bool) -> Soup:
+    """What one may take for a car, its long side along x.
+
+    small: fit for a pavement (bins, cabinets, bicycles); else sheds, skips, trailers, billboards.
+    """
     colour = _BOXES[rng.integers(len(_BOXES))] * rng.uniform(0.7, 1.3)
-    shape = int(rng.integers(9))
+    shape = int(rng.integers(5)) if small else int(rng.integers(5, 9))
     if shape == 0:
-        return join(
-            [_bin(colour * rng.uniform(0.7, 1.2), float(0.68 * i), rng) for i in range(int(rng.integers(1, 4)))]
-        )
+        count = int(rng.integers(1, 4))
+        return join([_bin(colour * rng.uniform(0.7, 1.2), 0.68 * i, rng) for i in range(count)])
     if shape == 1:
         case = box((float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.9, 1.5)), 0.45), Material.FLAT, colour)
         return join([case, box((1.5, 0.12, 0.5), Material.WALL, np.full(3, 0.2))])
     if shape == 2:
-        return _shed(rng, colour)
-    if shape == 3:
-        legs = [stick((x, 0, 0), (x, -1.0, 0), (0.05, 0.05), Material.METAL, _GREY) for x in (-1.2, 1.2)]
-        board = [_moved(box((3.0, 1.6, 0.12), Material.FLAT, np.full(3, 0.3)), 0.0, -0.9)]
-        for _ in range(5):
-            wide, tall = float(rng.uniform(0.3, 1.4)), float(rng.uniform(0.15, 0.6))
-            x, y = float(rng.uniform(-1.4 + wide / 2, 1.4 - wide / 2)), float(rng.uniform(1.0, 2.4 - tall))
-            board.append(_moved(box((wide, tall, 0.15), Material.FLAT, rng.uniform(0.02, 0.6, 3)), x, -y))
-        return _moved(join([*legs, *board]), 0.0, yaw=float(rng.uniform(0, 1.57)))
-    if shape == 4:
         return join([_moved(box((0.15, 0.9, 0.15), Material.FLAT, np.full(3, 0.35)), 1.5 * i) for i in range(4)])
-    if shape == 5:
-        return _container(rng, colour)
-    if shape == 6:
-        return _trailer(rng, colour)
-    if shape == 7:
-        pillar = stick((0, 0, 0), (0, -2.8, 0), (0.6, 0.6), Material.WALL, rng.uniform(0.1, 0.5, 3), 14)
-        cap = stick((0, -2.8, 0), (0, -3.0, 0), (0.72, 0.6), Material.FLAT, np.array([0.05, 0.10, 0.07]), 14)
+    if shape == 3:
+        pillar = stick((0, 0, 0), (0, -2.8, 0), (0.5, 0.5), Material.WALL, rng.uniform(0.1, 0.5, 3), 14)
+        cap = stick((0, -2.8, 0), (0, -3.0, 0), (0.62, 0.5), Material.FLAT, np.array([0.05, 0.10, 0.07]), 14)
         return tagged(join([pillar, cap]), Semantic.MISC)
-    return bicycles(rng)
+    if shape == 4:
+        return bicycles(rng)
+    if shape == 5:
+        return shed(rng, float(rng.uniform(2.2, 5.0)))
+    if shape == 6:
+        return _container(rng, colour)
+    if shape == 7:
+        return _trailer(rng, colour)
+    return _billboard(rng)
+
+
+def _billboard(rng: np.random.Generator) -> Soup:
+    """Posters on two legs."""
+    legs = [stick((x, 0, 0), (x, -1.0, 0), (0.05, 0.05), Material.METAL, _GREY) for x in (-1.2, 1.2)]
+    board = [_moved(box((3.0, 1.6, 0.12), Material.FLAT, np.full(3, 0.3)), 0.0, -0.9)]
+    for i in range(5):
+        wide, tall = float(rng.uniform(0.3, 1.4)), float(rng.uniform(0.15, 0.6))
+        x, y = float(rng.uniform(-1.4 + wide / 2, 1.4 - wide / 2)), float(rng.uniform(1.0, 2.4 - tall))
+        poster = box((wide, tall, 0.14 + 0.01 * i), Material.FLAT, rng.uniform(0.02, 0.6, 3))
+        board.append(_moved(poster, x, -y))
+    return _moved(join([*legs, *board]), 0.0, yaw=float(rng.uniform(0, 1.57)))
 
 
 def _bin(colour: np.ndarray, x: float, rng: np.random.Generator) -> Soup:
@@ -248,9 +256,10 @@ def _bin(colour: np.ndarray, x: float, rng: np.random.Generator) -> Soup:
     return _moved(join([body, lid]), x, yaw=float(rng.normal(0, 0.1)))
 
 
-def _shed(rng: np.random.Generator, colour: np.ndarray) -> Soup:
-    """A garden shed or a small garage."""
-    long, tall, wide = float(rng.uniform(2.2, 5.0)), float(rng.uniform(1.8, 2.4)), float(rng.uniform(1.8, 2.8))
+def shed(rng: np.random.Generator, long: float) -> Soup:
+    """A garden shed or a small garage, `long` m along x."""
+    colour = _BOXES[rng.integers(len(_BOXES))] * rng.uniform(0.7, 1.3)
+    tall, wide = float(rng.uniform(1.8, 2.4)), float(rng.uniform(1.8, 2.8))
     wood = rng.random() < 0.6
     walls = box(
         (long, tall, wide), Material.FENCE if wood else Material.WALL, colour if wood else np.full(3, 0.35)

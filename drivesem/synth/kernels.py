@@ -499,7 +499,6 @@ def surface(s: Spot, material: int, air: Air, street: Street, textures: Noise):
             base = dirty(s, textures)
             gloss = wp.vec3f(0.05 + 0.02 * air.wet, 1.0, 600.0)
         elif material == M_GLASS:
-            base = wp.vec3f(0.022, 0.025, 0.026)
             gloss = wp.vec3f(0.07, 1.0, 900.0)
         elif material == M_LIGHT:
             base *= 0.8
@@ -548,7 +547,10 @@ def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: Street, text
     soaked = street.soaked[material]
     out = dry * (1.0 - soaked[0] * air.wet)
     if soaked[1] + soaked[2] > 0.0:
-        puddle = saturate((noise(textures.soft, s.world[0] + 17.0, s.world[2], 1.0 / 0.06) - 0.5) * 3.0)
+        x = s.world[0]
+        z = s.world[2] * 0.5
+        depth = noise(textures.soft, x + 17.0, z, 1.0 / 0.04) + 0.25 * noise(textures.rough, x, z, 1.0 / 0.03)
+        puddle = saturate((depth - 0.6) * 2.5)
         film = air.wet * (soaked[1] + soaked[2] * puddle)
         view = wp.normalize(s.point)
         cosine = saturate(-wp.dot(view, s.normal))
@@ -975,7 +977,7 @@ def sun_kernel(
                         end,
                         shade.depth,
                         -1,
-                        owner,
+                        owner,  # not written to: no faces are asked for
                     )
 
 

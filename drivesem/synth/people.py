@@ -46,11 +46,13 @@ def _body(hip: np.ndarray, lean: float, colours: tuple[np.ndarray, ...]) -> tupl
     shirt, skin, hair = colours
     up = np.array([np.sin(lean), -np.cos(lean), 0.0])
     neck = hip + up * 0.56
-    chest = hip + up * 0.34
+    chest, waist = hip + up * 0.40, hip + up * 0.20
     head = neck + up * 0.15 + np.array([0.02, 0, 0])
     parts = [
         ball(hip + up * 0.06, (0.125, 0.16, 0.17), Material.CLOTH, shirt, 1),
-        ball(chest, (0.13, 0.27, 0.195), Material.CLOTH, shirt, 1),
+        ball(waist, (0.115, 0.22, 0.155), Material.CLOTH, shirt, 1),
+        ball(chest, (0.125, 0.19, 0.19), Material.CLOTH, shirt, 1),
+        ball(hip + up * 0.49, (0.075, 0.065, 0.215), Material.CLOTH, shirt, 1),
         stick(neck - up * 0.06, head, (0.06, 0.055), Material.CLOTH, skin),
         ball(head, (0.1, 0.125, 0.08), Material.CLOTH, skin, 1),
         ball(head + up * 0.035 - np.array([0.025, 0, 0]), (0.1, 0.11, 0.088), Material.CLOTH, hair, 1),

@@ -1,4 +1,8 @@
-"""From triangles to a photograph: visibility by the project's rasteriser at twice the resolution, then shading."""
+"""From triangles to a photograph: visibility at twice the resolution, then shading, then lens and sensor.
+
+Each step has two implementations: kernels, and plain numpy with the project's rasteriser (`backend="reference"`),
+which defines what the kernels compute.
+"""
 
 from __future__ import annotations
 
@@ -117,8 +121,8 @@ class Picture:
 @dataclass(frozen=True, slots=True)
 class Sight:
     """What the camera sees, at twice the resolution. faces: the triangles, at least those in view. face (2H, 2W)
-    index into them, -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W) int32,
-    -1 in the sky; semantic (2H, 2W) uint8, a `Semantic`.
+    index into them, -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W)
+    int32, -1 in the sky; semantic (2H, 2W) uint8, a `Semantic`.
     """
 
     faces: Soup
@@ -527,6 +531,8 @@ def _fringed(image: np.ndarray, shift_px: float) -> np.ndarray:
 
 _STREAKS = ((520, (6.0, 18.0), 1, 0.10), (130, (18.0, 46.0), 1, 0.16), (16, (50.0, 110.0), 2, 0.14))
 """Rain at three distances: streaks in an image of KITTI's size, lengths px, thickness px, opacity."""
+_STREAK_BRIGHTNESS = 0.85
+"""Display value of a drop: what lies behind, upside down, mostly sky."""
 
 
 def _streak(image: np.ndarray, amount: float, rng: np.random.Generator) -> None:
@@ -549,7 +555,3 @@ def _streak(image: np.ndarray, amount: float, rng: np.random.Generator) -> None:
         veil += layer * np.float32(opacity * (0.5 + 0.5 * amount) / 255)
     veil = cv2.GaussianBlur(veil, (3, 3), 0.6)[..., None]
     image += (np.float32(_STREAK_BRIGHTNESS) - image) * veil
-
-
-_STREAK_BRIGHTNESS = 0.85
-"""Display value of a drop: what lies behind, upside down, mostly sky."""

@@ -16,8 +16,8 @@ _F = np.float32
 
 def _soaked() -> np.ndarray:
     table = np.zeros((len(Material), 3), np.float32)
-    table[Material.ROAD] = 0.42, 0.30, 0.70
-    table[[Material.PARKING, Material.PAVEMENT]] = 0.36, 0.22, 0.55
+    table[Material.ROAD] = 0.48, 0.24, 0.50
+    table[[Material.PARKING, Material.PAVEMENT]] = 0.42, 0.18, 0.40
     table[Material.KERB] = 0.36, 0.15, 0.0
     table[Material.GRAVEL] = 0.36, 0.04, 0.60
     table[Material.ROOF] = 0.30, 0.10, 0.0
@@ -287,7 +287,7 @@ def _surface(
     if material == Material.PAINT:
         return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05 + 0.02 * light.wet, 1.0, 600.0))
     if material == Material.GLASS:
-        return _polish(s, light, noise, _rgb(0.022, 0.025, 0.026) * incoming, (0.07, 1.0, 900.0))
+        return _polish(s, light, noise, s.albedo * incoming, (0.07, 1.0, 900.0))
     if material == Material.LIGHT:
         return _polish(s, light, noise, s.albedo * 0.8 * incoming, (0.08, 0.9, 500.0))
     if material == Material.METAL:
@@ -306,7 +306,9 @@ def _wetted(s: Samples, material: Material, dry: np.ndarray, light: Light, noise
     out = dry * (1 - loss * _F(light.wet))
     if film + more <= 0:
         return out
-    puddle = np.clip((_noise(noise.soft, s.world[:, 0] + 17, s.world[:, 2], 0.06) - 0.5) * 3.0, 0, 1)
+    x, z = s.world[:, 0], s.world[:, 2]
+    depth = _noise(noise.soft, x + 17, z * _F(0.5), 0.04) + 0.25 * _noise(noise.rough, x, z * _F(0.5), 0.03)
+    puddle = np.clip((depth - 0.6) * 2.5, 0, 1)
     cover = _F(light.wet) * (film + more * puddle)
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)

@@ -35,6 +35,9 @@ _SEAT_M = 0.37
 """How far to the side of the middle the front seats stand."""
 _GREY_TO_LINEAR = 2.2
 
+_DOOR_MIRROR = torch.tensor([[0.15, -0.66, -0.5]], dtype=torch.float64)
+"""Where about a vehicle is widest, in the unit box."""
+
 Plane = tuple[tuple[float, float, float], float]
 """Normal and offset: points with normal . x = offset."""
 
@@ -49,9 +52,9 @@ class _Base:
 
 @dataclass(frozen=True, slots=True)
 class _Pieces:
-    """n triangles that lie in the faces of a mesh. parent (n,): their face; share (n, 3, 3): barycentric coordinates
-    of each corner in it; material (n,) uint8; albedo (n, 3) float32; cell (n,): 1 + stroke of a plate's character, or
-    0.
+    """n triangles that lie in the faces of a mesh. parent (n,): their face; share (n, 3, 3): barycentric
+    coordinates of each corner in it; material (n,) uint8; albedo (n, 3) float32; cell (n,): 1 + stroke of a
+    plate's character, or 0.
     """
 
     parent: np.ndarray
@@ -84,16 +87,16 @@ def _extent(base: _Base, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
 
 def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
     """The same surface, its triangles cut in two or three where they cross a plane."""
-    parent, share = pieces.parent, pieces.share
-    source = np.arange(len(parent))
+    corners, share = base.corners[pieces.parent], pieces.share
+    source = np.arange(len(corners))
     for normal, offset in planes:
-        reach = base.corners @ np.asarray(normal, np.float32) - np.float32(offset)
-        side = np.einsum("nij,nj->ni", share, reach[parent])
+        reach = corners @ np.asarray(normal, np.float32) - np.float32(offset)
+        side = np.einsum("nij,nj->ni", share, reach[source])
         # a tenth of a millimetre: thinner slivers are not worth a triangle
         crossing = np.flatnonzero((side.max(axis=1) > 1e-4) & (side.min(axis=1) < -1e-4))
         if not len(crossing):
             continue
-        side, whole = side[crossing], np.ones(len(parent), bool)
+        side, whole = side[crossing], np.ones(len(source), bool)
         whole[crossing] = False
         above = side > 0
         lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
@@ -106,17 +109,16 @@ def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
         split = np.concatenate([np.stack(t, axis=1) for t in ((a, p, q), (p, b, c), (p, c, q))])
         share = np.concatenate([share[whole], split])
         source = np.concatenate([source[whole], np.tile(source[crossing], 3)])
-        parent = np.concatenate([parent[whole], np.tile(parent[crossing], 3)])
-    part = np.abs(np.linalg.det(share)) > 1e-7
-    found = pieces.take(source[part])
-    return replace(found, parent=parent[part], share=share[part])
+    a, b, c = share[:, 0], share[:, 1], share[:, 2]
+    part = np.abs(np.einsum("ni,ni->n", a, np.cross(b, c))) > 1e-6
+    return replace(pieces.take(source[part]), share=share[part])
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleShape:
-    """A vehicle in the unit box. soup: its triangles, paint in a neutral tint, pattern[:, 3] >= 1 where a character
-    of the plate may darken a face; vertices (V, 3), faces (F, 3): of the mesh they lie in; normals (F, 3, 3): of its
-    corners; parent, share: as in `_Pieces`.
+    """A vehicle in the unit box. soup: its triangles, paint in a neutral tint, pattern[:, 3] >= 1 where a
+    character of the plate may darken a face; vertices (V, 3), faces (F, 3): of the mesh they lie in; normals
+    (F, 3, 3): of its corners; parent, share: as in `_Pieces`.
     """
 
     soup: Soup
@@ -135,9 +137,8 @@ def vehicle_mesh(kind: str, variant: int) -> Mesh:
 def instance_ffd(actor: Actor) -> np.ndarray:
     """Lattice offsets (64, 3) float32 that tell this vehicle from others of its mesh, in unit-box lengths.
 
-    Symmetric, a function of the actor's seed alone. Lattice points stay inside the unit box and those of its
-    outer faces on them, hence so does the vehicle (Bernstein polynomials keep the hull), and wheels stay on the
-    ground.
+    Symmetric, a function of the actor's seed alone. Ends, roof and ground stay where they are (their lattice
+    points do, and Bernstein polynomials keep the hull), and the width over the mirrors to within a centimetre.
     """
     rng = np.random.default_rng([0xFFD, actor.seed])
     spread = np.zeros((*LATTICE, 3))
@@ -153,6 +154,10 @@ def instance_ffd(actor: Actor) -> np.ndarray:
     offsets[3, :3, 0, 2] += rng.uniform(0, 0.02)
     offsets[:, :, 3, 2] = -offsets[:, :, 0, 2]
     mirrored = ffd.symmetrise(torch.from_numpy(offsets.reshape(LATTICE_POINTS, 3)))
+    # that makes it a little narrower where it is widest, at the door mirrors: widen it all by as much
+    narrower = float((ffd.lattice_weights(_DOOR_MIRROR) @ mirrored)[0, 2])
+    across = torch.linspace(-0.5, 0.5, LATTICE[2], dtype=torch.float64).repeat(LATTICE[0] * LATTICE[1])
+    mirrored[:, 2] += across * (1 / (1 - 2 * narrower) - 1)
     return mirrored.numpy().astype(np.float32)
 
 
@@ -179,9 +184,9 @@ def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
     if not fine:
         return pieces
     facing, middle = pieces.facing(base)[:, 0], pieces.middle(base)[:, 0]
-    found = [pieces.take(np.abs(facing) <= 0.5)]
+    found = [pieces.take((np.abs(facing) <= 0.5) | (facing * middle <= 0))]
     edges = 0.13 + 0.84 * (np.arange(_SIGNS)[:, None] + np.array([0.0, 0.36, 0.72])).reshape(-1) / _SIGNS
-    rows = np.array([0.18, 0.5, 0.82])
+    rows = np.array([0.16, 0.5, 0.84])
     for end in (1.0, -1.0):
         part = pieces.take((facing * end > 0.5) & (middle * end > 0))
         if not len(part.parent):
@@ -190,14 +195,13 @@ def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
         span = high - low
         left = low[2] if end > 0 else high[2]
         across = end * span[2]
-        planes: list[Plane] = [((0.0, 0.0, 1.0), float(left + across * e)) for e in (0.02, 0.1, *edges, 0.98)]
-        planes += [((0.0, 1.0, 0.0), float(low[1] + span[1] * r)) for r in (0.05, *rows, 0.95)]
+        planes: list[Plane] = [((0.0, 0.0, 1.0), float(left + across * e)) for e in (0.1, *edges)]
+        planes += [((0.0, 1.0, 0.0), float(low[1] + span[1] * r)) for r in rows]
         part = divided(base, part, planes)
         spot = part.middle(base)
         u, v = (spot[:, 2] - left) / across, (spot[:, 1] - low[1]) / span[1]
         part.albedo[:] = colour
-        part.albedo[(u > 0.02) & (u < 0.1)] = _PLATE_BLUE
-        part.albedo[(u < 0.02) | (u > 0.98) | (v < 0.05) | (v > 0.95)] = _DARK * 3
+        part.albedo[u < 0.1] = _PLATE_BLUE
         column, row = np.searchsorted(edges, u) - 1, np.searchsorted(rows, v) - 1
         sign, half = np.divmod(column, 3)
         stroke = (column >= 0) & (half < 2) & (row >= 0) & (row < 2)
@@ -251,8 +255,8 @@ def _lamps(
         outline = _lamp_outline(style, low, high, side, own)
         inner = low[2] if side > 0 else high[2]
         columns, rows = own.uniform(0.28, 0.42), own.uniform(0.3, 0.45)
-        z_edges = (0.05, columns, 0.5, 0.62, 0.8, 0.93) if fine else (columns, 0.62)
-        y_edges = (0.1, rows, 0.7, 0.9) if fine else (rows,)
+        z_edges = (0.06, columns, 0.5, 0.8) if fine else (columns, 0.5)
+        y_edges = (0.12, rows, 0.72) if fine else (rows,)
         planes: list[Plane] = list(outline)
         planes += [((0.0, 0.0, 1.0), float(inner + side * span[2] * e)) for e in z_edges]
         planes += [((0.0, 1.0, 0.0), float(low[1] + span[1] * e)) for e in y_edges]
@@ -270,32 +274,29 @@ def _lamps(
 def _head_lamp(u: np.ndarray, v: np.ndarray, columns: float, rows: float, rng: np.random.Generator) -> np.ndarray:
     """Albedo (n, 3) over a head lamp: u from the inner to the outer end, v from top to bottom."""
     albedo = np.broadcast_to(_HOUSING * rng.uniform(0.6, 2.6), (len(u), 3)).copy()
-    bright = (u > 0.05) & (u < columns) & (v > 0.1) & (v < 0.9)
-    bright |= (u > 0.5) & (u < 0.8) & (v > 0.1) & (v < 0.9)
+    bright = ((u > 0.06) & (u < columns) | (u > 0.5) & (u < 0.8)) & (v > 0.12)
     albedo[bright] = _CLEAR * rng.uniform(0.7, 1.3)
-    albedo[bright & (v > rows) & (v < 0.7)] = _CLEAR * 1.45
+    albedo[bright & (v > rows) & (v < 0.72)] = _CLEAR * 1.45
     if rng.random() < 0.4:
         albedo[u > 0.8] = _AMBER
-    elif rng.random() < 0.5:
-        albedo[v > 0.9] = _DARK * 2
     return albedo
 
 
 def _tail_lamp(u: np.ndarray, v: np.ndarray, columns: float, rows: float, rng: np.random.Generator) -> np.ndarray:
     """Albedo (n, 3) over a tail lamp, as `_head_lamp`."""
     albedo = np.broadcast_to(_RED * rng.uniform(0.6, 1.2), (len(u), 3)).copy()
-    albedo[(u < 0.05) | (u > 0.93) | (v < 0.1) | (v > 0.9)] = _DEEP_RED
+    albedo[(u < 0.06) | (v < 0.12)] = _DEEP_RED
     layout = int(rng.integers(4))
     if layout == 0:
-        albedo[(v > rows) & (v < 0.7) & (u > 0.05)] = _AMBER
-        albedo[(v > 0.7) & (v < 0.9)] = _CLEAR
+        albedo[(v > rows) & (v < 0.72) & (u > 0.06)] = _AMBER
+        albedo[v > 0.72] = _CLEAR * 0.9
     elif layout == 1:
-        albedo[(u > columns) & (u < 0.62) & (v > rows) & (v < 0.9)] = _CLEAR * 0.9
+        albedo[(u > columns) & (u < 0.5) & (v > rows)] = _CLEAR * 0.9
     elif layout == 2:
-        albedo[(v > 0.7) & (u < 0.5)] = _CLEAR * 0.8
-        albedo[(v > rows) & (v < 0.7) & (u > 0.5)] = _DEEP_RED
+        albedo[(v > 0.72) & (u < 0.5)] = _CLEAR * 0.8
+        albedo[(v > rows) & (v < 0.72) & (u > 0.5)] = _DEEP_RED
     else:
-        albedo[(u > columns) & (u < 0.8) & (v > rows) & (v < 0.7)] = _DEEP_RED
+        albedo[(u > columns) & (u < 0.8) & (v > rows) & (v < 0.72)] = _DEEP_RED
     return albedo
 
 
@@ -370,7 +371,7 @@ def _panes(base: _Base, pieces: _Pieces, rng: np.random.Generator, fine: bool) -
     pieces.material[seal], pieces.albedo[seal] = Material.TRIM, _DARK
     if rng.random() < 0.2:
         pieces.albedo[height > below] = _CHROME
-    tinted, light, cloth = rng.random() < 0.15, float(rng.uniform(0.06, 0.12)), float(rng.uniform(0.010, 0.03))
+    tinted, light, cloth = rng.random() < 0.15, float(rng.uniform(0.03, 0.06)), float(rng.uniform(0.008, 0.02))
     if not fine:
         return pieces
     screens = ~seal & (np.abs(facing[:, 0]) > 0.3)

@@ -33,11 +33,13 @@ _GROUND_ALBEDO = {
     Material.GRAVEL: (0.17, 0.15, 0.125),
 }
 """Linear albedo; asphalt 0.08 to 0.15, concrete 0.2 to 0.3, grass about 0.1 in the visible range."""
+_CROWN = 0.36
+"""Radius of the widest crowns, as a fraction of the tree's width scale."""
 _LAYER_M = 0.004
 """Height of patches and paint above the road: nothing to see, enough for the depth test."""
 _LEAVES = 52_000
 """Triangles of plants on one side of the road; once they are spent, what follows (farther away) is coarse."""
-_FINE_M = 26.0
+_FINE_M = 20.0
 """Nearer vehicles have plates with characters, seams and bars in their grilles: beyond, these are below a
 pixel."""
 _SEMANTIC = {
@@ -71,6 +73,7 @@ class _Builder:
         self.road, self.pool, self.rng = road, pool, rng
         self.parts: list[Soup] = []
         self.leaves = 0
+        self.plants: list[tuple[float, float]] = []
         self.used: dict[str, set[int]] = {"building": set(), "tree": set(), "bush": set(), "surface": set()}
 
     def draw(self, name: str, count: int) -> int:
@@ -83,6 +86,10 @@ class _Builder:
         """Whether nothing within `reach` of s stands on a crossing road."""
         crossing = self.road.crossing
         return crossing is None or s + reach < crossing[0] - 1 or s - reach > crossing[1] + 1
+
+    def clear_of_plants(self, d: float, s: float, reach: float) -> bool:
+        """Whether no tree or bush stands within `reach` of (d, s)."""
+        return all(np.hypot(d - other_d, s - other_s) > reach for other_d, other_s in self.plants)
 
     def put(
         self,
@@ -209,13 +216,16 @@ def _plant_detail(b: _Builder, spot: tuple[float, float], scale: float, reach_m:
     return min(_detail(float(np.hypot(x, max(z, 0.0))) * scale), most)
 
 
-def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
+def _tree(b: _Builder, d: float, s: float, height_m: float, room_m: float = np.inf) -> None:
+    """A tree; room_m: from its trunk to the next wall, into which its crown must not grow."""
     if not b.free(s, 0.5):
         return
+    b.plants.append((d, s))
     identifier = b.draw("tree", b.pool.trees)
     x, z = b.road.point(d, s)
     detail = _plant_detail(b, (float(x), float(z)), 9.0 / height_m, 0.35 * height_m)
     width = height_m * float(b.rng.uniform(0.85, 1.15))
+    width = min(width, max(room_m / _CROWN, 0.45 * height_m))
     soup = flora.tree(identifier, detail)
     b.leaves += len(soup)
     b.put(
@@ -230,6 +240,7 @@ def _tree(b: _Builder, d: float, s: float, height_m: float) -> None:
 def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
     if not b.free(s, size_m):
         return
+    b.plants.append((d, s))
     identifier = b.draw("bush", b.pool.trees)
     wide = size_m * float(b.rng.uniform(0.9, 1.5))
     x, z = b.road.point(d, s)
@@ -245,8 +256,8 @@ def _bush(b: _Builder, d: float, s: float, size_m: float) -> None:
     )
 
 
-def _city_row(b: _Builder, side: int, edge: float) -> None:
-    """Adjoining blocks of flats or houses along one side."""
+def _city_row(b: _Builder, side: int, edge: float) -> float:
+    """Adjoining blocks of flats or houses along one side; returns how far behind `edge` they stand, m."""
     rng = b.rng
     s = float(rng.uniform(-14, -6))
     storeys = int(rng.integers(2, 6))
@@ -268,6 +279,7 @@ def _city_row(b: _Builder, side: int, edge: float) -> None:
             )
             b.put(soup, edge + side * (set_back + depth / 2 + float(rng.uniform(0, 0.4))), middle)
         s += length + (float(rng.uniform(3, 8)) if rng.random() < 0.15 else 0.02)
+    return set_back
 
 
 def _houses(b: _Builder, side: int, edge: float) -> None:
@@ -290,19 +302,21 @@ def _houses(b: _Builder, side: int, edge: float) -> None:
             )
             b.put(soup, edge + side * (back + depth / 2), middle)
             plot = length + gap - 0.6
+            if gap > 4.5 and rng.random() < 0.5:
+                garage = furniture.shed(rng, min(gap - 1.2, 5.5))
+                b.put(garage, edge + side * (back + float(rng.uniform(2.0, 4.5))), s + length + gap / 2)
             _boundary(b, side, edge + side * float(rng.uniform(0.2, 0.5)), middle, plot)
             for _ in range(int(rng.integers(0, 4))):
                 where = s + float(rng.uniform(-gap, length + gap))
                 if rng.random() < 0.45:
-                    _tree(
-                        b, edge + side * float(rng.uniform(1.6, 3.2 + back * 0.5)), where, float(rng.uniform(4, 9))
-                    )
+                    off = float(rng.uniform(1.6, 3.2 + back * 0.5))
+                    room = max(back - off, 0.8) if abs(where - middle) < length / 2 + 2 else 3.0
+                    _tree(b, edge + side * off, where, min(float(rng.uniform(4, 9)), 3.0 + 2.5 * room), room)
                 else:
                     _bush(b, edge + side * float(rng.uniform(1.2, 2.5)), where, float(rng.uniform(0.8, 2.2)))
             if rng.random() < 0.5:
-                _tree(
-                    b, edge + side * (back + depth + float(rng.uniform(2, 8))), middle, float(rng.uniform(8, 14))
-                )
+                off = float(rng.uniform(3, 8))
+                _tree(b, edge + side * (back + depth + off), middle, float(rng.uniform(8, 14)), off)
         s += length + gap
 
 
@@ -328,10 +342,12 @@ def _boundary(b: _Builder, side: int, d: float, middle: float, length: float) ->
         b.put(tagged(buildings.railing(length, height, colour), Semantic.BUILDING), d, middle)
 
 
-def _tree_row(b: _Builder, d: float, spacing: tuple[float, float], height: tuple[float, float]) -> None:
+def _tree_row(
+    b: _Builder, d: float, spacing: tuple[float, float], height: tuple[float, float], room_m: float = np.inf
+) -> None:
     s = float(b.rng.uniform(-6, 6))
     while s < 130:
-        _tree(b, d + float(b.rng.normal(0, 0.15)), s, float(b.rng.uniform(*height)))
+        _tree(b, d + float(b.rng.normal(0, 0.15)), s, float(b.rng.uniform(*height)), room_m)
         s += float(b.rng.uniform(*spacing))
 
 
@@ -377,21 +393,22 @@ def _street_furniture(b: _Builder) -> None:
                 where,
                 turn + rng.normal(0, 0.06),
             )
+    small = bool(road.pavements)
     for _ in range(int(rng.integers(0, 5))):
         side = int(rng.choice([-1, 1]))
         where = float(rng.uniform(6, 55))
         if b.free(where, 3.0):
-            b.put(
-                furniture.clutter(rng),
-                _edge(b, side) + side * float(rng.uniform(0.8, 2.2)),
-                where,
-                float(rng.normal(0, 0.2)) + (np.pi if rng.random() < 0.5 else 0.0),
-            )
+            # on the pavement's outer side, or well off the road
+            d = _edge(b, side) + side * (-0.55 if small else float(rng.uniform(1.8, 3.0)))
+            turn = float(rng.normal(0, 0.02 if small else 0.2)) + (np.pi if rng.random() < 0.5 else 0.0)
+            thing = furniture.clutter(rng, small)
+            if small or b.clear_of_plants(d, where, 3.5):
+                b.put(thing, d, where, turn)
     if road.pavements and rng.random() < 0.3:
         side = int(rng.choice([-1, 1]))
         where = float(rng.uniform(10, 45))
         if b.free(where, 3.0):
-            b.put(furniture.bus_stop(rng), _edge(b, side) - side * 0.9, where, 0.0 if side < 0 else np.pi)
+            b.put(furniture.bus_stop(rng), _edge(b, side) - side * 0.75, where, 0.0 if side < 0 else np.pi)
     if road.crossing:
         for at, side, turn in ((road.crossing[0] - 1.0, 1, 0.0), (road.crossing[1] + 1.0, -1, np.pi)):
             reach = float(rng.uniform(2.5, 4.5)) if rng.random() < 0.5 else 0.0
@@ -461,11 +478,11 @@ def _road_details(b: _Builder) -> None:
             if b.free(float(s), 0.5):
                 x = edge + sign * 0.16
                 _decal(b, (x - 0.14, x + 0.14), (float(s), float(s) + 0.5), Material.CLOTH, np.full(3, 0.03))
-    for _ in range(int(rng.integers(1, 5))):
+    for _ in range(int(rng.integers(1, 5) if kerbs else rng.integers(2))):
         strip = lanes[0]
         d, s = float(rng.uniform(strip.d0 + 0.6, strip.d1 - 0.6)), float(rng.uniform(6, 40))
         angle = np.linspace(0, 2 * np.pi, 15)
-        for radius, grey, up in ((0.40, 0.07, 1.0), (0.32, 0.045, 1.5)):
+        for radius, grey, up in ((0.40, 0.085, 1.0), (0.32, 0.06, 1.5)):
             x, z = road.point(d + radius * np.cos(angle), s + radius * np.sin(angle))
             middle = np.broadcast_to(np.array([*road.point(d, s)]), (14, 2))
             flat = np.stack([middle, np.stack([x, z], 1)[:-1], np.stack([x, z], 1)[1:]], axis=1)
@@ -582,14 +599,16 @@ def _flank(b: _Builder, side: int, edge: float) -> None:
     b.leaves = 0
     if kind in ("residential", "city", "junction"):
         draw = rng.random()
+        room = 2.5
         if draw < (0.75 if kind == "residential" else 0.25):
             _houses(b, side, edge)
         elif draw < 0.88:
-            _city_row(b, side, edge)
+            room = _city_row(b, side, edge)
         else:
             _wood(b, side, edge)
         if rng.random() < 0.45:
-            _tree_row(b, edge - side * float(rng.uniform(0.4, 0.9)), (8, 15), (6, 11))
+            out = float(rng.uniform(0.4, 0.9))
+            _tree_row(b, edge - side * out, (8, 15), (6, 11), room + out)
         return
     draw = rng.random()
     if draw < 0.4:
@@ -603,8 +622,9 @@ def _flank(b: _Builder, side: int, edge: float) -> None:
         else:
             _fields(b, side, edge + side * 6)
     elif kind != "country" and draw < 0.9:
-        _city_row(b, side, edge + side * float(rng.uniform(4, 12)))
-        _tree_row(b, edge + side * float(rng.uniform(1.5, 3)), (10, 20), (6, 10))
+        out = float(rng.uniform(4, 12))
+        room = _city_row(b, side, edge + side * out)
+        _tree_row(b, edge + side * float(rng.uniform(1.5, 3)), (10, 20), (6, 10), room + out - 3)
     else:
         _houses(b, side, edge + side * float(rng.uniform(15, 35)))
         if rng.random() < 0.5:

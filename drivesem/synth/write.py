@@ -174,6 +174,7 @@ def make_frame(job: Job) -> int:
         sunny=job.variation != MIXED,
         camera=order.layout if order.layout in ("vkitti1", "vkitti2") else None,
         sequence=order.sequence,
+        bent=True,
     )
     plan = variation_of(plan_frame(order.seed, job.index, split, settings), job.variation)
     plan = apply_edits(plan, _edits_of(order.edits), job.index)

@@ -105,7 +105,8 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     background, mattes, shadows, sun = _layers(image, cuts, views, vehicles, road, horizon, settings.seed)
     environment, depth = _environment(background, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
-        depth = frame.depth.float()
+        # What stands behind the vehicles was never measured: there the estimate stays.
+        depth = torch.where(torch.from_numpy(vehicles), depth, frame.depth.float())
     objects, meshes = _objects(labels, cuts)
     provenance = dict(frame.provenance) | {"frame": frame.identifier, "derender": "template fit and patch fill"}
     for index, cut in enumerate(cuts):

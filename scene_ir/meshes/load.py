@@ -36,15 +36,25 @@ _NAMES = (
     (
         Part.LIGHT,
         r"(head|tail|brake|fog|turn|stop)[ _-]?light|lights?\b|lights?[_-](front|rear|back|left|right|[lr]\b|\d)"
-        r"|lamp|blinker|indicator",
+        r"|lamp|blinker|indicator|turn[ _-]?signal|\bfaros?\b|\bphares?\b|scheinwerfer",
     ),
-    (Part.OTHER, r"rim\b|rims|alloy|hubcap|brake|seat|interior|dash|steer|grill|plate|underbody|engine|chassis"),
-    (Part.TYRE, r"tyre|tire|wheel|rubber|pneu"),
-    (Part.GLASS, r"glass|window|windshield|windscreen|vitre|vidrio"),
-    (Part.PAINT, r"paint|body|carros|door|hood|bonnet|roof|fender|shell"),
+    (
+        Part.OTHER,
+        r"rim\b|rims|alloy|hubcap|brake|seat|interior|dash|steer|grill|plate|underbody|engine|chassis"
+        r"|door[ _-]?lines?|inside",
+    ),
+    (Part.TYRE, r"tyre|tire|wheel|rubber|pneu|neumatico|reifen"),
+    (Part.GLASS, r"glass|window|windshield|windscreen|vitre|vidrio|cristal|fenster"),
+    (
+        Part.PAINT,
+        r"paint|body|carros|karosserie|chapa|door|hood|bonnet|roof|fender|shell"
+        r"|(first|second|main|car)[ _-]?colou?r",
+    ),
 )
 """What material and mesh names say of a part; the first that is found counts."""
 _DEFAULT_COLOUR = 0.8
+_CAB = 0.2
+"""Windows whose centre is farther than this from the middle, in lengths, are those of a cab."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +69,11 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
     """Read a mesh file and turn it into the unit box: front along +x, y down, sides at z = -0.5 and 0.5.
 
     up: the file's axis that points up, "y", "z" or "-y". front: the file's axis that the vehicle looks along,
-    "+x" ... "-z", or "auto": the longest horizontal axis, towards parts named front, else away from the roof's
-    centre (bonnets are longer than boots). The scene graph is flattened; materials and textures become vertex
-    colours (a texture is read at the vertices: palettes come out exactly, photographs coarsely); parts are guessed
-    from material and mesh names. Files of `save_mesh` come back as they were saved, whatever the options.
+    "+x" ... "-z", or "auto": the longest horizontal axis, towards parts named front, else to the end where all
+    windows are (of lorries), else away from the roof's centre (bonnets are longer than boots). The scene graph is
+    flattened; materials and textures become vertex colours (a texture is read at the vertices: palettes come out
+    exactly, photographs coarsely); parts are guessed from material and mesh names. Files of `save_mesh` come back
+    as they were saved, whatever the options.
     Raises FormatError naming the file where it cannot be read or has no faces, RangeError for an unknown axis.
     """
     file = Path(path)
@@ -279,10 +290,28 @@ def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np
         forward = np.eye(3)[int(np.argmax(horizontal))]
         lead = float(forward @ soup.forward)
         if lead == 0.0:
+            lead = _window_side(soup, forward)
+        if lead == 0.0:
             lead = _bonnet_side(soup.vertices, soup.faces, forward, -down)
         if lead < 0:
             forward = -forward
     return np.stack([forward, down, np.cross(forward, down)])
+
+
+def _window_side(soup: _Soup, forward: NDArray[np.float64]) -> float:
+    """Where along `forward` the windows' surface lies, from the middle, in lengths; 0 unless it is near one end.
+
+    Of cars it lies within 0.1 of the middle, of lorries and panel vans beyond 0.25.
+    """
+    corners = soup.vertices[soup.faces[soup.part == int(Part.GLASS)]]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if area.sum() == 0:
+        return 0.0
+    along = soup.vertices @ forward
+    middle = (along.min() + along.max()) / 2
+    centre = float((corners.mean(axis=1) @ forward * area).sum() / area.sum())
+    lead = (centre - middle) / float(np.ptp(along))
+    return lead if abs(lead) > _CAB else 0.0
 
 
 def _bonnet_side(

@@ -187,6 +187,21 @@ def test_parts_named_front_decide_over_the_outline(tmp_path: Path) -> None:
     assert float(mesh.vertices[mesh.vertices[:, 1] < -0.99][:, 0].mean()) > 0.1
 
 
+@pytest.mark.parametrize("end", [1.0, -1.0])
+def test_windows_at_one_end_only_are_a_cabs(tmp_path: Path, end: float) -> None:
+    scene = trimesh.Scene()
+    for name, extents, centre in (
+        ("cargo", (2.4, 2.5, 6.0), (0.0, 2.0, -1.0 * end)),
+        ("cab", (2.3, 1.6, 1.5), (0.0, 1.5, 3.0 * end)),
+        ("glass", (2.0, 0.8, 0.1), (0.0, 2.4, 3.7 * end)),
+    ):
+        box = trimesh.creation.box(extents=extents, transform=trimesh.transformations.translation_matrix(centre))
+        scene.add_geometry(box, geom_name=name, node_name=name)
+    scene.export(tmp_path / "lorry.glb")
+    mesh = load_mesh(tmp_path / "lorry.glb")
+    assert mesh.vertices[mesh.faces[mesh.part == Part.GLASS]][..., 0].mean() > 0.3
+
+
 @pytest.mark.parametrize("name", ["sedan", "garbage-truck", "ambulance"])
 def test_kenney_vehicles_look_forward_with_palette_colours(name: str) -> None:
     file = KENNEY / f"{name}.glb"

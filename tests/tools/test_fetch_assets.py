@@ -195,20 +195,12 @@ def test_a_missing_client_is_one_clear_line(tool: ModuleType, tmp_path: Path) ->
         tool.run([sys.executable, "-c", "raise SystemExit('oh no')"], tmp_path, "give it by --deb")
 
 
-def test_skies_are_read_from_javascript(tool: ModuleType) -> None:
+def test_skies_are_read_from_javascript(tool: ModuleType, tmp_path: Path) -> None:
     exr = pytest.importorskip("OpenEXR")
     pixels = np.random.default_rng(0).uniform(0, 9, (16, 32, 3)).astype(np.float16)
-    with io.BytesIO():
-        path = Path(__file__).parent
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "a.exr"
-        exr.File(header, {"RGB": pixels}).write(str(path))
-        module = (
-            "export default 'data:application/exr;base64," + base64.b64encode(path.read_bytes()).decode() + "'"
-        )
+    path = tmp_path / "a.exr"
+    exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}).write(str(path))
+    module = "export default 'data:application/exr;base64," + base64.b64encode(path.read_bytes()).decode() + "'"
     assert tool.equirectangular(module, "a") == pytest.approx(pixels.astype(np.float32))
     with pytest.raises(FormatError, match="nothing"):
         tool.equirectangular("export default 3", "nothing")

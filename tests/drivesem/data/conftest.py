@@ -48,7 +48,7 @@ def _exposure(seed: int = 0, things: Sequence[tuple] = THINGS, empty_box: bool =
                 pixels=pixels,
                 truncation=0.25 if labelled else 0.0,
                 visible=visible,
-                occlusion=sum(visible <= step for step in (0.8, 0.5, 0.2)),
+                occlusion=sum(visible <= step for step in (0.9, 0.5, 0.1)),
                 translation=(x, 1.65, z),
                 yaw=float(generator.uniform(-np.pi, np.pi)),
                 size_lhw=(4.25, 1.5, 1.75),

@@ -23,18 +23,18 @@ from scene_ir.types import Camera
 
 @pytest.fixture(scope="module")
 def frame() -> SynthFrame:
-    return generate_frame(1, 0, with_background=True)
+    return generate_frame(1, 2, with_background=True)
 
 
 def test_the_same_arguments_give_the_same_bytes(frame):
-    again = generate_frame(1, 0)
+    again = generate_frame(1, 2)
     assert np.array_equal(again.image, frame.image)
     assert torch.equal(again.labels.boxes_xyxy, frame.labels.boxes_xyxy)
     assert again.manifest == frame.manifest
 
 
 def test_other_indices_seeds_and_splits_give_other_streets():
-    plans = [plan_frame(1, 0), plan_frame(1, 1), plan_frame(2, 0), plan_frame(1, 0, "heldout")]
+    plans = [plan_frame(1, 2), plan_frame(1, 1), plan_frame(2, 0), plan_frame(1, 2, "heldout")]
     cameras = {round(float(p.setting.view.height_m), 9) for p in plans}
     assert len(cameras) == len(plans)
 
@@ -53,7 +53,7 @@ def test_labels_fit_the_projected_boxes(frame):
 
 def test_occlusion_follows_from_the_visible_share(frame):
     for truth in frame.truths:
-        expected = 0 if truth.visible > 0.8 else 1 if truth.visible > 0.5 else 2 if truth.visible > 0.2 else 3
+        expected = 0 if truth.visible > 0.9 else 1 if truth.visible > 0.5 else 2 if truth.visible > 0.1 else 3
         assert truth.occlusion == expected
         assert 0 <= truth.visible <= 1
         assert 0 <= truth.truncation <= 1
@@ -102,7 +102,7 @@ def test_the_ground_plane_holds_every_vehicle(frame):
 
 
 def test_manifest_names_shapes_of_the_splits_own_pools(frame):
-    other = generate_frame(1, 0, "heldout")
+    other = generate_frame(1, 2, "heldout")
     for kind in ("building", "tree", "bush", "surface"):
         assert all(i < 10_000 for i in frame.manifest[kind])
         assert all(i >= 10_000 for i in other.manifest[kind])
@@ -139,7 +139,7 @@ def test_surroundings_leave_crossings_free():
 
 
 def test_actors_reach_the_ground_in_camera_axes():
-    plan = plan_frame(1, 0)
+    plan = plan_frame(1, 2)
     view = plan.setting.view
     for soup in actor_soups(plan):
         world = view.to_world(soup.corners + view.centre)
@@ -158,11 +158,11 @@ def test_view_turns_back_and_forth():
 
 
 def test_a_turned_down_frame_is_not_rendered():
-    assert render_frame(plan_frame(1, 0), accept=lambda truths: False) is None
+    assert render_frame(plan_frame(1, 2), accept=lambda truths: False) is None
 
 
 def test_shading_only_what_actors_touch_equals_shading_all(frame):
-    plan = plan_frame(1, 0)
+    plan = plan_frame(1, 2)
     empty = render_frame(replace(plan, actors=()))
     assert empty is not None
     assert np.abs(empty.image.astype(int) - frame.background.astype(int)).max() <= 1

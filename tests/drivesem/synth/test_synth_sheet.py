@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from drivesem import drawing
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
 from drivesem.synth import sheet as sheets
@@ -36,14 +37,14 @@ def folders(exposures: Sequence[Exposure], tmp_path_factory: pytest.TempPathFact
 def rows_of(exposure: Exposure) -> tuple[int, int, int]:
     """Where the photograph begins in the sheet of one exposure, row and column, and how tall it is."""
     tall = round(sheets._PHOTO_PX * exposure.camera.height / exposure.camera.width)
-    return sheets._MARGIN_PX + sheets._TEXT_PX + 10, sheets._MARGIN_PX, tall
+    return drawing.MARGIN_PX + drawing.TEXT_PX + 10, drawing.MARGIN_PX, tall
 
 
 def test_a_row_a_frame(exposures: Sequence[Exposure]) -> None:
     one, two = sheets.sheet(exposures[:1], PLACES[:1]), sheets.sheet(exposures, PLACES)
     assert one.dtype == two.dtype == np.uint8
     assert one.shape[1:] == two.shape[1:] == (sheets.WIDTH_PX, 3)
-    assert np.array_equal(two[: len(one) - sheets._MARGIN_PX], one[: -sheets._MARGIN_PX])
+    assert np.array_equal(two[: len(one) - drawing.MARGIN_PX], one[: -drawing.MARGIN_PX])
     assert np.array_equal(sheets.sheet(exposures, PLACES), two)
     made = exposures[0]
     top, left, tall = rows_of(made)
@@ -64,10 +65,10 @@ def test_a_folder_shows_what_was_written(exposures: Sequence[Exposure], folders:
     shown = sheets.sheet_of(dataset, ["000000"])
     made = sheets.sheet(exposures[:1], PLACES[:1])
     top, left, tall = rows_of(exposures[0])
-    right = left + sheets._PHOTO_PX + sheets._MARGIN_PX
-    depth = np.s_[top : top + tall // 2 - sheets._MARGIN_PX, right : right + 350]
+    right = left + sheets._PHOTO_PX + drawing.MARGIN_PX
+    depth = np.s_[top : top + tall // 2 - drawing.MARGIN_PX, right : right + 350]
     # 1/256 m for centimetres, but what lies beyond 256 m, which KITTI's depth cannot hold, is grey as the sky
-    grey = (shown[depth] == sheets._UNKNOWN).all(axis=-1)
+    grey = (shown[depth] == drawing.UNKNOWN).all(axis=-1)
     assert np.quantile(np.abs(shown[depth].astype(int) - made[depth])[~grey], 0.99) <= 8
     path = folders / "kitti/training/depth_2/000000.png"
     before = path.read_bytes()
@@ -104,19 +105,19 @@ def test_nothing_to_label(exposures: Sequence[Exposure]) -> None:
 
 def test_classes_and_depths_have_fixed_colours() -> None:
     classes = sheets._class_colours(np.array([[0, 1, 2, 3]]), ("Road", "Car", "Pedestrian", "Nonsense"))
-    assert classes[0].tolist() == [[100, 60, 100], [255, 127, 80], [220, 20, 60], list(sheets._UNKNOWN)]
-    depth = sheets._depth_colours(np.array([[1.0, 3.0, 30.0, 200.0, 500.0, np.inf, np.nan]]))[0].astype(int)
+    assert classes[0].tolist() == [[100, 60, 100], [255, 127, 80], [220, 20, 60], list(drawing.UNKNOWN)]
+    depth = drawing.depth_colours(np.array([[1.0, 3.0, 30.0, 200.0, 500.0, np.inf, np.nan]]))[0].astype(int)
     assert depth[0].tolist() == depth[1].tolist() == [253, 231, 37]  # both ends of matplotlib's viridis
     assert depth[3].tolist() == depth[4].tolist() == [68, 1, 84]
-    assert depth[5].tolist() == depth[6].tolist() == list(sheets._UNKNOWN)
+    assert depth[5].tolist() == depth[6].tolist() == list(drawing.UNKNOWN)
     assert depth[1].sum() > depth[2].sum() > depth[3].sum()
 
 
 def test_written_as_png_or_jpeg(tmp_path: Path) -> None:
     picture = np.full((20, 30, 3), (200, 100, 50), np.uint8)
-    sheets.write_sheet(tmp_path / "a.png", picture)
+    drawing.write_picture(tmp_path / "a.png", picture)
     assert np.array_equal(files.read_image(tmp_path / "a.png"), picture)
-    sheets.write_sheet(tmp_path / "a.jpg", picture)
+    drawing.write_picture(tmp_path / "a.jpg", picture)
     assert (tmp_path / "a.jpg").read_bytes().startswith(b"\xff\xd8")
     assert np.abs(files.read_image(tmp_path / "a.jpg").astype(int) - picture).max() <= 3
 

@@ -25,7 +25,7 @@ def settings_of(layout: str, people: bool) -> SynthSettings:
     virtual = layout.startswith("vkitti")
     layouts = LayoutSettings(variants=VARIANTS["train"], people=people)
     camera = layout if layout in ("vkitti1", "vkitti2") else None
-    return SynthSettings(layouts, sunny=virtual, camera=camera, sequence=2 if virtual else 1)
+    return SynthSettings(layouts, sunny=virtual, camera=camera, sequence=2 if virtual else 1, bent=True)
 
 
 def shows_vehicles(seed: int) -> bool:

@@ -94,6 +94,16 @@ def with_labels(frame: Frame, **changes) -> Frame:
     return replace(frame, labels=replace(frame.labels, **changes))
 
 
+def test_a_given_depth_is_used_but_for_the_vehicles_own(street):
+    depth = torch.full((street.frame.camera.height, street.frame.camera.width), 33.0)
+    depth[torch.from_numpy(street.mask)] = 11.0
+    masks = torch.from_numpy(street.mask)[None].float()
+    scene = derender(replace(street.frame, depth=depth, masks=masks), DerenderSettings(fit=False))
+    behind = scene.depth[torch.from_numpy(street.mask)]
+    assert (behind != 11.0).all()
+    assert (scene.depth == 33.0).float().mean() > 0.6
+
+
 def test_no_labels_is_an_error(street):
     with pytest.raises(ShapeError, match="labels"):
         derender(replace(street.frame, labels=None))

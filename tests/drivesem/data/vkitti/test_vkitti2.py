@@ -753,7 +753,7 @@ def test_any_objects_come_back(tmp_path_factory: pytest.TempPathFactory, things:
             assert getattr(back, name) == getattr(thing, name), name
         for name in ("translation", "yaw", "size_lhw", "world", "world_yxz"):
             assert getattr(back, name) == pytest.approx(getattr(thing, name), abs=1e-3), name
-        assert back.occlusion == sum(thing.visible <= step for step in (0.8, 0.5, 0.2))
+        assert back.occlusion == sum(thing.visible <= step for step in (0.9, 0.5, 0.1))
     assert dataset.labels(FIRST).kind == tuple(t.kind for t in things)
 
 

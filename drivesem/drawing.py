@@ -1,0 +1,100 @@
+"""What sheets are drawn with: texts, and pictures of depth and of objects. Pictures are (h, w, 3) uint8 RGB."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from scene_ir import files
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
+MARGIN_PX = 12
+TEXT_PX = 15
+PAPER = (250, 250, 250)
+INK = (30, 30, 30)
+UNKNOWN = (120, 120, 120)
+"""Sky in depth maps; pixels of no object."""
+NEAR_M, FAR_M = 3.0, 200.0
+"""Ends of the depth scale, which is logarithmic."""
+
+
+def write_picture(path: Path, picture: np.ndarray) -> None:
+    """Write a picture (h, w, 3) uint8 RGB as PNG, or as JPEG where the name says so, atomically."""
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        files.write_png(path, picture)
+        return
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    files.write_bytes(path, data.tobytes())
+
+
+def depth_colours(depth_m: np.ndarray) -> np.ndarray:
+    """Depth in viridis, near is bright, on a logarithmic scale; the sky, and no depth, in grey."""
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    level = np.log(np.clip(np.where(known, depth_m, FAR_M), NEAR_M, FAR_M) / NEAR_M) / np.log(FAR_M / NEAR_M)
+    colours = cv2.applyColorMap((255 * (1 - level)).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where(known[..., None], colours, np.array(UNKNOWN, np.uint8))
+
+
+def palette(count: int) -> np.ndarray:
+    """Colours (count, 3) uint8 of objects 0, 1, ..., in hues that differ from number to number."""
+    numbers = np.arange(1, count + 1)
+    hue = (numbers * 0.618034 % 1 * 180).astype(np.uint8)  # golden ratio: neighbours lie far apart
+    value = np.where(numbers % 2, 235, 190).astype(np.uint8)
+    hsv = np.stack([hue, np.full_like(hue, 200), value], axis=1)[None]
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if count else np.zeros((0, 3), np.uint8)
+
+
+def pale(image: np.ndarray) -> np.ndarray:
+    """A picture in pale grey, to draw on."""
+    return (128 + cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) // 4)[..., None].repeat(3, axis=2)
+
+
+def object_colours(instances: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Objects, instances (H, W) from 1, 0 is none, in their colours over the photograph in pale grey."""
+    colours = np.concatenate([np.zeros((1, 3), np.uint8), palette(int(instances.max(initial=0)))])
+    return np.where((instances > 0)[..., None], colours[instances], pale(image)).astype(np.uint8)
+
+
+def paste(canvas: np.ndarray, corner: tuple[int, int], picture: np.ndarray) -> None:
+    """Lay a picture over `canvas`, its upper left corner at `corner`."""
+    x, y = corner
+    canvas[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
+
+
+@lru_cache(maxsize=4)
+def _font(size_px: int) -> FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings along."""
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size_px)
+
+
+def text_extent(text: str, size_px: int) -> tuple[int, int]:
+    """Width and height in px that a text takes, with a margin of 2 px at its sides."""
+    return math.ceil(_font(size_px).getlength(text)) + 4, size_px + 3
+
+
+def write_text(
+    canvas: np.ndarray,
+    corner: tuple[int, int],
+    text: str,
+    colour: tuple[int, int, int] = INK,
+    size_px: int = TEXT_PX,
+) -> None:
+    """Write a line of text into `canvas`, its upper left corner at `corner`; what leaves the canvas is cut."""
+    from PIL import Image, ImageDraw
+
+    x, y = corner
+    wide, high = text_extent(text, size_px)
+    part = canvas[max(y, 0) : y + high + 3, max(x, 0) : x + wide]
+    picture = Image.fromarray(np.ascontiguousarray(part))
+    ImageDraw.Draw(picture).text((0, 0), text, colour, _font(size_px))
+    part[:] = np.asarray(picture)

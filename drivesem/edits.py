@@ -1,0 +1,265 @@
+"""What people write to change a scene: one grammar for generated streets, scene folders and the command line.
+
+An edit of one frame, as YAML or as nested mappings:
+
+    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast; or a name, such as sunset
+    foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
+    objects:
+      2: {translate: [0.5m, 0m], rotate: 10deg}
+      4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
+      5: {remove: true}
+      all: {rotate: 0.05}
+
+translate is along the vehicle's length and across to its left (+z of its own axes), on the ground; rotate is about
+its ground centre. Text needs a unit: m, deg or rad. A bare number of a YAML file is in theta's units: own lengths,
+rad. On the command line everything is text: `objects[2].translate=0.5m,0m`, `weather=fog`, `weather.rain=0.4`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scene_ir import files
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.ffd import SYMMETRIC_DIM
+from scene_ir.types import TEXTURE_DIM
+
+ALL = "all"
+WEATHER_NAMES = ("fog", "rain", "time", "overcast")
+FOLIAGE_NAMES = ("hue", "lightness", "density")
+WEATHERS: Mapping[str, Mapping[str, float]] = {
+    "fog": {"fog": 0.6, "overcast": 0.4},
+    "rain": {"rain": 0.8, "overcast": 0.6},
+    "sunset": {"time": 0.5},
+    "overcast": {"overcast": 1.0},
+    "night": {"time": 1.0},
+}
+"""Weather by name, as codes; those not named are 0."""
+OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "remove")
+FRAME_KEYS = ("objects", "weather", "foliage")
+_LENGTH_UNITS = {"m": 1.0}
+_ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
+_PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage)\.(\w+)")
+_TRUTH = {"true": True, "false": False}
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectEdit:
+    """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
+    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none.
+    """
+
+    translate: tuple[float, float] = (0.0, 0.0)
+    translate_m: tuple[float, float] = (0.0, 0.0)
+    rotate: float = 0.0
+    color: tuple[float, ...] = (0.0,) * TEXTURE_DIM
+    mesh: tuple[float, ...] = ()
+    remove: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
+            raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
+        if len(self.mesh) not in (0, SYMMETRIC_DIM):
+            raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameEdit:
+    """What happens to one frame. objects: by track (generated streets) or row (scenes), or "all"; weather (4,) in
+    [0, 1]; foliage (3,) in [-1, 1].
+    """
+
+    objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
+    weather: tuple[float, ...] = (0.0,) * len(WEATHER_NAMES)
+    foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_NAMES)
+
+
+Edits = Mapping[int | str, FrameEdit]
+"""Edits by frame number, or "all"."""
+
+
+def read_edits(path: Path) -> Edits:
+    """The edits in a YAML file of many frames: `frames: {all: ..., 3: ...}`, each as in this module's text.
+
+    FormatError naming the file and the place in it.
+    """
+    frames = mapping_of(f"{path}", _load(path), ("frames",)).get("frames", {})
+    found: dict[int | str, FrameEdit] = {}
+    for key, value in mapping_of(f"{path}: frames", frames).items():
+        number = _number_or_all(f"{path}: frames", key)
+        found[number] = frame_edit(f"{path}: frame {number}", value)
+    return found
+
+
+def read_frame_edit(path: Path) -> dict[str, Any]:
+    """The mappings of a YAML file of one frame's edit, checked. FormatError naming the file and the place."""
+    loaded = _load(path)
+    content = {} if loaded is None else mapping_of(str(path), loaded, FRAME_KEYS)
+    frame_edit(str(path), content)
+    return content
+
+
+def parse_setting(text: str) -> dict[str, Any]:
+    """`objects[2].translate=0.5m,0m`, `weather=fog`, `foliage.hue=0.5`: the same as nested mappings, checked.
+
+    FormatError naming the setting.
+    """
+    place, equals, value = (part.strip() for part in text.partition("="))
+    match = _PLACE.fullmatch(place)
+    if not equals or not value or match is None:
+        raise FormatError(
+            f"--set {text}",
+            f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=... or foliage.CODE=...",
+            "no value" if match is not None else "an unknown parameter",
+        )
+    row, parameter, weather, environment, code = match.groups()
+    found: dict[str, Any]
+    if weather is not None:
+        found = {weather: value}
+    elif environment is not None:
+        found = {environment: {code: value}}
+    else:
+        number: int | str = int(row) if row.isascii() and row.isdigit() else row
+        found = {"objects": {number: {parameter: _listed(parameter, value)}}}
+    frame_edit(f"--set {text}", found)
+    return found
+
+
+def _listed(parameter: str, value: str) -> Any:
+    if parameter in ("translate", "color", "mesh"):
+        return [part.strip() for part in value.split(",")]
+    return _TRUTH.get(value, value) if parameter == "remove" else value
+
+
+def merged(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Two edits as mappings, one after the other: what the second says of the same thing counts."""
+    found = dict(first)
+    for key, value in second.items():
+        before = found.get(key)
+        if key == "weather":
+            before, value = _weather(before), _weather(value)
+        both = isinstance(before, Mapping) and isinstance(value, Mapping)
+        found[key] = merged(before, value) if both and before is not None else value
+    return found
+
+
+def _weather(value: Any) -> Any:
+    """A weather's name as its codes; all codes, so that a name replaces what was there."""
+    if not isinstance(value, str) or value not in WEATHERS:
+        return value
+    return {**dict.fromkeys(WEATHER_NAMES, 0.0), **WEATHERS[value]}
+
+
+def frame_edit(where: str, value: Any) -> FrameEdit:
+    """The edit that nested mappings describe. FormatError: `where`, the place in them, expected, found."""
+    entry = mapping_of(where, value, FRAME_KEYS)
+    objects = mapping_of(f"{where}: objects", entry.get("objects") or {})
+    weather = entry.get("weather")
+    if isinstance(weather, str) and weather not in WEATHERS:
+        raise FormatError(f"{where}: weather", f"codes, or one of {', '.join(WEATHERS)}", repr(weather))
+    return FrameEdit(
+        objects={
+            _number_or_all(f"{where}: objects", key): _object_edit(f"{where}: object {key}", edit)
+            for key, edit in objects.items()
+        },
+        weather=_codes(f"{where}: weather", _weather(weather), WEATHER_NAMES, 0.0),
+        foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_NAMES, -1.0),
+    )
+
+
+def _load(path: Path) -> Any:
+    try:
+        return yaml.safe_load(files.read_text(path))
+    except yaml.YAMLError as error:
+        raise FormatError(str(path), "YAML", " ".join(str(error).split())) from error
+
+
+def _object_edit(where: str, value: Any) -> ObjectEdit:
+    entry = mapping_of(where, value, OBJECT_KEYS)
+    own, metres = [0.0, 0.0], [0.0, 0.0]
+    for i, item in enumerate(_list(f"{where}: translate", entry.get("translate", [0, 0]), 2)):
+        if isinstance(item, str):
+            metres[i] = _measure(f"{where}: translate", item, _LENGTH_UNITS)
+        else:
+            own[i] = _float(f"{where}: translate", item)
+    mesh = entry.get("mesh")
+    remove = entry.get("remove", False)
+    if not isinstance(remove, bool):
+        raise FormatError(f"{where}: remove", "true or false", repr(remove))
+    try:
+        return ObjectEdit(
+            translate=(own[0], own[1]),
+            translate_m=(metres[0], metres[1]),
+            rotate=_angle(f"{where}: rotate", entry.get("rotate", 0)),
+            color=_floats(f"{where}: color", entry.get("color", [0] * TEXTURE_DIM), TEXTURE_DIM),
+            mesh=() if mesh in (None, []) else _floats(f"{where}: mesh", mesh, SYMMETRIC_DIM),
+            remove=remove,
+        )
+    except RangeError as error:
+        raise FormatError(where, error.expected, error.actual) from error
+
+
+def mapping_of(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:
+    """`value`, a mapping with keys among `known`. FormatError."""
+    if not isinstance(value, dict):
+        raise FormatError(where, "a mapping", type(value).__name__)
+    for key in value:
+        if known is not None and key not in known:
+            raise FormatError(f"{where}: {key}", f"one of {', '.join(known)}", "an unknown key")
+    return value
+
+
+def _list(where: str, value: Any, length: int) -> list[Any]:
+    if not isinstance(value, list) or len(value) != length:
+        raise FormatError(where, f"a list of {length}", repr(value))
+    return value
+
+
+def _floats(where: str, value: Any, length: int) -> tuple[float, ...]:
+    return tuple(_float(where, item) for item in _list(where, value, length))
+
+
+def _float(where: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not math.isfinite(number):
+        raise FormatError(where, "a finite number", repr(value))
+    return number
+
+
+def _angle(where: str, value: Any) -> float:
+    return _measure(where, value, _ANGLE_UNITS) if isinstance(value, str) else _float(where, value)
+
+
+def _measure(where: str, text: str, units: Mapping[str, float]) -> float:
+    """Text with a unit, such as 10deg; 0 needs none."""
+    for unit, factor in units.items():
+        if text.strip().endswith(unit):
+            return _float(where, text.strip().removesuffix(unit)) * factor
+    if _float(where, text) != 0:
+        raise FormatError(where, f"a unit: {' or '.join(text.strip() + unit for unit in units)}", repr(text))
+    return 0.0
+
+
+def _number_or_all(where: str, key: Any) -> int | str:
+    if key == ALL or (isinstance(key, int) and not isinstance(key, bool) and key >= 0):
+        return key
+    raise FormatError(where, "a number from 0, or all", repr(key))
+
+
+def _codes(where: str, value: Any, names: tuple[str, ...], low: float) -> tuple[float, ...]:
+    entry = mapping_of(where, {} if value is None else value, names)
+    codes = tuple(_float(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
+    for name, code in zip(names, codes, strict=True):
+        if not low <= code <= 1:
+            raise FormatError(f"{where}.{name}", f"a code in [{low:g}, 1]", code)
+    return codes

@@ -1,0 +1,54 @@
+"""The folder of a run: new, or one with the same settings to go on in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drivesem.config import Common, UsageError, to_yaml
+from scene_ir import files
+
+CONFIG = "config.yaml"
+"""The resolved settings, in the run's folder."""
+PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
+"""Settings that change no frame's result: a run may be continued with others."""
+
+
+def claim(
+    out: Path, config: Common, clear: Callable[[Path], None], presentation: Collection[str] = PRESENTATION
+) -> None:
+    """Make `out` this run's folder. clear: removes what an earlier run wrote, for --no-resume.
+
+    Raises UsageError where `out` is a file, holds other files, or a run whose settings were others.
+    """
+    path = out / CONFIG
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    if path.exists():
+        if config.resume:
+            _check_settings(path, config, presentation)
+        else:
+            clear(out)
+    elif out.is_dir() and any(out.iterdir()):
+        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
+    files.write_text(path, to_yaml(config))
+
+
+def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:
+    def identity(settings: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in settings.items() if key not in presentation}
+
+    before = yaml.safe_load(files.read_text(path))
+    known = identity(before) if isinstance(before, dict) else {}
+    wanted = identity(asdict(config))
+    if known != wanted:
+        changed = [key for key, value in wanted.items() if known.get(key) != value]
+        raise UsageError(
+            str(path),
+            "the settings of this run (else another --out, or --no-resume)",
+            "other values of " + ", ".join(changed),
+        )

@@ -1,0 +1,120 @@
+"""Taking vehicles out of a scene: background shows where they stood, and what they hid of others is completed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from scene_ir import blend, surfaces
+from scene_ir.compositor import Compositor, Layers, RenderSettings
+from scene_ir.errors import RangeError
+from scene_ir.types import Crop, Objects, SceneIR, Source
+
+_ROW = re.compile(r"objects\[(\d+)\](.*)", re.DOTALL)
+
+
+def without_objects(scene: SceneIR, rows: Collection[int], settings: RenderSettings | None = None) -> SceneIR:
+    """The scene without the vehicles in `rows` and without their shadows; the others move up, in order.
+
+    What a removed vehicle hid of a farther one was known to be unseen because the nearer one's matte said so. That
+    matte goes, so the farther one's foreground takes up what is drawn there today: the mirrored side or the
+    template. Sources that nothing removed stood before keep every bit, as do photograph, background and maps.
+    Raises RangeError for a row that the scene does not have.
+    """
+    count = len(scene.objects)
+    for row in rows:
+        if not 0 <= row < count:
+            raise RangeError("objects", f"a row from 0 to {count - 1}" if count else "no row of none", row)
+    kept = [row for row in range(count) if row not in rows]
+    if len(kept) == count:
+        return scene
+    sources = scene.objects.source
+    if sources:
+        with torch.no_grad():
+            sources = _uncovered(scene, set(rows), settings)
+    objects = _rows(scene.objects, kept, tuple(sources[row] for row in kept) if sources else ())
+    return replace(scene, objects=objects, provenance=_renumbered(scene.provenance, kept))
+
+
+def _rows(objects: Objects, kept: Sequence[int], source: tuple[Source, ...]) -> Objects:
+    tensors = [f.name for f in fields(Objects) if f.name != "source"]
+    return replace(objects, source=source, **{name: getattr(objects, name)[list(kept)] for name in tensors})
+
+
+def _renumbered(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str, str]:
+    """What is told of `objects[i]` goes along with its object."""
+    place = {row: i for i, row in enumerate(kept)}
+    found = {}
+    for key, value in provenance.items():
+        match = _ROW.fullmatch(key)
+        if match is None:
+            found[key] = value
+        elif int(match[1]) in place:
+            found[f"objects[{place[int(match[1])]}]{match[2]}"] = value
+    return found
+
+
+def _uncovered(scene: SceneIR, removed: set[int], settings: RenderSettings | None) -> tuple[Source, ...]:
+    """The sources of all objects, those behind a removed one completed where it stood."""
+    photographed = scene.as_photographed()
+    objects, sources = photographed.objects, scene.objects.source
+    order = blend.paint_order(
+        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)
+    )
+    hidden: dict[int, Tensor] = {}
+    frame_hw = (scene.camera.height, scene.camera.width)
+    for place, row in enumerate(order):
+        nearer = [sources[i].foreground for i in order[place + 1 :] if i in removed]
+        mask = _support(nearer, frame_hw)
+        if row not in removed and bool(mask.any()):
+            hidden[row] = mask
+    if not hidden:
+        return sources
+    compositor = Compositor(photographed, settings)
+    layers = compositor.layers(compositor.moved(photographed))
+    return tuple(
+        _completed(source, layers, row, hidden[row]) if row in hidden else source
+        for row, source in enumerate(sources)
+    )
+
+
+def _support(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tensor:
+    """(H, W) bool: where any of the foregrounds, Crops (4, h, w), is not wholly transparent."""
+    mask = torch.zeros(frame_hw, dtype=torch.bool)
+    for crop in foregrounds:
+        _window(mask[None], crop).logical_or_(crop.values[3:].cpu() > 0)
+    return mask
+
+
+def _completed(source: Source, layers: Layers, row: int, hidden: Tensor) -> Source:
+    """The source with its foreground as `layers` draw it where `hidden` (H, W), as it was elsewhere."""
+    old = source.foreground
+    packed, size = layers.layout.spans()[row]
+    x0, y0 = layers.layout.rects[row, :2].tolist()
+    drawn = torch.cat([layers.colour[packed, :3], layers.opacity[packed, None]], dim=1).T.reshape(4, *size)
+    drawn = drawn.to(old.values).clamp(0.0, 1.0)
+    canvas = old.values.new_zeros(4, *hidden.shape)
+    used = torch.zeros_like(hidden)
+    _window(canvas, old)[:] = old.values
+    _window(used[None], old)[:] = True
+    new = Crop(drawn, x0, y0)
+    here = _window(canvas, new)
+    taken = _window(hidden[None], new)
+    if not bool((taken & ((drawn[3:] > 0) | (here[3:] > 0))).any()):
+        return source
+    here.copy_(torch.where(taken, drawn, here))
+    _window(used[None], new).logical_or_(taken & (drawn[3:] > 0))
+    rows, columns = used.any(dim=1).nonzero()[:, 0], used.any(dim=0).nonzero()[:, 0]
+    left, top = int(columns[0]), int(rows[0])
+    values = canvas[:, top : int(rows[-1]) + 1, left : int(columns[-1]) + 1].contiguous()
+    return replace(source, foreground=Crop(values, left, top))
+
+
+def _window(frame: Tensor, crop: Crop) -> Tensor:
+    """The view of a frame (C, H, W) that a crop lies on."""
+    h, w = crop.values.shape[1:]
+    return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]

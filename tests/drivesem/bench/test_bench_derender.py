@@ -1,0 +1,268 @@
+"""The benchmark of de-rendering: planted scenes get the marks they deserve, labels are off by what they should be."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from drivesem.bench import derender as bench
+from drivesem.bench.derender import Case, Edited, Move, Row, Shape
+from drivesem.cli import main
+from drivesem.synth.frames import SynthFrame
+from drivesem.synth.layout import Strip as Kerb
+from drivesem.synth.soup import Material
+from scene_ir import files
+from scene_ir.compositor import Compositor
+from scene_ir.errors import RangeError
+from scene_ir.types import SceneIR
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return bench.make_case(0, 0)
+
+
+@pytest.fixture(scope="module")
+def tracks(case: Case) -> list[int]:
+    return [t.actor.track for t in case.before.truths if t.labelled and t.actor.label in bench.VEHICLES]
+
+
+@pytest.fixture(scope="module")
+def empty(case: Case, tracks: list[int]) -> SynthFrame:
+    return bench.without(case, tracks)
+
+
+@pytest.fixture(scope="module")
+def perfect(case: Case, tracks: list[int], empty: SynthFrame) -> SceneIR:
+    return bench.perfect_scene(case.before, empty, tracks)
+
+
+def _displaced(scene: SceneIR, metres: float) -> SceneIR:
+    """As if its vehicles had been fitted so far to the side."""
+    shift = torch.tensor([metres, 0.0, 0.0])
+    sources = tuple(replace(s, translation=s.translation + shift) for s in scene.objects.source)
+    return replace(
+        scene, objects=replace(scene.objects, translation=scene.objects.translation + shift, source=sources)
+    )
+
+
+def test_a_case_has_a_vehicle_that_moves(case: Case) -> None:
+    move = case.move
+    assert sorted(abs(v) for v in move.shift_m) == [0, 0.5]
+    assert abs(move.turn) == pytest.approx(math.radians(10))
+    old, new = (next(t for t in f.truths if t.actor.track == move.track) for f in (case.before, case.moved))
+    assert np.linalg.norm(new.translation - old.translation) == pytest.approx(0.5, abs=1e-6)
+    assert math.remainder(new.yaw - old.yaw - move.turn, 2 * math.pi) == pytest.approx(0, abs=1e-6)
+    assert bench.eligible(old)
+    assert all(t.visible >= 0.05 for t in case.before.truths)
+
+
+def test_the_perfect_scene_gets_nearly_perfect_marks(case: Case, tracks: list[int], perfect: SceneIR) -> None:
+    row, strips = bench.judge(case, perfect, tracks)
+    assert len(row.shapes) == sum(map(bench.eligible, case.before.truths)) > 0
+    for shape in row.shapes:
+        assert shape.mesh_iou > 0.95
+        assert shape.matte_iou > 0.95
+        assert shape.template_iou is None
+    assert row.exact
+    assert row.identity_db >= 45
+    assert row.remove.psnr_db > 40
+    assert row.remove.unchanged_db < 25
+    assert row.move.psnr_db > row.move.unchanged_db + 3
+    assert row.move.perceptual < row.move.unchanged_perceptual
+    assert sum(row.move.error.values()) == pytest.approx(1, abs=1e-3)
+    assert set(row.move.error) == set(row.move.zones) <= set(bench.ZONES)
+    assert [strip.ours.shape for strip in strips] == [case.before.image.shape] * 2
+    json.dumps(bench.summary([row]), allow_nan=False)
+
+
+def test_the_moved_scene_moves_as_the_truth_does(case: Case, tracks: list[int], perfect: SceneIR) -> None:
+    moved = bench.moved_scene(case, perfect, tracks)
+    i = tracks.index(case.move.track)
+    truth = next(t for t in case.moved.truths if t.actor.track == case.move.track)
+    assert moved.objects.translation[i].numpy() == pytest.approx(truth.translation, abs=1e-5)
+    assert math.remainder(float(moved.objects.yaw[i]) - truth.yaw, 2 * math.pi) == pytest.approx(0, abs=1e-5)
+    others = [j for j in range(len(tracks)) if j != i]
+    assert torch.equal(moved.objects.translation[others], perfect.objects.translation[others])
+    assert bench.moved_scene(case, perfect, [-1] * len(tracks)) is perfect
+
+
+def test_misplaced_and_missing_vehicles_lose_marks(case: Case, tracks: list[int], perfect: SceneIR) -> None:
+    off = list(bench.silhouettes(case, Compositor(_displaced(perfect, 0.4)), tracks, None))
+    assert all(shape.mesh_iou < 0.9 for shape in off)
+    gone = list(bench.silhouettes(case, Compositor(perfect), [-1] * len(tracks), None))
+    assert gone
+    assert all(shape.mesh_iou == shape.matte_iou == 0 for shape in gone)
+
+
+def test_labels_are_off_by_what_they_should_be(case: Case) -> None:
+    true = case.before.labels
+    off = bench.disturbed(case.before, np.random.default_rng(1))
+    shift = (off.translation - true.translation).double()
+    ground = case.before.environment.ground.double()
+    assert shift[:, [0, 2]].norm(dim=1).tolist() == pytest.approx([0.2] * len(shift), abs=1e-5)
+    assert (shift @ ground[:3]).abs().max() < 1e-5
+    assert (off.yaw - true.yaw).abs().tolist() == pytest.approx([math.radians(5)] * len(shift), abs=1e-5)
+    ratio = off.size_lhw / true.size_lhw
+    assert (ratio - 1).abs().reshape(-1).tolist() == pytest.approx([0.05] * 3 * len(shift), abs=1e-5)
+    assert torch.equal(off.boxes_xyxy, true.boxes_xyxy)
+    again, other = (bench.disturbed(case.before, np.random.default_rng(s)) for s in (1, 2))
+    assert torch.equal(again.translation, off.translation)
+    assert not torch.equal(other.translation, off.translation)
+
+
+def test_a_label_at_the_camera_stays(case: Case) -> None:
+    before = case.before
+    near = before.labels.translation.clone()
+    near[0] = torch.tensor([0.0, 1.6, 0.5])
+    frame = replace(before, labels=replace(before.labels, translation=near))
+    off = bench.disturbed(frame, np.random.default_rng(0))
+    assert torch.equal(off.translation[0], near[0])
+    assert not torch.equal(off.translation[1:], near[1:])
+
+
+def test_de_rendering_is_given_neither_mask_nor_depth(case: Case) -> None:
+    frame = bench.photograph_of(case.before, case.before.labels)
+    assert frame.masks is None
+    assert frame.depth is None
+    assert frame.classes is None
+    assert frame.points is None
+    assert torch.equal(
+        (frame.photograph * 255).round().byte(), torch.from_numpy(case.before.image).permute(2, 0, 1)
+    )
+
+
+def test_what_is_in_the_way_forbids_a_move(case: Case) -> None:
+    plan = case.plan
+    actor = next(a for a in plan.actors if a.track == case.move.track)
+    assert bench._free(plan, actor, case.move)
+    x, z = actor.position_xz
+    cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
+    along, across = case.move.shift_m
+    ahead = 2 * along * (actor.size_lhw[0] + 0.6), 2 * across * (actor.size_lhw[2] + 0.6)
+    place = (x + ahead[0] * cos + ahead[1] * sin, z - ahead[0] * sin + ahead[1] * cos)
+    blocked = replace(plan, actors=(*plan.actors, replace(actor, position_xz=place, track=99)))
+    assert not bench._free(blocked, actor, case.move)
+
+
+def test_a_kerb_is_raised(case: Case) -> None:
+    road = replace(case.plan.setting.road, curvature=0.01, strips=(Kerb(3.0, 5.0, Material.PAVEMENT, 0.12),))
+    x, z = road.point(np.array([2.5, 3.5, 4.5, 5.5]), np.array([20.0, 30.0, 10.0, 25.0]))
+    corners = np.stack([x, z], axis=1)
+    assert bench._raised(road, corners) == 2
+    flat = replace(road, strips=(Kerb(3.0, 5.0, Material.ROAD, 0.0),))
+    assert bench._raised(flat, corners) == 0
+
+
+def test_what_the_photograph_never_saw(case: Case) -> None:
+    still = replace(case, moved=case.before, move=replace(case.move, shift_m=(0.0, 0.0), turn=0.0))
+    assert bench.never_seen(still) < 0.01
+    assert 0 < bench.never_seen(case) < 0.6
+    old = next(t for t in case.before.truths if t.actor.track == case.move.track)
+    turned = tuple(replace(t, yaw=t.yaw + math.pi) if t is old else t for t in case.before.truths)
+    about = replace(still, moved=replace(case.before, truths=turned))
+    assert bench.never_seen(about) > 0.8
+
+
+def test_the_region_is_what_changes(case: Case) -> None:
+    none = bench.changed_region(case.before, case.before, [])
+    assert not none.any()
+    same = bench.changed_region(case.before, case.before, [case.move.track])
+    seen = bench.share_of(case.before, case.move.track) > 0
+    assert same[seen].all()
+    assert np.count_nonzero(seen) < np.count_nonzero(same) < 3 * np.count_nonzero(seen)
+    whole = bench.changed_region(case.before, case.moved, [case.move.track])
+    assert whole[same].all()
+    apart = np.abs(case.before.image.astype(int) - case.moved.image).max(axis=2)
+    assert apart[~whole].max() <= 2
+
+
+def _row(index: int, move_db: float, **changes: Any) -> Row:
+    edited = Edited(move_db, 15.0, 0.1 * index, 0.9, 1000, {"vehicle": move_db}, {"vehicle": 1.0})
+    shape = Shape(1, "sedan", 60.0, 1.0, 0.8, 0.9 + 0.01 * index, 0.9)
+    row = Row(
+        index, "sun", "city", 3, (shape,), "sedan", (0.5, 0.0), 10.0, 0.1, edited, edited, 99.0, True,
+        1.0 + index, None,
+    )  # fmt: skip
+    return replace(row, **changes)
+
+
+def test_summary_lines() -> None:
+    rows = [_row(i, 20.0 + i) for i in range(11)]
+    lines = {line["measure"]: line for line in bench.summary(rows)}
+    move = lines["move, PSNR, dB"]
+    assert (move["median"], move["tail"], move["worst"], move["count"]) == (25, 21, 20, 11)
+    assert move["goal"] == "median 28"
+    # Where less is better the tail lies at the upper end.
+    assert (lines["time, s"]["tail"], lines["time, s"]["worst"]) == (10, 11)
+    assert lines["silhouette IoU, mesh"]["median"] == pytest.approx(0.95)
+    assert "peak memory, MB" not in lines
+    assert "move, ground, PSNR, dB" not in lines
+    assert not any(name.startswith("true") for name in lines)
+    given = [replace(row, ablations={"true masks": {"move_db": 30.0, "remove_db": 31.0}}) for row in rows[:2]]
+    more = {line["measure"]: line for line in bench.summary(given)}
+    assert more["true masks: remove, PSNR, dB"]["median"] == 31
+
+
+def test_the_worst_and_typical_sheets_are_kept(tmp_path: Path) -> None:
+    made, kept = tmp_path / "made", tmp_path / "kept"
+    rows = [_row(i, 20.0 + (7 * i) % 15) for i in range(15)]
+    for row in rows:
+        files.write_png(made / f"{row.index}.png", np.full((2, 2, 3), row.index, np.uint8))
+    bench._keep_sheets(rows, made, kept)
+    names = sorted(p.name for p in kept.iterdir())
+    assert len(names) == 12
+    assert names[4] == "worst-1-frame-0.png"
+    assert files.read_bytes(kept / names[4]) == files.read_bytes(made / "0.png")
+    assert sum(name.startswith("typical") for name in names) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--frames", "0"], "--frames: expected at least 1, found 0"),
+        (["--frames", "-3"], "--frames: expected at least 1, found -3"),
+        (["--workers", "0"], "--workers"),
+        (["--device", "quantum"], "quantum"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "derender", *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+def test_no_street_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "_promising", lambda plan: False)
+    with pytest.raises(RangeError, match="street 3 of seed 0"):
+        bench.make_case(0, 3)
+
+
+@pytest.mark.slow
+def test_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["bench", "derender", "--frames", "2", "--workers", "2", "--ablate", "--json"]
+    assert main([*words, "--out", str(tmp_path), "--markdown", str(tmp_path / "all.md")]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [row["index"] for row in result["rows"]] == [0, 1]
+    for row in result["rows"]:
+        assert row["identity_db"] >= 45
+        assert row["exact"]
+        assert row["derender_s"] > 0
+        assert 0 <= row["never_seen"] <= 1
+        assert all(0 <= s["mesh_iou"] <= 1 for s in row["shapes"])
+        assert all(s["height_px"] >= 40 and s["visible"] >= 0.7 for s in row["shapes"])
+        assert set(row["ablations"]) in (set(), set(bench.ABLATIONS))
+    assert result["command"] == "drivesem bench derender --ablate --frames 2 --workers 2"
+    assert {line["measure"] for line in result["summary"]} >= {"move, PSNR, dB", "remove, PSNR, dB"}
+    assert json.loads((tmp_path / "derender.json").read_text()) == result
+    assert "SqueezeDet backbone" in (tmp_path / "all.md").read_text()
+    assert sorted(p.name for p in (tmp_path / "derender").iterdir())[0].startswith("worst-1-frame-")
