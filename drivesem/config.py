@@ -292,8 +292,9 @@ def validate(config: Command) -> None:
     if isinstance(config, Bench):
         numbers("--cars", config.cars)
         numbers("--triangles", config.triangles, least=4)
-        if config.frames is not None and config.frames < 10:
-            raise UsageError("--frames", "at least 10", config.frames)
+        fewest = 10 if config.what == "synth" else 1
+        if config.frames is not None and config.frames < fewest:
+            raise UsageError("--frames", f"at least {fewest}", config.frames)
         if config.threads is not None and config.threads < 1:
             raise UsageError("--threads", "at least 1", config.threads)
 

@@ -7,9 +7,11 @@ street.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import multiprocessing
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -51,11 +53,11 @@ METHOD = (
     "degrees, free of collision, rendered by the compositor and by the generator, compared over both pictures' "
     "true masks grown by 3 px and all pixels that truly changed by more than 2 levels; unchanged: the photograph "
     "itself as the answer. never seen: share of the moved vehicle's pixels whose surface the photograph did not "
-    "show. Zones: outline, within 2 px of the true new border; vehicle, inside it; uncovered, the old mask beyond "
-    "it; ground, the rest. Remove: all vehicles that became objects. "
+    "show. Zones: outline, within 2 px of the true new border; seen and never seen, inside it; uncovered, the old "
+    "mask beyond it; ground, the rest. Remove: all vehicles that became objects, and those hardly to be seen. "
     f"{EXACT_DB:.0f} dB stands for equal. The {PERCEPTUAL}: unit-length features of conv1, fire3, fire5, squared "
     "difference, averaged over the region. The tail is the 10th percentile, or the 90th where less is better. "
-    "Peak memory is the process's while it de-renders, the generator's own tables included."
+    "Peak memory is the process's while it de-renders; the libraries and the generator's tables are in it."
 )
 QUICK_FRAMES, FULL_FRAMES = 12, 100
 SHIFT_M, TURN_RAD, STRETCH = 0.2, math.radians(5.0), 0.05
@@ -66,6 +68,7 @@ _MOVABLE_VISIBLE, _MOVABLE_TRUNCATION = 0.85, 0.1
 """Of a vehicle that is moved: more than a little hidden, and the truth shows what no photograph can know."""
 _LEAST_SEEN = 0.05
 """What shows less of itself has no label."""
+_HARDLY_SEEN = 0.3
 _GROW_PX = 3.0
 _CHANGED_LEVELS = 2
 _OUTLINE_PX = 2.0
@@ -79,10 +82,12 @@ _STREAM = 0xDE4E
 _WORST, _TYPICAL = 8, 4
 """Sheets that are kept."""
 _KB = 1024.0
-ZONES = ("vehicle", "outline", "uncovered", "ground")
+ZONES = ("seen", "never seen", "outline", "uncovered", "ground")
 ABLATIONS = (
     "true labels",
     "true masks",
+    "true pose",
+    "true shape",
     "true geometry",
     "true mattes",
     "true background",
@@ -113,7 +118,10 @@ class Case:
 @dataclass(frozen=True, slots=True)
 class Shape:
     """One vehicle's silhouettes: IoU of the template at the disturbed label, the fitted mesh, and the matte; 0
-    where de-rendering made no object of it. template_iou is None where the scene comes from elsewhere."""
+    where de-rendering made no object of it. template_iou is None where the scene comes from elsewhere. place_m: on
+    the ground, between its fitted and its true middle; yaw_deg: between its headings; stretch: largest relative
+    error of its sizes; all None without an object.
+    """
 
     track: int
     kind: str
@@ -122,6 +130,9 @@ class Shape:
     template_iou: float | None
     mesh_iou: float
     matte_iou: float
+    place_m: float | None = None
+    yaw_deg: float | None = None
+    stretch: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +350,7 @@ def _raised(road: Road, corners: np.ndarray) -> int:
 
 
 def disturbed(frame: SynthFrame, rng: np.random.Generator) -> Labels:
-    """The frame's labels with their 3D boxes off by a little; one that would reach behind the camera stays."""
+    """The frame's labels with their 3D boxes off by a little; one that would lie behind the camera stays."""
     labels, ground = frame.labels, frame.environment.ground.double()
     count = len(labels.kind)
     angle = torch.from_numpy(rng.uniform(0, 2 * math.pi, count))
@@ -397,7 +408,7 @@ def judge(
     ours = _picture(compositor.render(moved_scene(case, scene, tracks)).image)
     region = changed_region(before, case.moved, [move.track])
     edited = _edited(ours, before.image, case.moved.image, region, _zones(case, region))
-    gone = sorted({*tracks, *(t.actor.track for t in before.truths if eligible(t))})
+    gone = sorted({*tracks, *_removable(before)})
     empty = without(case, gone)
     cleared = _picture(scene.background)
     hole = changed_region(before, empty, gone)
@@ -412,7 +423,7 @@ def judge(
         moved=truth.actor.kind,
         shift_m=move.shift_m,
         turn_deg=round(math.degrees(move.turn), 1),
-        never_seen=round(never_seen(case), 4),
+        never_seen=round(float(never_seen(case)[case.moved.instance == move.track + 1].mean()), 4),
         move=edited,
         remove=removed,
         identity_db=identity_db,
@@ -438,6 +449,13 @@ def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
     translation[i] += torch.from_numpy(new.translation - old.translation).to(translation)
     yaw[i] += case.move.turn
     return scene.with_objects(translation=translation, yaw=yaw)
+
+
+def _removable(frame: SynthFrame) -> list[int]:
+    """Tracks of the vehicles that must be found, and of those that show too little to be: whatever becomes of
+    them, what they hide must not appear."""
+    vehicles = [t for t in frame.truths if t.actor.label in VEHICLES]
+    return [t.actor.track for t in vehicles if eligible(t) or t.visible < _HARDLY_SEEN]
 
 
 def without(case: Case, tracks: Sequence[int]) -> SynthFrame:
@@ -468,7 +486,8 @@ def _zones(case: Case, region: Mask) -> dict[str, Mask]:
     inside = silhouette.grow(new, -_OUTLINE_PX)
     outline = silhouette.grow(new, _OUTLINE_PX) & ~inside
     uncovered = silhouette.grow(old, _GROW_PX) & ~outline & ~inside
-    masks = (inside, outline, uncovered, ~(inside | outline | uncovered))
+    unseen = never_seen(case)
+    masks = (inside & ~unseen, inside & unseen, outline, uncovered, ~(inside | outline | uncovered))
     return {name: mask & region for name, mask in zip(ZONES, masks, strict=True)}
 
 
@@ -533,8 +552,10 @@ def silhouettes(
         whole[y0 : y0 + h, x0 : x0 + w] = truth.opacity.values[0].numpy() >= 0.5
         hidden = whole & ~seen
         mesh = matte = 0.0
+        place = yaw = stretch = None
         if track in tracks:
             i = list(tracks).index(track)
+            place, yaw, stretch = _pose_errors(scene, i, truth)
             mesh = silhouette.iou(meshes[i], seen, hidden)
             matte = silhouette.iou(drawn == i + 1, seen)
         start = None
@@ -543,16 +564,31 @@ def silhouettes(
             kind = silhouette.candidates(labels.kind[k], labels.size_lhw[k].tolist())[0]
             placed = silhouette.placed(kind, labels.translation[k], labels.yaw[k], labels.size_lhw[k])
             start = round(silhouette.iou(silhouette.silhouettes([placed], frame.camera)[0], seen, hidden), 4)
-        height = float(truth.box_xyxy[3] - truth.box_xyxy[1])
         yield Shape(
-            track,
-            truth.actor.kind,
-            round(height, 1),
-            round(truth.visible, 3),
-            start,
-            round(mesh, 4),
-            round(matte, 4),
+            track=track,
+            kind=truth.actor.kind,
+            height_px=round(float(truth.box_xyxy[3] - truth.box_xyxy[1]), 1),
+            visible=round(truth.visible, 3),
+            template_iou=start,
+            mesh_iou=round(mesh, 4),
+            matte_iou=round(matte, 4),
+            place_m=place,
+            yaw_deg=yaw,
+            stretch=stretch,
         )
+
+
+def _pose_errors(scene: SceneIR, index: int, truth: Truth) -> tuple[float, float, float]:
+    """Of an object: m on the ground, degrees, and relative size."""
+    objects = scene.objects
+    apart = objects.translation[index].double().numpy() - truth.translation
+    turn = math.remainder(float(objects.yaw[index]) - truth.yaw, 2 * math.pi)
+    ratio = objects.size_lhw[index].double().numpy() / np.array(truth.actor.size_lhw)
+    return (
+        round(float(np.hypot(apart[0], apart[2])), 4),
+        round(abs(math.degrees(turn)), 3),
+        round(float(np.abs(ratio - 1).max()), 4),
+    )
 
 
 def _meshes_seen(compositor: Compositor) -> list[Mask]:
@@ -577,15 +613,14 @@ def _far_to_near(scene: SceneIR) -> list[int]:
     return blend.paint_order(objects.size_lhw, objects.yaw, objects.translation, centre)
 
 
-def never_seen(case: Case) -> float:
-    """Share of the moved vehicle's true pixels whose surface the photograph did not show: turned away, hidden or
-    out of the image."""
+def never_seen(case: Case) -> Mask:
+    """Pixels (H, W) of the moved vehicle whose surface the photograph did not show: turned away, hidden or out of
+    the image."""
     before, after = case.before, case.moved
     old, new = _truth(before, case.move.track), _truth(after, case.move.track)
     value = case.move.track + 1
     rows, columns = np.nonzero(after.instance == value)
-    if not len(rows):
-        return 0.0
+    unseen = np.zeros(after.instance.shape, bool)
     matrix = before.camera.matrix.double().numpy()
     inverse, centre = np.linalg.inv(matrix[:, :3]), before.setting.view.centre
     ray = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ inverse.T
@@ -605,7 +640,8 @@ def never_seen(case: Case) -> float:
             y, x = y.clip(0, height - 1), x.clip(0, width - 1)
             near = np.abs(before.depth_m[y, x] - z) < _DEPTH_TOLERANCE_M
             shown |= inside & near & (before.instance[y, x] == value)
-    return float(1 - shown.mean())
+    unseen[rows, columns] = ~shown
+    return unseen
 
 
 def _ablations(case: Case, scene: SceneIR, tracks: list[int], frame: Frame) -> dict[str, dict[str, float]]:
@@ -627,11 +663,13 @@ def _ablations(case: Case, scene: SceneIR, tracks: list[int], frame: Frame) -> d
         found[name] = _figures(case, other, tracks_of(other, before), empty)
     perfect = perfect_scene(before, empty, tracks)
     parts: dict[str, tuple[str, ...]] = {
-        "true geometry": ("geometry",),
+        "true pose": ("pose",),
+        "true shape": ("shape",),
+        "true geometry": ("pose", "shape"),
         "true mattes": ("mattes",),
         "true background": ("background",),
         "true background and mattes": ("background", "mattes"),
-        "all true": ("geometry", "mattes", "background"),
+        "all true": ("pose", "shape", "mattes", "background"),
     }
     for name, true in parts.items():
         found[name] = _figures(case, _mixed(scene, perfect, true), tracks, empty)
@@ -652,15 +690,15 @@ def perfect_scene(before: SynthFrame, empty: SynthFrame, tracks: Sequence[int]) 
 
 
 def _mixed(scene: SceneIR, perfect: SceneIR, true: Sequence[str]) -> SceneIR:
-    """The scene with its geometry, mattes, or background and shadows those of another scene of the same
-    vehicles."""
-    geometry, mattes, background = (
-        perfect if part in true else scene for part in ("geometry", "mattes", "background")
+    """The scene with pose, shape (mesh, bending, size), mattes, or background and shadows those of another scene
+    of the same vehicles."""
+    pose, shape, mattes, background = (
+        perfect if part in true else scene for part in ("pose", "shape", "mattes", "background")
     )
     placed = replace(
         scene,
-        meshes=geometry.meshes,
-        objects=replace(geometry.objects, source=()),
+        meshes=shape.meshes,
+        objects=replace(shape.objects, translation=pose.objects.translation, yaw=pose.objects.yaw, source=()),
         environment=background.environment,
         background=background.background,
         depth=background.depth,
@@ -712,6 +750,9 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
         _line("silhouette IoU, mesh", [s.mesh_iou for s in shapes], goal="median 0.95"),
         _line("silhouette IoU, matte", [s.matte_iou for s in shapes], goal="median 0.95"),
         _line("silhouette IoU, template at the label", [s.template_iou for s in shapes]),
+        _line("place after the fit, error, m", [s.place_m for s in shapes], False),
+        _line("yaw after the fit, error, degrees", [s.yaw_deg for s in shapes], False),
+        _line("size after the fit, largest relative error", [s.stretch for s in shapes], False),
         _line("move, PSNR, dB", [r.move.psnr_db for r in rows], goal="median 28"),
         _line("move, unchanged, PSNR, dB", [r.move.unchanged_db for r in rows]),
         *(_line(f"move, {zone}, PSNR, dB", [r.move.zones.get(zone) for r in rows]) for zone in ZONES),
@@ -766,7 +807,15 @@ def _keep_sheets(rows: Sequence[Row], made: Path, kept: Path) -> None:
 
 
 def _reset_peak() -> bool:
-    """Forget the process's peak of resident memory so far; False where the system cannot."""
+    """Forget the process's peak of resident memory so far; False where the system cannot.
+
+    What earlier frames have freed goes back first: glibc keeps it, and it would count.
+    """
+    if sys.platform != "linux":
+        return False
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:

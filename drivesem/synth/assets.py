@@ -82,6 +82,9 @@ _PART_MATERIAL = np.array(
     np.uint8,
 )  # fmt: skip
 
+NEUTRAL = 0.5
+"""Albedo of paint that is neither lighter nor darker than a mesh's main paint."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
@@ -347,8 +350,8 @@ def with_parts(mesh: Mesh) -> Mesh:
 def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: float = 0.65) -> Soup:
     """A vehicle's triangles in the unit box with its parts' materials; normals are smooth at the given size.
 
-    albedo: of paint, 0.5 times its tint against the main paint, so that it can be painted anew; of windows, dark;
-    of the rest, its own.
+    albedo: of paint, NEUTRAL times its tint against the main paint, so that it can be painted anew; of windows,
+    dark; of the rest, its own.
     """
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     corners = vertices[faces]
@@ -359,7 +362,7 @@ def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: floa
     paint = part == Part.PAINT
     if paint.any():
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        albedo[paint] = 0.5 * _tint(albedo[paint], np.linalg.norm(flat[paint], axis=1))
+        albedo[paint] = NEUTRAL * _tint(albedo[paint], np.linalg.norm(flat[paint], axis=1))
     albedo[part == Part.GLASS] = _PANE
     soup = make(corners, Material.PAINT, (0.5, 0.5, 0.5))
     soup.material[:] = _PART_MATERIAL[part]

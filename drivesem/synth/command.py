@@ -103,4 +103,4 @@ def _compare(order: Order) -> dict[str, object]:
     found = compare(open_dataset(order.layout, order.out))
     found.plot(order.out / "distributions.png")
     files.write_text(order.out / "distributions.md", found.table())
-    return found.summary()
+    return found.summary()["distances"]

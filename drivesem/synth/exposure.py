@@ -78,7 +78,7 @@ def _object(truth: Truth, pixels: int, view: View, first_track: int) -> TrackedO
     return TrackedObject(
         track=first_track + actor.track,
         kind=actor.label,
-        model=f"{actor.kind}{actor.variant:03d}",
+        model=actor.model,
         paint=paint_name(actor.paint),
         moving=actor.speed_mps != 0,
         box_ltrb=(int(left), int(top), int(right), int(bottom)),

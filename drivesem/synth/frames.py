@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from drivesem.data.truth import occlusion_of
+from drivesem.synth.assets import Sky, with_sky
 from drivesem.synth.layout import (
     Actor,
     FittedCamera,
@@ -21,7 +22,7 @@ from drivesem.synth.layout import (
     plan_road,
     statistics,
 )
-from drivesem.synth.light import draw_light, draw_response
+from drivesem.synth.light import Light, draw_light, draw_response
 from drivesem.synth.noise import noise_set
 from drivesem.synth.render import (
     SUPERSAMPLING,
@@ -48,6 +49,8 @@ from scene_ir.types import Camera, Crop, Environment, Labels
 SPLITS = ("train", "heldout")
 VARIANTS = {"train": (0, 100), "heldout": (100, 60)}
 """First vehicle shape and their number: held-out scenes share no shape with training scenes."""
+_PHOTOGRAPHED_SHARE = 0.7
+"""Of frames under a photographed sky, where there are some."""
 _LEAST_VISIBLE = 0.05
 _LEAST_HEIGHT_PX = 10.0
 _LEAST_WIDTH_PX = 3.0
@@ -71,7 +74,8 @@ class SynthSettings:
     """What varies between uses of the generator. layout: vehicles and roads. sunny: clear weather only.
     tilt_rad: standard deviation of the camera's pitch and roll. camera: index into KITTI's four cameras, None:
     any, by name: Virtual KITTI's. sequence: frames of one drive, that follow each other by a tenth of a second.
-    bent: each vehicle's shape is bent in a way of its own, so that no two are alike.
+    bent: each vehicle's shape is bent in a way of its own, so that no two are alike. skies: photographed ones,
+    that stand in for the drawn sky in some frames.
     """
 
     layout: LayoutSettings | None = None
@@ -80,6 +84,7 @@ class SynthSettings:
     camera: int | Literal["vkitti1", "vkitti2"] | None = None
     sequence: int = 1
     bent: bool = False
+    skies: tuple[Sky, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +334,8 @@ def plan_frame(
     if layout.people:
         actors += place_people(rng[2], road, actors)
     light = draw_light(rng[3], view.up, settings.sunny)
+    if settings.skies:
+        light = _photographed_sky(light, settings, stream(seed, street, split, 16 * attempt + 6))
     setting = Setting(
         view=view,
         road=road,
@@ -340,6 +347,13 @@ def plan_frame(
     tracked = tuple(replace(_own_shape(a, settings.bent), track=i) for i, a in enumerate(actors))
     plan = Plan(tracked, setting, split, (seed, street, attempt))
     return drive(plan, (index - street) * FRAME_PERIOD_S)
+
+
+def _photographed_sky(light: Light, settings: SynthSettings, rng: np.random.Generator) -> Light:
+    skies = [s for s in settings.skies if s.sunny or not settings.sunny]
+    if not skies or rng.random() >= _PHOTOGRAPHED_SHARE:
+        return light
+    return with_sky(light, skies[int(rng.integers(len(skies)))], rng)
 
 
 def _own_shape(actor: Actor, bent: bool) -> Actor:
@@ -434,7 +448,7 @@ def render_frame(
     behind = plain or sight
     nearest = sight.nearest()
     tracks = np.array([0, *(a.track + 1 for a in plan.actors), 0], np.uint16)  # owner -1, the sky, reads the last
-    vehicles = {f"{t.actor.kind}-{t.actor.variant}" for t in truths if t.actor.label in ("Car", "Van", "Truck")}
+    vehicles = {t.actor.model for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(
         image=picture.image,
         background=None if empty is None else empty.image,

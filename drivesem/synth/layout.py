@@ -10,10 +10,14 @@ import json
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drivesem.synth.soup import Material
+
+if TYPE_CHECKING:
+    from drivesem.synth.assets import VehicleMesh
 
 ROAD_KINDS = ("residential", "city", "arterial", "motorway", "country", "junction")
 _ROAD_SHARE = (0.28, 0.25, 0.12, 0.07, 0.08, 0.20)
@@ -230,6 +234,12 @@ class Actor:
     speed_mps: float = 0.0
     track: int = 0
     ffd: tuple[float, ...] | None = None
+    mesh: VehicleMesh | None = None
+
+    @property
+    def model(self) -> str:
+        """Which shape it has, by the name that manifests give."""
+        return f"{self.kind}-{self.variant}" if self.mesh is None else f"mesh-{self.mesh.name}"
 
     @property
     def label(self) -> str:
@@ -241,7 +251,7 @@ class Actor:
 class LayoutSettings:
     """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists
     appear. vehicles: (fewest, most) to be seen a frame, or None for KITTI's distribution. max_heavy: most trucks
-    and buses.
+    and buses. fleet: vehicles from files, used instead of the templates of their type.
     """
 
     variants: tuple[int, int] = (0, 100)
@@ -249,6 +259,7 @@ class LayoutSettings:
     vehicles: tuple[int, int] | None = None
     max_heavy: int = 3
     kinds: tuple[str, ...] = field(default=ROAD_KINDS)
+    fleet: tuple[VehicleMesh, ...] = ()
 
 
 def plan_road(rng: np.random.Generator, kinds: tuple[str, ...] = ROAD_KINDS) -> Road:
@@ -697,6 +708,12 @@ def _settle(rng: np.random.Generator, road: Road, settings: LayoutSettings, spot
     wide = lane is None or lane.slack_m > 1.25
     kind, variant = _vehicle(rng, settings, parked, heavy and wide)
     size = _size(rng, kind, variant)
+    fleet = [m for m in settings.fleet if LABEL_OF_KIND[m.kind] == LABEL_OF_KIND[kind]]
+    mesh = fleet[int(rng.integers(len(fleet)))] if fleet else None
+    if mesh is not None:
+        kind, stretch = mesh.kind, np.clip(rng.normal(1.0, 0.015, 3), 0.97, 1.03)
+        length, height, width = (np.asarray(mesh.size_lhw) * stretch).tolist()
+        size = length, height, width
     d, yaw = spot.d, spot.yaw
     turn = float(rng.normal(0, statistics().yaw_spread_rad))
     if lane is not None and not lane.parked:
@@ -717,6 +734,7 @@ def _settle(rng: np.random.Generator, road: Road, settings: LayoutSettings, spot
         int(rng.integers(2**31)),
         lane_ds=None if lane is None else (d, spot.s),
         speed_mps=0.0 if lane is None else lane.speed_mps,
+        mesh=mesh,
     )
 
 

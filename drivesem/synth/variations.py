@@ -95,6 +95,7 @@ def _weather(setting: Setting, name: str, rng: np.random.Generator) -> tuple[Lig
             zenith=np.array([0.24, 0.40, 0.74]),
             horizon=np.array([0.98, 0.90, 0.80]),
             ambient=np.array([0.20, 0.22, 0.26]),
+            panorama=None,
             haze_per_m=float(rng.uniform(0.001, 0.0025)),
         )
         return light, replace(response, exposure=exposed * 1.05)
@@ -105,6 +106,7 @@ def _weather(setting: Setting, name: str, rng: np.random.Generator) -> tuple[Lig
         zenith=np.array([0.22, 0.28, 0.48]),
         horizon=np.array([1.0, 0.66, 0.42]),
         ambient=np.array([0.21, 0.19, 0.22]),
+        panorama=None,
         haze_per_m=float(rng.uniform(0.0008, 0.002)),
     )
     return light, replace(response, exposure=exposed * 1.1)
@@ -119,5 +121,6 @@ def _clouded(light: Light, grey: float) -> Light:
         horizon=np.array([0.95, 0.97, 1.0]) * grey,
         ambient=np.array([0.46, 0.475, 0.5]) * grey,
         clouds=1.0,
+        panorama=None,
         haze_per_m=float(max(light.haze_per_m, 0.001)),
     )

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from drivesem.synth.assets import NEUTRAL, vehicle_soup
 from drivesem.synth.layout import Actor
 from drivesem.synth.soup import Material, Soup, creased_normals, make
 from scene_ir import ffd
@@ -127,6 +128,15 @@ class VehicleShape:
     normals: np.ndarray
     parent: np.ndarray
     share: np.ndarray
+
+    @classmethod
+    def of(cls, soup: Soup) -> VehicleShape:
+        """The shape of a soup in the unit box, each triangle a face of its own."""
+        count = len(soup)
+        every = np.arange(count)
+        corners = np.arange(3 * count).reshape(count, 3)
+        whole = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
+        return cls(soup, soup.corners.reshape(-1, 3), corners, soup.normals, every, whole)
 
 
 def vehicle_mesh(kind: str, variant: int) -> Mesh:
@@ -410,10 +420,17 @@ def _sources(mesh: Mesh) -> np.ndarray:
     faces = mesh.faces.numpy()
     if mesh.colours is None:
         return np.full(len(faces), -1)
-    colour = mesh.colours.numpy()[faces].mean(axis=1)
-    table = np.array([solids.COLOUR[m] for m in solids.Material])
-    distance = np.abs(colour[:, None] - table[None]).max(axis=2)
-    return np.where(distance.min(axis=1) < 2e-3, distance.argmin(axis=1), -1)
+    table = _colour_key(np.array([solids.COLOUR[m] for m in solids.Material]))
+    order = np.argsort(table)
+    # the templates' vertices are split between materials: one tells its face's
+    key = _colour_key(mesh.colours.numpy())[faces[:, 0]]
+    place = np.minimum(np.searchsorted(table[order], key), len(order) - 1)
+    return np.where(table[order][place] == key, order[place], -1)
+
+
+def _colour_key(colours: np.ndarray) -> np.ndarray:
+    """One integer (n,) for each RGB colour (n, 3), to a thousandth."""
+    return np.rint(colours * 1000).astype(np.int64) @ np.array([1_000_000, 1_000, 1])
 
 
 def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed: int, fine: bool) -> _Pieces:
@@ -447,7 +464,7 @@ def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed:
     return _joined([*found, *groups.values()])
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=64)
 def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
     """A vehicle's mesh as triangles with details painted on; fine: with those seen from near only."""
     mesh, size = vehicle_mesh(kind, variant), np.array(typical_size_lhw(kind, variant), np.float32)
@@ -497,12 +514,15 @@ def vehicle(actor: Actor, fine: bool = True) -> Soup:
 
     fine: with the details that are seen from near only.
     """
-    shape = vehicle_shape(actor.kind, actor.variant, fine)
+    if actor.mesh is None:
+        shape = vehicle_shape(actor.kind, actor.variant, fine)
+    else:
+        shape = VehicleShape.of(vehicle_soup(actor.mesh, fine))
     soup = shape.soup if actor.ffd is None else deformed(shape, np.array(actor.ffd, np.float32))
     albedo = soup.albedo.copy()
     paint = soup.material == Material.PAINT
-    tint = albedo[paint] / max(float(np.median(albedo[paint])) if paint.any() else 1.0, 1e-3)
-    albedo[paint] = np.clip(tint * np.asarray(actor.paint, np.float32), 0, 0.9)
+    neutral = float(np.median(albedo[paint])) if actor.mesh is None and paint.any() else NEUTRAL
+    albedo[paint] = np.clip(albedo[paint] / max(neutral, 1e-3) * np.asarray(actor.paint, np.float32), 0, 0.9)
     cell = soup.pattern[:, 3].astype(np.int64)
     albedo[_strokes(actor.seed)[cell]] = _DARK * 2
     return replace(soup, albedo=albedo)

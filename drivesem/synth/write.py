@@ -15,6 +15,7 @@ from pathlib import Path
 from drivesem.data.registry import WRITERS, Writer
 from drivesem.data.truth import Place
 from drivesem.data.vkitti2 import Vkitti2Writer
+from drivesem.synth.assets import Assets, assets_from, meshes_in, of_split
 from drivesem.synth.edits import Edits, apply_edits, read_edits
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import (
@@ -24,6 +25,7 @@ from drivesem.synth.frames import (
     Plan,
     SynthFrame,
     SynthSettings,
+    boxes_alone,
     plan_frame,
     render_frame,
     second_camera,
@@ -42,6 +44,7 @@ _FIRST_WORLDS = (1, 2, 6, 18, 20)
 _STREETS_A_SCENE = 10
 """Single streets that share one of Virtual KITTI's scenes: their tracks stay below the 254 that its 8-bit instance
 images can tell apart."""
+_FEWEST_IN_A_DRIVE, _MOST_ATTEMPTS = 3, 10
 TRACKS_A_STREET = 25
 """Track numbers set apart for each of those."""
 Engine = Callable[["Callable[[Job], int]", "Sequence[Job]"], Iterator[int]]
@@ -90,6 +93,7 @@ class Order:
             raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
         parse_variations(",".join(self.variations))
         _edits_of(self.edits)
+        _pack(self.meshes, self.assets)
 
     def recipe(self) -> dict[str, object]:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""
@@ -150,6 +154,25 @@ def _edits_of(path: Path | None) -> Edits:
     return {} if path is None else read_edits(path)
 
 
+def _pack(meshes: Path | None, assets: Path | None) -> Assets:
+    """Vehicles and skies from the user's folders; a folder of meshes wins over the pack's vehicles."""
+    pack = Assets((), ()) if assets is None else assets_from(assets)
+    return pack if meshes is None else Assets(meshes_in(meshes), pack.skies)
+
+
+def _busy_attempt(seed: int, start: int, split: str, settings: SynthSettings) -> int:
+    """The first attempt at a drive that begins with some vehicles in view: one without would be empty for all its
+    frames. Single frames are empty as often as KITTI's.
+    """
+    if settings.sequence == 1:
+        return 0
+    for attempt in range(_MOST_ATTEMPTS):
+        seen = boxes_alone(plan_frame(seed, start, split, settings, attempt))
+        if sum(truth.labelled for truth in seen) >= _FEWEST_IN_A_DRIVE:
+            return attempt
+    return 0
+
+
 def _writer(order: Order) -> Writer:
     return Vkitti2Writer(order.out, 2) if order.cameras == 2 else WRITERS[order.layout](order.out)
 
@@ -169,14 +192,17 @@ def make_frame(job: Job) -> int:
         return place.number
     split = "heldout" if place.part == "val" else order.split
     virtual = order.layout.startswith("vkitti")
+    pack = _pack(order.meshes, order.assets)
     settings = SynthSettings(
-        layout=LayoutSettings(variants=VARIANTS[split], people=order.people),
+        layout=LayoutSettings(variants=VARIANTS[split], people=order.people, fleet=of_split(pack.vehicles, split)),
+        skies=tuple(sky for sky in pack.skies if sky.split == split),
         sunny=job.variation != MIXED,
         camera=order.layout if order.layout in ("vkitti1", "vkitti2") else None,
         sequence=order.sequence,
         bent=True,
     )
-    plan = variation_of(plan_frame(order.seed, job.index, split, settings), job.variation)
+    attempt = _busy_attempt(order.seed, job.index - job.index % order.sequence, split, settings)
+    plan = variation_of(plan_frame(order.seed, job.index, split, settings, attempt), job.variation)
     plan = apply_edits(plan, _edits_of(order.edits), job.index)
     first_track = 0
     if virtual and order.sequence == 1:

@@ -86,15 +86,27 @@ def quad_faces(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 def _clean(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Solid:
     """Merge coincident vertices (to 1 um), drop collapsed faces, turn the winding outwards (y up: see module)."""
-    key = np.round(vertices * 1e6).astype(np.int64)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    merged, faces = vertices[first], inverse.reshape(-1)[faces]
+    # a stable sort by rows: np.unique over rows takes five times as long
+    key = np.rint(vertices.T * 1e6).astype(np.int64)
+    order = np.lexsort(key[::-1])
+    ranked = key[:, order]
+    start = np.empty(len(order), bool)
+    start[0], start[1:] = True, (ranked[:, 1:] != ranked[:, :-1]).any(axis=0)
+    inverse = np.empty(len(order), np.int64)
+    inverse[order] = np.cumsum(start) - 1
+    merged, faces = vertices[order[start]], inverse[faces]
     keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
     faces, material = faces[keep], material[keep]
-    a, b, c = (merged[faces[:, i]] for i in range(3))
-    if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:
+    if _volume(merged, faces) < 0:
         faces = faces[:, ::-1]
     return Solid(merged, faces, material)
+
+
+def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Six times the signed volume within closed faces, m^3."""
+    a, b, c = vertices[faces].transpose(1, 2, 0)
+    x, y, z = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+    return float(a[0] @ x + a[1] @ y + a[2] @ z)
 
 
 def mirrored(solid: Solid) -> Solid:
@@ -242,14 +254,18 @@ def assemble(solids: Sequence[Solid], name: str) -> Mesh:
         ],
         axis=1,
     )
-    pairs = np.stack([faces[:, ::-1].reshape(-1), material.repeat(3)], axis=1)
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    # pairs of vertex and material as numbers from a small range: ticked off rather than sorted
+    pairs = (faces[:, ::-1] * len(Material) + material[:, None]).reshape(-1)
+    found = np.zeros(len(vertices) * len(Material), bool)
+    found[pairs] = True
+    inverse = (np.cumsum(found) - 1)[pairs]
+    vertex, surface = np.divmod(np.flatnonzero(found), len(Material))
     part = np.array([PART.get(Material(m), Part.OTHER) for m in range(len(Material))])
     colour = np.array([COLOUR[Material(m)] for m in range(len(Material))])
     return Mesh(
-        vertices=torch.from_numpy(unit[unique[:, 0]].astype(np.float32) + np.float32(0)),
+        vertices=torch.from_numpy(unit[vertex].astype(np.float32) + np.float32(0)),
         faces=torch.from_numpy(inverse.reshape(-1, 3).astype(np.int64)),
         part=torch.from_numpy(part[material].astype(np.int64)),
         name=name,
-        colours=torch.from_numpy(colour[unique[:, 1]].astype(np.float32)),
+        colours=torch.from_numpy(colour[surface].astype(np.float32)),
     )
