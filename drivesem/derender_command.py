@@ -27,9 +27,8 @@ from drivesem.pool import outcomes
 from drivesem.run_folder import PRESENTATION, claim
 from drivesem.scene_sheet import write_scene_sheet
 from drivesem.sources import SceneSource, open_source
-from scene_ir import files
 from scene_ir.errors import SceneError
-from scene_ir.io import load_scene, save_scene
+from scene_ir.io import count_objects, load_scene, save_scene
 
 RECORD, SHEET = "scene.json", "sheet.jpg"
 
@@ -84,7 +83,7 @@ def run(config: Derender) -> int:
     for name in names:
         whole = config.resume and (out / name / RECORD).is_file()
         if whole and (not config.sheet or (out / name / SHEET).is_file()):
-            done[name] = Taken(_count(out / name), None)
+            done[name] = Taken(count_objects(out / name), None)
         else:
             todo.append(name)
     failed: dict[str, str] = {}
@@ -117,12 +116,6 @@ def run(config: Derender) -> int:
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     lines.print(f"{len(frames)} scenes in {out} ({seconds:.0f} s)", soft_wrap=True)
     return 0
-
-
-def _count(folder: Path) -> int:
-    """How many objects the scene of a folder has, from its record alone."""
-    record = files.read_json(folder / RECORD)
-    return len(record["objects"]["yaw"])
 
 
 def _clear(identifiers: Iterable[str], out: Path) -> None:

@@ -186,7 +186,11 @@ def _normals(meshes: _Meshes, photograph: np.ndarray) -> np.ndarray:
 
 def _maps(scene: SceneIR) -> np.ndarray:
     """The maps of the surroundings, each in its colour, over the background in grey: it is what they tell of."""
-    canvas = cv2.cvtColor(as_bytes(scene.background), cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2).astype(np.float32)
+    canvas = (
+        cv2.cvtColor(as_bytes(scene.background), cv2.COLOR_RGB2GRAY)[..., None]
+        .repeat(3, axis=2)
+        .astype(np.float32)
+    )
     for name, colour in MAPS.items():
         share = 0.65 * getattr(scene.environment, name).detach().cpu().float().numpy()[..., None]
         canvas += share * (np.array(colour, np.float32) - canvas)

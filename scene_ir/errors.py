@@ -3,6 +3,8 @@
 All are `ValueError`s whose message is one line: what was looked at, what was expected, what was found.
 """
 
+from __future__ import annotations
+
 
 class SceneError(ValueError):
     """Base of the errors below; catch this one to catch every rejected input."""
@@ -12,6 +14,10 @@ class SceneError(ValueError):
         self.expected = expected
         self.actual = actual
         super().__init__(f"{field}: expected {expected}, found {actual}")
+
+    def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
+        """As processes hand errors to one another: `actual` as text, which always can be."""
+        return type(self), (self.field, self.expected, str(self.actual))
 
 
 class ShapeError(SceneError):

@@ -123,10 +123,7 @@ def load_scene(folder: Path) -> SceneIR:
     folder = Path(folder)
     if not folder.is_dir():
         raise FormatError(str(folder), "a folder with a scene", "no such folder")
-    path = folder / "scene.json"
-    root = _Node(str(path), files.read_json(path))
-    root.expect("schema", SCHEMA)
-    root.expect("version", VERSION)
+    root = _record(folder)
     camera_node = root["camera"]
     camera = camera_node.build(
         lambda: Camera(
@@ -173,6 +170,21 @@ def load_scene(folder: Path) -> SceneIR:
             provenance=provenance,
         )
     )
+
+
+def count_objects(folder: Path) -> int:
+    """How many objects the scene in `folder` has, from its record alone. FormatError naming file and key."""
+    root = _record(Path(folder))
+    return root["objects"]["translation"].rows()
+
+
+def _record(folder: Path) -> _Node:
+    """The record of a scene in this version of the schema."""
+    path = folder / "scene.json"
+    root = _Node(str(path), files.read_json(path))
+    root.expect("schema", SCHEMA)
+    root.expect("version", VERSION)
+    return root
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import Any
 
 from scene_ir import files
 
-
 SHARED = ("split", "seed", "vehicles", "building", "tree", "bush", "surface")
 """What a frame's manifest says of its origin and of the shapes it shows."""
 

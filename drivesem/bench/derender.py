@@ -8,6 +8,7 @@ street.
 from __future__ import annotations
 
 import ctypes
+import gc
 import math
 import multiprocessing
 import os
@@ -169,6 +170,7 @@ class Row:
     identity_db: float
     exact: bool
     derender_s: float
+    cpu_s: float
     peak_mb: float | None
     ablations: dict[str, dict[str, float]] = field(default_factory=dict)
 
@@ -230,13 +232,13 @@ def work(task: Task) -> Row:
     labels = disturbed(case.before, rng)
     frame = photograph_of(case.before, labels)
     reset = _reset_peak()
-    start = time.perf_counter()
+    start, cpu = time.perf_counter(), time.process_time()
     scene = derender(frame)
-    seconds = time.perf_counter() - start
+    seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     peak = _peak_mb() if reset else None
     tracks = tracks_of(scene, case.before)
     row, strips = judge(case, scene, tracks, labels, task.index)
-    row = replace(row, derender_s=round(seconds, 3), peak_mb=peak)
+    row = replace(row, derender_s=round(seconds, 3), cpu_s=round(cpu, 3), peak_mb=peak)
     if task.ablate:
         row = replace(row, ablations=_ablations(case, scene, tracks, frame))
     if task.sheets is not None:
@@ -429,6 +431,7 @@ def judge(
         identity_db=identity_db,
         exact=exact,
         derender_s=0.0,
+        cpu_s=0.0,
         peak_mb=None,
     )
     told = f"{truth.actor.kind} moved {move.shift_m[0]:+.1f} {move.shift_m[1]:+.1f} m, {row.turn_deg:+.0f} deg"
@@ -766,6 +769,7 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
         _line("identity in boxes, PSNR, dB", [r.identity_db for r in rows], goal="each 45"),
         _line("identity exact elsewhere, share", [float(r.exact) for r in rows], goal="each 1"),
         _line("time, s", [r.derender_s for r in rows], False, goal="each 8"),
+        _line("processor time, s", [r.cpu_s for r in rows], False),
         _line("peak memory, MB", [r.peak_mb for r in rows], False, goal="each 2000"),
     ]
     for name in ABLATIONS:
@@ -809,8 +813,9 @@ def _keep_sheets(rows: Sequence[Row], made: Path, kept: Path) -> None:
 def _reset_peak() -> bool:
     """Forget the process's peak of resident memory so far; False where the system cannot.
 
-    What earlier frames have freed goes back first: glibc keeps it, and it would count.
+    What earlier frames have left goes back first: cycles keep it, then glibc does, and it would count.
     """
+    gc.collect()
     if sys.platform != "linux":
         return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -117,16 +117,20 @@ def building(
 
 
 _PANEL = np.array([[0, 1, 2], [0, 2, 3]])
+_ACROSS, _UPWARDS = np.array([0, 1, 1, 0])[_PANEL], np.array([0, 0, 1, 1])[_PANEL]
+"""Which end of a panel's extent in x and in y each corner of its two triangles takes."""
 
 
 def _panels(x: np.ndarray, y: np.ndarray, z: float, material: int, albedo: np.ndarray) -> Soup:
     """Upright rectangles that face +z: x and height y (n, 2) from, to, m; z m."""
     x, y = np.atleast_2d(x), np.atleast_2d(y)
     n = len(x)
-    points = np.stack([x[:, [0, 1, 1, 0]], -y[:, [0, 0, 1, 1]], np.full((n, 4), z)], axis=2)
-    uv = np.stack([(x - x[:, :1])[:, [0, 1, 1, 0]], y[:, [0, 0, 1, 1]]], axis=2)
-    normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (2 * n, 3, 3))
-    return make(points[:, _PANEL].reshape(-1, 3, 3), material, albedo, normals, uv[:, _PANEL].reshape(-1, 3, 2))
+    points, uv = np.empty((n, 2, 3, 3), np.float32), np.empty((n, 2, 3, 2), np.float32)
+    points[..., 0], points[..., 1], points[..., 2] = x[:, _ACROSS], -y[:, _UPWARDS], z
+    uv[..., 0], uv[..., 1] = (x - x[:, :1])[:, _ACROSS], y[:, _UPWARDS]
+    normals = np.zeros((2 * n, 3, 3), np.float32)
+    normals[..., 2] = 1.0
+    return make(points, material, albedo, normals, uv)
 
 
 def _panel(x: tuple[float, float], y: tuple[float, float], z: float, material: int, albedo: np.ndarray) -> Soup:

@@ -6,7 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from drivesem.synth.soup import Material, Soup, ball, join, make, stick
+from drivesem.synth import mesh_kernels
+from drivesem.synth.soup import Material, Soup, balls, join, make, stick
 
 _GREENS = np.array(
     [[0.075, 0.115, 0.03], [0.055, 0.095, 0.03], [0.10, 0.135, 0.04], [0.12, 0.14, 0.05], [0.05, 0.075, 0.035]],
@@ -35,18 +36,10 @@ def leaves(
     size_m: one for all, or (n, 1).
     """
     n = points.shape[0]
-    facing = outward + rng.normal(0, 0.55, (n, 3))
-    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
-    one = np.cross(facing, rng.normal(0, 1, (n, 3)))
-    one /= np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-6)
-    two = np.cross(facing, one)
-    reach = size_m * rng.uniform(0.6, 1.5, (n, 1))
-    corners = (
-        points[:, None] + np.stack([one, -0.6 * one + 0.45 * two, -0.45 * one - 0.45 * two], 1) * reach[:, None]
-    )
-    shade = outward * 0.85 + facing * 0.35
-    shade /= np.linalg.norm(shade, axis=1, keepdims=True)
-    soup = make(corners, Material.LEAF, colour, np.repeat(shade[:, None], 3, axis=1))
+    jitter, spin = rng.normal(0, 1, (n, 3)), rng.normal(0, 1, (n, 3))
+    reach = np.broadcast_to(size_m, (n, 1))[:, 0] * rng.uniform(0.6, 1.5, n)
+    corners, normals = mesh_kernels.leaves(points, outward, (jitter, spin, reach))
+    soup = make(corners, Material.LEAF, colour, normals)
     soup.albedo[:] *= rng.lognormal(0.0, 0.22, (n, 1)).astype(np.float32)
     return soup
 
@@ -62,30 +55,13 @@ def _crown(
     share = radii.prod(axis=1) ** (2 / 3)
     blob = rng.choice(len(centres), size=count, p=share / share.sum())
     direction = rng.normal(0, 1, (count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    depth = np.where(
-        rng.random((count, 1)) < 0.14, rng.uniform(1.1, 1.32, (count, 1)), rng.uniform(0.8, 1.1, (count, 1))
-    )
-    points = centres[blob] + direction * radii[blob] * depth
-    inside = np.zeros(count, bool)
-    for centre, radius in zip(centres, radii, strict=True):
-        inside |= (((points - centre) / radius) ** 2).sum(axis=1) < 0.6
-    keep = ~inside
-    points, depth, direction = points[keep], depth[keep], direction[keep]
-    own = direction / radii[blob[keep]]
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
-    low, high = (centres - radii).min(axis=0), (centres + radii).max(axis=0)
-    whole = (points - (low + high) / 2) / (high - low)
-    whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-6)
-    outward = 0.6 * own + 0.4 * whole
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-6)
-    fine = 1 if size_m < 0.02 else 0
-    cores = [ball(c, r * 0.8, Material.LEAF, colour * 0.32, fine) for c, r in zip(centres, radii, strict=True)]
+    depth = np.where(rng.random(count) < 0.14, rng.uniform(1.1, 1.32, count), rng.uniform(0.8, 1.1, count))
+    kept, points, outward, light = mesh_kernels.crown((centres, radii), blob, direction, depth)
+    cores = balls(centres, radii * 0.8, Material.LEAF, colour * 0.32, 1 if size_m < 0.02 else 0)
     # single leaves against the sky must not look like shards
-    coat = leaves(points, outward, size_m * np.where(depth > 1.1, 0.55, 1.0), colour, rng)
-    light = (0.75 + 0.5 * (depth - 0.8) / 0.3) * (0.92 - 0.2 * own[:, 1:2]) * (0.95 - 0.2 * whole[:, 1:2])
-    coat.albedo[:] *= np.clip(light, 0.4, 1.5).astype(np.float32)
-    return [*cores, coat]
+    coat = leaves(points, outward, size_m * np.where(depth[kept, None] > 1.1, 0.55, 1.0), colour, rng)
+    coat.albedo[:] *= light[:, None]
+    return [cores, coat]
 
 
 _TREE_LEAVES = ((520, 0.044), (1700, 0.0265), (5200, 0.0155), (22000, 0.0078))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -32,13 +33,14 @@ from drivesem.synth.render import (
     View,
     blocks,
     fine_matrix,
+    pixel_sums,
     rasterise,
     render,
     render_without_actors,
     see,
 )
 from drivesem.synth.seasons import leaved
-from drivesem.synth.soup import Material, Soup, box, join, placed
+from drivesem.synth.soup import Material, Soup, box, join, placed, transformed
 from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
 from drivesem.synth.vehicles import instance_ffd
 from drivesem.synth.world import POOLS, actor_soup, surroundings
@@ -164,9 +166,7 @@ def _camera(rng: np.random.Generator, settings: SynthSettings) -> View:
 
 def _into_camera(soup: Soup, view: View) -> Soup:
     """The surroundings in camera axes about the centre of projection."""
-    corners = (view.to_camera(soup.corners) - view.centre).astype(np.float32)
-    normals = (soup.normals @ view.rotation.T).astype(np.float32)
-    return replace(soup, corners=corners, normals=normals)
+    return transformed(soup, view.rotation, view.to_camera(np.zeros(3)) - view.centre)
 
 
 def _stand(actor: Actor, view: View) -> np.ndarray:
@@ -183,9 +183,8 @@ def _place_actor(actor: Actor, owner: int, view: View) -> Soup:
     """An actor in camera axes about the centre of projection, upright as labels know it."""
     spot = _stand(actor, view)
     soup = actor_soup(actor, owner, float(np.linalg.norm(spot)))
-    turn = yaw_matrix(torch.tensor(yaw_in_camera(actor, view), dtype=torch.float64)).numpy().T
-    corners = (soup.corners @ turn + (spot - view.centre)).astype(np.float32)
-    return replace(soup, corners=corners, normals=(soup.normals @ turn).astype(np.float32))
+    turn = yaw_matrix(torch.tensor(yaw_in_camera(actor, view), dtype=torch.float64)).numpy()
+    return transformed(soup, turn, spot - view.centre)
 
 
 def full_boxes(actors: Sequence[Actor], view: View) -> np.ndarray:
@@ -233,7 +232,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
         cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
         whole = np.prod(full[i][2:] - full[i][:2])
         truncation = float(np.clip(1 - np.prod(cut[2:] - cut[:2]) / max(whole, 1e-6), 0, 1))
-        opacity = sum(b.astype(np.float32) for b in blocks(own)) / np.float32(n * n)
+        opacity = pixel_sums(own.view(np.uint8)).astype(np.float32) / np.float32(n * n)
         found.append(
             Truth(
                 actor=actor,
@@ -276,24 +275,33 @@ def table(rows: Sequence[ArrayLike], width: int) -> torch.Tensor:
     return torch.tensor(np.array(rows), dtype=torch.float32).reshape(-1, width)
 
 
-def _share(material: np.ndarray, chosen: tuple[Material, ...]) -> torch.Tensor:
-    """Share (H, W) of each pixel's samples made of the chosen materials."""
-    table = np.isin(np.arange(len(Material)), chosen).astype(np.float32)
-    parts = blocks(material)
-    return torch.from_numpy(sum(table[p] for p in parts) / np.float32(len(parts)))
+_SHARES = ((Material.SKY,), (Material.LEAF, Material.GRASS), (Material.ROAD, Material.PARKING))
+"""Materials whose share of each pixel an `Environment` knows: sky, foliage, road."""
+
+
+def _shares(material: np.ndarray) -> list[torch.Tensor]:
+    """Shares (H, W) of each pixel's samples made of the materials of `_SHARES`. material (2H, 2W)."""
+    # three counts of up to four in one number: three bits each
+    table = np.zeros(256, np.uint16)
+    for i, chosen in enumerate(_SHARES):
+        table[list(chosen)] = 1 << (3 * i)
+    counts = pixel_sums(cv2.LUT(material, table))
+    quarter = np.float32(1 / SUPERSAMPLING**2)
+    return [torch.from_numpy(((counts >> (3 * i)) & 7) * quarter) for i in range(len(_SHARES))]
 
 
 def _environment(sight: Sight, setting: Setting) -> Environment:
     view = setting.view
     up = view.up
+    sky, foliage, road = _shares(sight.material)
     return Environment(
         weather=torch.zeros(4),
         foliage=torch.zeros(3),
         sun=torch.tensor(setting.light.sun, dtype=torch.float32),
         ground=torch.tensor([*up, view.height_m], dtype=torch.float32),
-        sky=_share(sight.material, (Material.SKY,)),
-        foliage_map=_share(sight.material, (Material.LEAF, Material.GRASS)),
-        road=_share(sight.material, (Material.ROAD, Material.PARKING)),
+        sky=sky,
+        foliage_map=foliage,
+        road=road,
     )
 
 

@@ -19,7 +19,14 @@ import warp as wp
 from drivesem.synth.layout import Road
 from drivesem.synth.light import PANORAMA_GLARE, Light, Response, develop
 from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
-from drivesem.synth.shading import MIRRORED_GROUND, SOAKED, ground_light
+from drivesem.synth.shading import (
+    LEAF_DEPTH_M,
+    MIRRORED_GROUND,
+    SHADOW_OFFSET_M,
+    SHADOW_OFFSET_TEXELS,
+    SOAKED,
+    ground_light,
+)
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
 from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
 from scene_ir.raster.launch import halves, launch, start_warp, threads
@@ -35,6 +42,9 @@ FOLD, UNFOLD = wp.constant(wp.float32(1.0 / SIZE)), wp.constant(wp.float32(SIZE)
 LAST = wp.constant(wp.float32(SIZE - 1e-3))
 STRIDE = wp.constant(SIZE + 1)
 BYTES = wp.constant(wp.float32(BYTE_SUM_SCALE))
+LEAF_DEPTH, OFFSET, PER_TEXEL = (
+    wp.constant(wp.float32(v)) for v in (LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS)
+)
 GLARE = wp.constant(wp.float32(PANORAMA_GLARE))
 PI = wp.constant(wp.float32(np.pi))
 INFINITE = wp.constant(wp.float32(np.inf))
@@ -258,7 +268,7 @@ def reflected_radiance(air: Air, textures: Noise, direction: wp.vec3f, soft: boo
     ridge = 0.20 + 0.09 * noise(textures.soft, azimuth * 81.4872 + air.cloud_seed, height * 20.0, 1.0)
     sharpness = float(12.0)
     if soft:
-        ridge *= 0.45
+        ridge *= 0.7
         sharpness = 5.0
     above = saturate((height - ridge) * sharpness + 0.5)
     below = saturate(-height * 14.0 + 0.5)
@@ -550,7 +560,7 @@ def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: Street, text
         x = s.world[0]
         z = s.world[2] * 0.5
         depth = noise(textures.soft, x + 17.0, z, 1.0 / 0.04) + 0.25 * noise(textures.rough, x, z, 1.0 / 0.03)
-        puddle = saturate((depth - 0.6) * 2.5)
+        puddle = saturate((depth - 0.5) * 1.1)
         film = air.wet * (soaked[1] + soaked[2] * puddle)
         view = wp.normalize(s.point)
         cosine = saturate(-wp.dot(view, s.normal))
@@ -592,19 +602,22 @@ def lit_share(s: Spot, material: int, by_actor: bool, air: Air, shade: Shade):
     if shade.sunny == 0:
         return wp.vec2f(0.0, 0.0)
     away = air.sun
-    offset = float(0.25)
+    facing = wp.dot(s.normal, air.sun)
+    slope = wp.sqrt(wp.max(1.0 - facing * facing, 0.0))
     if material != M_LEAF:
-        if wp.dot(s.normal, air.sun) <= 0.0:
+        if facing <= 0.0:
             return wp.vec2f(0.0, 0.0)
         away = s.normal
-        offset = 0.03 + 0.0006 * s.point[2]
-    place = shade.rows * (s.point + away * offset) + shade.shift
     size = float(shade.texels)
     square = shade.texels * shade.texels
     for i in range(2):
         area = shade.near
         if i == 1:
             area = shade.far
+        offset = float(LEAF_DEPTH)
+        if material != M_LEAF:
+            offset = OFFSET + PER_TEXEL * (area[1] - area[0]) / size * slope
+        place = shade.rows * (s.point + away * offset) + shade.shift
         u = (place[0] - area[0]) * (size / (area[1] - area[0])) - 0.5
         v = (place[1] - area[2]) * (size / (area[3] - area[2])) - 0.5
         if wp.min(u, v) > 2.0:

@@ -175,7 +175,7 @@ def reflected_radiance(
     right, forward = light.ahead
     azimuth = np.arctan2(direction @ right, direction @ forward)
     ridge = 0.20 + 0.09 * sample(noise.soft, azimuth * 81.4872 + light.cloud_seed, height * 20.0)
-    ridge, sharpness = (ridge * 0.45, 5.0) if soft else (ridge, 12.0)
+    ridge, sharpness = (ridge * 0.7, 5.0) if soft else (ridge, 12.0)
     town = (light.ambient * 0.22 + light.sun_colour * 0.03).astype(np.float32)
     road = (ground * (light.ambient + 0.6 * light.sun_colour)).astype(np.float32)
     above = np.clip((height - ridge) * sharpness + 0.5, 0, 1)[:, None]

@@ -17,7 +17,14 @@ from drivesem.synth import kernels
 from drivesem.synth.layout import Road
 from drivesem.synth.light import Light, Response, develop, sky_radiance
 from drivesem.synth.noise import NoiseSet, white_noise
-from drivesem.synth.shading import Samples, shade, unit
+from drivesem.synth.shading import (
+    LEAF_DEPTH_M,
+    SHADOW_OFFSET_M,
+    SHADOW_OFFSET_TEXELS,
+    Samples,
+    shade,
+    unit,
+)
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
@@ -172,6 +179,13 @@ def blocks(values: np.ndarray) -> list[np.ndarray]:
     return [values[dy::n, dx::n] for dy in range(n) for dx in range(n)]
 
 
+def pixel_sums(samples: np.ndarray) -> np.ndarray:
+    """Sums (H, W) over the samples (2H, 2W) of each pixel, in their type; see `blocks`."""
+    n = SUPERSAMPLING
+    rows = samples[::n] + samples[1::n]
+    return rows[:, ::n] + rows[:, 1::n]
+
+
 def fine_matrix(view: View) -> np.ndarray:
     """(3, 3): centre-relative camera-space points to homogeneous pixels of the supersampled image."""
     n = SUPERSAMPLING
@@ -246,15 +260,17 @@ def _lit(
     facing = normal @ sun.astype(np.float32)
     leaf = material == Material.LEAF
     towards = np.flatnonzero((facing > 0) | leaf)
-    offset = np.where(leaf, 0.25, 0.03 + 0.0006 * point[:, 2])[towards, None].astype(np.float32)
-    moved = point[towards] + offset * np.where(leaf[towards, None], sun.astype(np.float32), normal[towards])
-    place = moved @ maps.rows[:, :3].T + maps.rows[:, 3]
+    slope = np.sqrt(np.maximum(1 - facing[towards] ** 2, 0))
+    away = np.where(leaf[towards, None], sun.astype(np.float32), normal[towards])
     by_actor = ((np.isin(material, GROUND)) | (owner > 0))[towards]
     share = np.ones(len(towards), np.float32)
     pending = np.ones(len(towards), bool)
     size = _SHADOW_TEXELS
     for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
         texel = (x1 - x0) / size
+        steep = SHADOW_OFFSET_M + SHADOW_OFFSET_TEXELS * texel * slope
+        offset = np.where(leaf[towards], LEAF_DEPTH_M, steep).astype(np.float32)
+        place = (point[towards] + offset[:, None] * away) @ maps.rows[:, :3].T + maps.rows[:, 3]
         u = (place[:, 0] - np.float32(x0)) * np.float32(1 / texel) - 0.5
         v = (place[:, 1] - np.float32(z0)) * np.float32(size / (z1 - z0)) - 0.5
         here = pending & (u > 2) & (v > 2) & (u < size - 4) & (v < size - 4)

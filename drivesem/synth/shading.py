@@ -12,6 +12,12 @@ from drivesem.synth.noise import NoiseSet, sample
 from drivesem.synth.soup import GROUND, Material
 
 _F = np.float32
+SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS = 0.015, 3.0
+"""How far before a surface its shadow is looked up, the more the more it turns from the sun: the lookup's tent
+spans two texels to each side, 2.8 across, which must not meet the surface itself.
+"""
+LEAF_DEPTH_M = 0.25
+"""How deep the sun shines into a crown."""
 
 
 def _soaked() -> np.ndarray:
@@ -308,7 +314,7 @@ def _wetted(s: Samples, material: Material, dry: np.ndarray, light: Light, noise
         return out
     x, z = s.world[:, 0], s.world[:, 2]
     depth = _noise(noise.soft, x + 17, z * _F(0.5), 0.04) + 0.25 * _noise(noise.rough, x, z * _F(0.5), 0.03)
-    puddle = np.clip((depth - 0.6) * 2.5, 0, 1)
+    puddle = np.clip((depth - 0.5) * 1.1, 0, 1)
     cover = _F(light.wet) * (film + more * puddle)
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)

@@ -120,11 +120,18 @@ def make(
         normals=np.asarray(normals, np.float32).reshape(-1, 3, 3),
         uv=np.zeros((count, 3, 2), np.float32) if uv is None else np.asarray(uv, np.float32).reshape(-1, 3, 2),
         material=np.full(count, int(material), np.uint8),
-        albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
-        pattern=np.broadcast_to(np.asarray(pattern, np.float32), (count, 4)).copy(),
+        albedo=_rows(albedo, count, 3),
+        pattern=_rows(pattern, count, 4),
         owner=np.zeros(count, np.int32),
         semantic=np.full(count, _SEMANTIC_OF_MATERIAL[int(material)]),
     )
+
+
+def _rows(values: np.ndarray | tuple[float, ...], count: int, width: int) -> np.ndarray:
+    """The values in each of `count` rows: np.broadcast_to takes five times as long for few."""
+    rows = np.empty((count, width), np.float32)
+    rows[:] = values
+    return rows
 
 
 def tagged(soup: Soup, semantic: Semantic) -> Soup:
@@ -144,13 +151,34 @@ def placed(
     cos, sin = np.cos(yaw), np.sin(yaw)
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
     size = np.asarray(scale, np.float32)
-    # one product of many rows is far quicker than many products of three
-    corners = (soup.corners.reshape(-1, 3) @ (turn * size).T + np.asarray(position, np.float32)).reshape(-1, 3, 3)
-    normals = soup.normals.reshape(-1, 3) @ (turn / size).T
-    if (size != 1).any():
+    corners = _product(soup.corners, (turn * size).T)
+    corners += np.asarray(position, np.float32)
+    normals = _product(soup.normals, (turn / size).T)
+    if tuple(scale) != (1, 1, 1):
         normals /= np.sqrt(np.maximum(np.einsum("ni,ni->n", normals, normals), 1e-24))[:, None]
-    normals = normals.reshape(-1, 3, 3)
-    return replace(soup, corners=corners, normals=normals)
+    return replace(soup, corners=corners.reshape(-1, 3, 3), normals=normals.reshape(-1, 3, 3))
+
+
+def transformed(soup: Soup, rotation: np.ndarray, shift: np.ndarray) -> Soup:
+    """A copy turned by a rotation (3, 3) and moved by a shift (3,)."""
+    turn = np.ascontiguousarray(rotation.T, np.float32)
+    corners = _product(soup.corners, turn)
+    corners += shift.astype(np.float32)
+    return replace(soup, corners=corners.reshape(-1, 3, 3), normals=_product(soup.normals, turn).reshape(-1, 3, 3))
+
+
+_ROWS = 16384
+"""So many rows times a small matrix are multiplied by one thread: OpenBLAS wakes others, which then spin, above a
+quarter of a million products."""
+
+
+def _product(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Rows of three numbers (n, 3) times a matrix (3, 3): many rows at once are far quicker than n / 3 times three."""
+    rows = points.reshape(-1, 3)
+    out = np.empty(rows.shape, np.float32)
+    for start in range(0, len(rows), _ROWS):
+        np.matmul(rows[start : start + _ROWS], matrix, out=out[start : start + _ROWS])
+    return out
 
 
 def quad(points: np.ndarray) -> np.ndarray:
@@ -206,24 +234,34 @@ def tube(
     start: np.ndarray, end: np.ndarray, radii: tuple[float, float], sides: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners and normals (F, 3, 3) of a closed, round stick from start to end (3,)."""
-    axis = np.asarray(end, float) - np.asarray(start, float)
-    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    axis = end - start
+    axis /= max(float(np.sqrt(axis @ axis)), 1e-9)
     helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.8 else np.array([0, 1.0, 0])
     one = _cross(axis, helper)
-    one /= np.linalg.norm(one)
-    two = _cross(axis, one)
+    one /= np.sqrt(one @ one)
+    ring = _circle(sides) @ np.stack([one, _cross(axis, one)])
+    low, high = start + ring * radii[0], end + ring * radii[1]
+    corners, normals = np.empty((2, 4, sides, 3, 3), np.float32)
+    for i, (a, b, c) in enumerate(
+        (
+            (low[:-1], low[1:], high[1:]),
+            (low[:-1], high[1:], high[:-1]),
+            (start, low[:-1], low[1:]),
+            (end, high[:-1], high[1:]),
+        )
+    ):
+        corners[i, :, 0], corners[i, :, 1], corners[i, :, 2] = a, b, c
+    normals[:2, :, 0], normals[0, :, 1], normals[:2, :, 2] = ring[:-1], ring[1:], ring[1:]
+    normals[1, :, 1], normals[1, :, 2], normals[2], normals[3] = ring[1:], ring[:-1], -axis, axis
+    return corners.reshape(-1, 3, 3), normals.reshape(-1, 3, 3)
+
+
+@lru_cache(maxsize=32)
+def _circle(sides: int) -> np.ndarray:
+    """Points (sides + 1, 2) around a circle, the first again at the end."""
     angle = np.arange(sides + 1) * 2 * np.pi / sides
-    ring = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
-    low, high = np.asarray(start) + ring * radii[0], np.asarray(end) + ring * radii[1]
-    a, b, c, d = low[:-1], low[1:], high[1:], high[:-1]
-    corners = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    n0, n1 = ring[:-1], ring[1:]
-    normals = np.concatenate([np.stack([n0, n1, n1], 1), np.stack([n0, n1, n0], 1)])
-    for point, circle, normal in ((start, low, -axis), (end, high, axis)):
-        middle = np.broadcast_to(np.asarray(point, float), circle[:-1].shape)
-        corners = np.concatenate([corners, np.stack([middle, circle[:-1], circle[1:]], 1)])
-        normals = np.concatenate([normals, np.broadcast_to(normal, (sides, 3, 3))])
-    return corners.astype(np.float32), normals.astype(np.float32)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def stick(
@@ -271,10 +309,21 @@ def ball(
     subdivisions: int = 1,
 ) -> Soup:
     """An ellipsoid."""
-    sphere = unit_sphere(subdivisions)
-    normals = sphere / np.asarray(radii, np.float32)
-    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    return make(sphere * np.asarray(radii, np.float32) + np.asarray(centre, np.float32), material, albedo, normals)
+    return balls(np.array([centre]), np.array([radii]), material, albedo, subdivisions)
+
+
+def balls(
+    centres: np.ndarray,
+    radii: np.ndarray,
+    material: int,
+    albedo: tuple[float, float, float] | np.ndarray,
+    subdivisions: int = 1,
+) -> Soup:
+    """Ellipsoids: centres and radii (k, 3)."""
+    sphere, size = unit_sphere(subdivisions)[None], np.asarray(radii, np.float32)[:, None, None]
+    normals = sphere / size
+    normals /= np.sqrt(np.einsum("kfij,kfij->kfi", normals, normals))[..., None]
+    return make(sphere * size + np.asarray(centres, np.float32)[:, None, None], material, albedo, normals)
 
 
 def creased_normals(corners: np.ndarray, crease_rad: float = 0.65) -> np.ndarray:

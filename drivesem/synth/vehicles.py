@@ -8,9 +8,10 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from drivesem.synth import mesh_kernels
 from drivesem.synth.assets import NEUTRAL, vehicle_soup
 from drivesem.synth.layout import Actor
-from drivesem.synth.soup import Material, Soup, creased_normals, make
+from drivesem.synth.soup import Material, Soup, make
 from scene_ir import ffd
 from scene_ir.meshes import solids
 from scene_ir.meshes.templates import KINDS, template, typical_size_lhw
@@ -45,10 +46,10 @@ Plane = tuple[tuple[float, float, float], float]
 
 @dataclass(frozen=True, slots=True)
 class _Base:
-    """The mesh's own faces at their size in metres: corners and unit normals (F, 3, 3)."""
+    """The mesh's own faces at their size in metres: corners (F, 3, 3), outward directions (F, 3)."""
 
     corners: np.ndarray
-    normals: np.ndarray
+    facing: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +69,18 @@ class _Pieces:
         """Those selected by a mask or by indices."""
         return _Pieces(*(getattr(self, f.name)[keep] for f in fields(self)))
 
+    def part(self, start: int, end: int) -> _Pieces:
+        """Those of a range, without a copy."""
+        return _Pieces(*(getattr(self, f.name)[start:end] for f in fields(self)))
+
     def middle(self, base: _Base) -> np.ndarray:
         """Centroids (n, 3) m."""
-        return np.einsum("ni,nij->nj", self.share.mean(axis=1), base.corners[self.parent])
+        share = (self.share[:, 0] + self.share[:, 1] + self.share[:, 2]) / np.float32(3)
+        return np.einsum("ni,nij->nj", share, base.corners[self.parent])
 
     def facing(self, base: _Base) -> np.ndarray:
         """Outward directions (n, 3) of the faces."""
-        return base.normals[self.parent].mean(axis=1)
+        return base.facing[self.parent]
 
 
 def _joined(pieces: list[_Pieces]) -> _Pieces:
@@ -88,55 +94,44 @@ def _extent(base: _Base, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
 
 def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
     """The same surface, its triangles cut in two or three where they cross a plane."""
-    corners, share = base.corners[pieces.parent], pieces.share
-    source = np.arange(len(corners))
-    for normal, offset in planes:
-        reach = corners @ np.asarray(normal, np.float32) - np.float32(offset)
-        side = np.einsum("nij,nj->ni", share, reach[source])
-        # a tenth of a millimetre: thinner slivers are not worth a triangle
-        crossing = np.flatnonzero((side.max(axis=1) > 1e-4) & (side.min(axis=1) < -1e-4))
-        if not len(crossing):
-            continue
-        side, whole = side[crossing], np.ones(len(source), bool)
-        whole[crossing] = False
-        above = side > 0
-        lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
-        order = (lone[:, None] + np.arange(3)) % 3
-        rows = np.arange(len(crossing))[:, None]
-        side, corner = side[rows, order], share[crossing][rows, order]
-        a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
-        p = a + (side[:, 0] / (side[:, 0] - side[:, 1]))[:, None] * (b - a)
-        q = a + (side[:, 0] / (side[:, 0] - side[:, 2]))[:, None] * (c - a)
-        split = np.concatenate([np.stack(t, axis=1) for t in ((a, p, q), (p, b, c), (p, c, q))])
-        share = np.concatenate([share[whole], split])
-        source = np.concatenate([source[whole], np.tile(source[crossing], 3)])
-    a, b, c = share[:, 0], share[:, 1], share[:, 2]
-    part = np.abs(np.einsum("ni,ni->n", a, np.cross(b, c))) > 1e-6
-    return replace(pieces.take(source[part]), share=share[part])
+    table = np.array([(*normal, offset) for normal, offset in planes], np.float32)
+    source, share = mesh_kernels.cut(base.corners, pieces.parent, pieces.share, table)
+    return replace(pieces.take(source), share=share)
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleShape:
-    """A vehicle in the unit box. soup: its triangles, paint in a neutral tint, pattern[:, 3] >= 1 where a
-    character of the plate may darken a face; vertices (V, 3), faces (F, 3): of the mesh they lie in; normals
-    (F, 3, 3): of its corners; parent, share: as in `_Pieces`.
+    """A vehicle in the unit box: n triangles that lie in the faces of a mesh. vertices (V, 3), faces (F, 3), normals
+    (F, 3, 3): of the mesh, and of its faces' corners; parent (n,) int32, share (n, 3, 3): as in `_Pieces`; material
+    (n,) uint8; albedo (n, 3), paint in a neutral tint; cell (n,) uint8: 1 + stroke of a plate's character that may
+    darken it, or 0.
     """
 
-    soup: Soup
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     parent: np.ndarray
     share: np.ndarray
+    material: np.ndarray
+    albedo: np.ndarray
+    cell: np.ndarray
 
     @classmethod
     def of(cls, soup: Soup) -> VehicleShape:
         """The shape of a soup in the unit box, each triangle a face of its own."""
         count = len(soup)
-        every = np.arange(count)
-        corners = np.arange(3 * count).reshape(count, 3)
+        every = np.arange(count, dtype=np.int32)
+        corners = np.arange(3 * count, dtype=np.int32).reshape(count, 3)
         whole = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
-        return cls(soup, soup.corners.reshape(-1, 3), corners, soup.normals, every, whole)
+        plain = np.zeros(count, np.uint8)
+        return cls(
+            soup.corners.reshape(-1, 3), corners, soup.normals, every, whole, soup.material, soup.albedo, plain
+        )
+
+    @property
+    def soup(self) -> Soup:
+        """The triangles as they are, not bent."""
+        return deformed(self, np.zeros((LATTICE_POINTS, 3), np.float32))
 
 
 def vehicle_mesh(kind: str, variant: int) -> Mesh:
@@ -173,17 +168,12 @@ def instance_ffd(actor: Actor) -> np.ndarray:
 
 def deformed(shape: VehicleShape, offsets: np.ndarray) -> Soup:
     """The vehicle's triangles after a free-form deformation of its mesh: offsets (64, 3)."""
-    points = torch.from_numpy(shape.vertices)
-    lattice = torch.from_numpy(np.ascontiguousarray(offsets, np.float32).reshape(LATTICE_POINTS, 3))
-    moved = ffd.deform(points, ffd.lattice_weights(points), lattice).numpy()
-    slope = ffd.jacobian(points, lattice).numpy()
-    # normals turn with the cofactors of the Jacobian
-    cofactor = np.stack(
-        [np.cross(slope[..., (i + 1) % 3], slope[..., (i + 2) % 3]) for i in range(3)], axis=-1
-    ).astype(np.float32)
-    normals = np.matmul(cofactor[shape.faces], shape.normals[..., None])[..., 0]
-    corners = np.matmul(shape.share, moved[shape.faces][shape.parent])
-    return replace(shape.soup, corners=corners, normals=np.matmul(shape.share, normals[shape.parent]))
+    lattice = np.asarray(offsets, np.float32).reshape(LATTICE_POINTS, 3)
+    mesh = shape.vertices, shape.faces, shape.normals
+    corners, normals = mesh_kernels.bent(mesh, (shape.parent, shape.share), lattice)
+    soup = make(corners, Material.PAINT, shape.albedo, normals)
+    soup.pattern[:, 3] = shape.cell
+    return replace(soup, material=shape.material)
 
 
 def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
@@ -436,8 +426,9 @@ def _colour_key(colours: np.ndarray) -> np.ndarray:
 def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed: int, fine: bool) -> _Pieces:
     """Details painted on the faces that the templates' builder made of known materials."""
     rng = np.random.default_rng([0xCA2, KINDS.index(kind), seed])
-    groups = {m: pieces.take(source == int(m)) for m in solids.Material}
-    found = [pieces.take(source < 0)]
+    pieces, ends = pieces.take(np.argsort(source, kind="stable")), np.cumsum(np.bincount(source + 1, minlength=len(solids.Material) + 1))
+    found = [pieces.part(0, int(ends[0]))]
+    groups = {m: pieces.part(int(ends[m]), int(ends[m + 1])) for m in solids.Material}
     sheet, car = groups[solids.Material.PAINT].albedo[:1], kind not in ("bus", "truck")
     trim = _joined([groups.pop(solids.Material.TRIM), groups.pop(solids.Material.CHROME)])
     glass, paint = groups.pop(solids.Material.GLASS), groups.pop(solids.Material.PAINT)
@@ -473,7 +464,8 @@ def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
         mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
     )
     corners = vertices[faces] * size
-    base = _Base(corners, creased_normals(corners))
+    smooth = mesh_kernels.creased_normals(vertices * size, faces)
+    base = _Base(corners, (smooth[:, 0] + smooth[:, 1] + smooth[:, 2]) / np.float32(3))
     table = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)
     pieces = _Pieces(
         parent=np.arange(len(faces)),
@@ -483,18 +475,17 @@ def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
         cell=np.zeros(len(faces), np.int64),
     )
     pieces = _detailed(kind, base, pieces, _sources(mesh), variant, fine)
-    # covectors of the unit box: placing a soup divides them by its size again
-    normals = base.normals * size
-    share = pieces.share.astype(np.float32)
-    soup = make(np.matmul(share, vertices[faces][pieces.parent]), Material.PAINT, (0.5, 0.5, 0.5))
-    soup = replace(
-        soup,
-        normals=np.matmul(share, normals[pieces.parent]),
+    return VehicleShape(
+        vertices=vertices,
+        faces=faces.astype(np.int32),
+        # covectors of the unit box: placing a soup divides them by its size again
+        normals=smooth * size,
+        parent=pieces.parent.astype(np.int32),
+        share=pieces.share,
         material=pieces.material,
         albedo=pieces.albedo,
+        cell=pieces.cell.astype(np.uint8),
     )
-    soup.pattern[:, 3] = pieces.cell
-    return VehicleShape(soup, vertices, faces, normals, pieces.parent, share)
 
 
 @lru_cache(maxsize=512)
@@ -519,10 +510,10 @@ def vehicle(actor: Actor, fine: bool = True) -> Soup:
     else:
         shape = VehicleShape.of(vehicle_soup(actor.mesh, fine))
     soup = shape.soup if actor.ffd is None else deformed(shape, np.array(actor.ffd, np.float32))
-    albedo = soup.albedo.copy()
+    albedo = soup.albedo
     paint = soup.material == Material.PAINT
     neutral = float(np.median(albedo[paint])) if actor.mesh is None and paint.any() else NEUTRAL
     albedo[paint] = np.clip(albedo[paint] / max(neutral, 1e-3) * np.asarray(actor.paint, np.float32), 0, 0.9)
     cell = soup.pattern[:, 3].astype(np.int64)
     albedo[_strokes(actor.seed)[cell]] = _DARK * 2
-    return replace(soup, albedo=albedo)
+    return soup

@@ -37,6 +37,8 @@ _CROWN = 0.36
 """Radius of the widest crowns, as a fraction of the tree's width scale."""
 _LAYER_M = 0.004
 """Height of patches and paint above the road: nothing to see, enough for the depth test."""
+_HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+"""Corners of a quadrilateral's two triangles."""
 _LEAVES = 52_000
 """Triangles of plants on one side of the road; once they are spent, what follows (farther away) is coarse."""
 _FINE_M = 20.0
@@ -164,12 +166,10 @@ def _patch(outline: np.ndarray, height_m: float, material: Material, albedo: np.
     """A flat, cut-up ground rectangle: outline (4, 2) of (x, z)."""
     xs = np.linspace(outline[0, 0], outline[1, 0], 9)
     zs = np.linspace(outline[0, 1], outline[2, 1], 9)
-    cells = [
-        np.array([[x0, -height_m, z0], [x1, -height_m, z0], [x1, -height_m, z1], [x0, -height_m, z1]])
-        for x0, x1 in pairwise(xs)
-        for z0, z1 in pairwise(zs)
-    ]
-    corners = np.concatenate([quad(c) for c in cells])
+    cells = np.full((8, 8, 4, 3), -height_m)
+    cells[..., [0, 3], 0], cells[..., [1, 2], 0] = xs[:-1, None, None], xs[1:, None, None]
+    cells[..., [0, 1], 2], cells[..., [2, 3], 2] = zs[None, :-1, None], zs[None, 1:, None]
+    corners = cells[:, :, _HALVES].reshape(-1, 3, 3)
     normals = np.broadcast_to([0.0, -1.0, 0.0], corners.shape)
     return make(corners, material, albedo, normals, corners[..., [0, 2]] + [300.0, 0.0], (seed, 0, 0, 0))
 
@@ -184,22 +184,17 @@ def _ribbon(
     seed: float,
 ) -> Soup:
     """A band along the road between two offsets, cut at stations s; vertical where both offsets are equal."""
-    sides = []
-    for offset, height in zip(d, heights_m, strict=True):
-        x, z = road.point(offset, s)
-        sides.append(np.stack([x, np.full_like(s, -height), z], axis=1))
-    low, high = sides
-    points = np.stack([low[:-1], high[:-1], high[1:], low[1:]], axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
-    start, end = slice(None, -1), slice(1, None)
-    outline = [
-        np.stack(np.broadcast_arrays(np.float64(d[i]), s[j]), axis=-1)
-        for i, j in zip((0, 1, 1, 0), (start, start, end, end), strict=True)
-    ]
-    uv = np.stack(outline, axis=1)[:, np.array([[0, 1, 2], [0, 2, 3]])]
+    count = len(s) - 1
+    points, uv = np.empty((count, 4, 3)), np.empty((count, 4, 2))
+    for i, (near, far) in enumerate(((0, 3), (1, 2))):
+        x, z = road.point(d[i], s)
+        for corner, ends in ((near, slice(None, -1)), (far, slice(1, None))):
+            points[:, corner, 0], points[:, corner, 1], points[:, corner, 2] = x[ends], -heights_m[i], z[ends]
+            uv[:, corner, 0], uv[:, corner, 1] = d[i], s[ends]
     upright = np.array([1.0 if d[0] < 0 else -1.0, -0.05, 0.0])
     normal = upright if d[0] == d[1] else np.array([0.0, -1.0, 0.0])
-    normals = np.broadcast_to(normal / np.linalg.norm(normal), (2 * (len(s) - 1), 3, 3))
-    return make(points.reshape(-1, 3, 3), material, albedo, normals, uv.reshape(-1, 3, 2), (seed, 0, 0, 0))
+    normals = np.broadcast_to(normal / np.linalg.norm(normal), (2 * count, 3, 3))
+    return make(points[:, _HALVES], material, albedo, normals, uv[:, _HALVES], (seed, 0, 0, 0))
 
 
 def _detail(distance_m: float) -> int:

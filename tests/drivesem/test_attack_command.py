@@ -12,7 +12,7 @@ import pytest
 from drivesem.cli import main
 from drivesem.feasibility_check import check_scene
 from drivesem.results import load_frame
-from drivesem.synth.write import synthesise
+from drivesem.synth.write import Order, synthesise
 from scene_ir.io import load_scene
 
 WORDS = ["attack", "--combo", "2", "--steps", "2", "--json"]
@@ -117,7 +117,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest
 def kitti_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three frames in KITTI's layout: one with vehicles, one without, one with a broken label."""
     root = tmp_path_factory.mktemp("kitti")
-    for _ in synthesise(root, 3, seed=11, split="heldout"):
+    for _ in synthesise(Order(root, 3, seed=11, split="heldout")):
         pass
     labels = root / "training" / "label_2"
     lines = [ln for ln in (labels / "000001.txt").read_text().splitlines() if ln.split()[0] == "Pedestrian"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -31,7 +32,7 @@ Street = Callable[..., SceneIR]
 
 
 def edit_of(*settings: str) -> FrameEdit:
-    changes: dict = {}
+    changes: dict[Any, Any] = {}
     for text in settings:
         changes = merged(changes, parse_setting(text))
     return frame_edit("edit", changes)

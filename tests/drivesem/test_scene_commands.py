@@ -121,7 +121,7 @@ def test_a_folder_a_frame(taken: Path) -> None:
 
 
 def empty_streets(root: Path, calibrated: tuple[int, ...], count: int = 3) -> np.ndarray:
-    """A KITTI folder of small pictures without objects; only some frames have their calibration. -> the picture."""
+    """A KITTI folder of small pictures without objects; some frames have a calibration. -> the picture."""
     image = np.full((60, 200, 3), 90, np.uint8)
     for i in range(count):
         files.write_png(root / "training" / "image_2" / f"{i:06d}.png", image)
@@ -132,6 +132,7 @@ def empty_streets(root: Path, calibrated: tuple[int, ...], count: int = 3) -> np
     return image
 
 
+@pytest.mark.slow
 def test_processes_do_not_matter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "D"
     empty_streets(root, (0, 2))
@@ -155,7 +156,7 @@ def test_what_it_tells_of_each_frame(taken: Path, tmp_path: Path, capsys: pytest
     assert 0 < frame["seconds"] <= found["seconds"]
     assert found["failed"] == {}
     assert Path(found["out"]) == out
-    assert main(words[:-2] + ["--out", str(out)]) == 0
+    assert main(words) == 0
     assert f"demo-000: {frame['objects']} vehicles, there before" in capsys.readouterr().out
 
 
@@ -177,6 +178,17 @@ def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path, capsys: pytest
     again, _ = succeed(words, capsys)
     assert all(frame["seconds"] is None for frame in again["frames"].values())
     assert again["frames"]["demo-000"]["objects"] == found["frames"]["demo-000"]["objects"]
+
+
+def test_a_scene_of_another_version_is_refused(
+    taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "S"
+    shutil.copytree(taken, out)
+    record = out / "demo-001" / "scene.json"
+    record.write_text(record.read_text().replace('"version": 1', '"version": 99'))
+    said = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
+    assert "scene.json: version: expected 1, found 99" in said
 
 
 def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -364,7 +376,7 @@ def test_what_is_no_scene_is_named(
 def test_the_sheet_shows_photograph_background_and_no_difference(taken: Path) -> None:
     scene = load_scene(taken / "demo-001")
     sheet = scene_sheet(scene, "demo-001")
-    written = cv2.imread(str(taken / "demo-001" / "sheet.jpg"))[..., ::-1]
+    written = files.read_image(taken / "demo-001" / "sheet.jpg")
     assert np.abs(written.astype(int) - sheet).mean() < 2
     tall = round(PANEL_PX * scene.camera.height / scene.camera.width)
     panels = []
@@ -396,7 +408,7 @@ def test_the_sheet_tells_of_a_difference(taken: Path) -> None:
     objects = replace(scene.objects, source=(spoilt, *scene.objects.source[1:]))
     sheet = scene_sheet(replace(scene, objects=objects), "t")
     part = np.abs(sheet[-300:].astype(int) - still[-300:])[..., -PANEL_PX:, :]
-    assert GAIN <= part.max()
+    assert part.max() >= GAIN
 
 
 @pytest.mark.skipif(not KITTI.is_dir(), reason="needs ../shared/data/kitti")

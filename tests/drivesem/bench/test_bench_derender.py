@@ -195,7 +195,7 @@ def _row(index: int, move_db: float, **changes: Any) -> Row:
     shape = Shape(1, "sedan", 60.0, 1.0, 0.8, 0.9 + 0.01 * index, 0.9)
     row = Row(
         index, "sun", "city", 3, (shape,), "sedan", (0.5, 0.0), 10.0, 0.1, edited, edited, 99.0, True,
-        1.0 + index, None,
+        1.0 + index, 1.0, None,
     )  # fmt: skip
     return replace(row, **changes)
 
