@@ -30,18 +30,17 @@ import numpy as np
 import torch
 import yaml
 
-from drivesem.synth.layout import LABEL_OF_KIND
 from drivesem.synth.light import Light, Panorama
 from drivesem.synth.soup import Material, Soup, creased_normals, make
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.meshes.load import Imported, import_mesh
 from scene_ir.meshes.lod import simplify
+from scene_ir.meshes.templates import KINDS
 from scene_ir.types import Mesh, Part
 
 SIDECAR = "vehicles.yaml"
 _SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
-VEHICLE_KINDS = tuple(kind for kind, label in LABEL_OF_KIND.items() if label in ("Car", "Van", "Truck"))
 _MOST_FACES = 20_000
 """Heavier meshes are simplified when read: a car 500 px high shows no more."""
 _PANE = (0.022, 0.025, 0.026)
@@ -100,7 +99,7 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True)
 class VehicleMesh:
-    """A vehicle from a file. name: the file's, its id; kind: one of VEHICLE_KINDS; size_lhw: usual size, m.
+    """A vehicle from a file. name: the file's, its id; kind: one of the templates' KINDS; size_lhw: usual size, m.
 
     Small, hashable and picklable: the triangles are read when asked for and few are kept.
     """
@@ -207,8 +206,8 @@ def _entry(field: str, raw: object) -> _Entry:
     if unknown:
         raise FormatError(field, f"keys among {', '.join(sorted(_KEYS))}", unknown[0])
     kind = raw.get("kind")
-    if kind is not None and kind not in VEHICLE_KINDS:
-        raise FormatError(f"{field}: kind", " or ".join(VEHICLE_KINDS), kind)
+    if kind is not None and kind not in KINDS:
+        raise FormatError(f"{field}: kind", " or ".join(KINDS), kind)
     up, front = str(raw.get("up", "auto")), str(raw.get("front", "auto"))
     if up not in ("auto", "y", "z", "-y"):
         raise FormatError(f"{field}: up", "auto, y, z or -y", up)

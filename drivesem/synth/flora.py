@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from drivesem.synth import mesh_kernels
-from drivesem.synth.soup import Material, Soup, balls, join, make, stick
+from drivesem.synth.soup import Material, Soup, balls, compact, join, make, stick
 
 _GREENS = np.array(
     [[0.075, 0.115, 0.03], [0.055, 0.095, 0.03], [0.10, 0.135, 0.04], [0.12, 0.14, 0.05], [0.05, 0.075, 0.035]],
@@ -112,10 +112,10 @@ def tree(identifier: int, detail: int) -> Soup:
             )
     number, size_m = _TREE_LEAVES[detail]
     parts += _crown(centres, radii, number, size_m, colour, np.random.default_rng([0x7EF, identifier, detail]))
-    return join(parts)
+    return compact(join(parts))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=128)
 def bush(identifier: int, detail: int) -> Soup:
     """A bush standing on the ground, about 1 m wide and high (scale it)."""
     rng = np.random.default_rng([0xB05, identifier])
@@ -126,7 +126,7 @@ def bush(identifier: int, detail: int) -> Soup:
     centres[0, 1] = -0.6
     number, size_m = ((140, 0.12), (520, 0.07), (2200, 0.036), (7500, 0.02))[detail]
     radii = np.repeat(size[:, None], 3, axis=1)
-    return join(_crown(centres, radii, number, size_m, colour, rng))
+    return compact(join(_crown(centres, radii, number, size_m, colour, rng)))
 
 
 def hedge(size_m: tuple[float, float, float], front: float, detail: int, rng: np.random.Generator) -> Soup:

@@ -1,5 +1,6 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
-# ruff: noqa: E501, UP018 - the line above; Warp needs int(0) to declare what a loop changes
+# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and evaluates
+# both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
 """What is done to triangles one by one, as Warp kernels: cutting, smoothing, bending; leaves around a crown."""
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ def cut_kernel(
                 until = wp.min(count, room)
                 for t in range(until):
                     at = base + 3 * t
-                    side = wp.vec3f(wp.dot(slots[at], reach), wp.dot(slots[at + 1], reach), wp.dot(slots[at + 2], reach))
+                    side = wp.vec3f(
+                        wp.dot(slots[at], reach), wp.dot(slots[at + 1], reach), wp.dot(slots[at + 2], reach)
+                    )
                     if wp.max(side) > SLIVER_M:
                         if wp.min(side) < -SLIVER_M:
                             up = wp.vec3i(int(side[0] > 0.0), int(side[1] > 0.0), int(side[2] > 0.0))
@@ -167,8 +170,12 @@ def bend_kernel(
         aside = wp.vec3f()
         for k in range(4):
             at = j * DEEP + k * WIDE
-            value = lattice[at] * bz[0] + lattice[at + 1] * bz[1] + lattice[at + 2] * bz[2] + lattice[at + 3] * bz[3]
-            slope = lattice[at] * sz[0] + lattice[at + 1] * sz[1] + lattice[at + 2] * sz[2] + lattice[at + 3] * sz[3]
+            value = (
+                lattice[at] * bz[0] + lattice[at + 1] * bz[1] + lattice[at + 2] * bz[2] + lattice[at + 3] * bz[3]
+            )
+            slope = (
+                lattice[at] * sz[0] + lattice[at + 1] * sz[1] + lattice[at + 2] * sz[2] + lattice[at + 3] * sz[3]
+            )
             across += value * by[k]
             down += value * sy[k]
             aside += slope * by[k]
@@ -268,7 +275,9 @@ def leaf_kernel(
 
 
 def _vectors(values: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, np.float32).reshape(-1, 3), dtype=wp.vec3f, copy=False, device="cpu")
+    return wp.array(
+        np.ascontiguousarray(values, np.float32).reshape(-1, 3), dtype=wp.vec3f, copy=False, device="cpu"
+    )
 
 
 def _indices(values: np.ndarray) -> wp.array:

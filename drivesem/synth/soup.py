@@ -173,12 +173,22 @@ quarter of a million products."""
 
 
 def _product(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Rows of three numbers (n, 3) times a matrix (3, 3): many rows at once are far quicker than n / 3 times three."""
+    """Rows (n, 3) of the points times a matrix (3, 3): far quicker at once than three rows at a time."""
     rows = points.reshape(-1, 3)
     out = np.empty(rows.shape, np.float32)
     for start in range(0, len(rows), _ROWS):
         np.matmul(rows[start : start + _ROWS], matrix, out=out[start : start + _ROWS])
     return out
+
+
+def compact(soup: Soup) -> Soup:
+    """The same triangles in less memory, to keep: what is zero all over is one number seen many times."""
+    plain = {
+        f.name: np.broadcast_to(np.zeros(1, values.dtype), values.shape)
+        for f in fields(Soup)
+        if not (values := getattr(soup, f.name)).any()
+    }
+    return replace(soup, **plain)
 
 
 def quad(points: np.ndarray) -> np.ndarray:

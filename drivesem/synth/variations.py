@@ -3,7 +3,7 @@ cameras."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,41 @@ MIXED = "mixed"
 """Not a variation of Virtual KITTI's: each street in weather of its own, as training sets want it."""
 _TURNS_DEG = {"15-deg-left": -15.0, "15-deg-right": 15.0, "30-deg-left": -30.0, "30-deg-right": 30.0}
 _WEATHERS = ("fog", "morning", "overcast", "rain", "sunset")
+
+
+@dataclass(frozen=True, slots=True)
+class _LowSun:
+    """Light of an hour: ranges of the sun's height and of haze, colours as in `Light`, factor of exposure."""
+
+    elevation_deg: tuple[float, float]
+    sun_colour: tuple[float, float, float]
+    zenith: tuple[float, float, float]
+    horizon: tuple[float, float, float]
+    ambient: tuple[float, float, float]
+    haze_per_m: tuple[float, float]
+    exposure: float
+
+
+_LOW_SUNS = {
+    "morning": _LowSun(
+        (14, 20),
+        (0.95, 0.80, 0.60),
+        (0.24, 0.40, 0.74),
+        (0.98, 0.90, 0.80),
+        (0.20, 0.22, 0.26),
+        (0.001, 0.0025),
+        1.05,
+    ),
+    "sunset": _LowSun(
+        (5, 9),
+        (0.85, 0.48, 0.22),
+        (0.22, 0.28, 0.48),
+        (1.0, 0.66, 0.42),
+        (0.21, 0.19, 0.22),
+        (0.0008, 0.002),
+        1.1,
+    ),
+}
 VARIATIONS = ("clone", *_TURNS_DEG, *_WEATHERS)
 """In Virtual KITTI's words. "clone" is a clear day."""
 
@@ -87,29 +122,18 @@ def _weather(setting: Setting, name: str, rng: np.random.Generator) -> tuple[Lig
             _clouded(light, grey), haze_per_m=float(rng.uniform(0.003, 0.006)), wet=float(rng.uniform(0.7, 1.0))
         )
         return light, replace(response, streaks=float(rng.uniform(0.4, 1.0)), noise=response.noise * 1.2)
-    if name == "morning":
-        light = replace(
-            light,
-            sun=_low_sun(setting, float(rng.uniform(14, 20))),
-            sun_colour=np.array([0.95, 0.80, 0.60]) * float(rng.uniform(0.75, 0.95)),
-            zenith=np.array([0.24, 0.40, 0.74]),
-            horizon=np.array([0.98, 0.90, 0.80]),
-            ambient=np.array([0.20, 0.22, 0.26]),
-            panorama=None,
-            haze_per_m=float(rng.uniform(0.001, 0.0025)),
-        )
-        return light, replace(response, exposure=exposed * 1.05)
+    low = _LOW_SUNS[name]
     light = replace(
         light,
-        sun=_low_sun(setting, float(rng.uniform(5, 9))),
-        sun_colour=np.array([0.85, 0.48, 0.22]) * float(rng.uniform(0.7, 0.9)),
-        zenith=np.array([0.22, 0.28, 0.48]),
-        horizon=np.array([1.0, 0.66, 0.42]),
-        ambient=np.array([0.21, 0.19, 0.22]),
+        sun=_low_sun(setting, float(rng.uniform(*low.elevation_deg))),
+        sun_colour=np.array(low.sun_colour) * float(rng.uniform(0.72, 0.92)),
+        zenith=np.array(low.zenith),
+        horizon=np.array(low.horizon),
+        ambient=np.array(low.ambient),
         panorama=None,
-        haze_per_m=float(rng.uniform(0.0008, 0.002)),
+        haze_per_m=float(rng.uniform(*low.haze_per_m)),
     )
-    return light, replace(response, exposure=exposed * 1.1)
+    return light, replace(response, exposure=exposed * low.exposure)
 
 
 def _clouded(light: Light, grey: float) -> Light:

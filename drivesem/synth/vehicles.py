@@ -101,10 +101,10 @@ def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
 
 @dataclass(frozen=True, slots=True)
 class VehicleShape:
-    """A vehicle in the unit box: n triangles that lie in the faces of a mesh. vertices (V, 3), faces (F, 3), normals
-    (F, 3, 3): of the mesh, and of its faces' corners; parent (n,) int32, share (n, 3, 3): as in `_Pieces`; material
-    (n,) uint8; albedo (n, 3), paint in a neutral tint; cell (n,) uint8: 1 + stroke of a plate's character that may
-    darken it, or 0.
+    """A vehicle in the unit box: n triangles that lie in the faces of a mesh. vertices (V, 3), faces (F, 3),
+    normals (F, 3, 3): of the mesh, and of its faces' corners; parent (n,) int32, share (n, 3, 3): as in
+    `_Pieces`; material (n,) uint8; albedo (n, 3), paint in a neutral tint; cell (n,) uint8: 1 + stroke of a
+    plate's character that may darken it, or 0.
     """
 
     vertices: np.ndarray
@@ -426,7 +426,8 @@ def _colour_key(colours: np.ndarray) -> np.ndarray:
 def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed: int, fine: bool) -> _Pieces:
     """Details painted on the faces that the templates' builder made of known materials."""
     rng = np.random.default_rng([0xCA2, KINDS.index(kind), seed])
-    pieces, ends = pieces.take(np.argsort(source, kind="stable")), np.cumsum(np.bincount(source + 1, minlength=len(solids.Material) + 1))
+    pieces = pieces.take(np.argsort(source, kind="stable"))
+    ends = np.cumsum(np.bincount(source + 1, minlength=len(solids.Material) + 1))
     found = [pieces.part(0, int(ends[0]))]
     groups = {m: pieces.part(int(ends[m]), int(ends[m + 1])) for m in solids.Material}
     sheet, car = groups[solids.Material.PAINT].albedo[:1], kind not in ("bus", "truck")
@@ -455,7 +456,7 @@ def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed:
     return _joined([*found, *groups.values()])
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=32)
 def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
     """A vehicle's mesh as triangles with details painted on; fine: with those seen from near only."""
     mesh, size = vehicle_mesh(kind, variant), np.array(typical_size_lhw(kind, variant), np.float32)

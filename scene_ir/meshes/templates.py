@@ -444,7 +444,7 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
     return assemble(solids, name)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def template(kind: str, variant: int = 0) -> Mesh:
     """A vehicle of one of the KINDS; each `variant` (>= 0) is another outline of its family, 0 the canonical one.
 
@@ -461,6 +461,7 @@ def template(kind: str, variant: int = 0) -> Mesh:
     return _car(shape, name)
 
 
+@lru_cache(maxsize=4096)
 def typical_size_lhw(kind: str, variant: int = 0) -> tuple[float, float, float]:
     """Length, height, width (m) that this variant's outline was drawn with: plausible for its kind."""
     _check(kind, variant)

@@ -198,7 +198,9 @@ def test_the_second_check_shares_no_code():
         if isinstance(n, ast.Import | ast.ImportFrom)
         for a in n.names
     }
-    assert imported <= {"__future__", "math", "cv2", "numpy", "numpy.typing", "scene_ir.types"}
+    assert imported <= {
+        *("__future__", "collections.abc", "math", "cv2", "numpy", "numpy.typing", "scene_ir.types")
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,404 @@
+"""Where vehicles stand, from a photograph and 2D boxes alone: a small network, and the ground they stand on.
+
+The network sees the photograph around a box and the box's own numbers, and says what the head of 3D-SDN (Yao et
+al., NeurIPS 2018, section 3.1) says: viewing angle as cosine and sine, offset of the projected centre, log sizes,
+log depth, template. Two departures: the angle is told within one of twelve bins (Mousavian et al., CVPR 2017), so
+that "front or back?" is a choice and not an average, and the depth comes with its own uncertainty. No deformation
+code: labels do not carry one, the fit to the outline finds its own, and within a kind shapes differ by less than a
+pixel of the network's input.
+
+Depths of the network and of the ground plane, which is estimated from all vehicles of the frame, are joined by
+their variances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from scene_ir.derender.maps import CAMERA_HEIGHT
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.meshes.outlines import KINDS
+from scene_ir.types import Camera, check_shape
+from scene_ir.weights import load_into, read_weights
+
+Array = NDArray[np.float32]
+
+WEIGHTS = Path(__file__).parent / "weights" / "pose.safetensors"
+"""What the package ships; `tools/train_pose.py` makes it."""
+CROP_HW = (64, 96)
+CONTEXT = 1.3
+"""Side of the crop, in sides of the box."""
+BINS = 12
+"""Of the viewing angle, 30 degrees each, centred at multiples of that."""
+NUMBERS = 9
+"""What the network is told of a box, see `box_numbers`."""
+MEAN_LHW = {"Car": (4.07, 1.62, 1.68), "Truck": (9.97, 3.30, 2.55)}
+"""m, of cars and vans together and of trucks and buses, in generated streets; KITTI's are within 6%."""
+_IS = {"Car": "Car", "Van": "Car", "Truck": "Truck"}
+_BORDER_PX = 2.0
+"""A box that comes this near to the image's border is cut by it."""
+_MEAN, _SPREAD = 0.45, 0.27
+"""Of the photograph's values, about."""
+_LEVEL_SIZE = np.array([-2.0, -2.6])
+"""Middle of log(width / focal) and log(height / focal)."""
+
+_PRIOR = (0.02, 0.015, 0.15)
+"""Standard deviations of the road's slope to the side and ahead, and of the camera's height, m."""
+_GIVEN = (0.004, 0.003, 0.03)
+"""The same of a plane that the caller knows."""
+_LEAST_SIGMA = 0.03
+"""Of the network's log depth: it saw generated pictures only."""
+_FOOT_PX, _FOOT_SHARE = 1.0, 0.02
+"""Error of the row where a vehicle stands: px, and share of its height in the image."""
+_HUBER = 1.5
+"""Standard deviations from which on a vehicle pulls at the plane, or the plane at a vehicle, no stronger."""
+
+
+class _Block(nn.Module):
+    """Convolution, normalisation, ReLU; added to its input where that has the same shape."""
+
+    def __init__(self, channels: int, out: int, stride: int) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(channels, out, 3, stride=stride, padding=1, bias=False)
+        self.normalisation = nn.BatchNorm2d(out)
+        self.residual = stride == 1 and channels == out
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu(self.normalisation(self.convolution(x)))
+        return x + y if self.residual else y
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What the network says of N boxes. bins (N, 12) logits; turn (N, 12, 2): cosine and sine, not normalised, of
+    the angle from each bin's centre; offset (N, 2): of the projected 3D centre from the box's centre, in box
+    sides; size (N, 3): log length, height, width over the class's means; depth (N,): log of the centre's depth
+    over that of a box of mean height; log_sigma (N,): of it; kind (N, 8): logits of `KINDS`.
+    """
+
+    bins: Tensor
+    turn: Tensor
+    offset: Tensor
+    size: Tensor
+    depth: Tensor
+    log_sigma: Tensor
+    kind: Tensor
+
+
+_OUT = (BINS, 2 * BINS, 2, 3, 1, 1, len(KINDS))
+
+
+class PoseNet(nn.Module):
+    """crops (N, 3, 64, 96) RGB in [0, 1] and numbers (N, 9) to `Said`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers = ((3, 16, 2), (16, 32, 2), (32, 32, 1), (32, 64, 2), (64, 64, 1), (64, 128, 2), (128, 128, 1))
+        self.blocks = nn.Sequential(*(_Block(*layer) for layer in layers))
+        self.squeeze = nn.Conv2d(128, 40, 1)
+        cells = 40 * (CROP_HW[0] // 16) * (CROP_HW[1] // 16)
+        self.hidden = nn.Linear(cells + NUMBERS, 160)
+        self.out = nn.Linear(160 + NUMBERS, sum(_OUT))
+
+    def forward(self, crops: Tensor, numbers: Tensor) -> Said:
+        x = ((crops - _MEAN) / _SPREAD).contiguous(memory_format=torch.channels_last)
+        x = F.relu(self.squeeze(self.blocks(x))).flatten(1)
+        x = F.relu(self.hidden(torch.cat([x, numbers], 1)))
+        bins, turn, offset, size, depth, log_sigma, kind = self.out(torch.cat([x, numbers], 1)).split(_OUT, 1)
+        return Said(
+            bins, turn.reshape(-1, BINS, 2), offset, size, depth[:, 0], log_sigma[:, 0].clamp(-4.5, 0.5), kind
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Vehicles in camera axes, one a box. translation (N, 3) m, bottom-face centre; yaw (N,) rad in [-pi, pi);
+    size_lhw (N, 3) m; kind: one of `KINDS` each; log_depth_sigma (N,): standard deviation of the depth's
+    logarithm; facing (N,) in [0.5, 1]: how sure it is which end is the front; ground (4,): the plane
+    n.x + d = 0, n up.
+    """
+
+    translation: Tensor
+    yaw: Tensor
+    size_lhw: Tensor
+    kind: tuple[str, ...]
+    log_depth_sigma: Tensor
+    facing: Tensor
+    ground: Tensor
+
+
+@lru_cache(maxsize=1)
+def shipped() -> PoseNet:
+    """The network with the package's weights, in eval mode. FormatError where they are missing or damaged."""
+    return load(WEIGHTS)
+
+
+def load(path: Path) -> PoseNet:
+    """The network with the weights of a file, in eval mode. FormatError naming file and key."""
+    network = PoseNet()
+    load_into(network, read_weights(path)[1], path)
+    network.requires_grad_(False)
+    return network.eval()
+
+
+def box_numbers(boxes_xyxy: Tensor, kinds: Sequence[str], camera: Camera) -> Tensor:
+    """What the network is told of boxes (N, 4) px, (N, 9): centre from the principal point over focal length (2),
+    log width and height over focal length about their means (2), whether the image's border cuts it left, above,
+    right, below (4), and whether it is a truck.
+    """
+    k = camera.intrinsics.to(boxes_xyxy)
+    focal, principal = torch.stack([k[0, 0], k[1, 1]]), torch.stack([k[0, 2], k[1, 2]])
+    centre = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - principal) / focal
+    size = torch.log((boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) / focal) - torch.from_numpy(_LEVEL_SIZE).to(centre)
+    limit = boxes_xyxy.new_tensor([camera.width - 1, camera.height - 1])
+    cut = torch.cat([boxes_xyxy[:, :2] <= _BORDER_PX, boxes_xyxy[:, 2:] >= limit - _BORDER_PX], 1)
+    truck = boxes_xyxy.new_tensor([float(_IS[kind] == "Truck") for kind in kinds])
+    return torch.cat([centre, size, cut.to(centre), truck[:, None]], 1)
+
+
+def crops_of(
+    image: NDArray[Any], boxes_xyxy: Array, size_hw: tuple[int, int] = CROP_HW, context: float = CONTEXT
+) -> NDArray[Any]:
+    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3), grey beyond the
+    image.
+
+    A crop is `context` times as wide and high as its box. Smaller ones are taken from a halved (quartered, ...)
+    picture, so that no pixel is skipped.
+    """
+    height, width = size_hw
+    halves = [image]
+    out = np.zeros((len(boxes_xyxy), height, width, 3), image.dtype)
+    grey = 0.5 if image.dtype.kind == "f" else 128
+    for i, (x0, y0, x1, y1) in enumerate(boxes_xyxy.astype(np.float64)):
+        wide, high = context * (x1 - x0), context * (y1 - y0)
+        level = max(int(math.log2(max(min(wide / width, high / height), 1.0))), 0)
+        while len(halves) <= level and min(halves[-1].shape[:2]) >= 2:
+            last = halves[-1]
+            even = last[: last.shape[0] // 2 * 2, : last.shape[1] // 2 * 2]
+            halves.append(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
+        level = min(level, len(halves) - 1)
+        scale = 0.5**level
+        # a pixel's centre is at its integer: crop column j shows image column left + (j + 1/2) * step
+        step = np.array([wide / width, high / height])
+        left = np.array([(x0 + x1 - wide) / 2, (y0 + y1 - high) / 2])
+        start = (left + 0.5 * step + 0.5) * scale - 0.5
+        to_image = np.array([[step[0] * scale, 0, start[0]], [0, step[1] * scale, start[1]]])
+        out[i] = cv2.warpAffine(
+            halves[level],
+            to_image,
+            (width, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(grey, grey, grey),
+        )
+    return out
+
+
+def mean_sizes(kinds: Sequence[str]) -> Tensor:
+    """Mean length, height, width (N, 3) m of the vehicles' classes."""
+    return torch.tensor([MEAN_LHW[_IS[kind]] for kind in kinds], dtype=torch.float32).reshape(-1, 3)
+
+
+def mean_depth(boxes_xyxy: Tensor, kinds: Sequence[str], camera: Camera) -> Tensor:
+    """Depth (N,) m at which a vehicle of mean height is as high as its box."""
+    return camera.intrinsics[1, 1] * mean_sizes(kinds)[:, 1] / (boxes_xyxy[:, 3] - boxes_xyxy[:, 1])
+
+
+def mirrored(numbers: Tensor) -> Tensor:
+    """The numbers of a box in the mirrored image."""
+    turned = numbers[:, [0, 1, 2, 3, 6, 5, 4, 7, 8]].clone()
+    turned[:, 0] = -turned[:, 0]
+    return turned
+
+
+def unmirrored(said: Said) -> Said:
+    """What was said of mirrored images, as of the images themselves: angle a becomes pi - a."""
+    bins = (BINS // 2 - torch.arange(BINS)) % BINS
+    return Said(
+        said.bins[:, bins],
+        said.turn[:, bins] * said.turn.new_tensor([1.0, -1.0]),
+        said.offset * said.offset.new_tensor([-1.0, 1.0]),
+        said.size,
+        said.depth,
+        said.log_sigma,
+        said.kind,
+    )
+
+
+def viewing_angle(said: Said) -> tuple[Tensor, Tensor]:
+    """The viewing angle alpha (N,) rad and how sure its direction is (N,) in [0.5, 1]: the likeliest bin and its
+    neighbours, each with its say; against the same, half a turn away.
+    """
+    chance = said.bins.softmax(1)
+    centre = torch.arange(BINS) * (2 * math.pi / BINS)
+    angle = centre + torch.atan2(said.turn[..., 1], said.turn[..., 0])
+    along = torch.arange(-1, 2)
+    around = chance + chance.roll(1, 1) + chance.roll(-1, 1)
+    best = around.argmax(1)
+    near = (best[:, None] + along) % BINS
+    weight = chance.gather(1, near)
+    chosen = angle.gather(1, near)
+    alpha = torch.atan2((weight * chosen.sin()).sum(1), (weight * chosen.cos()).sum(1))
+    ahead = around.gather(1, best[:, None])[:, 0]
+    behind = around.gather(1, ((best + BINS // 2) % BINS)[:, None])[:, 0]
+    return alpha, ahead / (ahead + behind).clamp(min=1e-9)
+
+
+def _both(network: PoseNet, crops: Tensor, numbers: Tensor) -> Said:
+    """What the network says of boxes, and of the same in the mirror, in the mean."""
+    one = network(crops, numbers)
+    other = unmirrored(network(crops.flip(3), mirrored(numbers)))
+    return Said(
+        torch.log(0.5 * (one.bins.softmax(1) + other.bins.softmax(1)) + 1e-9),
+        F.normalize(one.turn, dim=-1) + F.normalize(other.turn, dim=-1),
+        0.5 * (one.offset + other.offset),
+        0.5 * (one.size + other.size),
+        0.5 * (one.depth + other.depth),
+        0.5 * (one.log_sigma + other.log_sigma),
+        0.5 * (one.kind + other.kind),
+    )
+
+
+@torch.no_grad()
+def estimate(
+    photograph: Tensor,
+    boxes_xyxy: Tensor,
+    kinds: Sequence[str],
+    camera: Camera,
+    ground: Tensor | None = None,
+    network: PoseNet | None = None,
+) -> Poses:
+    """Poses and sizes of the vehicles in 2D boxes.
+
+    photograph (3, H, W) RGB in [0, 1]; boxes_xyxy (N, 4) px; kinds: "Car", "Van" or "Truck", one a box; ground
+    (4,): the plane n.x + d = 0 with n up, where it is known, otherwise it is estimated from the vehicles and a
+    camera 1.65 m above a level road; network: another than the shipped one. Raises ShapeError and RangeError.
+    """
+    check_shape("photograph", photograph, 3, camera.height, camera.width)
+    check_shape("boxes_xyxy", boxes_xyxy, None, 4)
+    if len(kinds) != len(boxes_xyxy):
+        raise ShapeError("kinds", f"{len(boxes_xyxy)}, one a box", len(kinds))
+    for i, kind in enumerate(kinds):
+        if kind not in _IS:
+            raise RangeError(f"kinds[{i}]", " or ".join(_IS), repr(kind))
+    boxes = boxes_xyxy.detach().cpu().float()
+    for i, box in enumerate(boxes):
+        if not bool(torch.isfinite(box).all() and (box[2:] > box[:2]).all()):
+            raise RangeError(f"boxes_xyxy[{i}]", "finite, with an area", box.tolist())
+    if ground is not None:
+        check_shape("ground", ground, 4)
+        if not bool(torch.isfinite(ground).all()) or float(ground[1]) >= 0:
+            raise RangeError("ground", "a finite plane whose normal points up", ground.tolist())
+    if not len(boxes):
+        plane, _ = fit_plane(np.zeros((0, 3)), np.zeros(0), *_known(ground))
+        nothing = torch.zeros(0)
+        return Poses(torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane))
+    image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
+    crops = torch.from_numpy(crops_of(image, boxes.numpy())).permute(0, 3, 1, 2)
+    said = _both(network or shipped(), crops, box_numbers(boxes, kinds, camera))
+    alpha, facing = viewing_angle(said)
+    size = mean_sizes(kinds) * said.size.exp()
+    depth = mean_depth(boxes, kinds, camera) * said.depth.exp()
+    sigma = said.log_sigma.exp().clamp(min=_LEAST_SIGMA)
+    centre_px = (boxes[:, :2] + boxes[:, 2:]) / 2 + said.offset * (boxes[:, 2:] - boxes[:, :2])
+    centre = back_project(centre_px, depth, camera)
+    foot = centre + size[:, 1:2] * torch.tensor([0.0, 0.5, 0.0])
+    scale, sigma, plane = _onto_ground(foot, size, sigma, camera, ground)
+    translation = foot * scale[:, None]
+    yaw = alpha + torch.atan2(translation[:, 0], translation[:, 2])
+    return Poses(
+        translation,
+        (yaw + math.pi) % (2 * math.pi) - math.pi,
+        size * scale[:, None],
+        tuple(KINDS[int(i)] for i in said.kind.argmax(1)),
+        sigma,
+        facing,
+        plane,
+    )
+
+
+def back_project(pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
+    """Points (N, 3) m in camera axes seen at pixels (N, 2) at depth z (N,) m."""
+    p = camera.matrix.to(pixels)
+    w = depth * p[2, 2] + p[2, 3]
+    y = (pixels[:, 1] * w - p[1, 2] * depth - p[1, 3]) / p[1, 1]
+    x = (pixels[:, 0] * w - p[0, 2] * depth - p[0, 3] - p[0, 1] * y) / p[0, 0]
+    return torch.stack([x, y, depth], 1)
+
+
+def _known(ground: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes and height (3,) of the plane before any vehicle is seen, and their standard deviations (3,)."""
+    if ground is None:
+        return np.array([0.0, 0.0, CAMERA_HEIGHT]), np.array(_PRIOR)
+    n = ground.double().cpu().numpy()
+    return -n[[0, 2, 3]] / n[1], np.array(_GIVEN)
+
+
+def _normal_form(plane: np.ndarray) -> Tensor:
+    normal = np.array([plane[0], -1.0, plane[1], plane[2]])
+    return torch.from_numpy((normal / np.linalg.norm(normal[:3])).astype(np.float32))
+
+
+def fit_plane(
+    points: np.ndarray, sigma: np.ndarray, expected: np.ndarray, spread: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The plane y = a x + b z + c, (3,), and its covariance (3, 3), from points (N, 3) m whose height above it is
+    known to sigma (N,) m, and what is expected of it (3,) with spread (3,). Iterated least squares, Huber's
+    weights.
+    """
+    design = np.stack([points[:, 0], points[:, 2], np.ones(len(points))], 1) / sigma[:, None]
+    goal = points[:, 1] / sigma
+    prior = np.diag(1 / spread)
+    plane = expected.copy()
+    weight = np.ones(len(points))
+    precision = prior**2
+    for _ in range(8):
+        weight = _HUBER / np.maximum(np.abs(design @ plane - goal), _HUBER)
+        precision = (design * weight[:, None]).T @ design + prior**2
+        plane = np.linalg.solve(precision, (design * weight[:, None]).T @ goal + prior**2 @ expected)
+    return plane, np.linalg.inv(precision)
+
+
+def _onto_ground(
+    foot: Tensor, size: Tensor, sigma: Tensor, camera: Camera, ground: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """By how much (N,) each vehicle is farther away, and larger, than the network thinks, so that it stands on
+    the ground; the uncertainty (N,) of the depth's logarithm after that; the plane (4,).
+
+    Along the ray to its foot (N, 3) a vehicle's size and depth grow together: what is seen stays the same. Each
+    one is held against the plane that the others stand on, so that no opinion counts twice.
+    """
+    points, spread = foot.double().numpy(), sigma.double().numpy()
+    known = _known(ground)
+    above = np.maximum(np.abs(points[:, 1]), 0.5) * spread
+    rows = _FOOT_PX + _FOOT_SHARE * float(camera.intrinsics[1, 1]) * size[:, 1].numpy() / points[:, 2]
+    foot_m = rows * points[:, 2] / float(camera.intrinsics[1, 1])
+    scale, left = np.ones(len(points)), spread.copy()
+    for i, point in enumerate(points):
+        others = np.arange(len(points)) != i
+        plane, covariance = fit_plane(points[others], np.hypot(above, foot_m)[others], *known)
+        at = np.array([point[0], point[2], 1.0])
+        slope = point[1] - plane[0] * point[0] - plane[1] * point[2]
+        if slope <= 0.1:
+            continue  # above the horizon: it does not stand on this plane
+        farther = math.log(plane[2] / slope)
+        doubt = math.sqrt(at @ covariance @ at + foot_m[i] ** 2) / max(plane[2], 0.5)
+        # what contradicts the network by more than their errors explain is a kerb, a hill or a cut box
+        trust = min(1.0, _HUBER / max(abs(farther) / math.hypot(doubt, spread[i]), 1e-9)) ** 2
+        own, its = 1 / spread[i] ** 2, trust / doubt**2
+        scale[i] = math.exp(farther * its / (own + its))
+        left[i] = (own + its) ** -0.5
+    plane, _ = fit_plane(points * scale[:, None], np.hypot(above, foot_m), *known)
+    return torch.from_numpy(scale).float(), torch.from_numpy(left).float(), _normal_form(plane)

@@ -1,0 +1,63 @@
+"""Weights of the small networks of this package: safetensors files, read without the library of that name.
+
+Format: eight bytes, the header's length; the header, JSON; then raw little-endian numbers
+(github.com/huggingface/safetensors, "Format").
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+_DTYPES = {"F16": "<f2", "F32": "<f4"}
+_HEADER = 8
+"""Bytes that tell the header's length."""
+
+
+def read_weights(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Metadata and float32 tensors of a file of float16 or float32 tensors. FormatError naming file and key."""
+    data = files.read_bytes(path)
+    length = int.from_bytes(data[:_HEADER], "little")
+    if len(data) < _HEADER or len(data) - _HEADER < length:
+        raise FormatError(str(path), "a safetensors file", f"{len(data)} bytes, cut short")
+    try:
+        header: Any = json.loads(data[_HEADER : _HEADER + length])
+    except ValueError as error:
+        raise FormatError(f"{path}: header", "JSON", str(error).splitlines()[0]) from error
+    if not isinstance(header, dict):
+        raise FormatError(f"{path}: header", "an object", type(header).__name__)
+    metadata = header.pop("__metadata__", {})
+    body = memoryview(data)[_HEADER + length :]
+    return metadata, {name: _tensor(f"{path}: {name}", entry, body) for name, entry in header.items()}
+
+
+def _tensor(where: str, entry: Any, body: memoryview) -> Tensor:
+    try:
+        dtype = np.dtype(_DTYPES[entry["dtype"]])
+        start, end = entry["data_offsets"]
+        values = np.frombuffer(body[start:end], dtype).reshape(entry["shape"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(where, f"{' or '.join(_DTYPES)} of its shape and offsets", repr(error)[:80]) from error
+    if not np.isfinite(values).all():
+        raise FormatError(where, "finite numbers", "NaN or infinity")
+    return torch.from_numpy(values.astype(np.float32))
+
+
+def load_into(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+    """Give a network the tensors of a file. FormatError naming file and key where they are another network's."""
+    expected = {k: v for k, v in network.state_dict().items() if v.is_floating_point()}
+    for name in sorted(expected.keys() ^ tensors.keys()):
+        found = "none" if name in expected else "a tensor"
+        raise FormatError(f"{path}: {name}", "a tensor" if name in expected else "none", found)
+    for name, tensor in tensors.items():
+        if tensor.shape != expected[name].shape:
+            raise FormatError(f"{path}: {name}", f"shape {tuple(expected[name].shape)}", tuple(tensor.shape))
+    network.load_state_dict(tensors, strict=False)

@@ -1,0 +1,603 @@
+"""Train the network that places vehicles from 2D boxes (`scene_ir.derender.pose`) on generated streets.
+
+    drivesem synth --layout kitti --split train --seed 31 --frames 2000 --out build/pose_train
+    drivesem synth --layout kitti --split heldout --seed 32 --frames 150 --out build/pose_held
+    python tools/train_pose.py --data build/pose_train --held-out build/pose_held
+
+A run goes on from its last checkpoint, to the same bytes as one that was never stopped (one thread, one machine).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors.boxes import iou_matrix
+from detectors.registry import load_detector, read_weights, write_weights
+from detectors.types import CLASSES
+from drivesem.data.classes import VEHICLES
+from drivesem.data.kitti import KittiDataset
+from scene_ir import files
+from scene_ir.derender import pose
+from scene_ir.derender.pose import KINDS, PoseNet, Said
+from scene_ir.types import Camera, Category, Frame, Labels
+
+STORE_HW = (96, 144)
+STORE_CONTEXT = 1.75
+"""Crops are kept larger than the network's, so that boxes can be jittered."""
+LEAST_HEIGHT_PX, MOST_OCCLUSION = 16.0, 2
+JITTER = 0.035
+"""Standard deviation of a box's sides, in its sides: the shipped detector's on generated frames is about that."""
+CLASS_OF = {Category.CAR: "Car", Category.TRUCK: "Truck"}
+
+
+def class_of(kind: str) -> str:
+    """What a detector calls a vehicle of a data set's type."""
+    return CLASS_OF[VEHICLES[kind]]
+
+
+def usable(labels: Labels) -> list[int]:
+    """Rows of vehicles that are large and visible enough, with a 3D box."""
+    height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    good = (height >= LEAST_HEIGHT_PX) & (labels.occlusion <= MOST_OCCLUSION) & torch.isfinite(labels.yaw)
+    good &= labels.truncation < 0.7
+    return [i for i in range(len(labels.kind)) if labels.kind[i] in VEHICLES and bool(good[i])]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of K boxes. box (K, 4) px; centre (K, 2) px and depth (K,) m of the 3D centre; alpha (K,) rad;
+    size (K, 3) m; kind (K,) index into KINDS, -1 where not known; truck (K,) bool; camera (K, 6): focal lengths,
+    principal point, width, height.
+    """
+
+    box: Tensor
+    centre: Tensor
+    depth: Tensor
+    alpha: Tensor
+    size: Tensor
+    kind: Tensor
+    truck: Tensor
+    camera: Tensor
+
+    def rows(self, index: Tensor) -> Truth:
+        """Those of an index."""
+        return Truth(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def truth_of(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequence[int]) -> Truth:
+    """What is known of the labels `rows`."""
+    index = torch.tensor(rows, dtype=torch.int64)
+    size, foot = labels.size_lhw[index], labels.translation[index]
+    middle = foot - size[:, 1:2] * torch.tensor([0.0, 0.5, 0.0])
+    clip = middle @ camera.matrix[:, :3].T + camera.matrix[:, 3]
+    k = camera.intrinsics
+    told = torch.tensor([k[0, 0], k[1, 1], k[0, 2], k[1, 2], camera.width, camera.height])
+    return Truth(
+        labels.boxes_xyxy[index],
+        clip[:, :2] / clip[:, 2:],
+        middle[:, 2],
+        labels.yaw[index] - torch.atan2(foot[:, 0], foot[:, 2]),
+        size,
+        torch.tensor(kinds, dtype=torch.int64),
+        torch.tensor([class_of(labels.kind[i]) == "Truck" for i in rows]),
+        told.expand(len(rows), 6),
+    )
+
+
+class CropStore:
+    """Crops and truths of a folder that the generator wrote, kept in `cache`."""
+
+    def __init__(self, root: Path, cache: Path) -> None:
+        manifest = files.read_json(root / "manifest.json")
+        dataset = KittiDataset(root)
+        crops_path, truth_path = cache / "crops.npy", cache / "truth.npz"
+        stamp = cache / "frames.json"
+        told = {"seed": manifest["seed"], "split": manifest["split"], "frames": len(manifest["frames"])}
+        self.frames = len(manifest["frames"])
+        if not (stamp.is_file() and json.loads(stamp.read_text()) == told):
+            cache.mkdir(parents=True, exist_ok=True)
+            crops, truths = [], []
+            for entry in manifest["frames"]:
+                frame = dataset.frame(f"{entry['number']:06d}")
+                assert frame.labels is not None
+                rows = usable(frame.labels)
+                if not rows:
+                    continue
+                models = [o["model"] for o in entry["objects"] if o["labelled"]]
+                kinds = [KINDS.index(models[i].rsplit("-", 1)[0]) for i in rows]
+                truths.append(truth_of(frame.labels, rows, frame.camera, kinds))
+                image = (frame.photograph.numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
+                crops.append(pose.crops_of(image, truths[-1].box.numpy(), STORE_HW, STORE_CONTEXT))
+            np.save(crops_path, np.concatenate(crops))
+            joined = {f.name: np.concatenate([getattr(t, f.name) for t in truths]) for f in fields(Truth)}
+            files.write_npz(truth_path, joined)
+            files.write_json(stamp, told)
+        self.crops = np.load(crops_path, mmap_mode="r")
+        arrays = files.read_npz(truth_path)
+        self.truth = Truth(*(torch.from_numpy(arrays[f.name]) for f in fields(Truth)))
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What the network should say of N boxes: see `Said`; kind (N,) int64."""
+
+    alpha: Tensor
+    offset: Tensor
+    size: Tensor
+    depth: Tensor
+    kind: Tensor
+
+
+def numbers_of(truth: Truth, box: Tensor) -> Tensor:
+    """`pose.box_numbers` of boxes that differ from the truth's, each with its own camera."""
+    rows = []
+    for i in range(len(box)):
+        fx, fy, cx, cy, width, height = truth.camera[i].tolist()
+        camera = Camera(torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), int(height), int(width))
+        rows.append(pose.box_numbers(box[i : i + 1], ["Truck" if truth.truck[i] else "Car"], camera))
+    return torch.cat(rows)
+
+
+def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, Tensor, Targets]:
+    """Crops (N, 3, 64, 96), numbers (N, 9) and targets of a step: a function of the seed and the step alone."""
+    rng = np.random.default_rng([settings.seed, step])
+    per_epoch = max(len(store) // settings.batch, 1)
+    epoch, place = divmod(step, per_epoch)
+    order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
+    chosen = np.sort(order[place * settings.batch : (place + 1) * settings.batch])
+    n = len(chosen)
+    truth = store.truth.rows(torch.from_numpy(chosen))
+    crops = torch.from_numpy(store.crops[chosen]).permute(0, 3, 1, 2).float() / 255
+    sides = (truth.box[:, 2:] - truth.box[:, :2]).repeat(1, 2)
+    limit = truth.camera[:, 4:6] - 1
+    cut = torch.cat([truth.box[:, :2] <= 2, truth.box[:, 2:] >= limit - 2], 1)
+    amount = rng.choice([0.4, 1.0, 2.0], (n, 1), p=[0.3, 0.5, 0.2])
+    noise = torch.from_numpy(np.clip(rng.normal(0, JITTER, (n, 4)), -0.1, 0.1) * amount).float()
+    box = truth.box + noise * sides * ~cut
+    size, middle = box[:, 2:] - box[:, :2], (box[:, :2] + box[:, 2:]) / 2
+    shift = (middle - (truth.box[:, :2] + truth.box[:, 2:]) / 2) * 2 / sides[:, :2] / STORE_CONTEXT
+    stretch = size / sides[:, :2] * pose.CONTEXT / STORE_CONTEXT
+    theta = torch.zeros(n, 2, 3)
+    theta[:, 0, 0], theta[:, 1, 1], theta[:, :, 2] = stretch[:, 0], stretch[:, 1], shift
+    grid = F.affine_grid(theta, [n, 3, *pose.CROP_HW], align_corners=False)
+    crops = F.grid_sample(crops, grid, padding_mode="border", align_corners=False)
+    kinds = ["Truck" if t else "Car" for t in truth.truck]
+    numbers = numbers_of(truth, box)
+    offset = (truth.centre - middle) / size
+    mean = truth.camera[:, 1] * pose.mean_sizes(kinds)[:, 1] / size[:, 1]
+    alpha = truth.alpha
+    flip = torch.from_numpy(rng.random(n) < 0.5)
+    crops = torch.where(flip[:, None, None, None], crops.flip(3), crops)
+    numbers = torch.where(flip[:, None], pose.mirrored(numbers), numbers)
+    alpha = torch.where(flip, math.pi - alpha, alpha)
+    offset = torch.where(flip[:, None], offset * torch.tensor([-1.0, 1.0]), offset)
+    targets = Targets(
+        alpha, offset, torch.log(truth.size / pose.mean_sizes(kinds)), torch.log(truth.depth / mean), truth.kind
+    )
+    return looks(crops, rng), numbers, targets
+
+
+def looks(crops: Tensor, rng: np.random.Generator) -> Tensor:
+    """The crops in other light, other colours, less sharp, noisier, partly hidden."""
+    n = len(crops)
+
+    def draw(low: float, high: float) -> Tensor:
+        return torch.from_numpy(rng.uniform(low, high, (n, 1, 1, 1))).float()
+
+    crops = crops.clamp(1e-4, 1) ** torch.exp(draw(-0.5, 0.5))
+    grey = crops.mean(1, keepdim=True)
+    crops = grey + (crops - grey) * torch.where(draw(0, 1) < 0.1, torch.zeros(1), draw(0.5, 1.6))
+    tint = torch.from_numpy(rng.normal(1, 0.06, (n, 3, 1, 1))).float()
+    level = crops.mean((1, 2, 3), keepdim=True)
+    crops = (level + (crops - level) * draw(0.6, 1.4)) * tint * draw(0.7, 1.3)
+    # some as small as far cars are, some blurred
+    less = int(rng.integers(0, n // 2 + 1))
+    if less:
+        factor = float(rng.uniform(0.25, 0.8))
+        small = F.interpolate(crops[:less], scale_factor=factor, mode="area")
+        crops = torch.cat([F.interpolate(small, crops.shape[2:], mode="bilinear"), crops[less:]])
+    crops = crops + torch.from_numpy(rng.normal(0, 1, crops.shape).astype(np.float32)) * draw(0, 0.04)
+    height, width = crops.shape[2:]
+    for i in np.nonzero(rng.random(n) < 0.25)[0]:
+        h, w = int(rng.uniform(0.1, 0.5) * height), int(rng.uniform(0.1, 0.4) * width)
+        y, x = int(rng.integers(0, height - h)), int(rng.integers(0, width - w))
+        crops[i, :, y : y + h, x : x + w] = torch.from_numpy(rng.uniform(0, 1, (3, 1, 1))).float()
+    return crops.clamp(0, 1)
+
+
+def loss_terms(said: Said, wanted: Targets) -> dict[str, Tensor]:
+    """Terms of the loss, means over boxes, and their weighted sum "total"."""
+    centre = torch.arange(pose.BINS) * (2 * math.pi / pose.BINS)
+    apart = wanted.alpha[:, None] - centre
+    near = (apart.cos() > math.cos(1.5 * math.pi / pose.BINS)).float()
+    # the truth belongs to the two nearest bins by its distance to each
+    share = (1 - (torch.atan2(apart.sin(), apart.cos()).abs() / (2 * math.pi / pose.BINS))).clamp(min=0)
+    bins = -(share * said.bins.log_softmax(1)).sum(1)
+    direction = F.normalize(said.turn, dim=-1, eps=1e-6)
+    apart_vector = (direction - torch.stack([apart.cos(), apart.sin()], -1)).square().sum(-1)
+    turn = (torch.sqrt(apart_vector + 1e-4) * near).sum(1) / near.sum(1)
+    depth = (said.depth - wanted.depth).abs() * torch.exp(-said.log_sigma) + said.log_sigma
+    terms = {
+        "bins": bins.mean(),
+        "turn": turn.mean(),
+        "offset": F.smooth_l1_loss(said.offset, wanted.offset, beta=0.02),
+        "size": F.smooth_l1_loss(said.size, wanted.size, beta=0.02),
+        "depth": depth.mean(),
+        "depth_error": (said.depth - wanted.depth).abs().mean(),
+        "kind": F.cross_entropy(said.kind, wanted.kind),
+    }
+    weights = {"bins": 1.0, "turn": 4.0, "offset": 4.0, "size": 3.0, "depth": 0.3, "depth_error": 4.0, "kind": 0.3}
+    return terms | {"total": sum((weights[k] * v for k, v in terms.items()), torch.zeros(()))}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides on the result of a run."""
+
+    steps: int = 4000
+    batch: int = 64
+    rate: float = 2e-3
+    weight_decay: float = 0.02
+    average: float = 0.998
+    seed: int = 0
+
+
+class Run:
+    """Weights, their average and the optimiser's state."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        torch.manual_seed(settings.seed)
+        self.network = PoseNet().train()
+        self.average = {k: v.detach().clone() for k, v in self._tensors().items()}
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay
+        )
+        self.seconds = 0.0
+        self.step_number = 0
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {k: v for k, v in self.network.state_dict().items() if v.is_floating_point()}
+
+    def step(self, store: CropStore) -> dict[str, float]:
+        """One step of the optimiser; the terms of the loss."""
+        start, step, settings = time.perf_counter(), self.step_number, self.settings
+        crops, numbers, targets = batch_of(store, step, settings)
+        warm = min(1.0, (step + 1) / 100)
+        rate = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        terms = loss_terms(self.network(crops, numbers), targets)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms["total"].backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        if not bool(torch.isfinite(norm)):
+            raise FloatingPointError(f"step {step}: expected a finite gradient, found a norm of {float(norm)}")
+        self.optimiser.step()
+        decay = min(settings.average, (1 + step) / (10 + step))
+        for name, tensor in self._tensors().items():
+            self.average[name].lerp_(tensor.detach(), 1 - decay)
+        self.step_number += 1
+        self.seconds += time.perf_counter() - start
+        return {k: float(v.detach()) for k, v in terms.items()}
+
+    def averaged(self) -> PoseNet:
+        """A network with the averaged weights, rounded as they are shipped, in eval mode."""
+        network = PoseNet()
+        network.load_state_dict({k: v.half().float() for k, v in self.average.items()}, strict=False)
+        network.requires_grad_(False)
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write the checkpoint, atomically."""
+        tensors = {f"weights.{k}": v.detach().contiguous() for k, v in self._tensors().items()}
+        tensors |= {f"average.{k}": v.contiguous() for k, v in self.average.items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{index}.{k}": v.contiguous() for k, v in state.items()}
+        settings = json.dumps(asdict(self.settings), sort_keys=True)
+        facts = {"step": str(self.step_number), "seconds": repr(self.seconds), "settings": settings}
+        write_weights(path, facts, tensors)
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint. ValueError where it belongs to other settings."""
+        facts, tensors = read_weights(path)
+        wanted = json.dumps(asdict(self.settings), sort_keys=True)
+        if facts["settings"] != wanted:
+            raise ValueError(f"{path}: expected settings {wanted}, found {facts['settings']}")
+        state: dict[int, dict[str, Tensor]] = {}
+        weights: dict[str, Tensor] = {}
+        for key, tensor in tensors.items():
+            section, name = key.split(".", 1)
+            if section == "weights":
+                weights[name] = tensor
+            elif section == "average":
+                self.average[name].copy_(tensor)
+            else:
+                index, part = name.split(".", 1)
+                state.setdefault(int(index), {})[part] = tensor
+        self.network.load_state_dict(weights, strict=False)
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        self.step_number, self.seconds = int(facts["step"]), float(facts["seconds"])
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of K vehicles: yaw (K,) rad, depth (K,) relative, size (K, 3) relative, right template (K,); moderate (K,):
+    whether KITTI's moderate level has it.
+    """
+
+    yaw: np.ndarray
+    depth: np.ndarray
+    size: np.ndarray
+    kind: np.ndarray
+    moderate: np.ndarray
+    place_m: np.ndarray
+
+    def summary(self) -> dict[str, float]:
+        """The figures of the model card over all these vehicles."""
+        yaw = np.degrees(self.yaw)
+        if not len(yaw):
+            return {"vehicles": 0}
+        flipped = yaw > 90
+        figures = {
+            "vehicles": len(yaw),
+            "yaw_deg": float(np.median(yaw)),
+            "yaw_deg_p90": float(np.percentile(yaw, 90)),
+            "flipped": float(flipped.mean()),
+            "axis_deg": float(np.median(np.minimum(yaw, 180 - yaw))),
+            "depth_pc": 100 * float(np.median(self.depth)),
+            "depth_pc_p90": 100 * float(np.percentile(self.depth, 90)),
+            "place_m": float(np.median(self.place_m)),
+        }
+        figures |= {f"{n}_pc": 100 * float(np.median(s)) for n, s in zip("lhw", self.size.T, strict=True)}
+        return figures | {"kind": float(self.kind.mean())}
+
+    def chosen(self, mask: np.ndarray) -> Errors:
+        """Those of a mask."""
+        return Errors(*(getattr(self, f.name)[mask] for f in fields(self)))
+
+
+def judge(
+    frames: Sequence[tuple[Frame, list[int]]], network: PoseNet, found: Sequence[Found] | None = None
+) -> Errors:
+    """Errors of the estimate on frames, whose vehicles' templates are given too (-1: not known). Boxes are the
+    labels', or what was `found`, of which those count that meet a label (IoU of at least 0.5).
+    """
+    rows: list[tuple[float, ...]] = []
+    for number, (frame, kinds) in enumerate(frames):
+        labels = frame.labels
+        assert labels is not None
+        index = usable(labels)
+        classes = [class_of(labels.kind[i]) for i in index]
+        boxes, answers = labels.boxes_xyxy[index], list(range(len(index)))
+        if found is not None:
+            overlap = iou_matrix(boxes, found[number].boxes_xyxy)
+            boxes, classes = found[number].boxes_xyxy, list(found[number].kinds)
+            best = overlap.max(1) if overlap.numel() else None
+            answers = [
+                int(best.indices[i]) if best is not None and float(best.values[i]) >= 0.5 else -1
+                for i in range(len(index))
+            ]
+        poses = pose.estimate(frame.photograph, boxes, classes, frame.camera, network=network)
+        for row, answer in zip(index, answers, strict=True):
+            if answer < 0:
+                continue
+            turn = float(poses.yaw[answer] - labels.yaw[row])
+            z = float(labels.translation[row, 2])
+            size = torch.log(poses.size_lhw[answer] / labels.size_lhw[row]).abs().tolist()
+            height = float(labels.boxes_xyxy[row, 3] - labels.boxes_xyxy[row, 1])
+            moderate = height >= 25 and int(labels.occlusion[row]) <= 1 and float(labels.truncation[row]) <= 0.3
+            rows.append(
+                (
+                    abs(math.remainder(turn, 2 * math.pi)),
+                    abs(float(poses.translation[answer, 2]) / z - 1),
+                    *size,
+                    float(KINDS.index(poses.kind[answer]) == kinds[row]),
+                    float(moderate),
+                    float((poses.translation[answer] - labels.translation[row]).norm()),
+                )
+            )
+    table = np.array(rows, np.float64).reshape(-1, 8)
+    return Errors(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5], table[:, 6] > 0, table[:, 7])
+
+
+@dataclass(frozen=True)
+class Found:
+    """A detector's vehicles in one frame: boxes_xyxy (N, 4) px, kinds."""
+
+    boxes_xyxy: Tensor
+    kinds: tuple[str, ...]
+
+
+def detected(frames: Sequence[tuple[Frame, list[int]]]) -> list[Found]:
+    """What the shipped detector finds, from its score of best F1 on."""
+    detector = load_detector("squeezedet")
+    out = []
+    for frame, _ in frames:
+        with torch.no_grad():
+            seen = detector.decode(detector(frame.photograph[None]))[0]
+        rows = [
+            i
+            for i in range(len(seen))
+            if float(seen.scores[i]) >= detector.t_star and CLASSES[int(seen.labels[i])] in ("Car", "Truck")
+        ]
+        out.append(Found(seen.boxes_xyxy[rows], tuple(CLASSES[int(seen.labels[i])] for i in rows)))
+    return out
+
+
+def frames_of(root: Path, limit: int | None = None) -> list[tuple[Frame, list[int]]]:
+    """Labelled frames of a KITTI folder, and each label's template, -1 where no manifest tells it."""
+    dataset = KittiDataset(root)
+    manifest = root / "manifest.json"
+    models = {}
+    if manifest.is_file():
+        for entry in files.read_json(manifest)["frames"]:
+            models[f"{entry['number']:06d}"] = [o["model"] for o in entry["objects"] if o["labelled"]]
+    out = []
+    for identifier in dataset.identifiers[:limit]:
+        frame = dataset.frame(identifier)
+        assert frame.labels is not None
+        names = [m.rsplit("-", 1)[0] for m in models.get(identifier, [""] * len(frame.labels.kind))]
+        out.append((frame, [KINDS.index(n) if n in KINDS else -1 for n in names]))
+    return out
+
+
+CARD = """# Poses of vehicles from 2D boxes, trained on generated streets
+
+- Architecture: `scene_ir.derender.pose.PoseNet`, {parameters:,} parameters: seven 3x3 convolutions on a 64x96 crop
+  around the box, the box's numbers beside them, the head of 3D-SDN (viewing angle in twelve bins with cosine and
+  sine, offset of the centre, log sizes, log depth with its uncertainty, template; no deformation code).
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
+- Data: {frames:,} frames of the project's own generator (`{data}`), {boxes:,} vehicles at least 16 px high; no
+  photographs. Boxes jittered by {jitter:.1%} of their sides, mirrored, other light and colours, blur, noise, parts
+  hidden.
+- Training: {steps:,} steps of {batch}, {minutes:.0f} minutes on one CPU thread, seed {seed}.
+
+## Figures
+
+Held out: {held_out} frames of the generator (shapes and streets that no training frame has). "moderate": at least
+25 px high, occlusion at most 1, truncation at most 0.3; "all": at least 16 px, occlusion at most 2, truncation
+below 0.7. KITTI: {real} labelled frames, labels hidden from the estimate but for the boxes where so stated. The
+detector is `squeezedet` at its t*; a vehicle counts where its box meets the label's (IoU of at least 0.5). Yaw
+errors are medians over all, turned ones (front taken for back) included; the axis is yaw but for half turns.
+
+{table}
+
+{remark}
+## Limits
+
+It has seen generated pictures only, taken 1.65 m above the road (3 cm up or down): from other heights its depths
+are biased, and so are those of vehicles much larger or smaller than others of their class. Not for use in a
+vehicle.
+
+## Train it again
+
+```
+drivesem synth --layout kitti --split train --seed {train_seed} --frames {frames} --out {data}
+drivesem synth --layout kitti --split heldout --seed {held_seed} --frames {held_out} --out {held_name}
+python tools/train_pose.py --data {data} --held-out {held_name} --steps {steps} --seed {seed}
+```
+"""
+COLUMNS = (
+    *(("vehicles", "vehicles", "{:.0f}"), ("yaw_deg", "yaw", "{:.2f}°"), ("yaw_deg_p90", "yaw, 90%", "{:.1f}°")),
+    *(("flipped", "turned", "{:.1%}"), ("axis_deg", "axis", "{:.2f}°"), ("depth_pc", "depth", "{:.1f}%")),
+    *(("depth_pc_p90", "depth, 90%", "{:.1f}%"), ("place_m", "place", "{:.2f} m"), ("l_pc", "length", "{:.1f}%")),
+    *(("h_pc", "height", "{:.1f}%"), ("w_pc", "width", "{:.1f}%"), ("kind", "template", "{:.0%}")),
+)
+
+
+def table_of(figures: dict[str, dict[str, float]]) -> str:
+    """A Markdown table, a row a set of vehicles."""
+    lines = ["| boxes | " + " | ".join(c[1] for c in COLUMNS) + " |", "| --- |" + " --- |" * len(COLUMNS)]
+    for name, row in figures.items():
+        cells = [
+            text.format(row[key]) if key in row and not math.isnan(row[key]) else "" for key, _, text in COLUMNS
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def all_figures(network: PoseNet, held: Path, real: Path | None) -> dict[str, dict[str, float]]:
+    """Figures of the model card by the name of their row."""
+    figures = {}
+    for name, root in (("generated", held), ("KITTI", real)):
+        if root is None:
+            continue
+        frames = frames_of(root)
+        found = detected(frames)
+        for boxes, errors in (("labels", judge(frames, network)), ("detector", judge(frames, network, found))):
+            for level, part in (("moderate", errors.chosen(errors.moderate)), ("all", errors)):
+                row = part.summary()
+                if name == "KITTI":
+                    row.pop("kind", None)
+                figures[f"{name}, {boxes}, {level}"] = row
+    return figures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="generated frames to train on, KITTI layout")
+    parser.add_argument("--held-out", type=Path, required=True, help="generated frames to judge by, KITTI layout")
+    parser.add_argument("--also", type=Path, help="labelled photographs whose figures go into the model card")
+    parser.add_argument("--run", type=Path, default=Path("build/pose"), help="checkpoint, log, crops")
+    parser.add_argument("--out", type=Path, default=pose.WEIGHTS)
+    parser.add_argument("--steps", type=int, default=Settings.steps)
+    parser.add_argument("--batch", type=int, default=Settings.batch)
+    parser.add_argument("--rate", type=float, default=Settings.rate)
+    parser.add_argument("--seed", type=int, default=Settings.seed)
+    parser.add_argument(
+        "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
+    )
+    parser.add_argument("--remark", default="", help="a remark for the model card")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    settings = Settings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
+    store = CropStore(arguments.data, arguments.run / "train")
+    print(f"{len(store)} vehicles in {store.frames} frames", flush=True)
+    run = Run(settings)
+    checkpoint = arguments.run / "checkpoint.safetensors"
+    if checkpoint.is_file():
+        run.load(checkpoint)
+        print(f"going on from step {run.step_number}", flush=True)
+    end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
+    held = frames_of(arguments.held_out)
+    log_path = arguments.run / "log.csv"
+    with log_path.open("a", newline="") as file:
+        log = csv.writer(file)
+        while run.step_number < end:
+            terms = run.step(store)
+            if run.step_number % 50 == 0:
+                log.writerow([run.step_number, f"{run.seconds:.1f}", *(f"{v:.4f}" for v in terms.values())])
+                file.flush()
+            if run.step_number % 250 == 0 or run.step_number == end:
+                run.save(checkpoint)
+            if run.step_number % 500 == 0:
+                errors = judge(held[:40], run.averaged())
+                told = {k: round(v, 3) for k, v in errors.chosen(errors.moderate).summary().items()}
+                print(f"step {run.step_number}, {run.seconds:.0f} s: {told}", flush=True)
+    if run.step_number < settings.steps:
+        return
+    network = run.averaged()
+    figures = all_figures(network, arguments.held_out, arguments.also)
+    print(table_of(figures))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    write_weights(arguments.out, facts, {k: v.half().contiguous() for k, v in run.average.items()})
+    card = CARD.format(
+        parameters=sum(p.numel() for p in network.parameters()),
+        file=arguments.out.name,
+        frames=store.frames,
+        data=f"build/{arguments.data.name}",
+        boxes=len(store),
+        jitter=JITTER,
+        steps=settings.steps,
+        batch=settings.batch,
+        minutes=run.seconds / 60,
+        seed=settings.seed,
+        held_out=len(held),
+        held_name=f"build/{arguments.held_out.name}",
+        train_seed=files.read_json(arguments.data / "manifest.json")["seed"],
+        held_seed=files.read_json(arguments.held_out / "manifest.json")["seed"],
+        real=len(KittiDataset(arguments.also)) if arguments.also else 0,
+        table=table_of(figures),
+        remark=f"{arguments.remark}\n" if arguments.remark else "",
+    )
+    files.write_text(arguments.out.with_suffix(".md"), card)
+
+
+if __name__ == "__main__":
+    main()
