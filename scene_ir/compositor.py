@@ -11,6 +11,7 @@ Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pi
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
@@ -248,7 +249,8 @@ class Compositor:
             self._corners = self._trimmed_corners(objects, base)
         self._size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
-        self._pack = _Pack([self])
+        # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
+        self._pack = _Pack([weakref.proxy(self)])
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
         self._texels, self._shadows, self.fixed = None, None, None

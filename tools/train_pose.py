@@ -82,8 +82,6 @@ def truth_of(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequenc
     size, foot = labels.size_lhw[index], labels.translation[index]
     middle = foot - size[:, 1:2] * torch.tensor([0.0, 0.5, 0.0])
     clip = middle @ camera.matrix[:, :3].T + camera.matrix[:, 3]
-    k = camera.intrinsics
-    told = torch.tensor([k[0, 0], k[1, 1], k[0, 2], k[1, 2], camera.width, camera.height])
     return Truth(
         labels.boxes_xyxy[index],
         clip[:, :2] / clip[:, 2:],
@@ -91,8 +89,8 @@ def truth_of(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequenc
         labels.yaw[index] - torch.atan2(foot[:, 0], foot[:, 2]),
         size,
         torch.tensor(kinds, dtype=torch.int64),
-        torch.tensor([class_of(labels.kind[i]) == "Truck" for i in rows]),
-        told.expand(len(rows), 6),
+        pose.is_truck([labels.kind[i] for i in rows]),
+        pose.camera_numbers(camera).expand(len(rows), 6),
     )
 
 
@@ -143,16 +141,6 @@ class Targets:
     kind: Tensor
 
 
-def numbers_of(truth: Truth, box: Tensor) -> Tensor:
-    """`pose.box_numbers` of boxes that differ from the truth's, each with its own camera."""
-    rows = []
-    for i in range(len(box)):
-        fx, fy, cx, cy, width, height = truth.camera[i].tolist()
-        camera = Camera(torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), int(height), int(width))
-        rows.append(pose.box_numbers(box[i : i + 1], ["Truck" if truth.truck[i] else "Car"], camera))
-    return torch.cat(rows)
-
-
 def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, Tensor, Targets]:
     """Crops (N, 3, 64, 96), numbers (N, 9) and targets of a step: a function of the seed and the step alone."""
     rng = np.random.default_rng([settings.seed, step])
@@ -165,7 +153,7 @@ def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, T
     crops = torch.from_numpy(store.crops[chosen]).permute(0, 3, 1, 2).float() / 255
     sides = (truth.box[:, 2:] - truth.box[:, :2]).repeat(1, 2)
     limit = truth.camera[:, 4:6] - 1
-    cut = torch.cat([truth.box[:, :2] <= 2, truth.box[:, 2:] >= limit - 2], 1)
+    cut = torch.cat([truth.box[:, :2] <= pose.BORDER_PX, truth.box[:, 2:] >= limit - pose.BORDER_PX], 1)
     amount = rng.choice([0.4, 1.0, 2.0], (n, 1), p=[0.3, 0.5, 0.2])
     noise = torch.from_numpy(np.clip(rng.normal(0, JITTER, (n, 4)), -0.1, 0.1) * amount).float()
     box = truth.box + noise * sides * ~cut
@@ -177,7 +165,7 @@ def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, T
     grid = F.affine_grid(theta, [n, 3, *pose.CROP_HW], align_corners=False)
     crops = F.grid_sample(crops, grid, padding_mode="border", align_corners=False)
     kinds = ["Truck" if t else "Car" for t in truth.truck]
-    numbers = numbers_of(truth, box)
+    numbers = pose.box_numbers(box, truth.truck, truth.camera)
     offset = (truth.centre - middle) / size
     mean = truth.camera[:, 1] * pose.mean_sizes(kinds)[:, 1] / size[:, 1]
     alpha = truth.alpha
@@ -211,7 +199,8 @@ def looks(crops: Tensor, rng: np.random.Generator) -> Tensor:
         factor = float(rng.uniform(0.25, 0.8))
         small = F.interpolate(crops[:less], scale_factor=factor, mode="area")
         crops = torch.cat([F.interpolate(small, crops.shape[2:], mode="bilinear"), crops[less:]])
-    crops = crops + torch.from_numpy(rng.normal(0, 1, crops.shape).astype(np.float32)) * draw(0, 0.04)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    crops = crops + torch.randn(crops.shape, generator=generator) * draw(0, 0.04)
     height, width = crops.shape[2:]
     for i in np.nonzero(rng.random(n) < 0.25)[0]:
         h, w = int(rng.uniform(0.1, 0.5) * height), int(rng.uniform(0.1, 0.4) * width)

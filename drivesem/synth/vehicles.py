@@ -46,10 +46,25 @@ Plane = tuple[tuple[float, float, float], float]
 
 @dataclass(frozen=True, slots=True)
 class _Base:
-    """The mesh's own faces at their size in metres: corners (F, 3, 3), outward directions (F, 3)."""
+    """The mesh's own faces at their size in metres: corners (F, 3, 3), outward directions (F, 3), and the least and
+    greatest coordinates (F, 3) of their corners."""
 
     corners: np.ndarray
     facing: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, corners: np.ndarray, normals: np.ndarray) -> _Base:
+        """Of faces' corners and the normals (F, 3, 3) there."""
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        return cls(corners, _mean(normals), low, high)
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Means (n, 3) of three corners' values (n, 3, 3): np.mean takes five times as long over an axis of three."""
+    return (values[:, 0] + values[:, 1] + values[:, 2]) / np.float32(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +90,7 @@ class _Pieces:
 
     def middle(self, base: _Base) -> np.ndarray:
         """Centroids (n, 3) m."""
-        share = (self.share[:, 0] + self.share[:, 1] + self.share[:, 2]) / np.float32(3)
-        return np.einsum("ni,nij->nj", share, base.corners[self.parent])
+        return np.einsum("ni,nij->nj", _mean(self.share), base.corners[self.parent])
 
     def facing(self, base: _Base) -> np.ndarray:
         """Outward directions (n, 3) of the faces."""
@@ -88,8 +102,7 @@ def _joined(pieces: list[_Pieces]) -> _Pieces:
 
 
 def _extent(base: _Base, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
-    corners = base.corners[pieces.parent].reshape(-1, 3)
-    return corners.min(axis=0), corners.max(axis=0)
+    return base.low[pieces.parent].min(axis=0), base.high[pieces.parent].max(axis=0)
 
 
 def divided(base: _Base, pieces: _Pieces, planes: list[Plane]) -> _Pieces:
@@ -324,14 +337,19 @@ def _grille(base: _Base, pieces: _Pieces, rng: np.random.Generator) -> _Pieces:
 def _seam(base: _Base, pieces: _Pieces, mask: np.ndarray, plane: Plane, width_m: float) -> _Pieces:
     """A dark gap along a plane over the faces of a mask."""
     normal, offset = plane
-    reach = (base.corners @ np.asarray(normal, np.float32) - np.float32(offset))[pieces.parent]
-    near = mask & (reach.max(axis=1) > -width_m / 2) & (reach.min(axis=1) < width_m / 2)
-    if not near.any():
+    near = np.flatnonzero(mask)
+    reach = base.corners[pieces.parent[near]] @ np.asarray(normal, np.float32) - np.float32(offset)
+    a, b, c = reach[:, 0], reach[:, 1], reach[:, 2]
+    above, below = np.maximum(np.maximum(a, b), c), np.minimum(np.minimum(a, b), c)
+    near = near[(above > -width_m / 2) & (below < width_m / 2)]
+    if not len(near):
         return pieces
+    others = np.ones(len(mask), bool)
+    others[near] = False
     part = divided(base, pieces.take(near), [(normal, offset - width_m / 2), (normal, offset + width_m / 2)])
     inside = np.abs(part.middle(base) @ np.asarray(normal) - offset) < width_m / 2
     part.material[inside], part.albedo[inside] = Material.TRIM, _DARK
-    return _joined([pieces.take(~near), part])
+    return _joined([pieces.take(others), part])
 
 
 def _seams(
@@ -462,11 +480,11 @@ def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
     mesh, size = vehicle_mesh(kind, variant), np.array(typical_size_lhw(kind, variant), np.float32)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     colours = (
-        mesh.colours.numpy()[faces].mean(axis=1) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
+        _mean(mesh.colours.numpy()[faces]) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
     )
     corners = vertices[faces] * size
     smooth = mesh_kernels.creased_normals(vertices * size, faces)
-    base = _Base(corners, (smooth[:, 0] + smooth[:, 1] + smooth[:, 2]) / np.float32(3))
+    base = _Base.of(corners, smooth)
     table = np.array([int(_PART_MATERIAL[Part(p)]) for p in range(len(Part))], np.uint8)
     pieces = _Pieces(
         parent=np.arange(len(faces)),

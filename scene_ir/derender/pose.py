@@ -47,11 +47,11 @@ NUMBERS = 9
 MEAN_LHW = {"Car": (4.07, 1.62, 1.68), "Truck": (9.97, 3.30, 2.55)}
 """m, of cars and vans together and of trucks and buses, in generated streets; KITTI's are within 6%."""
 _IS = {"Car": "Car", "Van": "Car", "Truck": "Truck"}
-_BORDER_PX = 2.0
+BORDER_PX = 2.0
 """A box that comes this near to the image's border is cut by it."""
 _MEAN, _SPREAD = 0.45, 0.27
 """Of the photograph's values, about."""
-_LEVEL_SIZE = np.array([-2.0, -2.6])
+_LEVEL_SIZE = (-2.0, -2.6)
 """Middle of log(width / focal) and log(height / focal)."""
 
 _PRIOR = (0.02, 0.015, 0.15)
@@ -153,26 +153,35 @@ def load(path: Path) -> PoseNet:
     return network.eval()
 
 
-def box_numbers(boxes_xyxy: Tensor, kinds: Sequence[str], camera: Camera) -> Tensor:
+def box_numbers(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
     """What the network is told of boxes (N, 4) px, (N, 9): centre from the principal point over focal length (2),
     log width and height over focal length about their means (2), whether the image's border cuts it left, above,
-    right, below (4), and whether it is a truck.
+    right, below (4), and whether it is a truck. trucks (N,) bool; cameras (N or 1, 6): see `camera_numbers`.
     """
-    k = camera.intrinsics.to(boxes_xyxy)
-    focal, principal = torch.stack([k[0, 0], k[1, 1]]), torch.stack([k[0, 2], k[1, 2]])
+    focal, principal, limit = cameras[:, :2], cameras[:, 2:4], cameras[:, 4:] - 1
     centre = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - principal) / focal
-    size = torch.log((boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) / focal) - torch.from_numpy(_LEVEL_SIZE).to(centre)
-    limit = boxes_xyxy.new_tensor([camera.width - 1, camera.height - 1])
-    cut = torch.cat([boxes_xyxy[:, :2] <= _BORDER_PX, boxes_xyxy[:, 2:] >= limit - _BORDER_PX], 1)
-    truck = boxes_xyxy.new_tensor([float(_IS[kind] == "Truck") for kind in kinds])
-    return torch.cat([centre, size, cut.to(centre), truck[:, None]], 1)
+    size = torch.log((boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) / focal) - boxes_xyxy.new_tensor(_LEVEL_SIZE)
+    cut = torch.cat([boxes_xyxy[:, :2] <= BORDER_PX, boxes_xyxy[:, 2:] >= limit - BORDER_PX], 1)
+    return torch.cat([centre, size, cut.to(centre), trucks.to(centre)[:, None]], 1)
+
+
+def camera_numbers(camera: Camera) -> Tensor:
+    """Focal lengths, principal point, width, height of a camera, (1, 6) px."""
+    k = camera.intrinsics.float()
+    size = k.new_tensor([camera.width, camera.height])
+    return torch.cat([k.diagonal()[:2], k[:2, 2], size])[None]
+
+
+def is_truck(kinds: Sequence[str]) -> Tensor:
+    """Which of the vehicles are trucks or buses, (N,) bool."""
+    return torch.tensor([_IS[kind] == "Truck" for kind in kinds], dtype=torch.bool)
 
 
 def crops_of(
     image: NDArray[Any], boxes_xyxy: Array, size_hw: tuple[int, int] = CROP_HW, context: float = CONTEXT
 ) -> NDArray[Any]:
-    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3), grey beyond the
-    image.
+    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3), grey
+    beyond the image.
 
     A crop is `context` times as wide and high as its box. Smaller ones are taken from a halved (quartered, ...)
     picture, so that no pixel is skipped.
@@ -307,7 +316,7 @@ def estimate(
         return Poses(torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane))
     image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     crops = torch.from_numpy(crops_of(image, boxes.numpy())).permute(0, 3, 1, 2)
-    said = _both(network or shipped(), crops, box_numbers(boxes, kinds, camera))
+    said = _both(network or shipped(), crops, box_numbers(boxes, is_truck(kinds), camera_numbers(camera)))
     alpha, facing = viewing_angle(said)
     size = mean_sizes(kinds) * said.size.exp()
     depth = mean_depth(boxes, kinds, camera) * said.depth.exp()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -246,6 +248,23 @@ def test_truncated_vehicle_is_the_photograph_and_can_be_pulled_into_view(street:
     mask = truth.object_id == 1
     assert float((pulled.object_id == 1)[mask].to(torch.float64).mean()) > 0.97
     assert float((pulled.image - truth.image).abs().mean(dim=0)[mask].mean()) < 0.08
+
+
+def test_a_compositor_is_freed_with_its_last_user_and_leaves_its_gradients_usable(photographed: SceneIR) -> None:
+    yaw = photographed.objects.yaw.clone().requires_grad_(True)
+    gc.collect()
+    gc.disable()
+    try:
+        compositor = Compositor(photographed)
+        image = compositor.render(photographed.with_objects(yaw=yaw)).image
+        gone = weakref.ref(compositor)
+        del compositor
+        assert gone() is None
+        image.square().mean().backward()
+    finally:
+        gc.enable()
+    assert yaw.grad is not None
+    assert bool(torch.isfinite(yaw.grad).all())
 
 
 def test_no_objects(photographed: SceneIR) -> None:
