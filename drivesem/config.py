@@ -100,8 +100,12 @@ class Attack(Common):
 
 @dataclass(frozen=True)
 class Derender(Common):
-    """Take labelled photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
+    """Take photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
 
+    photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
+    """A photograph without labels: vehicles are found by the shipped detector and placed by a small network."""
+    focal: float | None = None
+    """Focal length of PHOTO in px; by default EXIF's, or 0.58 of its longer side."""
     dataset: str = DEMO
     """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
@@ -263,6 +267,12 @@ def validate(config: Command) -> None:
                 "--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root
             )
     if isinstance(config, Derender):
+        if config.photo is not None and config.dataset != DEMO:
+            raise UsageError("PHOTO", "no --dataset beside it", f"--dataset {config.dataset}")
+        if config.focal is not None and config.photo is None:
+            raise UsageError("--focal", "a PHOTO beside it", "none")
+        if config.focal is not None and not (math.isfinite(config.focal) and config.focal > 0):
+            raise UsageError("--focal", "positive px", config.focal)
         if config.velodyne and config.dataset != "kitti":
             raise UsageError("--velodyne", "--dataset kitti beside it", f"--dataset {config.dataset}")
         if config.device != "cpu":

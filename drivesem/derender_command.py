@@ -1,4 +1,4 @@
-"""`drivesem derender`: a scene folder for each frame of a data set."""
+"""`drivesem derender`: a scene folder for each frame of a data set, or for one photograph."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from drivesem.config import Derender
 from drivesem.pool import outcomes
 from drivesem.run_folder import PRESENTATION, claim
 from drivesem.scene_sheet import write_scene_sheet
-from drivesem.sources import SceneSource, open_source
+from drivesem.sources import PlainPhotograph, SceneSource, open_source
 from scene_ir.errors import SceneError
 from scene_ir.io import count_objects, load_scene, save_scene
 
@@ -74,7 +74,7 @@ def run(config: Derender) -> int:
     """Take apart the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     config = replace(config, fit=config.fit and not config.fast, fast=False)
-    out = Path(config.out or f"scenes/{config.dataset}")
+    out = Path(config.out or f"scenes/{config.dataset if config.photo is None else Path(config.photo).stem}")
     worker = _Worker(config, out)
     claim(out, config, partial(_clear, worker.source.identifiers()), (*PRESENTATION, "sheet"))
     names = list(islice(worker.source.identifiers(), config.limit))
@@ -92,6 +92,9 @@ def run(config: Derender) -> int:
         *(TimeElapsedColumn(), TimeRemainingColumn()),
     )
     console = Console(stderr=True)
+    if isinstance(worker.source, PlainPhotograph):
+        focal = worker.source.focal
+        console.print(f"camera: focal length {focal.length_px:.0f} px ({focal.source})", soft_wrap=True)
     with Progress(*columns, console=console, disable=not todo) as progress:
         task = progress.add_task("taking frames apart", total=len(todo))
         for name, outcome in outcomes(worker.take_apart, partial(_in_process, config, out), todo, config):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from drivesem.config import DEMO, Attack, Derender
-from scene_ir.types import SceneIR
+from scene_ir.types import Frame, SceneIR
 
 DEMO_SCENES = 10
 
@@ -72,8 +72,41 @@ class PhotographSource:
         return derender(self._dataset.frame(identifier), self._settings)
 
 
+class PlainPhotograph:
+    """One photograph without labels: vehicles are found and placed by the shipped networks."""
+
+    def __init__(self, path: Path, config: Derender) -> None:
+        from drivesem.label_free import focal_of, settings_for
+        from scene_ir.derender.derender import DerenderSettings
+
+        self._path = path
+        self.focal = focal_of(path, config.focal)
+        self._settings = settings_for(DerenderSettings(fit=config.fit))
+
+    def identifiers(self) -> Iterator[str]:
+        return iter([self._path.stem])
+
+    def has_vehicles(self, identifier: str) -> bool:
+        from drivesem.data.classes import vehicle_count
+
+        return vehicle_count(self._frame().labels) > 0
+
+    def scene(self, identifier: str) -> SceneIR:
+        from scene_ir.derender.derender import derender
+
+        return derender(self._frame(), self._settings)
+
+    def _frame(self) -> Frame:
+        from drivesem.label_free import detect, label_free, photograph
+
+        frame = photograph(self._path, self.focal.length_px if self.focal.source == "given" else None)
+        return label_free(frame, detect(frame))
+
+
 def open_source(config: Attack | Derender) -> SceneSource:
     """The source that the configuration names. Raises SceneError for an unknown or unreadable data set."""
+    if isinstance(config, Derender) and config.photo is not None:
+        return PlainPhotograph(Path(config.photo), config)
     if config.dataset == DEMO:
         return DemoSource(config.seed, config.limit or DEMO_SCENES)
     return PhotographSource(config)

@@ -32,7 +32,7 @@ from drivesem.synth.demo import take_apart
 from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
 from drivesem.synth.layout import Actor, Road, clearance, footprint
-from drivesem.synth.render import blocks
+from drivesem.synth.view import blocks
 from scene_ir import blend, files, surfaces
 from scene_ir.compositor import Compositor
 from scene_ir.derender import silhouette

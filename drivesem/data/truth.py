@@ -12,8 +12,8 @@ from scene_ir.types import Camera, Labels
 SKY_CM = 65535
 """Depth of the sky (Virtual KITTI)."""
 OCCLUSION_STEPS = (0.9, 0.5, 0.1)
-"""Visible fractions above which an object counts as occlusion 0, 1, 2 (KITTI's codes); below all, 3. With these the
-codes are shared out among rendered vehicles as they are in KITTI's labels, which people gave by eye."""
+"""Visible fractions above which an object counts as occlusion 0, 1, 2 (KITTI's codes); below all, 3. With
+these the codes are shared out among rendered vehicles as they are in KITTI's labels, which people gave by eye."""
 
 
 def occlusion_of(visible: float) -> int:

@@ -22,8 +22,8 @@ from drivesem.synth.frames import (
     table,
 )
 from drivesem.synth.layout import LayoutSettings
-from drivesem.synth.render import blocks
 from drivesem.synth.soup import GROUND
+from drivesem.synth.view import blocks
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
 from scene_ir.sources import solve_sources

@@ -10,8 +10,8 @@ import torch
 
 from drivesem.data.truth import SKY_CM, Exposure, TrackedObject
 from drivesem.synth.frames import SynthFrame, Truth
-from drivesem.synth.render import View
 from drivesem.synth.soup import Semantic
+from drivesem.synth.view import View
 from scene_ir.geometry import yaw_matrix
 
 CLASS_NAMES = tuple(

@@ -25,24 +25,12 @@ from drivesem.synth.layout import (
 )
 from drivesem.synth.light import Light, draw_light, draw_response
 from drivesem.synth.noise import noise_set
-from drivesem.synth.render import (
-    SUPERSAMPLING,
-    Setting,
-    Shadow,
-    Sight,
-    View,
-    blocks,
-    fine_matrix,
-    pixel_sums,
-    rasterise,
-    render,
-    render_without_actors,
-    see,
-)
+from drivesem.synth.render import fine_matrix, nearest, pixel_sums, rasterise, render, render_without_actors, see
 from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed, transformed
 from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
 from drivesem.synth.vehicles import instance_ffd
+from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
@@ -454,7 +442,7 @@ def render_frame(
     plain = see(street, view) if with_background else None
     empty = None if plain is None else render_without_actors(plain, picture, setting)
     behind = plain or sight
-    nearest = sight.nearest()
+    closest = nearest(sight)
     tracks = np.array([0, *(a.track + 1 for a in plan.actors), 0], np.uint16)  # owner -1, the sky, reads the last
     vehicles = {t.actor.model for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(
@@ -463,9 +451,9 @@ def render_frame(
         background_depth_m=None if plain is None else plain.depth_m,
         labels=_labels(truths),
         truths=tuple(truths),
-        depth_m=sight.depth.reshape(-1)[nearest],
-        semantic=sight.semantic.reshape(-1)[nearest],
-        instance=tracks[sight.owner.reshape(-1)[nearest]],
+        depth_m=sight.depth.reshape(-1)[closest],
+        semantic=sight.semantic.reshape(-1)[closest],
+        instance=tracks[sight.owner.reshape(-1)[closest]],
         owner=sight.owner,
         ground_material=blocks(behind.material)[0],
         setting=setting,

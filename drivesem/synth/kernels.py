@@ -10,7 +10,7 @@ holds both together. Rows and pixels are dealt out to the threads, so the result
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,12 +28,10 @@ from drivesem.synth.shading import (
     ground_light,
 )
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
+from drivesem.synth.view import Setting, Shadow, Sight, SunMaps
 from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
 from scene_ir.raster.launch import halves, launch, start_warp, threads
 from scene_ir.raster.verbs import NEAR_M
-
-if TYPE_CHECKING:
-    from drivesem.synth.render import Setting, Shadow, Sight, SunMaps
 
 start_warp()
 wp.set_module_options(OPTIONS)

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 from drivesem.synth import kernels
-from drivesem.synth.layout import Road
-from drivesem.synth.light import Light, Response, develop, sky_radiance
-from drivesem.synth.noise import NoiseSet, white_noise
+from drivesem.synth.light import develop, sky_radiance
+from drivesem.synth.noise import white_noise
 from drivesem.synth.shading import (
     LEAF_DEPTH_M,
     SHADOW_OFFSET_M,
@@ -26,91 +25,24 @@ from drivesem.synth.shading import (
     unit,
 )
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
+from drivesem.synth.view import (
+    SHADOW_VIEWS_M,
+    SUPERSAMPLING,
+    Setting,
+    Shadow,
+    Sight,
+    SunMaps,
+    View,
+    blocks,
+)
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
-from scene_ir.types import Camera
 
 Backend = Literal["warp", "reference"]
 """Kernels, or the plain numpy that defines what they compute."""
-SUPERSAMPLING = 2
-"""Samples a pixel along each axis."""
 _SHADOW_TEXELS = 1024
-_SHADOW_VIEWS_M = ((-15.0, 15.0, 1.0, 31.0), (-56.0, 56.0, -2.0, 110.0))
-"""Rectangles (x0, x1, z0, z1) of the ground that the near and the far shadow map cover, m to the right and ahead
-of the camera."""
 _SHADOW_DISTANCE_M = 3000.0
 """The sun stands this far away in the reference's shadow maps: it bends walls of 20 m by 3 cm."""
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of
-    projection in camera axes (KITTI's camera 2 sits beside the origin). height_m: of the axes' origin above the
-    ground. position_xz: of the origin, m; heading: rad that the camera is turned to the right, part of `rotation`.
-    """
-
-    camera: Camera
-    rotation: np.ndarray
-    height_m: float
-    position_xz: tuple[float, float] = (0.0, 0.0)
-    heading: float = 0.0
-
-    @property
-    def origin(self) -> np.ndarray:
-        """The origin (3,) of camera axes in world axes."""
-        return np.array([self.position_xz[0], -self.height_m, self.position_xz[1]])
-
-    @property
-    def centre(self) -> np.ndarray:
-        """The centre of projection (3,) in camera axes."""
-        matrix = self.camera.matrix.double().numpy()
-        return -np.linalg.solve(matrix[:, :3], matrix[:, 3])
-
-    def to_camera(self, world: np.ndarray) -> np.ndarray:
-        """Camera axes of world points (..., 3)."""
-        return (world - self.origin) @ self.rotation.T
-
-    def to_world(self, points: np.ndarray) -> np.ndarray:
-        """World axes of camera-space points (..., 3)."""
-        return points @ self.rotation.astype(points.dtype) + self.origin.astype(points.dtype)
-
-    @property
-    def up(self) -> np.ndarray:
-        """The ground's normal (3,) in camera axes."""
-        return self.rotation @ np.array([0.0, -1.0, 0.0])
-
-
-@dataclass(frozen=True, slots=True)
-class Shadow:
-    """A footprint under which the sky is hidden: corners' centre (x, z), yaw, size_lhw, in world axes."""
-
-    position_xz: tuple[float, float]
-    yaw: float
-    size_lhw: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """What a frame is rendered with, apart from the triangles."""
-
-    view: View
-    road: Road
-    light: Light
-    response: Response
-    noise: NoiseSet
-    grain_seed: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SunMaps:
-    """Shadow maps. rows (3, 4): camera axes about the centre to x, z on the ground, to the right and ahead of the
-    camera, and the distance along the sun's rays; depth (views, 2, texels, texels): the least of it, the second
-    axis is surroundings, actors; areas: the views' (x0, x1, z0, z1), m.
-    """
-
-    rows: np.ndarray
-    depth: np.ndarray
-    areas: tuple[tuple[float, float, float, float], ...] = _SHADOW_VIEWS_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,30 +55,6 @@ class Picture:
     developed: np.ndarray
     touched: np.ndarray
     sun_maps: SunMaps | None
-
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """What the camera sees, at twice the resolution. faces: the triangles, at least those in view. face (2H, 2W)
-    index into them, -1 in the sky; depth (2H, 2W) m, inf in the sky; material (2H, 2W) uint8; owner (2H, 2W)
-    int32, -1 in the sky; semantic (2H, 2W) uint8, a `Semantic`.
-    """
-
-    faces: Soup
-    face: np.ndarray
-    depth: np.ndarray
-    material: np.ndarray
-    owner: np.ndarray
-    semantic: np.ndarray
-
-    def nearest(self) -> np.ndarray:
-        """(H, W) int64 flat indices into the fine arrays: of each pixel's samples, the nearest to the camera."""
-        return kernels.nearest(self.depth)
-
-    @property
-    def depth_m(self) -> np.ndarray:
-        """(H, W) m, of the nearest of a pixel's samples, inf in the sky."""
-        return np.minimum.reduce(blocks(self.depth))
 
 
 def _in_front(points: np.ndarray, view: View) -> np.ndarray:
@@ -171,12 +79,6 @@ def _extent(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest (F,) of three corners' values (F, 3)."""
     a, b, c = values[:, 0], values[:, 1], values[:, 2]
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-
-
-def blocks(values: np.ndarray) -> list[np.ndarray]:
-    """The samples of all pixels, one (H, W) array for each place inside a pixel."""
-    n = SUPERSAMPLING
-    return [values[dy::n, dx::n] for dy in range(n) for dx in range(n)]
 
 
 def pixel_sums(samples: np.ndarray) -> np.ndarray:
@@ -224,15 +126,15 @@ def sun_maps(soup: Soup, setting: Setting, backend: Backend = "warp") -> SunMaps
     shift = to_map @ (to_ground @ view.to_world(view.centre) - [*view.position_xz, 0.0])
     placing = np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32)
     if backend == "warp":
-        return SunMaps(placing, kernels.sun_depth(soup, placing, _SHADOW_VIEWS_M, _SHADOW_TEXELS))
+        return SunMaps(placing, kernels.sun_depth(soup, placing, SHADOW_VIEWS_M, _SHADOW_TEXELS))
     ground = np.isin(soup.material, GROUND)
     corners = soup.corners[~ground]
     actor = soup.owner[~ground] > 0
     placed = corners @ rows.T.astype(np.float32) + shift.astype(np.float32)
-    depth = np.full((len(_SHADOW_VIEWS_M), 2, _SHADOW_TEXELS, _SHADOW_TEXELS), np.inf, np.float32)
+    depth = np.full((len(SHADOW_VIEWS_M), 2, _SHADOW_TEXELS, _SHADOW_TEXELS), np.inf, np.float32)
     size = _SHADOW_TEXELS
     ends = [_extent(placed[..., 0]), _extent(placed[..., 1])]
-    for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
+    for i, (x0, x1, z0, z1) in enumerate(SHADOW_VIEWS_M):
         inside = (ends[0][1] > x0) & (ends[0][0] < x1) & (ends[1][1] > z0) & (ends[1][0] < z1)
         for j, chosen in enumerate((inside & ~actor, inside & actor)):
             points = placed[chosen]
@@ -266,7 +168,7 @@ def _lit(
     share = np.ones(len(towards), np.float32)
     pending = np.ones(len(towards), bool)
     size = _SHADOW_TEXELS
-    for i, (x0, x1, z0, z1) in enumerate(_SHADOW_VIEWS_M):
+    for i, (x0, x1, z0, z1) in enumerate(SHADOW_VIEWS_M):
         texel = (x1 - x0) / size
         steep = SHADOW_OFFSET_M + SHADOW_OFFSET_TEXELS * texel * slope
         offset = np.where(leaf[towards], LEAF_DEPTH_M, steep).astype(np.float32)
@@ -339,6 +241,11 @@ def _open_sky(
         open_sky[ground[near]] *= (1 - np.minimum(dark, 0.97)).astype(np.float32)
         hemmed[ground[near]] |= dark > 0
     return open_sky, hemmed
+
+
+def nearest(sight: Sight) -> np.ndarray:
+    """(H, W) int64 flat indices into the fine arrays: of each pixel's samples, the nearest to the camera."""
+    return kernels.nearest(sight.depth)
 
 
 def see(soup: Soup, view: View, backend: Backend = "warp") -> Sight:

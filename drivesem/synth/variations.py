@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivesem.synth.light import Light, Response
-from drivesem.synth.render import Setting, View
+from drivesem.synth.view import Setting, View
 from scene_ir.errors import RangeError
 
 MIXED = "mixed"

@@ -46,8 +46,8 @@ Plane = tuple[tuple[float, float, float], float]
 
 @dataclass(frozen=True, slots=True)
 class _Base:
-    """The mesh's own faces at their size in metres: corners (F, 3, 3), outward directions (F, 3), and the least and
-    greatest coordinates (F, 3) of their corners."""
+    """The mesh's own faces at their size in metres: corners (F, 3, 3), outward directions (F, 3), and the least
+    and greatest coordinates (F, 3) of their corners."""
 
     corners: np.ndarray
     facing: np.ndarray
@@ -479,9 +479,7 @@ def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
     """A vehicle's mesh as triangles with details painted on; fine: with those seen from near only."""
     mesh, size = vehicle_mesh(kind, variant), np.array(typical_size_lhw(kind, variant), np.float32)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    colours = (
-        _mean(mesh.colours.numpy()[faces]) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
-    )
+    colours = _mean(mesh.colours.numpy()[faces]) if mesh.colours is not None else np.full((len(faces), 3), 0.5)
     corners = vertices[faces] * size
     smooth = mesh_kernels.creased_normals(vertices * size, faces)
     base = _Base.of(corners, smooth)

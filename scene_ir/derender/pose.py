@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from scene_ir.derender.maps import CAMERA_HEIGHT
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.outlines import KINDS
 from scene_ir.types import Camera, check_shape
 from scene_ir.weights import load_into, read_weights
@@ -38,7 +39,7 @@ Array = NDArray[np.float32]
 WEIGHTS = Path(__file__).parent / "weights" / "pose.safetensors"
 """What the package ships; `tools/train_pose.py` makes it."""
 CROP_HW = (64, 96)
-CONTEXT = 1.3
+CONTEXT = 1.5
 """Side of the crop, in sides of the box."""
 BINS = 12
 """Of the viewing angle, 30 degrees each, centred at multiples of that."""
@@ -180,8 +181,8 @@ def is_truck(kinds: Sequence[str]) -> Tensor:
 def crops_of(
     image: NDArray[Any], boxes_xyxy: Array, size_hw: tuple[int, int] = CROP_HW, context: float = CONTEXT
 ) -> NDArray[Any]:
-    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3), grey
-    beyond the image.
+    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3);
+    beyond the image it is grey.
 
     A crop is `context` times as wide and high as its box. Smaller ones are taken from a halved (quartered, ...)
     picture, so that no pixel is skipped.
@@ -288,12 +289,15 @@ def estimate(
     camera: Camera,
     ground: Tensor | None = None,
     network: PoseNet | None = None,
+    looks: int = 1,
 ) -> Poses:
     """Poses and sizes of the vehicles in 2D boxes.
 
     photograph (3, H, W) RGB in [0, 1]; boxes_xyxy (N, 4) px; kinds: "Car", "Van" or "Truck", one a box; ground
     (4,): the plane n.x + d = 0 with n up, where it is known, otherwise it is estimated from the vehicles and a
-    camera 1.65 m above a level road; network: another than the shipped one. Raises ShapeError and RangeError.
+    camera 1.65 m above a level road; network: another than the shipped one; looks: 1, or more for boxes that are
+    not tight, such as a detector's: each next look is at the boxes of what was found. Raises ShapeError and
+    RangeError.
     """
     check_shape("photograph", photograph, 3, camera.height, camera.width)
     check_shape("boxes_xyxy", boxes_xyxy, None, 4)
@@ -303,6 +307,8 @@ def estimate(
         if kind not in _IS:
             raise RangeError(f"kinds[{i}]", " or ".join(_IS), repr(kind))
     boxes = boxes_xyxy.detach().cpu().float()
+    if looks < 1:
+        raise RangeError("looks", "at least 1", looks)
     for i, box in enumerate(boxes):
         if not bool(torch.isfinite(box).all() and (box[2:] > box[:2]).all()):
             raise RangeError(f"boxes_xyxy[{i}]", "finite, with an area", box.tolist())
@@ -315,8 +321,23 @@ def estimate(
         nothing = torch.zeros(0)
         return Poses(torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane))
     image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
+    network = network or shipped()
+    poses = _look(network, image, boxes, kinds, camera, ground)
+    for _ in range(looks - 1):
+        found = project_boxes(poses.size_lhw, poses.yaw, poses.translation, camera.matrix.float())
+        found = clip_boxes(found, camera.height, camera.width)
+        tight = (found[:, 2:] - found[:, :2] >= 0.5 * (boxes[:, 2:] - boxes[:, :2])).all(1)
+        boxes = torch.where(tight[:, None], found, boxes)
+        poses = _look(network, image, boxes, kinds, camera, ground)
+    return poses
+
+
+def _look(
+    network: PoseNet, image: Array, boxes: Tensor, kinds: Sequence[str], camera: Camera, ground: Tensor | None
+) -> Poses:
+    """Poses from boxes (N, 4) px as they are; image (H, W, 3)."""
     crops = torch.from_numpy(crops_of(image, boxes.numpy())).permute(0, 3, 1, 2)
-    said = _both(network or shipped(), crops, box_numbers(boxes, is_truck(kinds), camera_numbers(camera)))
+    said = _both(network, crops, box_numbers(boxes, is_truck(kinds), camera_numbers(camera)))
     alpha, facing = viewing_angle(said)
     size = mean_sizes(kinds) * said.size.exp()
     depth = mean_depth(boxes, kinds, camera) * said.depth.exp()
@@ -405,7 +426,7 @@ def _onto_ground(
         farther = math.log(plane[2] / slope)
         doubt = math.sqrt(at @ covariance @ at + foot_m[i] ** 2) / max(plane[2], 0.5)
         # what contradicts the network by more than their errors explain is a kerb, a hill or a cut box
-        trust = min(1.0, _HUBER / max(abs(farther) / math.hypot(doubt, spread[i]), 1e-9)) ** 2
+        trust = min(1.0, _HUBER / max(abs(farther) / math.hypot(doubt, spread[i]), 1e-9)) ** 4
         own, its = 1 / spread[i] ** 2, trust / doubt**2
         scale[i] = math.exp(farther * its / (own + its))
         left[i] = (own + its) ** -0.5

@@ -14,7 +14,7 @@ from drivesem.synth.frames import (
     plan_frame,
     render_frame,
 )
-from drivesem.synth.render import View, blocks
+from drivesem.synth.view import View, blocks
 from drivesem.synth.world import POOLS, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, project_boxes

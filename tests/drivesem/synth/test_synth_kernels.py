@@ -12,8 +12,9 @@ from drivesem.synth.frames import SynthSettings, actor_soups, plan_frame
 from drivesem.synth.layout import Marking, Road
 from drivesem.synth.light import Light, Panorama, Response, develop, reflected_radiance, sky_radiance
 from drivesem.synth.noise import noise_set, white_noise
-from drivesem.synth.render import Setting, Shadow, View, blocks, render, see, sun_maps, take
+from drivesem.synth.render import nearest, render, see, sun_maps, take
 from drivesem.synth.soup import Material, box, join, make, placed
+from drivesem.synth.view import Setting, Shadow, View, blocks
 from scene_ir.types import Camera
 
 PAINTED = [m for m in Material if m != Material.SKY]
@@ -168,13 +169,13 @@ def test_as_many_threads_as_you_like_give_the_same_bytes():
 def test_the_nearest_sample_is_the_nearest():
     view = a_view()
     sight = see(a_world(view), view)
-    nearest = sight.nearest()
-    assert nearest.dtype == np.int64
-    assert np.array_equal(sight.depth.reshape(-1)[nearest], sight.depth_m)
-    rows, columns = np.divmod(nearest, sight.depth.shape[1])
+    places = nearest(sight)
+    assert places.dtype == np.int64
+    assert np.array_equal(sight.depth.reshape(-1)[places], sight.depth_m)
+    rows, columns = np.divmod(places, sight.depth.shape[1])
     assert np.array_equal(rows // 2, np.broadcast_to(np.arange(96)[:, None], (96, 320)))
     assert np.array_equal(columns // 2, np.broadcast_to(np.arange(320), (96, 320)))
-    assert np.array_equal(nearest[0, :2], [0, 2])  # of equal ones the first
+    assert np.array_equal(places[0, :2], [0, 2])  # of equal ones the first
 
 
 def test_ground_below_the_camera_is_cut_at_the_near_plane():

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from drivesem.synth import mesh_kernels
-from drivesem.synth.render import blocks, pixel_sums
+from drivesem.synth.render import pixel_sums
 from drivesem.synth.soup import Material, Soup, ball, balls, box, compact, creased_normals, join, transformed
 from drivesem.synth.vehicles import vehicle_mesh
+from drivesem.synth.view import blocks
 from scene_ir.meshes.templates import typical_size_lhw
 
 
