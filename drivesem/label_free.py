@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ from scene_ir.derender.derender import DerenderSettings
 from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import FormatError, RangeError
-from scene_ir.geometry import clip_boxes, project_boxes
+from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
 from scene_ir.types import Camera, Frame, Labels
 
 DEFAULT_FOCAL = 0.58
@@ -49,6 +50,10 @@ VEHICLE_CLASSES = ("Car", "Truck")
 _PEOPLE_LHW = {"Pedestrian": (0.8, 1.75, 0.65), "Cyclist": (1.75, 1.75, 0.6)}
 """m, of KITTI's people, about: they only have to hide what is behind them."""
 
+_AFLOAT = (0.8, 0.02)
+"""m, and m a metre of distance: what stands higher above or deeper below the ground than this is no vehicle."""
+_INSIDE = 0.35
+"""Share of the smaller footprint from which on two vehicles cannot both be where they are."""
 DETECTOR_LOOKS = 2
 """A detector's boxes are not tight: the network looks again at those of what it found."""
 FITTING = FitSettings(max_shift_m=0.8, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
@@ -171,10 +176,10 @@ def label_free(
     """The frame with labels made from a detector's boxes: poses by `scene_ir.derender.pose`, people where they
     stand, occlusion by what is nearer, truncation by the image's border. Vehicles' boxes are their poses'.
 
-    detections: all of them count, in their order; labels are indices into `classes`, of which all but cars,
-    trucks, pedestrians and cyclists are left out. ground (4,): the road's plane, where it is known. What is hidden
-    is estimated from boxes, so that it is more than is really hidden. Raises RangeError for a label beyond
-    `classes` and for boxes without area.
+    detections: in their order; labels are indices into `classes`, of which all but cars, trucks, pedestrians and
+    cyclists are left out. So are vehicles that would float above the ground or stand where a surer one does.
+    ground (4,): the road's plane, where it is known. What is hidden is estimated from boxes, so that it is more
+    than is really hidden. Raises RangeError for a label beyond `classes` and for boxes without area.
     """
     names = [_class_name(int(label), classes) for label in detections.labels]
     boxes = detections.boxes_xyxy.float()
@@ -193,6 +198,7 @@ def label_free(
     boxes = boxes.clone()
     boxes[vehicles] = inside[vehicles]
     seen = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
+    seen[vehicles] &= _possible(poses, detections.scores[vehicles])
     kept = [i for i in sorted(vehicles + people) if bool(seen[i])]
     labels = Labels(
         kind=tuple(names[i] for i in kept),
@@ -230,6 +236,23 @@ def _people(boxes: Tensor, kinds: list[str], camera: Camera, poses: Poses) -> Te
     scale = -poses.ground[3] / (small @ poses.ground[:3])
     believable = (scale > 0.6) & (scale < 1.6) & (boxes[:, 3] < camera.height - 1 - BORDER_PX)
     return small * torch.where(believable, scale, torch.ones(()))[:, None]
+
+
+def _possible(poses: Poses, scores: Tensor) -> Tensor:
+    """Which vehicles (N,) can stand where they are: on the ground, and not inside one of a higher score."""
+    above = (poses.translation @ poses.ground[:3] + poses.ground[3]).abs()
+    possible = above <= _AFLOAT[0] + _AFLOAT[1] * poses.translation[:, 2]
+    feet = ground_footprint(poses.size_lhw, poses.yaw, poses.translation).numpy()
+    order = [int(i) for i in scores.argsort(descending=True, stable=True) if bool(possible[i])]
+    kept: list[int] = []
+    for i in order:
+        smaller = [min(cv2.contourArea(feet[i]), cv2.contourArea(feet[j])) for j in kept]
+        shared = [cv2.intersectConvexConvex(feet[i], feet[j])[0] for j in kept]
+        if all(s < _INSIDE * area for s, area in zip(shared, smaller, strict=True)):
+            kept.append(i)
+        else:
+            possible[i] = False
+    return possible
 
 
 def _truncation(full: Tensor, inside: Tensor) -> Tensor:

@@ -267,7 +267,7 @@ class Run:
 
     def step(self, store: CropStore) -> dict[str, float]:
         """One step of the optimiser; the terms of the loss."""
-        start, step, settings = time.perf_counter(), self.step_number, self.settings
+        start, step, settings = time.process_time(), self.step_number, self.settings
         crops, numbers, targets = batch_of(store, step, settings)
         warm = min(1.0, (step + 1) / 100)
         rate = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
@@ -284,7 +284,7 @@ class Run:
         for name, tensor in self._tensors().items():
             self.average[name].lerp_(tensor.detach(), 1 - decay)
         self.step_number += 1
-        self.seconds += time.perf_counter() - start
+        self.seconds += time.process_time() - start
         return {k: float(v.detach()) for k, v in terms.items()}
 
     def averaged(self) -> PoseNet:
@@ -458,7 +458,7 @@ CARD = """# Poses of vehicles from 2D boxes, trained on generated streets
 - Data: {frames:,} frames of the project's own generator (`{data}`), {boxes:,} vehicles at least 16 px high; no
   photographs. Boxes jittered by 2 to 12% of their sides, as a detector's are; mirrored, other light and colours,
   blur, noise, parts hidden.
-- Training: {steps:,} steps of {batch}, {minutes:.0f} minutes on one CPU thread, seed {seed}.
+- Training: {steps:,} steps of {batch}, {minutes:.0f} minutes on one CPU core, seed {seed}.{note}
 
 ## Figures
 
@@ -470,7 +470,6 @@ errors are medians over all, turned ones (front taken for back) included; the ax
 
 {table}
 
-{remark}
 ## Limits
 
 It has seen generated pictures only, taken 1.65 m above the road (3 cm up or down): from other heights its depths
@@ -484,6 +483,7 @@ drivesem synth --layout kitti --split train --seed {train_seed} --frames {frames
 drivesem synth --layout kitti --split heldout --seed {held_seed} --frames {held_out} --out {held_name}
 python tools/train_pose.py --data {data} --held-out {held_name} --steps {steps} --seed {seed}
 ```
+The generator was version {version}. With the same, on the same machine, another run gives the same bytes.
 """
 COLUMNS = (
     *(("vehicles", "vehicles", "{:.0f}"), ("yaw_deg", "yaw", "{:.2f}°"), ("yaw_deg_p90", "yaw, 90%", "{:.1f}°")),
@@ -535,7 +535,7 @@ def main() -> None:
     parser.add_argument(
         "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
     )
-    parser.add_argument("--remark", default="", help="a remark for the model card")
+    parser.add_argument("--remark", default="", help="a remark on this run for the model card")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings = Settings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
@@ -585,7 +585,8 @@ def main() -> None:
         held_seed=files.read_json(arguments.held_out / "manifest.json")["seed"],
         real=len(KittiDataset(arguments.also)) if arguments.also else 0,
         table=table_of(figures),
-        remark=f"{arguments.remark}\n" if arguments.remark else "",
+        version=files.read_json(arguments.data / "manifest.json")["generator"],
+        note=f"\n  {arguments.remark}" if arguments.remark else "",
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

@@ -52,7 +52,7 @@ BORDER_PX = 2.0
 """A box that comes this near to the image's border is cut by it."""
 _MEAN, _SPREAD = 0.45, 0.27
 """Of the photograph's values, about."""
-_LEVEL_SIZE = (-2.0, -2.6)
+LEVEL_SIZE = (-2.0, -2.6)
 """Middle of log(width / focal) and log(height / focal)."""
 
 _PRIOR = (0.02, 0.015, 0.15)
@@ -161,7 +161,7 @@ def box_numbers(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
     """
     focal, principal, limit = cameras[:, :2], cameras[:, 2:4], cameras[:, 4:] - 1
     centre = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - principal) / focal
-    size = torch.log((boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) / focal) - boxes_xyxy.new_tensor(_LEVEL_SIZE)
+    size = torch.log((boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]) / focal) - boxes_xyxy.new_tensor(LEVEL_SIZE)
     cut = torch.cat([boxes_xyxy[:, :2] <= BORDER_PX, boxes_xyxy[:, 2:] >= limit - BORDER_PX], 1)
     return torch.cat([centre, size, cut.to(centre), trucks.to(centre)[:, None]], 1)
 

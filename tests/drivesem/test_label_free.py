@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -133,14 +134,41 @@ def test_detections_become_labels() -> None:
     assert float(labels.translation[2, 2]) == pytest.approx(720 * 1.75 / 110, rel=0.6)
 
 
-def test_what_is_behind_is_hidden() -> None:
-    boxes = [[500.0, 170, 700, 300], [500, 172, 560, 212], [640, 165, 760, 240], [800, 170, 900, 240]]
-    labels = label_free(frame_of(), seen(boxes, [CAR] * 4)).labels
+def known(places: torch.Tensor) -> Callable[..., pose.Poses]:
+    """An estimate that puts cars, all heading away, at these places on a level road."""
+    count = len(places)
+    one, ground = torch.ones(count), torch.tensor([0.0, -1, 0, 1.65])
+    size = torch.tensor([4.0, 1.5, 1.7]).expand(count, 3)
+    poses = pose.Poses(places, one * math.pi / 2, size, ("sedan",) * count, 0.05 * one, one, ground)
+    return lambda *_, **__: poses
+
+
+def cars(count: int) -> Detections:
+    return seen([[100.0 * i, 100, 100 * i + 50, 150] for i in range(count)], [CAR] * count)
+
+
+def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One car behind another, one beside, one half out of the image, one behind the camera."""
+    places = torch.tensor([[0.0, 1.65, 10], [0.3, 1.65, 20], [9, 1.65, 20], [-8, 1.65, 9.5], [0, 1.65, -5]])
+    monkeypatch.setattr("drivesem.label_free.estimate", known(places))
+    labels = label_free(frame_of(), cars(5)).labels
     assert labels is not None
-    assert float(labels.translation[0, 2]) < float(labels.translation[1, 2])
-    assert labels.occlusion[0] == 0
-    assert labels.occlusion[1] >= 1
-    assert labels.occlusion[3] == 0
+    assert torch.equal(labels.translation, places[:4])
+    assert labels.occlusion.tolist() == [0, 3, 0, 0]
+    assert labels.truncation[:3].tolist() == [0, 0, 0]
+    assert 0.2 < float(labels.truncation[3]) < 0.8
+    assert float(labels.boxes_xyxy[3, 0]) == 0
+
+
+def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two cars in one place the surer one stays; one above the ground goes; neighbours stay."""
+    places = torch.tensor([[0.0, 1.65, 10], [0.4, 1.65, 11], [3.0, 1.65, 10], [6.0, -1.5, 15], [8.0, 2.2, 25]])
+    monkeypatch.setattr("drivesem.label_free.estimate", known(places))
+    found = cars(5)
+    found.scores[1] = 0.95
+    labels = label_free(frame_of(), found).labels
+    assert labels is not None
+    assert torch.equal(labels.translation, places[[1, 2, 4]])
 
 
 def test_no_detections_and_wrong_labels() -> None:

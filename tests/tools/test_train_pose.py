@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -42,11 +43,11 @@ def streets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(streets: Path) -> object:
+def store(streets: Path) -> Any:
     return training.CropStore(streets, streets.parent / "cache")
 
 
-def test_crops_are_kept(streets: Path, store: object) -> None:
+def test_crops_are_kept(streets: Path, store: Any) -> None:
     again = training.CropStore(streets, streets.parent / "cache")
     assert len(again) == len(store) > 4
     assert again.crops.shape[1:] == (*training.STORE_HW, 3)
@@ -55,7 +56,7 @@ def test_crops_are_kept(streets: Path, store: object) -> None:
     assert bool((again.truth.box[:, 3] - again.truth.box[:, 1] >= training.LEAST_HEIGHT_PX).all())
 
 
-def test_targets_are_what_the_estimate_undoes(store: object) -> None:
+def test_targets_are_what_the_estimate_undoes(store: Any) -> None:
     """Angle, offset and depth of jittered, mirrored boxes lead back to the truth."""
     crops, numbers, targets = training.batch_of(store, 0, SETTINGS)
     assert crops.shape == (4, 3, *pose.CROP_HW)
@@ -63,7 +64,7 @@ def test_targets_are_what_the_estimate_undoes(store: object) -> None:
     assert float(crops.max()) <= 1
     assert numbers.shape == (4, pose.NUMBERS)
     # the box's height and the mean size tell a depth; the target is what is missing from it
-    heights = torch.exp(numbers[:, 3] + pose._LEVEL_SIZE[1])
+    heights = torch.exp(numbers[:, 3] + pose.LEVEL_SIZE[1])
     kinds = ["Truck" if t else "Car" for t in numbers[:, 8] > 0]
     depth = pose.mean_sizes(kinds)[:, 1] / heights * targets.depth.exp()
     gaps = (depth[:, None] / store.truth.depth - 1).abs().min(1)
@@ -76,13 +77,13 @@ def test_targets_are_what_the_estimate_undoes(store: object) -> None:
     same = apart(targets.alpha).abs() < 1e-4
     assert bool((same | (apart(math.pi - targets.alpha).abs() < 1e-4)).all())
     ray = (true.centre - true.camera[:, 2:4]) / true.camera[:, :2]
-    middle = numbers[:, :2] + targets.offset * torch.exp(numbers[:, 2:4] + torch.tensor(pose._LEVEL_SIZE))
+    middle = numbers[:, :2] + targets.offset * torch.exp(numbers[:, 2:4] + torch.tensor(pose.LEVEL_SIZE))
     sign = torch.where(same, 1.0, -1.0)
     torch.testing.assert_close(middle[:, 0] * sign, ray[:, 0], atol=1e-4, rtol=0)
     torch.testing.assert_close(middle[:, 1], ray[:, 1], atol=1e-4, rtol=0)
 
 
-def said_of(targets: object, confidence: float) -> Said:
+def said_of(targets: Any, confidence: float) -> Said:
     n = len(targets.alpha)
     apart = targets.alpha[:, None] - torch.arange(BINS) * (2 * math.pi / BINS)
     kind = torch.nn.functional.one_hot(targets.kind, len(KINDS)) * 20.0
@@ -97,7 +98,7 @@ def said_of(targets: object, confidence: float) -> Said:
     )
 
 
-def test_the_truth_costs_least(store: object) -> None:
+def test_the_truth_costs_least(store: Any) -> None:
     _, _, targets = training.batch_of(store, 0, SETTINGS)
     right = training.loss_terms(said_of(targets, 40.0), targets)
     for name in ("turn", "offset", "size", "depth_error", "kind"):
@@ -113,7 +114,7 @@ def test_the_truth_costs_least(store: object) -> None:
         assert float(wrong["total"]) > float(right["total"]) + 0.05, change.keys()
 
 
-def test_a_run_goes_on_where_it_stopped(store: object, tmp_path: Path) -> None:
+def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
     whole = training.Run(SETTINGS)
     terms = [whole.step(store)["total"] for _ in range(6)]

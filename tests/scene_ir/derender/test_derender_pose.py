@@ -99,6 +99,8 @@ def test_a_known_ground_corrects_the_depth_along_the_ray() -> None:
     assert bool((found.log_depth_sigma < 0.05).all())
     ray = found.translation / found.translation[:, 2:]
     torch.testing.assert_close(ray, place / place[:, 2:], atol=5e-3, rtol=0)
+    # what is farther is as much larger
+    torch.testing.assert_close(found.size_lhw / found.translation[:, 2:], size / place[:, 2:], atol=2e-3, rtol=0)
     # a plane far below is not believed
     assert float(alone.translation[0, 2]) == pytest.approx(float(place[0, 2]), rel=0.06)
 
