@@ -2,7 +2,8 @@
 
 The fill is Wexler's space-time completion (CVPR 2004) with the randomised nearest-neighbour search of PatchMatch
 (Barnes 2009). Copies prefer sources at the same height above or below the horizon, where a road's texture has the
-same scale. Everything is numpy: the same input and seed give the same bytes.
+same scale, and where a guide says what is to be seen (`street.continued`), sources that look like it. Everything
+is numpy: the same input and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -32,18 +33,23 @@ class FillSettings:
     away costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's
     border; search_px: how far from the best source so far others are tried, at the coarsest level in px of the
     full image, then in px of each level; ground_weight: cost of showing no ground where ground must be; guessed:
-    weight of a pixel in the hole against one outside, when patches are compared.
+    weight of a pixel in the hole against one outside, when patches are compared; guide_weight: cost of a source
+    whose surroundings, blurred by guide_px, have not the guide's colour; settle_px: over which distance the fill's
+    mean colour is brought to the guide's.
     """
 
     coarsest_radius: float = 4.0
     max_levels: int = 6
-    iterations: tuple[int, int] = (10, 2)
+    iterations: tuple[int, int] = (8, 2)
     row_weight: float = 0.05
     column_weight: float = 0.004
     search_px: tuple[float, float] = (160.0, 24.0)
     ground_weight: float = 0.02
     guessed: float = 0.3
     confidence_px: float = 12.0
+    guide_weight: float = 3.0
+    guide_px: float = 2.5
+    settle_px: float = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,31 +95,39 @@ def fill(
     ground: Ground,
     seed: int = 0,
     settings: FillSettings | None = None,
+    guide: Image | None = None,
 ) -> Image:
     """The image with `hole` filled from pixels that are not `forbidden`.
 
     image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row,
-    px; ground: where ground is to be seen, and where it can be copied from -> (H, W, 3) in [0, 1], equal to the
-    image outside the hole.
+    px; ground: where ground is to be seen, and where it can be copied from; guide (H, W, 3): roughly what is to be
+    seen, smooth in the hole -> (H, W, 3) in [0, 1], equal to the image outside the hole.
     """
     settings = settings or FillSettings()
     if not hole.any():
         return image.copy()
     forbidden = forbidden | hole
     pyramid = [(image.astype(np.float32), hole, forbidden)]
-    grounds = [ground]
+    grounds, guides = [ground], [guide]
     while len(pyramid) < settings.max_levels and min(pyramid[-1][1].shape) >= 48:
         level_image, level_hole, level_forbidden = pyramid[-1]
         if float(_distance(level_hole).max()) <= settings.coarsest_radius:
             break
         pyramid.append(_halve(level_image, level_hole, level_forbidden))
-        grounds.append(grounds[-1].halved(pyramid[-1][1].shape[::-1]))
+        size = pyramid[-1][1].shape[::-1]
+        grounds.append(grounds[-1].halved(size))
+        finer = guides[-1]
+        smaller = None if finer is None else cv2.resize(finer, size, interpolation=cv2.INTER_AREA)
+        guides.append(None if smaller is None else np.asarray(smaller, np.float32))
     rng = np.random.default_rng(seed)
     source: NDArray[np.int64] | None = None
     current = pyramid[-1][0]
     for index in reversed(range(len(pyramid))):
         level_image, level_hole, level_forbidden = pyramid[index]
-        if source is None:
+        level_guide = guides[index]
+        if source is None and level_guide is not None:
+            start = level_guide
+        elif source is None:
             start = level_image[first_guess(level_forbidden, grounds[index])]
         else:
             size = (level_image.shape[1], level_image.shape[0])
@@ -122,8 +136,20 @@ def fill(
         share = index / max(len(pyramid) - 1, 1)
         rounds = round(settings.iterations[1] + (settings.iterations[0] - settings.iterations[1]) * share)
         level = _Level(start, level_hole, level_forbidden, grounds[index], (horizon, 2**index), settings)
+        if level_guide is not None:
+            level.follow(level_guide)
         current, source = level.run(source, rounds, rng)
+    if guide is not None:
+        current = current + _mean_inside(guide - current, hole, settings.settle_px)
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
+
+
+def _mean_inside(values: Image, mask: Mask, sigma: float) -> Image:
+    """Gaussian mean (H, W, 3) of the values in the mask."""
+    weight = mask.astype(np.float32)
+    total = cv2.GaussianBlur(weight, (0, 0), sigma)
+    mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
+    return np.asarray(mean, np.float32)
 
 
 def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -214,6 +240,14 @@ class _Level:
         certain = cv2.copyMakeBorder(certain, pad, pad, pad, pad, cv2.BORDER_REFLECT).reshape(-1)
         trust = certain[self._flat(self.rows, self.columns)[:, None] + self.offsets]
         self.trust = np.repeat(trust / trust.sum(1, keepdims=True), 3, axis=1)
+        self.guide: Image | None = None
+        self.blurred = image
+
+    def follow(self, guide: Image) -> None:
+        """Prefer sources that look like the guide (H, W, 3) at the place that they are copied to."""
+        self.guide = guide[self.rows, self.columns]
+        image = self.padded[self.pad : -self.pad, self.pad : -self.pad]
+        self.blurred = _mean_inside(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
 
     def _flat(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
         return (rows + self.pad) * self.stride + columns + self.pad
@@ -232,6 +266,9 @@ class _Level:
         dx = (columns - self.columns[which]) / self.column_unit
         cost = colour + self.settings.row_weight * dy * dy + self.settings.column_weight * dx * dx
         cost = cost + self.wanted[which] * (1 - self.ground.like[rows, columns])
+        if self.guide is not None:
+            apart = self.blurred[rows, columns] - self.guide[which]
+            cost = cost + self.settings.guide_weight * np.einsum("pk,pk->p", apart, apart)
         return np.where(self.allowed[rows, columns], cost, np.inf).astype(np.float32)
 
     def _try(self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -87,16 +87,24 @@ def ground_view(placement: Placement, ground: torch.Tensor, camera: Camera) -> G
 
 
 def light(
-    image: Array, road: Array, vehicles: Mask, views: Sequence[GroundView], settings: ShadowSettings | None = None
+    image: Array,
+    road: Array,
+    vehicles: Mask,
+    views: Sequence[GroundView],
+    settings: ShadowSettings | None = None,
+    behind: Callable[[Mask], Array] | None = None,
 ) -> Light:
     """Brightness as it is, and of the ground as it would be lit: continued from the road around the cars' places.
 
-    image (H, W, 3); road (H, W) in [0, 1]; vehicles (H, W): all cars' pixels.
+    image (H, W, 3); road (H, W) in [0, 1]; vehicles (H, W): all cars' pixels; behind: gives the image (H, W, 3)
+    with a mask's pixels continued from the others, so that light and dark strips along the road are no shadows.
     """
     settings = settings or ShadowSettings()
     # The brightest channel: in a shadow all three fall, on a red or blue thing one stays.
     grey = cv2.GaussianBlur(image.max(-1), (0, 0), 1.0)
     zone = np.logical_or.reduce([view.distance < settings.reach_m for view in views]) | grow(vehicles, 3)
+    if behind is not None:
+        return Light(grey, cv2.GaussianBlur(behind(zone).max(-1), (0, 0), 1.0))
     known = (road > 0.5) & ~zone
     if not known.any():
         known = ~zone

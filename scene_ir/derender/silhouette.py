@@ -70,7 +70,7 @@ class FitSettings:
     max_stretch: float = 0.08
     max_offset: float = 0.08
     prior: float = 0.004
-    box: float = 5.0
+    box: float = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,9 +271,12 @@ def fit(
 
 def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
     """How far (4,) the extent of a mesh is from a label's box on each side, squared, in units of the band."""
-    # What is nearer than half a metre projects anywhere; such boxes are cut by the image's border anyway.
+    # What lies beyond the image's border shows in no box; what is nearer than half a metre projects anywhere.
     pixels = clip[:, :2] / clip[:, 2:].clamp(min=0.5)
-    extremes = torch.cat([pixels.amin(0), pixels.amax(0)])
+    shown = ((pixels >= window.frame[:2]) & (pixels <= window.frame[2:])).all(1) & (clip[:, 2] > 0.5)
+    if not bool(shown.any()):
+        return box_xyxy.new_zeros(4)
+    extremes = torch.cat([pixels[shown].amin(0), pixels[shown].amax(0)])
     scale = window.zoom.diagonal()[:2].repeat(2)
     offset = window.zoom[:2, 2].repeat(2)
     band = _BAND * max(window.pull.shape)
@@ -283,12 +286,13 @@ def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
 @dataclass(frozen=True, slots=True)
 class _Window:
     """pull (h, w): signed distance to the mask over the band, in [-1, 1], 0 where unknown; length: px of outline;
-    zoom (3, 3): image pixels to window pixels.
+    zoom (3, 3): image pixels to window pixels; frame (4,): the image's border xyxy in window pixels.
     """
 
     pull: NDArray[np.float32]
     length: float
     zoom: Tensor
+    frame: Tensor
 
 
 def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
@@ -321,7 +325,13 @@ def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
     resized = cv2.resize(
         pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
-    return _Window(np.asarray(resized, np.float32).reshape(size[::-1]), 2.0 * (size[0] + size[1]), zoom)
+    corners = torch.tensor([[0.0, 0.0, 1.0], [width - 1.0, height - 1.0, 1.0]]) @ zoom.T
+    return _Window(
+        np.asarray(resized, np.float32).reshape(size[::-1]),
+        2.0 * (size[0] + size[1]),
+        zoom,
+        corners[:, :2].reshape(4),
+    )
 
 
 def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

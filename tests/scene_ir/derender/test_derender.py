@@ -185,3 +185,15 @@ def test_all_real_frames_come_back(identifier):
     assert psnr(image, frame.photograph) > 50
     for index in range(len(scene.objects)):
         assert float(scene.provenance[f"objects[{index}].mask_iou"]) > 0.45
+
+
+def test_a_2d_box_counts_only_where_it_is_not_the_3d_boxs_own_picture(street):
+    from scene_ir.derender.derender import _boxes
+    from scene_ir.geometry import project_boxes
+
+    labels, camera = street.frame.labels, street.frame.camera
+    assert _boxes(labels, [0], camera).trust.tolist() == [[1.0, 1.0, 1.0, 1.0]]
+    drawn = project_boxes(labels.size_lhw, labels.yaw, labels.translation, camera.matrix)
+    assert _boxes(replace(labels, boxes_xyxy=drawn), [0], camera).trust.tolist() == [[0.0, 1.0, 0.0, 0.0]]
+    hidden = replace(labels, occlusion=torch.tensor([2]))
+    assert _boxes(hidden, [0], camera).trust.tolist() == [[0.0, 0.0, 0.0, 0.0]]

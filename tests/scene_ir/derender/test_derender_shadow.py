@@ -108,3 +108,17 @@ def test_factors_darken_only_in_their_region():
     assert factor[1, 1] == pytest.approx([0.4] * 3)
     assert factor[0, 0] == pytest.approx([1.0] * 3)
     assert (factor[2:] == 1).all()
+
+
+def test_what_is_known_to_be_behind_a_car_tells_a_dark_strip_from_its_shadow():
+    image, factor = shaded(toward(0.6, 0.0))
+    strip = np.where(np.abs(view().local[..., 0] - 2.5) < 0.4, 0.6, 1.0).astype(np.float32)
+    empty = np.full_like(image, 0.6) * strip[..., None]
+    photograph = np.where(vehicle()[..., None], image, image * strip[..., None])
+    plain, told = (
+        shadow.light(photograph, ROAD, vehicle(), [view()], behind=behind) for behind in (None, lambda _: empty)
+    )
+    dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (view().distance < 2.4)
+    assert np.count_nonzero(dark) > 50
+    wrong, right = (shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0] for light in (plain, told))
+    assert right[dark].mean() < 0.1 < wrong[dark].mean()

@@ -162,3 +162,13 @@ def test_a_tiny_car_is_found():
     image = cv2.GaussianBlur(painted(truth), (3, 3), 0.5)
     found = silhouette.instance_mask(image, truth, NOTHING, (2.0, 2.0, 2.0))
     assert silhouette.iou(found, truth) > 0.6
+
+
+def test_a_box_holds_a_car_that_the_image_cuts_by_what_is_inside():
+    truth = car(x=-3.2, z=5.2, yaw=0.3)
+    target = outline(truth)
+    x0, y0, x1, y1 = silhouette.extent(target)
+    assert x0 == 0
+    boxes = Boxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 1.0, 1.0]]))
+    fitted = silhouette.fit([truth], [target], [NOTHING], boxes, CAMERA, FitSettings())[0]
+    assert silhouette.iou(outline(fitted), target) > 0.97

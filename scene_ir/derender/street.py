@@ -1,0 +1,214 @@
+"""What a street's plane tells of a hole: lane lines, kerbs and verges go on along the road, colours sideways.
+
+The ground is laid out in metres, straightened along the road, whose heading and bend the edges on the ground vote
+for. What stays the same along the road is a profile across it; what is left is continued sideways, row by row.
+The result is smooth but has the street's structure: `background.fill` adds the texture. Huang et al. (SIGGRAPH
+2014) guide completion by planes and their translations in a like way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from scene_ir.derender.background import push_pull
+from scene_ir.types import Camera
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_HEADINGS = np.linspace(-0.5, 0.5, 81)
+"""Slopes of the road against the camera's axis that are tried."""
+_BENDS = np.linspace(-0.012, 0.012, 13)
+"""1/m, curvatures that are tried: down to a radius of 83 m."""
+_VOTERS = 6000
+_VOTE_SLOPE = 0.03
+"""Difference in slope at which an edge's vote has fallen to 1/e."""
+_BEND_COST = 4.0
+"""A straight road is likelier than a bent one: share of the votes that each 1/m costs."""
+_EDGE = 0.08
+_ACROSS_M, _ALONG = 0.07, 0.03
+"""Cells of the profile: m across, and natural logarithm of the distance."""
+_COLUMNS, _ROWS = 700, 160
+_TINT = 0.15
+"""Difference in tint from the street's colour at which a cell of the ground counts half."""
+_SQUASH = 8
+"""Columns that become one before colours are continued: so they go on sideways rather than up and down."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreetSettings:
+    """far_m: ground beyond is not told apart from what stands on it; vote_m: edges nearer than this vote for the
+    road's course; robust: difference of colour from the profile at which a pixel counts half; marking: difference
+    from the street's colour at which a pixel of the ground counts half when colours are continued sideways.
+    """
+
+    far_m: float = 90.0
+    vote_m: float = 45.0
+    robust: float = 0.04
+    marking: float = 0.08
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """Where each pixel's ray meets the ground. across, along (H, W) m, to the right and ahead; along is inf above
+    the horizon."""
+
+    across: NDArray[np.float32]
+    along: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Continued:
+    """image (H, W, 3): known pixels and their smooth continuation; ground (H, W): pixels that see ground, the
+    hidden ones by interpolation; heading, bend: of the road, slope and 1/m."""
+
+    image: Image
+    ground: Mask
+    heading: float
+    bend: float
+
+
+def plane_view(ground: torch.Tensor, camera: Camera) -> Plane:
+    """The ground as the camera sees it. ground (4,): plane n.x + d = 0."""
+    matrix = camera.matrix.double().numpy()
+    inverse = np.linalg.inv(matrix[:, :3])
+    centre = -inverse @ matrix[:, 3]
+    plane = ground.double().numpy()
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    ray = inverse[:, 0] * u[..., None] + inverse[:, 1] * v[..., None] + inverse[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step = -(plane[:3] @ centre + plane[3]) / (ray @ plane[:3])
+    seen = np.isfinite(step) & (step > 0) & (step < 400)
+    step = np.where(seen, step, 0)
+    across = np.where(seen, centre[0] + step * ray[..., 0], 0)
+    along = np.where(seen, centre[2] + step * ray[..., 2], np.inf)
+    return Plane(across.astype(np.float32), np.where(along > 0, along, np.inf).astype(np.float32))
+
+
+def continued(
+    image: Image,
+    unknown: Mask,
+    road: NDArray[np.float32],
+    plane: Plane,
+    horizon: float,
+    settings: StreetSettings | None = None,
+) -> Continued:
+    """What the known pixels say of the unknown ones.
+
+    image (H, W, 3) in [0, 1]; unknown (H, W): must not be used; road (H, W) in [0, 1]: how much known pixels look
+    like road; horizon: its row, px.
+    """
+    settings = settings or StreetSettings()
+    foot = foot_rows(road, unknown, horizon)
+    below = np.arange(image.shape[0])[:, None] >= foot[None]
+    ground = below & (plane.along < settings.far_m)
+    heading, bend = course(image, ~unknown & ground & (plane.along < settings.vote_m), plane)
+    along = np.where(ground, plane.along, 1.0)
+    straight = plane.across - heading * along - bend * along**2 / 2
+    column = np.rint(straight / _ACROSS_M).astype(np.int64) + _COLUMNS // 2
+    row = np.rint(np.log(np.maximum(along, 1.0)) / _ALONG).astype(np.int64)
+    laid_out = ground & (column >= 0) & (column < _COLUMNS) & (row < _ROWS)
+    cell = np.where(laid_out, row * _COLUMNS + column, 0)
+    street, profile = _profile(image, cell, laid_out & ~unknown, settings.robust)
+    street = np.where(laid_out[..., None], street.reshape(-1, 3)[cell], 0)
+    profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
+    rest = (image - profile).astype(np.float32)
+    # A marking that the profile does not explain is a dash or a crossing's bar: continued, it would be a smear.
+    odd = np.abs(rest - street).max(-1) / settings.marking
+    weight = np.where(unknown, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
+    guess = np.clip(_sideways(rest, weight) + profile, 0, 1)
+    return Continued(np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend)
+
+
+def foot_rows(road: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
+    """Row (W,) at which each column's ground ends; where that is hidden, interpolated between both sides."""
+    height, width = road.shape
+    ground = (road > 0.5) & (np.arange(height)[:, None] > horizon + 1)
+    ground = cv2.morphologyEx(ground.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    top = ground.argmax(0)
+    covered = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    columns = np.arange(width)
+    sure = ground.any(0) & ~covered[top, columns] & ~covered[np.maximum(top - 3, 0), columns]
+    if np.count_nonzero(sure) < 10:
+        return np.full(width, horizon + 0.08 * (height - horizon))
+    return np.interp(columns, columns[sure], median_filter(top[sure].astype(float), 15, mode="nearest"))
+
+
+def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
+    """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow; 0, 0
+    where there are too few."""
+    grey = cv2.GaussianBlur(image.mean(-1), (0, 0), 1.0)
+    gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3)
+    strength = np.hypot(gx, gy)
+    kernel = np.ones((5, 5), np.uint8)
+    inside = cv2.erode(known.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
+    rows, columns = np.nonzero(inside & (strength > _EDGE))
+    if rows.size < 50:
+        return 0.0, 0.0
+    every = rows.size // _VOTERS + 1
+    rows, columns = rows[::every], columns[::every]
+    tangent_u, tangent_v = -gy[rows, columns], gx[rows, columns]
+
+    def change(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Along the edge: central differences in the image."""
+        right, left = values[rows, columns + 1], values[rows, columns - 1]
+        down, up = values[rows + 1, columns], values[rows - 1, columns]
+        return ((right - left) * tangent_u + (down - up) * tangent_v) / 2
+
+    across, along = change(plane.across), change(plane.along)
+    length = np.maximum(np.hypot(across, along), 1e-9)
+    across, along, away = across / length, along / length, plane.along[rows, columns]
+    weight = np.minimum(strength[rows, columns], 0.3)
+    best = (-np.inf, 0.0, 0.0)
+    for bend in _BENDS.tolist():
+        slope = _HEADINGS[:, None].astype(np.float32) + np.float32(bend) * away
+        votes = np.exp(-(((across - slope * along) / _VOTE_SLOPE) ** 2)) @ weight
+        index = int(np.argmax(votes))
+        best = max(best, (float(votes[index]) * (1 - _BEND_COST * abs(bend)), float(_HEADINGS[index]), bend))
+    return best[1], best[2]
+
+
+def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) -> tuple[Image, Image]:
+    """The street's colour, smooth, and how much what runs along the road differs from it, both (rows, columns, 3)
+    of the straightened ground."""
+    shape = (_ROWS, _COLUMNS)
+    where, size = cell[known], _ROWS * _COLUMNS
+    count = np.bincount(where, minlength=size).reshape(shape)
+    colour = np.stack([np.bincount(where, image[..., c][known], size) for c in range(3)], -1).reshape(*shape, 3)
+    colour = (colour / np.maximum(count, 1)[..., None]).astype(np.float32)
+    filled = (count > 0).astype(np.float32)
+
+    def mean(values: Image, weight: NDArray[np.float32], sigma: tuple[float, float]) -> tuple[Image, Image]:
+        total = cv2.GaussianBlur(weight, (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
+        blurred = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
+        return (blurred / np.maximum(total, 1e-4)[..., None]).astype(np.float32), np.asarray(total, np.float32)
+
+    street, _ = mean(colour, filled, (1.5, 40.0))
+    difference = colour - street
+    # Paint has colours that no ground has: a car that nobody labelled must not run on along the road.
+    tint = np.abs(difference - difference.mean(-1, keepdims=True)).max(-1)
+    filled = filled / (1 + (tint / _TINT) ** 4)
+    weight = filled
+    line, total = mean(difference, weight, (10.0, 0.5))
+    for _ in range(3):
+        # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
+        weight = filled / (1 + (np.abs(difference - line).max(-1) / robust) ** 2)
+        line, total = mean(difference, weight, (10.0, 0.5))
+    return street, line * np.clip(total * 10, 0, 1)[..., None]
+
+
+def _sideways(image: Image, weight: NDArray[np.float32]) -> Image:
+    """Smooth continuation (H, W, 3), mostly within rows, of pixels that count by weight (H, W)."""
+    height, width = weight.shape
+    size = (max(width // _SQUASH, 1), height)
+    mass = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    colour = cv2.resize(image * weight[..., None], size, interpolation=cv2.INTER_AREA)
+    colour = (colour / np.maximum(mass, 1e-6)[..., None]).astype(np.float32)
+    smooth = push_pull(colour, np.minimum(mass * 2, 1).astype(np.float32))
+    return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

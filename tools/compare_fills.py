@@ -1,0 +1,170 @@
+"""How well methods fill the holes that removed vehicles leave, as a Markdown table.
+
+python tools/compare_fills.py --frames 8
+
+Generated streets of the held-out pools; the generator's own picture without the vehicles is the truth. All methods
+get the same holes: the pixels that truly change, grown by 3 px. PSNR over the holes, and over their ground and
+upright parts by the true depth; a perceptual distance, less is better; medians over the frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivesem.bench.closeness import Perception, Picture, psnr
+from drivesem.bench.derender import changed_region, make_case, share_of, without
+from scene_ir.derender import background, maps, street
+from scene_ir.derender.derender import VEHICLES
+from scene_ir.derender.silhouette import grow
+
+Mask = NDArray[np.bool_]
+SEED = 0
+_SAME_DEPTH = 0.08
+"""Relative difference from the plane's depth up to which a pixel is ground."""
+_OPENCV_PX = 4.0
+"""Radius of OpenCV's methods."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """photograph, truth (H, W, 3) uint8; hole, ground, people (H, W): what to fill, what of it is ground, and what
+    nothing may be copied from."""
+
+    photograph: Picture
+    truth: Picture
+    hole: Mask
+    ground: Mask
+    people: Mask
+    plane: street.Plane
+    road: NDArray[np.float32]
+    horizon: float
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """The photograph in [0, 1]."""
+        return self.photograph.astype(np.float32) / np.float32(255)
+
+    @property
+    def forbidden(self) -> Mask:
+        """Pixels that are no source."""
+        return grow(self.hole, 2) | self.people
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    options = parser.parse_args()
+    holes = [make_hole(index) for index in range(options.frames)]
+    perception = Perception()
+    lines = [
+        "| method | PSNR, dB | ground | upright | perceptual | seconds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in options.methods:
+        figures = np.array([_figures(hole, METHODS[name], perception) for hole in holes])
+        lines.append(f"| {name} | " + " | ".join(f"{value:.2f}" for value in np.nanmedian(figures, axis=0)) + " |")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0
+
+
+def make_hole(index: int) -> Hole:
+    """The hole that all vehicles of a generated street leave."""
+    case = make_case(SEED, index)
+    before = case.before
+    tracks = [t.actor.track for t in before.truths if t.actor.label in VEHICLES]
+    empty = without(case, tracks)
+    hole = changed_region(before, empty, tracks)
+    people = np.zeros(hole.shape, bool)
+    for truth in before.truths:
+        if truth.actor.track not in tracks:
+            people |= share_of(before, truth.actor.track) > 0
+    plane = street.plane_view(before.environment.ground, before.camera)
+    flat = np.isfinite(plane.along) & np.isfinite(empty.depth_m)
+    along, depth = np.where(flat, plane.along, 1.0), np.where(flat, empty.depth_m, 2.0)
+    ground = flat & (np.abs(along - depth) < _SAME_DEPTH * depth)
+    horizon = maps.horizon_row(before.environment.ground, before.camera)
+    image = before.image.astype(np.float32) / np.float32(255)
+    road = np.where(hole, 0, maps.road_map(image, horizon, hole)).astype(np.float32)
+    return Hole(before.image, empty.image, hole, ground, people & ~hole, plane, road, horizon)
+
+
+def _figures(hole: Hole, method: Callable[[Hole], NDArray[np.float32]], perception: Perception) -> list[float]:
+    start = time.perf_counter()
+    found = method(hole)
+    seconds = time.perf_counter() - start
+    picture = np.clip(np.rint(found * 255), 0, 255).astype(np.uint8)
+    picture = np.where(hole.hole[..., None], picture, hole.truth)
+    parts = [hole.hole, hole.hole & hole.ground, hole.hole & ~hole.ground]
+    levels = [psnr(picture, hole.truth, part) if part.any() else float("nan") for part in parts]
+    return [*levels, perception.distance(picture, hole.truth, hole.hole), seconds]
+
+
+def _opencv(kind: int) -> Callable[[Hole], NDArray[np.float32]]:
+    def run(hole: Hole) -> NDArray[np.float32]:
+        filled = cv2.inpaint(hole.photograph, grow(hole.hole, 2).astype(np.uint8), _OPENCV_PX, kind)
+        return np.asarray(filled, np.float32) / np.float32(255)
+
+    return run
+
+
+def _xphoto(kind: int) -> Callable[[Hole], NDArray[np.float32]]:
+    def run(hole: Hole) -> NDArray[np.float32]:
+        valid = (~grow(hole.hole, 2)).astype(np.uint8) * 255
+        shift_map = kind == cv2.xphoto.INPAINT_SHIFTMAP
+        source = cv2.cvtColor(hole.photograph, cv2.COLOR_RGB2Lab) if shift_map else hole.photograph[..., ::-1]
+        target = np.zeros_like(hole.photograph)
+        cv2.xphoto.inpaint(np.ascontiguousarray(source), valid, target, kind)
+        filled = cv2.cvtColor(target, cv2.COLOR_Lab2RGB) if shift_map else target[..., ::-1]
+        return np.asarray(filled, np.float32) / np.float32(255)
+
+    return run
+
+
+def _smooth(hole: Hole) -> NDArray[np.float32]:
+    return background.push_pull(hole.image, (~hole.forbidden).astype(np.float32))
+
+
+def _patches(hole: Hole) -> NDArray[np.float32]:
+    known_ground = background.Ground(hole.hole & hole.ground, hole.road)
+    return background.fill(hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground)
+
+
+def _continued(hole: Hole) -> street.Continued:
+    road = np.where(hole.forbidden, 0, hole.road).astype(np.float32)
+    return street.continued(hole.image, hole.forbidden, road, hole.plane, hole.horizon)
+
+
+def _street(hole: Hole) -> NDArray[np.float32]:
+    return _continued(hole).image
+
+
+def _street_patches(hole: Hole) -> NDArray[np.float32]:
+    guide = _continued(hole)
+    known_ground = background.Ground(guide.ground, np.where(hole.forbidden, 0, hole.road))
+    return background.fill(hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground, guide=guide.image)
+
+
+METHODS: dict[str, Callable[[Hole], NDArray[np.float32]]] = {
+    "Telea": _opencv(cv2.INPAINT_TELEA),
+    "Navier-Stokes": _opencv(cv2.INPAINT_NS),
+    "FSR, fast": _xphoto(cv2.xphoto.INPAINT_FSR_FAST),
+    "ShiftMap": _xphoto(cv2.xphoto.INPAINT_SHIFTMAP),
+    "push-pull": _smooth,
+    "patches, true ground": _patches,
+    "street": _street,
+    "street and patches": _street_patches,
+}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
