@@ -6,7 +6,8 @@ writes `vehicles/*.glb` and `vehicles.yaml` (kind, size, author, licence of each
 and `LICENCES.md`. The vehicles are of the Debian package sweethome3d-furniture 1.8 (CC-BY 3.0 and CC0), the skies
 of the npm package @pmndrs/assets 1.7.0 (CC0). Both are fetched by the ordinary clients, apt-get and npm; where one
 is missing, the package can be given as a file (--deb, --skies). What is there already is not made again, so that a
-run that was stopped goes on; files are written whole or not at all. Skies need `pip install OpenEXR`.
+run that was stopped goes on; files are written whole or not at all. Skies need OpenEXR, which
+`pip install -e ".[assets]"` brings.
 """
 
 from __future__ import annotations

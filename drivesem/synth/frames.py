@@ -238,7 +238,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
     return found
 
 
-def _labels(truths: list[Truth]) -> Labels:
+def labels_of(truths: Sequence[Truth]) -> Labels:
     """KITTI labels; what is hardly visible or tiny becomes a region to ignore."""
     kept = [t for t in truths if t.labelled]
     ignored = [
@@ -449,7 +449,7 @@ def render_frame(
         image=picture.image,
         background=None if empty is None else empty.image,
         background_depth_m=None if plain is None else plain.depth_m,
-        labels=_labels(truths),
+        labels=labels_of(truths),
         truths=tuple(truths),
         depth_m=sight.depth.reshape(-1)[closest],
         semantic=sight.semantic.reshape(-1)[closest],

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesem.synth.compare import Comparison, histograms, reference
-from drivesem.synth.frames import Plan, SynthSettings, Truth, boxes_alone, plan_frame, table
+from drivesem.synth.frames import Plan, SynthSettings, boxes_alone, labels_of, plan_frame
 from drivesem.synth.layout import (
     MARGIN_M,
     MOST_VEHICLES,
@@ -26,7 +26,6 @@ from drivesem.synth.layout import (
 )
 from drivesem.synth.soup import Material
 from scene_ir.geometry import ground_footprint
-from scene_ir.types import Labels
 
 
 def _actors(seed: int, **changes: object) -> list[Actor]:
@@ -106,21 +105,7 @@ def plans() -> list[Plan]:
 @pytest.fixture(scope="module")
 def comparison(plans) -> Comparison:
     """150 streets beside KITTI: what the boxes of their actors hide of one another, without surroundings."""
-    return Comparison(histograms(_seen(boxes_alone(plan)) for plan in plans), reference())
-
-
-def _seen(truths: list[Truth]) -> Labels:
-    kept = [t for t in truths if t.labelled]
-    return Labels(
-        kind=tuple(t.actor.label for t in kept),
-        boxes_xyxy=table([t.box_xyxy for t in kept], 4),
-        truncation=torch.tensor([t.truncation for t in kept], dtype=torch.float32),
-        occlusion=torch.tensor([t.occlusion for t in kept], dtype=torch.int64),
-        translation=table([t.translation for t in kept], 3),
-        yaw=torch.tensor([t.yaw for t in kept], dtype=torch.float32),
-        size_lhw=table([t.actor.size_lhw for t in kept], 3),
-        ignore_xyxy=torch.zeros(0, 4),
-    )
+    return Comparison(histograms(labels_of(boxes_alone(plan)) for plan in plans), reference())
 
 
 @pytest.mark.parametrize(
