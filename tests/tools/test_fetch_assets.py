@@ -200,9 +200,8 @@ def test_skies_are_read_from_javascript(tool: ModuleType, tmp_path: Path) -> Non
 
     pixels = np.random.default_rng(0).uniform(0, 9, (16, 32, 3)).astype(np.float16)
     path = tmp_path / "a.exr"
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}).write(
-        str(path)
-    )
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": pixels}).write(str(path))
     module = "export default 'data:application/exr;base64," + base64.b64encode(path.read_bytes()).decode() + "'"
     assert tool.equirectangular(module, "a") == pytest.approx(pixels.astype(np.float32))
     with pytest.raises(FormatError, match="nothing"):
