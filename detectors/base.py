@@ -1,11 +1,13 @@
-"""The contract of every detector with gradients: images to raw predictions, to a loss, to detections."""
+"""The contract of detectors: images to raw predictions, to detections; with gradients, also to a loss."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from detectors.types import Detections, Targets
@@ -50,6 +52,31 @@ class RawPredictions:
             self.confidence_logits[rows],
             self.image_hw,
         )
+
+
+class Predictor(Protocol):
+    """A detector that need have no gradient: what `Detector` is, less loss and t*; detectors of other projects.
+
+    name; classes: labels are indices into it, "Car" among them where it knows cars. What `forward` gives is its
+    own affair, `decode` takes it.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+
+    def forward(self, images: Tensor) -> Any:
+        """images (B, 3, H, W), RGB in [0, 1], any size."""
+        ...
+
+    def decode(self, raw: Any) -> list[Detections]:
+        """One Detections for each image, best first, boxes inside the image; carries no gradient."""
+        ...
+
+
+@torch.no_grad()
+def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
+    """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each."""
+    return predictor.decode(predictor.forward(images))
 
 
 class Detector(nn.Module, ABC):

@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from detectors.base import Detector, DetectorError
+from detectors.base import Detector, DetectorError, Predictor
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES
 
@@ -19,6 +19,26 @@ ARCHITECTURES: dict[str, type[SqueezeDet]] = {"squeezedet": SqueezeDet}
 
 SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safetensors"}
 """Detectors that come with the package."""
+
+
+ONNX = "onnx:"
+"""Before the path of an ONNX graph: onnx:FILE."""
+
+
+def load_predictor(
+    name_or_path: str | Path, device: str | torch.device = "cpu", tiling: str = "auto"
+) -> Predictor:
+    """A detector that is only asked what it finds: `onnx:FILE`, or what `load_detector` takes.
+
+    device: of the latter; graphs run on the CPU. tiling: of a graph, "auto" or "off" (see
+    `detectors.adapters.onnx`). Raises DetectorError as `load_detector` does, and for a file that is no graph, a
+    graph of no known kind, or where ONNX Runtime is missing.
+    """
+    if not str(name_or_path).startswith(ONNX):
+        return load_detector(name_or_path, device)
+    from detectors.adapters.onnx import OnnxPredictor
+
+    return OnnxPredictor(Path(str(name_or_path).removeprefix(ONNX)), tiling)
 
 
 def load_detector(
@@ -34,6 +54,8 @@ def load_detector(
     Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
     to another architecture; the message names the file, what was expected and what was found.
     """
+    if str(name_or_path).startswith(ONNX):
+        raise DetectorError(f"detector: expected one with gradients, found {str(name_or_path)!r}, which has none")
     path = SHIPPED.get(str(name_or_path), Path(name_or_path))
     if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
         known = ", ".join(sorted(SHIPPED))

@@ -1,0 +1,176 @@
+"""Detectors from ONNX files: planted predictions, tiles, and files that are something else."""
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from detectors.adapters import nanodet
+from detectors.adapters.coco import NAMES
+from detectors.adapters.onnx import OnnxPredictor
+from detectors.base import DetectorError, predict
+from detectors.registry import load_detector, load_predictor
+
+NANODET = Path(__file__).resolve().parents[4] / "shared" / "data" / "detectors" / "nanodet_m.onnx"
+SIDE = 64
+"""Of the tiny graphs' input: 8 x 8, 4 x 4 and 2 x 2 cells."""
+CAR, TRUCK = NAMES.index("car"), NAMES.index("truck")
+
+
+def outputs(plants: Mapping[tuple[int, int, int, int], tuple[float, ...]]) -> dict[str, np.ndarray]:
+    """NanoDet's outputs: (stride, row, column, class) -> (score, left, top, right, bottom), in strides."""
+    found = {}
+    for stride in (8, 16, 32):
+        cells = SIDE // stride
+        scores, bins = np.zeros((1, cells * cells, 80)), np.zeros((1, cells * cells, 4, 8))
+        for (level, row, column, label), (score, *distances) in plants.items():
+            if level != stride:
+                continue
+            scores[0, row * cells + column, label] = score
+            for side, distance in enumerate(distances):
+                low = int(distance)
+                # softmax over two bins alone: their mean is the distance
+                bins[0, row * cells + column, side] = -50.0
+                bins[0, row * cells + column, side, low] = np.log(max(1 - (distance - low), 1e-9))
+                bins[0, row * cells + column, side, min(low + 1, 7)] = np.log(max(distance - low, 1e-9))
+        found[f"scores{stride}"] = scores
+        found[f"boxes{stride}"] = bins.reshape(1, cells * cells, 32)
+    return found
+
+
+Make = Callable[..., Path]
+
+
+@pytest.fixture
+def graph(constant_graph: Callable[..., bytes], tmp_path: Path) -> Make:
+    """A file with constant outputs, for an input (1, 3, SIDE, SIDE) or another one."""
+
+    def make(given: Mapping[str, np.ndarray], shape: tuple[int | str, ...] = (1, 3, SIDE, SIDE)) -> Path:
+        pytest.importorskip("onnxruntime")
+        path = tmp_path / "tiny.onnx"
+        path.write_bytes(constant_graph(shape, given))
+        return path
+
+    return make
+
+
+def test_a_planted_box_is_read(graph: Make) -> None:
+    path = graph(
+        outputs({(8, 2, 3, CAR): (0.9, 1.5, 1.0, 2.25, 0.5), (16, 1, 1, TRUCK): (0.4, 0.5, 0.5, 0.5, 0.5)})
+    )
+    predictor = OnnxPredictor(path)
+    (found,) = predict(predictor, torch.zeros(1, 3, SIDE, SIDE))
+    assert [predictor.classes[int(label)] for label in found.labels] == ["Car", "truck"]
+    torch.testing.assert_close(found.scores, torch.tensor([0.9, 0.4]))
+    # centres at (column + 1/2) strides; from edges to pixel centres, half a pixel less
+    x, y = 3.5 * 8 - 0.5, 2.5 * 8 - 0.5
+    expected = [[x - 12, y - 8, x + 18, y + 4], [24 - 8.5, 24 - 8.5, 24 + 7.5, 24 + 7.5]]
+    torch.testing.assert_close(found.boxes_xyxy, torch.tensor(expected), atol=1e-3, rtol=0)
+
+
+def test_a_picture_of_another_shape_is_scaled_and_centred(graph: Make) -> None:
+    # 2 px of a picture of 64 x 128 make one of the network, whose rows 16 to 47 show it
+    path = graph(outputs({(8, 4, 2, CAR): (0.9, 1.0, 1.0, 1.0, 1.0)}))
+    (found,) = predict(OnnxPredictor(path, "off"), torch.zeros(1, 3, 64, 128))
+    expected = torch.tensor([[24.0, 24, 56, 56]]) - 0.5
+    torch.testing.assert_close(found.boxes_xyxy, expected, atol=1e-3, rtol=0)
+
+
+def test_every_window_has_its_place(graph: Make) -> None:
+    # The graph sees the same in every window: in the whole picture and in three of 64 x 64.
+    path = graph(outputs({(8, 4, 4, CAR): (0.9, 1.0, 1.0, 1.0, 1.0)}))
+    (found,) = predict(OnnxPredictor(path), torch.zeros(1, 3, 64, 128))
+    centres = (found.boxes_xyxy[:, 0] + found.boxes_xyxy[:, 2]) / 2
+    assert sorted(round(float(c), 1) for c in centres) == [35.5, 67.5, 71.5, 99.5]
+
+
+def test_what_the_network_is_fed() -> None:
+    image = torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1)
+    blue, green, red = nanodet.prepare(image).flatten().tolist()
+    assert blue == pytest.approx(-103.53 / 57.375)
+    assert green == pytest.approx((127.5 - 116.28) / 57.12)
+    assert red == pytest.approx((255 - 123.675) / 58.395)
+
+
+def test_a_box_is_cut_at_the_pictures_border(graph: Make) -> None:
+    path = graph(outputs({(32, 0, 0, CAR): (0.9, 2.0, 2.0, 0.25, 0.25)}))
+    (found,) = predict(OnnxPredictor(path), torch.zeros(1, 3, SIDE, SIDE))
+    torch.testing.assert_close(found.boxes_xyxy, torch.tensor([[0.0, 0, 23.5, 23.5]]), atol=1e-3, rtol=0)
+
+
+def test_nothing_is_found_in_an_empty_picture(graph: Make) -> None:
+    first, second = predict(OnnxPredictor(graph(outputs({}))), torch.zeros(2, 3, 64, 128))
+    assert len(first) == len(second) == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "expected an ONNX file, found none"),
+        (b"this is no graph", "expected an ONNX graph, found"),
+    ],
+)
+def test_files_that_are_none(content: bytes | None, message: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "own.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DetectorError, match=rf"own\.onnx: {message}") as caught:
+        load_predictor(f"onnx:{path}")
+    assert "\n" not in str(caught.value)
+
+
+def test_graphs_of_no_known_kind(graph: Make) -> None:
+    with pytest.raises(DetectorError, match=r"expected the outputs of nanodet, found y \[1, 5\]"):
+        OnnxPredictor(graph({"y": np.zeros((1, 5))}))
+    wrong = outputs({})
+    wrong["scores8"] = wrong["scores8"][:, 1:]
+    with pytest.raises(DetectorError, match="expected the outputs of nanodet"):
+        OnnxPredictor(graph(wrong))
+
+
+@pytest.mark.parametrize("shape", [(1, 3, "height", "width"), (1, 1, 64, 64), (3, 64, 64)])
+def test_inputs_that_are_no_image_of_one_size(shape: tuple[int | str, ...], graph: Make) -> None:
+    with pytest.raises(
+        DetectorError, match=r"expected one input \(1, 3, height, width\) of fixed size, found image"
+    ):
+        OnnxPredictor(graph(outputs({}), shape))
+
+
+def test_a_missing_runtime_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(DetectorError, match=r"own\.onnx: needs ONNX Runtime: pip install 'onnxruntime>=1\.19'"):
+        load_predictor("onnx:own.onnx")
+
+
+def test_what_has_no_gradient_is_no_detector_to_attack() -> None:
+    with pytest.raises(DetectorError, match=r"expected one with gradients, found 'onnx:own\.onnx'"):
+        load_detector("onnx:own.onnx")
+
+
+def test_tiling_has_two_ways(graph: Make) -> None:
+    with pytest.raises(DetectorError, match="tiles: expected auto or off, found 'some'"):
+        load_predictor(f"onnx:{graph(outputs({}))}", tiling="some")
+
+
+def test_the_shipped_detector_is_a_predictor_too() -> None:
+    predictor = load_predictor("squeezedet")
+    (found,) = predict(predictor, torch.zeros(1, 3, 64, 96))
+    assert "Car" in predictor.classes
+    assert bool((found.scores >= 0).all())
+
+
+@pytest.mark.skipif(not NANODET.is_file(), reason="needs ../shared/data/detectors/nanodet_m.onnx")
+def test_nanodet_is_recognised_and_threads_follow_torch() -> None:
+    pytest.importorskip("onnxruntime")
+    predictor = OnnxPredictor(NANODET)
+    assert predictor.format is nanodet.FORMAT
+    assert predictor.input_hw == (416, 416)
+    assert predictor.classes.index("Car") == CAR
+    assert predictor._session.get_session_options().intra_op_num_threads == torch.get_num_threads()
+    raw = predictor.forward(torch.full((1, 3, 375, 1242), 0.5))
+    assert [len(seen) for seen in raw.images] == [4]
+    assert all(bool((d.scores <= 1).all()) for d in predictor.decode(raw))
