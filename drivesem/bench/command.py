@@ -1,4 +1,4 @@
-"""`drivesem bench step|render|memory|synth|derender`: figures with method, machine and versions."""
+"""`drivesem bench step|render|memory|synth|derender|found|label-free`: figures with method, machine, versions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from detectors.base import DetectorError
 from detectors.registry import load_detector
-from drivesem.bench import derender, memory, render, step, synth, tables
+from drivesem.bench import derender, found, label_free, memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
 from drivesem.config import Bench, UsageError, numbers, processes
@@ -46,12 +46,14 @@ def run(config: Bench) -> int:
         "memory": _memory,
         "synth": _synth,
         "derender": _derender,
+        "found": _found,
+        "label-free": _label_free,
     }
     console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
-    found = measure[config.what](config, cars, triangles, console)
+    measured = measure[config.what](config, cars, triangles, console)
     result = {
         "what": config.what,
-        **found,
+        **measured,
         "machine": machine(config.device),
         "versions": versions(),
         "command": _command(config),
@@ -147,12 +149,50 @@ def _derender(config: Bench, cars: list[int], triangles: list[int], console: Con
     }
 
 
+def _found(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+    targets = _targets(config)
+    sheets = None if targets is None else targets[0].with_suffix("")
+    try:
+        frames = dict(_watched(found.measure(config, sheets), found.count(config), console))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    rows = [car for name in sorted(frames) for car in frames[name]]
+    if sheets is not None:
+        found.rank_sheets(rows, sheets)
+    return {
+        "frames": len(frames),
+        "rows": [asdict(row) for row in rows],
+        "summary": found.summary(rows),
+        "method": found.METHOD,
+    }
+
+
+def _label_free(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+    total = len(label_free.names(config))
+    frames = dict(_watched(label_free.measure(config), total, console))
+    ordered = [frames[name] for name in sorted(frames)]
+    return {
+        "frames": len(frames),
+        "rows": [asdict(row) for frame in ordered for row in frame.rows],
+        "summary": label_free.summary(ordered),
+        "method": label_free.METHOD,
+    }
+
+
 def _watched(rows: Iterator[T], total: int, console: Console) -> Iterator[T]:
     """The same rows; says how far it has come."""
     with console.status("measuring") as status:
         for done, row in enumerate(rows, start=1):
             status.update(f"measuring: {done} rows of about {total}")
             yield row
+
+
+_FOUND = ("dataset", "root", "scenes", "tiles", "limit")
+"""Settings of bench found."""
 
 
 def _seconds(name: str, config: Bench) -> float:
@@ -187,7 +227,7 @@ def _command(config: Bench) -> str:
     default = Bench(what=config.what)
     words = ["drivesem", "bench", config.what, *(["--quick"] if config.quick else [])]
     words += ["--ablate"] if config.ablate else []
-    for name in ("cars", "triangles", "frames", "workers", "threads", "detector", "device", "seed"):
+    for name in ("cars", "triangles", "frames", "workers", "threads", "detector", "device", "seed", *_FOUND):
         value = getattr(config, name)
         if value != getattr(default, name):
             words += [f"--{name}", str(value)]

@@ -54,6 +54,15 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
         "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
         "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
     },
+    "label-free": {
+        "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
+        "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
+    },
+    "found": {
+        "which": ("cars", "cars"), "measure": ("figure", "figure"), "cars": ("count", "count"),
+        "found": ("found", "found"), "share": ("share", "share"), "low": ("from", "from"), "high": ("to", "to"),
+        "goal": ("goal", "goal"),
+    },
 }  # fmt: skip
 """Field of a row, its heading in the documentation, and the short one for terminals, where it is shown there."""
 TITLES = {
@@ -64,6 +73,8 @@ TITLES = {
     "memory": "Memory",
     "synth": "The scene generator",
     "derender": "De-rendering beside the generator's truth",
+    "label-free": "Photographs without labels, beside labels that were hidden",
+    "found": "Cars that a detector finds, removed and moved",
 }
 
 

@@ -1,0 +1,356 @@
+"""A detector's judgement of de-rendered photographs: are removed cars found again, and moved ones where they are?
+
+The photograph is asked first, so that only what the detector knows is counted. What it finds after all cars are
+taken out is a remnant; a car that it no longer finds after a small move was drawn badly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from detectors.base import Predictor
+from detectors.registry import load_predictor
+from drivesem.bench.found_sheet import failure_sheet
+from drivesem.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
+from drivesem.config import Bench, Derender
+from drivesem.edits import FrameEdit, ObjectEdit
+from drivesem.feasibility_check import check_places
+from drivesem.labels import Labeller, MovedLabels
+from drivesem.pool import outcomes
+from drivesem.scene_edits import moved
+from drivesem.sources import SceneSource, open_source
+from scene_ir import files
+from scene_ir.compositor import Compositor, render
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.io import load_scene
+from scene_ir.removal import without_objects
+from scene_ir.types import Category, SceneIR
+
+METHOD = (
+    "Cars (KITTI's Car and Van) that became objects. Found: a detection of class Car with a score above 0.3 and "
+    "an IoU of at least 0.5 with the box, each detection for one car only. Removed: of the cars found in the "
+    "photograph, those found again at their old boxes after all objects were taken out; beside it at an IoU of "
+    "0.3 already, as a vehicle of any class, at a score of 0.1 already, and those in whose old boxes at least "
+    "half of a car lies that the photograph did not have. Moved: each car by 0.5 m along its heading and by 10 "
+    "degrees, signs by seed such that it leaves neither road nor picture, hits nothing and stays as visible; one "
+    "at a time, and all together; of those found in the photograph, the ones found at their moved boxes; as "
+    "often: found at moved boxes over found at old ones. Judged: at least 25 px high and at most partly occluded, "
+    "as labelled. Intervals: Wilson, 95 %. Pictures are rounded to 8 bits before they are judged."
+)
+FAINT_SCORE, LOOSE_IOU = 0.1, 0.3
+"""At which removal is looked at more strictly, beside."""
+MOVE_M, TURN_RAD = 0.5, math.radians(10.0)
+LEAST_HEIGHT_PX, MOST_OCCLUSION = 25.0, 1
+_MORE_CUT = 0.05
+"""Share of a car by which a move may carry it farther out of the picture."""
+_Z_95 = 1.959964
+"""Of the normal distribution, two-sided 95 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarRow:
+    """One car of one frame. judged: high and visible enough. before: in the photograph; removed, removed_any: at
+    the old box in the emptied picture, as a car and as any vehicle; removed_faint: as a car at a tenth of a score;
+    ghost: the surest car that lies at least half in the old box and was not in the photograph; alone, together: at
+    the moved box, None where no move was possible. move: (m along the heading, rad).
+    """
+
+    frame: str
+    row: int
+    box_xyxy: tuple[float, ...]
+    height_px: float
+    occlusion: int
+    truncation: float
+    judged: bool
+    before: Sight
+    removed: Sight
+    removed_any: Sight
+    removed_faint: Sight
+    ghost: Sight
+    move: tuple[float, float] | None
+    alone: Sight | None
+    together: Sight | None
+
+
+def measure(config: Bench, sheets: Path | None = None) -> Iterator[tuple[str, list[CarRow]]]:
+    """Frame by frame, in the order in which they are done: its identifier and its cars.
+
+    config: dataset, root, scenes, detector, tiles, limit, seed, workers. sheets: a folder that gets a picture
+    of each failure. Raises DetectorError, SceneError or UsageError for bad input.
+    """
+    judge = _Judge(config, sheets)
+    names = judge.names()
+    for name, outcome in outcomes(judge.frame, partial(_in_process, config, sheets), names, config):
+        yield name, outcome()
+
+
+def count(config: Bench) -> int:
+    """How many frames `measure` goes through."""
+    return len(_names(config))
+
+
+def _in_process(config: Bench, sheets: Path | None) -> Callable[[str], list[CarRow]]:
+    return _Judge(config, sheets).frame
+
+
+def _source(config: Bench) -> SceneSource:
+    asked = Derender(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
+    return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
+
+
+def _names(config: Bench) -> list[str]:
+    return list(_source(config).identifiers())[: config.limit]
+
+
+class _Folder:
+    """Scenes that `drivesem derender` wrote, wherever below a folder they lie."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._names = sorted(p.parent.relative_to(folder).as_posix() for p in folder.rglob("scene.json"))
+        if not self._names:
+            raise FormatError(str(folder), "scenes as drivesem derender writes them", "none")
+
+    def identifiers(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def has_vehicles(self, identifier: str) -> bool:
+        return len(self.scene(identifier).objects) > 0
+
+    def scene(self, identifier: str) -> SceneIR:
+        return load_scene(self._folder / identifier)
+
+
+class _Judge:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Bench, sheets: Path | None) -> None:
+        self._config = config
+        self._source = _source(config)
+        self._sheets = sheets
+        self._predictor = load_predictor(config.detector, config.device, config.tiles)
+
+    def names(self) -> list[str]:
+        return list(self._source.identifiers())[: self._config.limit]
+
+    def frame(self, name: str) -> list[CarRow]:
+        number = self.names().index(name)
+        rng = np.random.default_rng([self._config.seed, number])
+        return judge(name, self._source.scene(name), self._predictor, rng, self._sheets)
+
+
+def judge(
+    name: str, scene: SceneIR, predictor: Predictor, rng: np.random.Generator, sheets: Path | None = None
+) -> list[CarRow]:
+    """The cars of one scene, removed and moved. rng: signs of the moves. sheets: a folder for failures' pictures.
+
+    Raises FormatError for a detector that knows no cars.
+    """
+    if CAR not in predictor.classes:
+        raise FormatError("detector", f"one with class {CAR}", ", ".join(predictor.classes))
+    rows = (scene.objects.category == int(Category.CAR)).nonzero()[:, 0].tolist()
+    if not rows:
+        return []
+    eye = Eye(predictor)
+    moves = _Moves(scene, rows, rng)
+    photograph = eye.look(scene.photograph, scene.objects.box2d)
+    emptied = eye.look(_emptied(scene), scene.objects.box2d)
+    crowd = eye.look(*moves.together())
+    found: list[CarRow] = []
+    for row in rows:
+        chosen = moves.alone.get(row)
+        alone = None if chosen is None else eye.look(chosen.image, chosen.boxes_xyxy)
+        box, occlusion = scene.objects.box2d[row].tolist(), int(scene.objects.occlusion[row])
+        height = box[3] - box[1]
+        car = CarRow(
+            frame=name,
+            row=row,
+            box_xyxy=tuple(round(v, 2) for v in box),
+            height_px=round(height, 1),
+            occlusion=occlusion,
+            truncation=round(float(scene.objects.truncation[row]), 3),
+            judged=height >= LEAST_HEIGHT_PX and occlusion <= MOST_OCCLUSION,
+            before=photograph.assigned[row],
+            removed=emptied.sight(row, (CAR,)),
+            removed_any=emptied.sight(row, VEHICLES),
+            removed_faint=emptied.sight(row, (CAR,), FAINT_SCORE),
+            ghost=emptied.ghost(row, photograph),
+            move=None if chosen is None else (chosen.along_m, chosen.turn),
+            alone=None if alone is None else alone.assigned[row],
+            together=crowd.assigned[row] if row in moves.in_crowd else None,
+        )
+        found.append(car)
+        if sheets is None:
+            continue
+        for kind in failures(car):
+            view = {"removed": emptied, "alone": alone, "together": crowd}[kind]
+            assert view is not None
+            now = {"removed": car.removed, "alone": car.alone, "together": car.together}[kind] or UNSEEN
+            told = f"{name} row {row}, {kind}: IoU {car.before.iou:.2f}, score {car.before.score:.2f} before, "
+            told += f"{now.iou:.2f}, {now.score:.2f} now"
+            files.write_png(
+                sheets / f"{kind}-{_plain(name)}-{row}.png", failure_sheet(photograph, view, row, told)
+            )
+    return found
+
+
+def failures(car: CarRow) -> list[str]:
+    """What went wrong with a car that the photograph shows: removed, alone, together."""
+    if not car.before.found:
+        return []
+    found = ["removed"] if car.removed.found else []
+    return found + [
+        k for k, s in (("alone", car.alone), ("together", car.together)) if s is not None and not s.found
+    ]
+
+
+def _emptied(scene: SceneIR) -> Tensor:
+    empty = without_objects(scene, range(len(scene.objects)))
+    with torch.no_grad():
+        return render([empty])[0].image
+
+
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    """A scene with one car moved, its picture (3, H, W), and the boxes (N, 4) px of all objects in it."""
+
+    along_m: float
+    turn: float
+    scene: SceneIR
+    image: Tensor
+    boxes_xyxy: Tensor
+
+
+class _Moves:
+    """A move of each car of a scene that can be moved, and the scene with as many of them as fit together.
+
+    alone: by row, what could be moved; in_crowd: rows moved in `together`.
+    """
+
+    def __init__(self, scene: SceneIR, rows: Sequence[int], rng: np.random.Generator) -> None:
+        self._compositor = Compositor(scene)
+        self._scene = scene
+        with torch.no_grad():
+            self._labeller = Labeller(scene, self._compositor.render(scene))
+        signs = {row: rng.permutation(4) for row in rows}
+        self.alone = {row: move for row in rows if (move := self._possible(row, signs[row])) is not None}
+        self.in_crowd: list[int] = []
+
+    def _possible(self, row: int, order: NDArray[np.int64]) -> _Moved | None:
+        for k in order.tolist():
+            along, turn = (1 - 2 * (k & 1)) * MOVE_M, (1 - (k & 2)) * TURN_RAD
+            changed = self._changed({row: (along, turn)})
+            if changed is None:
+                continue
+            image, labels = self._drawn(changed)
+            if self._as_visible(labels, row):
+                return _Moved(along, turn, changed, image, labels.boxes_xyxy)
+        return None
+
+    def _changed(self, places: Mapping[int, tuple[float, float]]) -> SceneIR | None:
+        """The scene with cars moved, (m along, rad) by row; None where one leaves the road or hits another."""
+        edits: dict[int | str, ObjectEdit] = {
+            row: ObjectEdit(translate_m=(along, 0.0), rotate=turn) for row, (along, turn) in places.items()
+        }
+        changed = moved(self._scene, FrameEdit(edits))
+        return None if check_places(self._scene, changed, range(len(self._scene.objects))) else changed
+
+    def _drawn(self, changed: SceneIR) -> tuple[Tensor, MovedLabels]:
+        with torch.no_grad():
+            drawn = self._compositor.render(changed)
+            return drawn.image, self._labeller.moved(changed, drawn)
+
+    def _as_visible(self, labels: MovedLabels, row: int) -> bool:
+        """Whether a car is about as much in the picture as before, and hidden by others no more."""
+        objects = self._scene.objects
+        cut = float(labels.truncation[row] - objects.truncation[row]) > _MORE_CUT
+        return not (
+            cut or bool(labels.became_ignored[row]) or int(labels.occlusion[row]) > int(objects.occlusion[row])
+        )
+
+    def together(self) -> tuple[Tensor, Tensor]:
+        """The picture (3, H, W) of as many moves at once as do not collide, and all objects' boxes (N, 4) px."""
+        places: dict[int, tuple[float, float]] = {}
+        changed = self._scene
+        for row, move in self.alone.items():
+            more = self._changed({**places, row: (move.along_m, move.turn)})
+            if more is not None:
+                places[row], changed = (move.along_m, move.turn), more
+        image, labels = self._drawn(changed)
+        self.in_crowd = [row for row in places if self._as_visible(labels, row)]
+        return image, labels.boxes_xyxy
+
+
+def wilson(found: int, count: int) -> tuple[float, float]:
+    """The 95 % interval of a share, after Wilson (1927). RangeError unless 0 <= found <= count and count >= 1."""
+    if count < 1 or not 0 <= found <= count:
+        raise RangeError("share", "0 to all of at least one", f"{found} of {count}")
+    share, z2 = found / count, _Z_95 * _Z_95
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = _Z_95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def summary(cars: Sequence[CarRow]) -> list[dict[str, Any]]:
+    """A line a figure, of the judged cars, then of all: how many, how many found, share and interval, the goal."""
+    return _summary([c for c in cars if c.judged], "judged") + _summary(cars, "all")
+
+
+def _summary(cars: Sequence[CarRow], which: str) -> list[dict[str, Any]]:
+    known = [c for c in cars if c.before.found]
+    lines = [
+        _line(which, "in the photograph", [c.before.found for c in cars]),
+        _line(which, "removed, found again", [c.removed.found for c in known], "at most 0.05"),
+        _line(which, f"removed, IoU {LOOSE_IOU}", [c.removed.iou >= LOOSE_IOU for c in known]),
+        _line(which, "removed, as any vehicle", [c.removed_any.found for c in known]),
+        _line(which, f"removed, score {FAINT_SCORE}", [c.removed_faint.found for c in known]),
+        _line(which, "removed, a new car in its place", [c.ghost.score > 0 for c in known]),
+    ]
+    for name, key in (("one at a time", "alone"), ("all together", "together")):
+        pairs = [(c.before.found, sight.found) for c in cars if (sight := getattr(c, key)) is not None]
+        lines.append(_line(which, f"moved {name}", [now for then, now in pairs if then], "at least 0.95"))
+        then, now = (sum(column) for column in zip(*pairs, strict=True)) if pairs else (0, 0)
+        if then:
+            line = {"cars": then, "found": now, "share": round(now / then, 4)}
+            lines.append({"which": which, "measure": f"moved {name}, as often", **line})
+    return [line for line in lines if line["cars"]]
+
+
+def _line(which: str, measure: str, found: Sequence[bool], goal: str | None = None) -> dict[str, Any]:
+    line: dict[str, Any] = {"which": which, "measure": measure, "cars": len(found), "found": sum(found)}
+    if found:
+        low, high = wilson(sum(found), len(found))
+        line |= {"share": round(sum(found) / len(found), 4), "low": round(low, 4), "high": round(high, 4)}
+    return {**line, "goal": goal}
+
+
+def rank_sheets(cars: Sequence[CarRow], folder: Path) -> None:
+    """Name the pictures of failures by how bad they are, judged cars before others: removed-01-000008-3.png.
+
+    Pictures of earlier runs go.
+    """
+    kept: set[str] = set()
+    for kind in ("removed", "alone", "together"):
+        failed = [c for c in cars if kind in failures(c)]
+        failed.sort(key=lambda c: (not c.judged, -(c.removed.score if kind == "removed" else c.before.score)))
+        for place, car in enumerate(failed, start=1):
+            name = f"{_plain(car.frame)}-{car.row}.png"
+            kept.add(f"{kind}-{place:02d}-{name}")
+            (folder / f"{kind}-{name}").replace(folder / f"{kind}-{place:02d}-{name}")
+        for old in folder.glob(f"{kind}-*.png"):
+            if old.name not in kept:
+                old.unlink()
+
+
+def _plain(name: str) -> str:
+    return name.replace("/", "_")
