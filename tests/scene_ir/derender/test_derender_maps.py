@@ -1,4 +1,4 @@
-"""Ground plane, depth, sky, foliage and road by rule."""
+"""Ground plane, horizon, depth and sun by rule."""
 
 from __future__ import annotations
 
@@ -21,16 +21,6 @@ def labels_at(points: list[list[float]]) -> Labels:
     )  # fmt: skip
 
 
-def street() -> np.ndarray:
-    rng = np.random.default_rng(0)
-    image = np.zeros((200, 480, 3), np.float32)
-    image[:50] = (0.7, 0.82, 0.98)
-    image[50:95] = (0.2, 0.42, 0.15)
-    image[95:] = 0.5
-    image[50:] += rng.normal(0, 0.03, (150, 480, 1)).astype(np.float32)
-    return np.clip(image, 0, 1)
-
-
 def test_without_labels_the_ground_is_level_at_camera_height():
     assert maps.fit_ground(None, []) == pytest.approx(LEVEL, abs=1e-6)
 
@@ -49,28 +39,6 @@ def test_horizon_and_plane_depth_of_a_level_camera():
     depth = maps.plane_depth(LEVEL, CAMERA)
     assert np.isinf(depth[:88]).all()
     assert depth[188, 100] == pytest.approx(380 * 1.65 / 100, rel=1e-4)
-
-
-def test_sky_foliage_and_road_are_where_they_are():
-    image = street()
-    nothing = np.zeros(image.shape[:2], bool)
-    sky = maps.sky_map(image, 88.0, nothing)
-    road = maps.road_map(image, 88.0, nothing)
-    foliage = maps.foliage_map(image, sky, road, nothing)
-    assert sky[:44].mean() > 0.95
-    assert sky[56:].max() < 0.05
-    assert foliage[60:85].mean() > 0.8
-    assert foliage[110:].mean() < 0.1
-    assert road[110:].mean() > 0.9
-    assert road[:88].max() == 0
-
-
-def test_vehicles_are_neither_sky_nor_foliage():
-    image = street()
-    car = np.zeros(image.shape[:2], bool)
-    car[20:90, 100:200] = True
-    assert maps.sky_map(image, 88.0, car)[car].max() == 0
-    assert maps.foliage_map(image, np.zeros_like(image[..., 0]), np.zeros_like(image[..., 0]), car)[car].max() == 0
 
 
 def test_depth_is_ground_below_a_wall_above_and_infinite_in_the_sky():

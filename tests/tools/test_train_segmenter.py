@@ -1,0 +1,134 @@
+"""Training of the segmentation network: what it is shown, what it should say, and that a run can be gone on
+with."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from scene_ir.derender.segment import Class
+
+ROOT = Path(__file__).resolve().parents[2]
+specification = importlib.util.spec_from_file_location("train_segmenter", ROOT / "tools" / "train_segmenter.py")
+assert specification is not None
+assert specification.loader is not None
+training: Any = importlib.util.module_from_spec(specification)
+sys.modules["train_segmenter"] = training
+specification.loader.exec_module(training)
+SETTINGS = training.Settings(steps=4, batch=2, frames=2)
+
+
+@pytest.fixture(scope="module")
+def streets() -> list[Any]:
+    return [training.street(7, index, "train") for index in range(2)]
+
+
+@pytest.fixture(scope="module")
+def store(streets: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "street", lambda seed, index, split: streets[index])
+        return training.Store(tmp_path_factory.mktemp("segment"), 2, 7, "train")
+
+
+def test_classes_are_the_generators(streets: list[Any]) -> None:
+    frame = streets[0]
+    classes = training.classes_of(frame)
+    environment = frame.environment
+    clear = {"sky": [Class.SKY], "foliage_map": [Class.LEAVES, Class.GRASS], "road": [Class.ROAD]}
+    for name, kinds in clear.items():
+        share = getattr(environment, name).numpy()
+        found = np.isin(classes, kinds)
+        assert found[share == 1].mean() > 0.999, name
+        assert found[share == 0].mean() < 0.001, name
+    vehicle = np.isin(frame.semantic, [12, 13, 14])
+    assert np.array_equal(classes == Class.VEHICLE, vehicle)
+
+
+def test_a_store_is_made_once_and_of_one_stream(store: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    assert len(store) == 2
+    assert store.images.shape == (2, *training.STORE_HW, 3)
+    frame = training.street(7, 0, "train")
+    made = []
+    monkeypatch.setattr(training, "street", lambda *key: (made.append(key), frame)[1])
+    first = training.Store(tmp_path, 1, 7, "train")
+    second = training.Store(tmp_path, 1, 7, "train")
+    assert made == [(7, 0, "train")]
+    assert np.array_equal(first.classes, second.classes)
+    assert np.array_equal(first.images[0], store.images[0])
+    with pytest.raises(ValueError, match="expected frames of"):
+        training.Store(tmp_path, 1, 8, "train")
+
+
+def test_a_crop_keeps_picture_classes_and_elevation_together(store: Any) -> None:
+    for seed in range(6):
+        image, classes, height = training.cropped(store, 0, np.random.default_rng(seed))
+        assert image.shape == (*training.CROP_HW, 3)
+        assert set(np.unique(classes)) <= set(Class)
+        sky = classes == Class.SKY
+        assert not sky[height < -0.03].any()
+        assert not (classes == Class.ROAD)[height > 0.03].any()
+        assert (np.diff(height, axis=0) < 0).all()
+
+
+def test_a_step_is_a_function_of_seed_and_number(store: Any) -> None:
+    first, again, other = (training.batch_of(store, step, SETTINGS) for step in (3, 3, 4))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first[0], other[0])
+    images, heights, classes = first
+    assert images.shape == (2, 3, *training.CROP_HW)
+    assert heights.shape == (2, 1, *training.CROP_HW)
+    assert classes.shape == (2, *training.CROP_HW)
+    assert 0 <= float(images.min()) <= float(images.max()) <= 1
+
+
+def test_pictures_stay_neither_black_nor_white(store: Any) -> None:
+    levels = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        image, classes, height = training.cropped(store, seed % 2, rng)
+        training.other_surfaces(image, classes, height, rng)
+        levels.append(float(training.other_camera(image, rng).mean()))
+    assert min(levels) > 0.03
+    assert max(levels) < 0.97
+    assert np.std(levels) > 0.05
+
+
+def test_the_truth_costs_least(store: Any) -> None:
+    _, _, classes = training.batch_of(store, 0, SETTINGS)
+    shares = F.avg_pool2d(F.one_hot(classes, len(Class)).permute(0, 3, 1, 2).float(), 2)
+    right = training.loss_of((shares + 1e-6).log(), classes)
+    assert right < training.loss_of((shares.roll(1, 1) + 1e-6).log(), classes)
+    assert right < training.loss_of(torch.zeros_like(shares), classes)
+
+
+def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    whole = training.Run(SETTINGS)
+    losses = [whole.step(store) for _ in range(4)]
+    first = training.Run(SETTINGS)
+    for _ in range(2):
+        first.step(store)
+    first.save(tmp_path / "checkpoint.safetensors")
+    second = training.Run(SETTINGS)
+    second.load(tmp_path / "checkpoint.safetensors")
+    assert [second.step(store) for _ in range(2)] == losses[2:]
+    for name, value in whole.average.items():
+        assert torch.equal(value, second.average[name]), name
+    other = training.Run(replace(SETTINGS, rate=1e-3))
+    with pytest.raises(ValueError, match="expected settings"):
+        other.load(tmp_path / "checkpoint.safetensors")
+
+
+def test_judged_by_overlap(streets: list[Any]) -> None:
+    figures = training.judge(training.Run(SETTINGS).averaged(), streets)
+    assert set(figures) == set(training.JUDGED)
+    assert all(0 <= whole <= 1 for whole, _ in figures.values())
+    assert training.table_of(figures).count("\n") == 1 + len(figures)

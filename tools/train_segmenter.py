@@ -1,0 +1,519 @@
+"""Train the network that tells sky, foliage and road apart (`scene_ir.derender.segment`) on generated streets.
+
+    python tools/train_segmenter.py --run build/segment
+
+A run first makes its frames (they are kept in its folder), then trains. It goes on where it was stopped, to the
+same bytes as one that was never stopped (one thread, one machine).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors.registry import read_weights, write_weights
+from drivesem.synth.frames import (
+    GENERATOR_VERSION,
+    VARIANTS,
+    SynthFrame,
+    SynthSettings,
+    plan_frame,
+    render_frame,
+    variation_of,
+)
+from drivesem.synth.layout import LayoutSettings
+from drivesem.synth.soup import Material, Semantic
+from drivesem.synth.variations import MIXED, VARIATIONS
+from scene_ir import files
+from scene_ir.derender import segment
+from scene_ir.derender.segment import Class, SegmentNet
+
+STREAM = 0x5E6
+"""Keeps this tool's random numbers apart from the generator's."""
+MIXED_SHARE, LEAVES_SHARE = 0.5, 0.6
+"""Of frames in weather of their own and not in one of Virtual KITTI's variations; of frames whose foliage is
+changed by the generator's codes."""
+LEAVES = ((-0.6, 0.6), (-0.8, 0.6), (-0.6, 0.7))
+"""Ranges of those codes: hue, lightness, density."""
+STORE_HW = (192, 624)
+"""Size at which frames are kept: KITTI's, halved."""
+STORE_FOCAL_PX = 361.0
+CLASS_OF = {
+    Material.SKY: Class.SKY,
+    Material.LEAF: Class.LEAVES,
+    Material.GRASS: Class.GRASS,
+    Material.ROAD: Class.ROAD,
+    Material.PARKING: Class.ROAD,
+    Material.PAVEMENT: Class.GROUND,
+    Material.KERB: Class.GROUND,
+    Material.GRAVEL: Class.GROUND,
+}
+"""What a material is, where no vehicle and no person is seen; all others are `Class.OTHER`."""
+ACTORS = {
+    Semantic.CAR: Class.VEHICLE,
+    Semantic.VAN: Class.VEHICLE,
+    Semantic.TRUCK: Class.VEHICLE,
+    Semantic.PEDESTRIAN: Class.PERSON,
+    Semantic.CYCLIST: Class.PERSON,
+}
+
+
+def classes_of(frame: SynthFrame) -> np.ndarray:
+    """The `Class` (H, W) uint8 of each pixel. The frame is one without a background of its own."""
+    table = np.full(256, Class.OTHER, np.uint8)
+    for material, kind in CLASS_OF.items():
+        table[material] = kind
+    found = table[frame.ground_material]
+    for semantic, kind in ACTORS.items():
+        found[frame.semantic == semantic] = kind
+    return found
+
+
+def street(seed: int, index: int, split: str) -> SynthFrame:
+    """Frame `index` of a stream: any weather, any season, from turned cameras too."""
+    rng = np.random.default_rng([STREAM, seed, index, split == "train"])
+    layout = LayoutSettings(variants=VARIANTS[split], people=True)
+    plan = plan_frame(seed, index, split, SynthSettings(layout=layout, bent=True))
+    name = MIXED if rng.random() < MIXED_SHARE else str(rng.choice(VARIATIONS))
+    leaves = tuple(float(rng.uniform(*reach)) for reach in LEAVES)
+    plan = replace(variation_of(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
+    frame = render_frame(plan)
+    assert frame is not None
+    return frame
+
+
+def shrunk(classes: np.ndarray) -> np.ndarray:
+    """The class (h, w) that most of each pixel of a kept frame shows. classes: (H, W)."""
+    height, width = STORE_HW
+    shares = [
+        cv2.resize((classes == kind).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        for kind in Class
+    ]
+    return np.argmax(shares, axis=0).astype(np.uint8)
+
+
+class Store:
+    """Frames of a stream at the size `STORE_HW`, made as far as they are not there yet.
+
+    images (N, h, w, 3) uint8, classes (N, h, w) uint8, elevation (N, h, w) float16: see `segment.elevation`.
+    """
+
+    def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        stamp = folder / "frames.json"
+        told = {"seed": seed, "split": split}
+        found = files.read_json(stamp) if stamp.is_file() else told | {"frames": 0}
+        if {k: found[k] for k in told} != told:
+            raise ValueError(f"{stamp}: expected frames of {told}, found {found}")
+        height, width = STORE_HW
+        for index in range(found["frames"], frames):
+            frame = street(seed, index, split)
+            image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
+            height_of = segment.elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
+            files.write_npz(
+                folder / f"{index:05d}.npz",
+                {"image": image, "classes": shrunk(classes_of(frame)), "elevation": height_of},
+            )
+            files.write_json(stamp, told | {"frames": index + 1})
+        parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
+        self.images = np.stack([p["image"] for p in parts])
+        self.classes = np.stack([p["classes"] for p in parts])
+        self.elevation = np.stack([p["elevation"] for p in parts])
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+CROP_HW = (112, 224)
+ZOOM = (0.75, 1.35)
+"""Crops of this size are taken from frames zoomed by a factor in this range of the network's focal length."""
+
+
+def _draw(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(rng.uniform(low, high))
+
+
+def _smooth(rng: np.random.Generator, cells: int) -> np.ndarray:
+    """Smooth noise (h, w) of about standard deviation 1, with so many cells along the crop's height."""
+    grid = rng.normal(0, 1, (cells, cells * 2)).astype(np.float32)
+    return cv2.resize(grid, CROP_HW[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def cropped(store: Store, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A part of a frame, zoomed, mirrored or not: image (h, w, 3) in [0, 1], classes (h, w), elevation (h, w)."""
+    height, width = CROP_HW
+    whole_height, whole_width = STORE_HW
+    down = _draw(rng, *ZOOM) * segment.INPUT_FOCAL_PX / STORE_FOCAL_PX
+    across = down * _draw(rng, 0.9, 1.1)
+    y0 = _draw(rng, 0, whole_height * down - height)
+    x0 = _draw(rng, 0, whole_width * across - width)
+    mirror = rng.random() < 0.5
+    matrix = np.array([[across, 0, -x0], [0, down, -y0]])
+    if mirror:
+        matrix[0] = -matrix[0] + np.array([0, 0, width - 1])
+
+    def taken(values: np.ndarray, how: int) -> np.ndarray:
+        return cv2.warpAffine(values, matrix, (width, height), flags=how, borderMode=cv2.BORDER_REPLICATE)
+
+    image = taken(store.images[index], cv2.INTER_LINEAR).astype(np.float32) / 255
+    classes = taken(store.classes[index], cv2.INTER_NEAREST)
+    return image, classes, taken(store.elevation[index].astype(np.float32), cv2.INTER_LINEAR)
+
+
+def other_surfaces(
+    image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Each kind of thing in colours and light of its own, other skies, unknown things in the way; in place.
+
+    What the generator draws always alike must not be what the network goes by.
+    """
+    height, width = classes.shape
+    if rng.random() < 0.4:
+        gains = np.exp(rng.normal(0, 0.25, (len(Class), 1)) + rng.normal(0, 0.06, (len(Class), 3)))
+        image *= cv2.blur(gains.astype(np.float32)[classes], (5, 5))
+    if rng.random() < 0.15:
+        # walls in the sun, as white as the sky beside them
+        image *= 1 + (classes == Class.OTHER)[..., None] * _draw(rng, 0.5, 2.0)
+    if rng.random() < 0.5:
+        # leaves and grass in the sun: speckles
+        green = ((classes == Class.LEAVES) | (classes == Class.GRASS))[..., None]
+        speckles = np.exp(_draw(rng, 0.2, 0.7) * _smooth(rng, int(rng.integers(30, CROP_HW[0]))))[..., None]
+        yellow = np.array([1.0, _draw(rng, 0.8, 1.0), _draw(rng, 0.3, 0.9)], np.float32) * _draw(rng, 0.8, 1.8)
+        image *= 1 + green * (speckles * (yellow if rng.random() < 0.5 else 1.0) - 1)
+    sky = (classes == Class.SKY)[..., None]
+    if sky.any() and rng.random() < 0.6:
+        top = np.array([_draw(rng, 0.2, 1.0), 0.0, 1.0], np.float32)
+        top[1] = _draw(rng, float(top[0]), 1.0)
+        top *= _draw(rng, 0.55, 1.1)
+        low = top + (_draw(rng, 0.8, 1.15) - top) * _draw(rng, 0, 1)
+        share = np.clip(elevation / 0.25, 0, 1)[..., None]
+        drawn = low + (top - low) * share
+        if rng.random() < 0.4:
+            clouds = np.clip(_smooth(rng, 4) + 0.6 * _smooth(rng, 12) - _draw(rng, -0.5, 1), 0, 1)[..., None]
+            drawn = drawn + (_draw(rng, 0.75, 1.1) - drawn) * clouds
+        opacity = cv2.blur(sky.astype(np.float32)[..., 0], (3, 3))[..., None]
+        image += (drawn - image) * opacity
+    for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.35 else 0):
+        h, w = int(_draw(rng, 6, 70)), int(_draw(rng, 3, 70))
+        y, x = int(rng.integers(0, height - h)), int(rng.integers(0, width - w))
+        colour = rng.uniform(0, 1, 3) * rng.choice([0.25, 1.0]) if rng.random() < 0.6 else _draw(rng, 0, 1)
+        grain = 1 + 0.25 * _smooth(rng, int(rng.integers(2, 24)))[y : y + h, x : x + w, None]
+        image[y : y + h, x : x + w] = colour * grain
+        classes[y : y + h, x : x + w] = Class.OTHER
+    ground = np.isin(classes, (Class.ROAD, Class.GROUND, Class.GRASS, Class.OTHER))[..., None]
+    if rng.random() < 0.4:
+        image *= 1 + ground * _draw(rng, 0.05, 0.3) * _smooth(rng, int(rng.integers(8, 60)))[..., None]
+    if rng.random() < 0.5:
+        # the shade of trees and houses that are not in the picture
+        noise = _smooth(rng, int(rng.integers(2, 6))) + _draw(rng, 0, 0.7) * _smooth(rng, int(rng.integers(8, 40)))
+        shade = 1 / (1 + np.exp(-8 * (noise - _draw(rng, -0.5, 1))))[..., None]
+        image *= 1 - shade * (1 - sky) * _draw(rng, 0.3, 0.85)
+
+
+def other_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The picture (h, w, 3) in another exposure, other colours, less sharp, hazy, noisy, compressed."""
+    if rng.random() < 0.15:
+        air = _draw(rng, 0.5, 1.0)
+        image = image + (air - image) * _draw(rng, 0.1, 0.5)
+    level = _draw(rng, 0.2, 0.65)
+    image = image * (level / max(float(image.mean()), 0.02) * rng.normal(1, 0.06, 3))
+    image = np.clip(image, 0, 4).astype(np.float32)
+    grey = image.mean(-1, keepdims=True)
+    image = grey + (image - grey) * (_draw(rng, 0.5, 1.7) if rng.random() < 0.93 else 0.0)
+    image = np.clip(image, 0, 1) ** np.exp(rng.normal(0, 0.3))
+    if rng.random() < 0.5:
+        # a steeper curve: black shade, white light, as photographs against the sun have
+        middle = float(image.mean())
+        image = np.clip(middle + (image - middle) * _draw(rng, 1.0, 2.0), 0, 1)
+    if rng.random() < 0.35:
+        image = cv2.GaussianBlur(image, (0, 0), _draw(rng, 0.4, 1.4))
+    elif rng.random() < 0.4:
+        image = image + (image - cv2.GaussianBlur(image, (0, 0), 1.0)) * _draw(rng, 0.3, 1.2)
+    image = image + rng.standard_normal(image.shape, np.float32) * _draw(rng, 0, 0.05) * (rng.random() < 0.7)
+    image = np.clip(image, 0, 1).astype(np.float32)
+    if rng.random() < 0.2:
+        levels = (image * 255).astype(np.uint8)
+        _, packed = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(20, 80))])
+        image = cv2.imdecode(packed, cv2.IMREAD_COLOR).astype(np.float32) / 255
+    return image
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides on the result of a run. frames: of the training set."""
+
+    steps: int = 1800
+    batch: int = 8
+    frames: int = 340
+    rate: float = 3e-3
+    weight_decay: float = 0.02
+    average: float = 0.99
+    seed: int = 0
+
+
+HORIZON_ERROR = 0.012
+"""Standard deviation of the elevation that the network is told: a plane estimated from a photograph is off."""
+
+
+def batch_of(store: Store, step: int, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
+    """Images (N, 3, h, w), elevations (N, 1, h, w) and classes (N, h, w) of a step: a function of the seed and the
+    step alone."""
+    images, heights, classes = [], [], []
+    for place in range(settings.batch):
+        number = step * settings.batch + place
+        epoch, inside = divmod(number, len(store))
+        order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
+        rng = np.random.default_rng([settings.seed, step, place])
+        image, found, height = cropped(store, int(order[inside]), rng)
+        other_surfaces(image, found, height, rng)
+        images.append(other_camera(image, rng))
+        classes.append(found)
+        heights.append(height + np.float32(rng.normal(0, HORIZON_ERROR)))
+    return (
+        torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2),
+        torch.from_numpy(np.stack(heights))[:, None],
+        torch.from_numpy(np.stack(classes)).long(),
+    )
+
+
+WEIGHTS_OF_CLASSES = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.1, 2.0)
+"""In the loss, in the order of `Class`: what is rare counts more."""
+
+
+def loss_of(logits: Tensor, classes: Tensor) -> Tensor:
+    """Cross entropy () of logits (N, C, h/2, w/2) with the shares of the classes (N, h, w) in each 2x2 px."""
+    shares = F.avg_pool2d(F.one_hot(classes, len(Class)).permute(0, 3, 1, 2).float(), 2)
+    weights = logits.new_tensor(WEIGHTS_OF_CLASSES)[:, None, None]
+    return -(shares * logits.log_softmax(1) * weights).sum(1).mean()
+
+
+class Run:
+    """Weights, their average and the optimiser's state."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        torch.manual_seed(settings.seed)
+        self.network = SegmentNet().train()
+        self.average = {k: v.detach().clone() for k, v in self._tensors().items()}
+        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay
+        )
+        self.seconds = 0.0
+        self.step_number = 0
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {k: v for k, v in self.network.state_dict().items() if v.is_floating_point()}
+
+    def step(self, store: Store) -> float:
+        """One step of the optimiser; the loss."""
+        start, step, settings = time.process_time(), self.step_number, self.settings
+        images, heights, classes = batch_of(store, step, settings)
+        warm = min(1.0, (step + 1) / 50)
+        for group in self.optimiser.param_groups:
+            group["lr"] = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+        with torch.autocast("cpu", torch.bfloat16):
+            logits = self.network(images, heights)
+        loss = loss_of(logits.float(), classes)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        if not bool(torch.isfinite(norm)):
+            raise FloatingPointError(f"step {step}: expected a finite gradient, found a norm of {float(norm)}")
+        self.optimiser.step()
+        decay = min(settings.average, (1 + step) / (10 + step))
+        for name, tensor in self._tensors().items():
+            self.average[name].lerp_(tensor.detach(), 1 - decay)
+        self.step_number += 1
+        self.seconds += time.process_time() - start
+        return float(loss.detach())
+
+    def averaged(self) -> SegmentNet:
+        """A network with the averaged weights, rounded as they are shipped, in eval mode."""
+        network = SegmentNet()
+        network.load_state_dict({k: v.half().float() for k, v in self.average.items()}, strict=False)
+        network.requires_grad_(False)
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write the checkpoint, atomically."""
+        tensors = {f"weights.{k}": v.detach().contiguous() for k, v in self._tensors().items()}
+        tensors |= {f"average.{k}": v.contiguous() for k, v in self.average.items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{index}.{k}": v.contiguous() for k, v in state.items()}
+        settings = json.dumps(asdict(self.settings), sort_keys=True)
+        facts = {"step": str(self.step_number), "seconds": repr(self.seconds), "settings": settings}
+        write_weights(path, facts, tensors)
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint. ValueError where it belongs to other settings."""
+        facts, tensors = read_weights(path)
+        wanted = json.dumps(asdict(self.settings), sort_keys=True)
+        if facts["settings"] != wanted:
+            raise ValueError(f"{path}: expected settings {wanted}, found {facts['settings']}")
+        state: dict[int, dict[str, Tensor]] = {}
+        weights: dict[str, Tensor] = {}
+        for key, tensor in tensors.items():
+            section, name = key.split(".", 1)
+            if section == "weights":
+                weights[name] = tensor
+            elif section == "average":
+                self.average[name].copy_(tensor)
+            else:
+                index, part = name.split(".", 1)
+                state.setdefault(int(index), {})[part] = tensor
+        self.network.load_state_dict(weights, strict=False)
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        self.step_number, self.seconds = int(facts["step"]), float(facts["seconds"])
+
+
+JUDGED = ("sky", "foliage", "road", "vehicle")
+
+
+def judge(network: SegmentNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[float, float]]:
+    """For each of `JUDGED`, intersection over union of map and truth, both cut at one half: over all frames'
+    pixels, and the 10th percentile of the frames that show at least 500 px of it."""
+    pixels: dict[str, list[tuple[int, int]]] = {name: [] for name in JUDGED}
+    each: dict[str, list[float]] = {name: [] for name in JUDGED}
+    for frame in frames:
+        image = frame.image.astype(np.float32) / 255
+        environment = frame.environment
+        seen = segment.segment(image, environment.ground, frame.camera, network=network)
+        vehicle = np.isin(frame.semantic, [kind for kind, found in ACTORS.items() if found == Class.VEHICLE])
+        truths = (environment.sky, environment.foliage_map, environment.road, torch.from_numpy(vehicle).float())
+        for name, share in zip(JUDGED, truths, strict=True):
+            found, truth = getattr(seen, name) > 0.5, share.numpy() > 0.5
+            both, either = int((found & truth).sum()), int((found | truth).sum())
+            pixels[name].append((both, either))
+            if truth.sum() >= 500:
+                each[name].append(both / either)
+    whole = {name: np.sum(rows, axis=0) for name, rows in pixels.items()}
+    return {
+        name: (
+            float(whole[name][0] / max(whole[name][1], 1)),
+            float(np.percentile(each[name], 10)) if each[name] else float("nan"),
+        )
+        for name in JUDGED
+    }
+
+
+CARD = """# Sky, foliage and road in photographs, trained on generated streets
+
+- Architecture: `scene_ir.derender.segment.SegmentNet`, {parameters:,} parameters: a U-Net of 3x3 convolutions with
+  a depthwise middle, on the picture at 0.4 of KITTI's size (focal length {focal:.0f} px) and the elevation of
+  each pixel's ray above the horizon; half of the first stages' channels are normalised over the picture itself.
+  Eight classes: {classes}.
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
+- Data: {frames:,} frames of the project's own generator, version {version}, in all its weathers, seasons and
+  camera angles; no photographs. Each class in other colours and light, other skies, shade, unknown things in the
+  way; other exposure, contrast and colours, blur, haze, noise, compression; zoomed, mirrored.
+- Training: {steps:,} steps of {batch} crops, {minutes:.0f} minutes of one CPU core, seed {seed}.{note}
+
+## Figures
+
+Held out: {held_out} frames of the generator (shapes and streets that no training frame has). Intersection over
+union of the maps as they are used (guided filter, rule of the horizon), cut at one half, with the truth: over all
+pixels, and the 10th percentile of the frames that show at least 500 px of the class.
+
+{table}
+
+## Limits
+
+It has seen generated pictures only. Foliage is leaves and grass; trunks are not. What it knows least is deep
+shade, where leaves, walls and ground are all black, and what no generated street has: trams, tracks, bridges.
+Paving and asphalt of one colour are often taken for one another. Not for use in a vehicle.
+
+## Train it again
+
+```
+python tools/train_segmenter.py --frames {frames} --steps {steps} --seed {seed}
+```
+With the same generator, on the same machine, another run gives the same bytes.
+"""
+
+
+def table_of(figures: dict[str, tuple[float, float]]) -> str:
+    """A Markdown table, a row a map."""
+    rows = [f"| {name} | {whole:.3f} | {tail:.3f} |" for name, (whole, tail) in figures.items()]
+    return "\n".join(["| map | IoU | 10th percentile |", "| --- | --- | --- |", *rows])
+
+
+TRAIN_SEED, HELD_SEED = 41, 42
+"""Of the generator's streams."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, default=Path("build/segment"), help="frames, checkpoint, log")
+    parser.add_argument("--out", type=Path, default=segment.WEIGHTS)
+    parser.add_argument("--frames", type=int, default=Settings.frames)
+    parser.add_argument("--held-out", type=int, default=60, help="generated frames to judge by")
+    parser.add_argument("--steps", type=int, default=Settings.steps)
+    parser.add_argument("--batch", type=int, default=Settings.batch)
+    parser.add_argument("--rate", type=float, default=Settings.rate)
+    parser.add_argument("--seed", type=int, default=Settings.seed)
+    parser.add_argument(
+        "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
+    )
+    parser.add_argument("--remark", default="", help="a remark on this run for the model card")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
+    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
+    print(f"{len(store)} frames", flush=True)
+    run = Run(settings)
+    checkpoint = arguments.run / "checkpoint.safetensors"
+    if checkpoint.is_file():
+        run.load(checkpoint)
+        print(f"going on from step {run.step_number}", flush=True)
+    end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
+    with (arguments.run / "log.csv").open("a", newline="") as file:
+        log = csv.writer(file)
+        while run.step_number < end:
+            loss = run.step(store)
+            if run.step_number % 25 == 0:
+                log.writerow([run.step_number, f"{run.seconds:.1f}", f"{loss:.4f}"])
+                file.flush()
+            if run.step_number % 100 == 0 or run.step_number == end:
+                run.save(checkpoint)
+                print(f"step {run.step_number}, {run.seconds:.0f} s: {loss:.3f}", flush=True)
+    if run.step_number < settings.steps:
+        return
+    network = run.averaged()
+    figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
+    print(table_of(figures))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    write_weights(arguments.out, facts, {k: v.half().contiguous() for k, v in run.average.items()})
+    card = CARD.format(
+        parameters=sum(p.numel() for p in network.parameters()),
+        focal=segment.INPUT_FOCAL_PX,
+        classes=", ".join(kind.name.lower() for kind in Class),
+        file=arguments.out.name,
+        frames=len(store),
+        version=GENERATOR_VERSION,
+        steps=settings.steps,
+        batch=settings.batch,
+        minutes=run.seconds / 60,
+        seed=settings.seed,
+        held_out=arguments.held_out,
+        table=table_of(figures),
+        note=f"\n  {arguments.remark}" if arguments.remark else "",
+    )
+    files.write_text(arguments.out.with_suffix(".md"), card)
+
+
+if __name__ == "__main__":
+    main()
