@@ -15,8 +15,10 @@ from drivesem.config import (
     Attack,
     Bench,
     Command,
+    Convert,
     Derender,
     Edit,
+    Eval,
     Gradcheck,
     Render,
     Synth,
@@ -135,6 +137,14 @@ def _run(config: Command) -> int:
         from drivesem import gradcheck
 
         return gradcheck.run(config)
+    if isinstance(config, Eval):
+        from drivesem import eval_command
+
+        return eval_command.run(config)
+    if isinstance(config, Convert):
+        from drivesem import convert_command
+
+        return convert_command.run(config)
     raise UsageError("command", ", ".join(COMMANDS), type(config).__name__)
 
 

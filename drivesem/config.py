@@ -116,6 +116,10 @@ class Derender(Common):
     """Fit template, pose and shape to the photograph's silhouettes."""
     fast: Flag = False
     """No fit: templates stay where the labels put them. The same as --no-fit."""
+    meshes: str | None = None
+    """A folder of vehicle meshes (OBJ, GLB, PLY) to choose from beside the templates."""
+    segmenter: str | None = None
+    """An ONNX file of a segmentation network that maps sky, foliage and road, instead of the shipped one."""
     sheet: Flag = False
     """Also draw sheet.jpg into each scene's folder: photograph, mattes, normals, depth, maps, shadows, background,
     re-render and difference."""
@@ -191,10 +195,13 @@ class Synth(Common):
 class Bench(Common):
     """Measure: one attack step, the renderer, peak memory, the scene generator, or de-rendering."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth", "derender"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth", "derender", "found", "label-free"]] = (
+        "step"
+    )
     """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
     memory above the detector's own; synth: the scene generator; derender: de-rendered generated frames beside the
-    generator's truth."""
+    generator's truth; found: whether a detector finds removed cars again, and moved ones where they are;
+    label-free: vehicles of photographs whose labels are hidden, beside those labels."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
@@ -202,14 +209,23 @@ class Bench(Common):
     triangles: str = "2000,5000"
     """Triangles a car, with commas."""
     frames: int | None = None
-    """Frames that bench synth makes in each row, by default 200, with --quick 40; or that bench derender takes
-    apart, by default 100, with --quick 12."""
+    """Frames that bench synth makes in each row, by default 200, with --quick 40; that bench derender takes apart,
+    by default 100, with --quick 12; or that bench label-free looks at, by default 60, with --quick 12."""
     ablate: Flag = False
     """Bench derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: int | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one."""
+    """Name of a shipped detector, or a .safetensors file of one; bench found also takes onnx:FILE, a detector that
+    was trained elsewhere."""
+    dataset: str = DEMO
+    """Bench found, label-free: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str | None = None
+    """Bench found, label-free: folder of the data set, such as KITTI's with training/image_2, label_2, calib."""
+    scenes: str | None = None
+    """Bench found: a folder of scenes that drivesem derender wrote, instead of a data set."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 
@@ -234,6 +250,89 @@ class Gradcheck(Common):
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
 
 
+@dataclass(frozen=True)
+class Eval(Command):
+    """Figures of detections against labels, as COCO, KITTI or VOC define them; or of a detector on a data set."""
+
+    gt: str | None = None
+    """Labels: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of
+    drivesem attack."""
+    pred: str | None = None
+    """Detections: a folder of KITTI result files (with scores), COCO results, YOLO text files, or a run."""
+    pred_b: str | None = None
+    """A second set of detections of the same frames, compared with the first by a paired test."""
+    protocol: Literal["coco", "kitti", "voc"] = "coco"
+    """Which benchmark's rules."""
+    gt_format: Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"] = "auto"
+    """Layout of --gt; auto looks at what lies there."""
+    pred_format: Literal["auto", "kitti", "coco", "yolo", "run"] = "auto"
+    """Layout of --pred and --pred-b."""
+    small_detections: Literal["ignore", "count"] = "ignore"
+    """KITTI: detections below the minimum height are ignored (development kit of 2017) or counted (the older)."""
+    map: str | None = None
+    """Classes of the detections by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
+    map_gt: str | None = None
+    """The same for the labels."""
+    classes: str | None = None
+    """Judge these classes only, with commas."""
+    frames: str | None = None
+    """A file with one identifier a line: judge these frames only."""
+    stage: Literal["attacked", "attacked-paper", "rerendered", "benign"] = "attacked"
+    """Of a run: detections after the attack, beside labels that moved or the benign ones; in the re-rendered
+    photograph; in the photograph."""
+    stage_b: Literal["attacked", "attacked-paper", "rerendered", "benign"] | None = None
+    """The same for --pred-b; by default --stage."""
+    bootstrap: int | None = None
+    """Draws of frames for confidence intervals and paired tests; 0 leaves them out. By default 200, and none of
+    more than 5,000 frames, whose figures hardly vary, unless two detectors are compared."""
+    seed: int = 0
+    """Seed of the draws."""
+    out: str | None = None
+    """Folder for metrics.json, CSV, Markdown and PNG."""
+    detector: str | None = None
+    """Instead of --gt and --pred: run this detector, a shipped one, a .safetensors file or onnx:FILE."""
+    dataset: str = "kitti"
+    """Of --detector: kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str | None = None
+    """Of --detector: folder of the data set."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+    limit: int | None = None
+    """Of --detector: the first N frames."""
+    device: str = "cpu"
+    """Of --detector: torch device."""
+    min_height: float = 25.0
+    """Of --detector: lower objects are neither missed nor a hit, px."""
+    max_occlusion: int = 1
+    """Of --detector: objects occluded more (KITTI's 0 to 3) are neither missed nor a hit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Command):
+    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, and say what is lost."""
+
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
+    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file."""
+    out: Annotated[str, tyro.conf.arg(aliases=["-o"])]
+    """Folder to write, new or empty; or a .json file for COCO."""
+    to_format: Annotated[Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2"], tyro.conf.arg(aliases=["--to"])]
+    """Layout to write."""
+    from_format: Annotated[
+        Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"], tyro.conf.arg(aliases=["--from"])
+    ] = "auto"
+    """Layout of SOURCE; auto looks at what lies there."""
+    scores: Flag = False
+    """SOURCE holds detections with scores, not labels."""
+    images: str | None = None
+    """Folder of the images, for their sizes, which COCO and YOLO need; by default where SOURCE has them."""
+    image_size: str | None = None
+    """WIDTHxHEIGHT of all images, px, instead of looking at them."""
+    copy_images: Flag = False
+    """Also copy the images into the new layout (KITTI, COCO and YOLO)."""
+    map: str | None = None
+    """Classes by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
+
+
 COMMANDS: dict[str, type[Command]] = {
     "attack": Attack,
     "derender": Derender,
@@ -242,6 +341,8 @@ COMMANDS: dict[str, type[Command]] = {
     "synth": Synth,
     "bench": Bench,
     "gradcheck": Gradcheck,
+    "eval": Eval,
+    "convert": Convert,
 }
 
 
@@ -257,7 +358,7 @@ def validate(config: Command) -> None:
             raise UsageError("--workers", "at least 1", config.workers)
         if config.limit is not None and config.limit < 1:
             raise UsageError("--limit", "at least 1", config.limit)
-    if isinstance(config, Attack | Derender | Gradcheck):
+    if isinstance(config, Attack | Derender | Gradcheck | Bench):
         if config.dataset not in DATASETS:
             raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(config.dataset))
         if config.dataset != DEMO and config.root is None:
@@ -273,6 +374,12 @@ def validate(config: Command) -> None:
             raise UsageError("--focal", "a PHOTO beside it", "none")
         if config.focal is not None and not (math.isfinite(config.focal) and config.focal > 0):
             raise UsageError("--focal", "positive px", config.focal)
+        if config.meshes is not None and config.photo is None and config.dataset == DEMO:
+            raise UsageError("--meshes", "a PHOTO or a --dataset of photographs beside it", f"--dataset {DEMO}")
+        if config.meshes is not None and not Path(config.meshes).is_dir():
+            raise UsageError("--meshes", "a folder", config.meshes)
+        if config.segmenter is not None and config.photo is None and config.dataset == DEMO:
+            raise UsageError("--segmenter", "a PHOTO or a --dataset of photographs beside it", f"--dataset {DEMO}")
         if config.velodyne and config.dataset != "kitti":
             raise UsageError("--velodyne", "--dataset kitti beside it", f"--dataset {config.dataset}")
         if config.device != "cpu":
@@ -312,6 +419,34 @@ def validate(config: Command) -> None:
             raise UsageError("--frames", f"at least {fewest}", config.frames)
         if config.threads is not None and config.threads < 1:
             raise UsageError("--threads", "at least 1", config.threads)
+        if config.scenes is not None and config.dataset != DEMO:
+            raise UsageError("--scenes", "no --dataset beside it", f"--dataset {config.dataset}")
+    if isinstance(config, Eval):
+        _validate_eval(config)
+
+
+def _validate_eval(config: Eval) -> None:
+    if (config.gt is None or config.pred is None) == (config.detector is None):
+        raise UsageError("--gt and --pred, or --detector", "one or the other", "both" if config.gt else "neither")
+    if config.detector is not None and config.root is None:
+        raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
+    if config.detector is not None and config.dataset not in DATASETS[1:]:
+        raise UsageError("--dataset", f"one of {', '.join(DATASETS[1:])}", repr(config.dataset))
+    if config.bootstrap is not None and config.bootstrap < 0:
+        raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+    if config.limit is not None and config.limit < 1:
+        raise UsageError("--limit", "at least 1", config.limit)
+
+
+def class_map(setting: str, text: str | None) -> dict[str, str | None]:
+    """The names of "car=Car,bus=-", None where a class is left out. Raises UsageError naming the setting."""
+    pairs: dict[str, str | None] = {}
+    for part in text.split(",") if text else ():
+        name, sign, to = (word.strip() for word in part.partition("="))
+        if not (name and sign and to):
+            raise UsageError(setting, "NAME=CLASS with commas", repr(part))
+        pairs[name] = None if to == "-" else to
+    return pairs
 
 
 def numbers(setting: str, text: str, least: int = 1) -> list[int]:

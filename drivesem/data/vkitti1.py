@@ -238,6 +238,10 @@ class Vkitti1Dataset:
         folder = self.root / f"{_PREFIX}{kind}" / shot.world / shot.variation
         return folder / f"{shot.digits}.png" if folder.is_dir() else None
 
+    def image_path(self, identifier: str) -> Path:
+        """The file of a frame's photograph. RangeError for a frame that is not there."""
+        return self._shot(identifier).path
+
     def objects(self, identifier: str) -> tuple[TrackedObject, ...]:
         """All that motgt says of the objects in one frame, in file order.
 

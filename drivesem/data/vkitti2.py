@@ -383,6 +383,10 @@ class Vkitti2Dataset:
                 return folder / f"Camera_{shot.camera}" / f"{prefix}_{shot.digits}.png"
         return None
 
+    def image_path(self, identifier: str) -> Path:
+        """The file of a frame's photograph. RangeError for a frame that is not there."""
+        return self._shot(identifier).path
+
     def objects(self, identifier: str) -> tuple[TrackedObject, ...]:
         """All that the tables say of the objects in one frame, in the order of bbox.txt.
 

@@ -134,19 +134,11 @@ class YoloDataset:
 
     def labels(self, identifier: str) -> Labels:
         """The labels of one frame; of its image, the header is read. FormatError naming file, line and field."""
-        image = self._image(identifier)
-        width, height = _size_wh(image)
-        path = _beside(image, "labels")
-        text = files.read_text(path) if path.exists() else ""
-        rows = [
-            self._parse(f"{path}:{i}", line.split(), width, height)
-            for i, line in enumerate(text.splitlines(), start=1)
-            if line.strip()
-        ]
+        rows, _ = self.rows(identifier)
         count = len(rows)
         return Labels(
             kind=tuple(kind for kind, _ in rows),
-            boxes_xyxy=torch.tensor([box for _, box in rows]).reshape(-1, 4),
+            boxes_xyxy=torch.tensor([from_coco(box) for _, box in rows]).reshape(-1, 4),
             truncation=torch.full((count,), math.nan),
             occlusion=torch.full((count,), UNKNOWN_OCCLUSION, dtype=torch.int64),
             translation=torch.full((count, 3), math.nan),
@@ -155,25 +147,25 @@ class YoloDataset:
             ignore_xyxy=torch.zeros(0, 4),
         )
 
-    def _parse(self, where: str, parts: list[str], width: int, height: int) -> tuple[str, list[float]]:
-        """A line's class and box in this project's pixels."""
-        if len(parts) != 5:
-            raise FormatError(where, "5 fields: class cx cy w h", len(parts))
-        if not parts[0].isdecimal() or int(parts[0]) not in self.class_names:
-            raise FormatError(f"{where}: class", f"one of the {len(self.class_names)} in names", repr(parts[0]))
-        shares: list[float] = []
-        for name, part in zip(("cx", "cy", "w", "h"), parts[1:], strict=True):
-            try:
-                share = float(part)
-            except ValueError:
-                share = math.nan
-            positive = share > 0 or name in ("cx", "cy")
-            if not (-EDGE <= share <= 1 + EDGE and positive):
-                raise FormatError(f"{where}: {name}", "a share of the image in [0, 1]", repr(part))
-            shares.append(share)
-        cx, cy, w, h = shares
-        box_xywh = ((cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height)
-        return self.class_names[int(parts[0])], from_coco(box_xywh)
+    def rows(self, identifier: str) -> tuple[list[tuple[str, list[float]]], tuple[int, int]]:
+        """A frame's class and box (left, top, width, height in COCO's pixels) a line, and its width and height.
+
+        Of the image, the header is read. FormatError naming file, line and field.
+        """
+        image = self._image(identifier)
+        width, height = size_of_image(image)
+        path = _beside(image, "labels")
+        text = files.read_text(path) if path.exists() else ""
+        rows = [
+            parse_line(f"{path}:{i}", line.split(), self.class_names, (width, height))
+            for i, line in enumerate(text.splitlines(), start=1)
+            if line.strip()
+        ]
+        return rows, (width, height)
+
+    def image_path(self, identifier: str) -> Path:
+        """The file of a frame's image. RangeError for a frame that is not there."""
+        return self._image(identifier)
 
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph, camera, labels.
@@ -199,6 +191,28 @@ class YoloDataset:
             labels=self.labels(identifier),
             provenance={"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name},
         )
+
+
+def parse_line(
+    where: str, parts: Sequence[str], class_names: Mapping[int, str], size_wh: tuple[int, int]
+) -> tuple[str, list[float]]:
+    """A line's class, and its box as left, top, width, height in COCO's pixels. FormatError naming the field."""
+    if len(parts) != 5:
+        raise FormatError(where, "5 fields: class cx cy w h", len(parts))
+    if not parts[0].isdecimal() or int(parts[0]) not in class_names:
+        raise FormatError(f"{where}: class", f"one of the {len(class_names)} in names", repr(parts[0]))
+    shares: list[float] = []
+    for name, part in zip(("cx", "cy", "w", "h"), parts[1:], strict=True):
+        try:
+            share = float(part)
+        except ValueError:
+            share = math.nan
+        positive = share > 0 or name in ("cx", "cy")
+        if not (-EDGE <= share <= 1 + EDGE and positive):
+            raise FormatError(f"{where}: {name}", "a share of the image in [0, 1]", repr(part))
+        shares.append(share)
+    (cx, cy, w, h), (width, height) = shares, size_wh
+    return class_names[int(parts[0])], [(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height]
 
 
 def _mapping(path: Path) -> dict[str, Any]:
@@ -236,7 +250,7 @@ def _beside(image: Path, folder: str) -> Path:
     return Path(*parts).with_suffix(".txt")
 
 
-def _size_wh(path: Path) -> tuple[int, int]:
+def size_of_image(path: Path) -> tuple[int, int]:
     """Width and height of an image, from its header. FormatError."""
     from PIL import Image, UnidentifiedImageError
 

@@ -48,7 +48,7 @@ RULES = (
     Rule(
         "drivesem.evaluation",
         ("detectors.types", "detectors.boxes"),
-        ("torch", "numpy", "pycocotools"),
+        ("torch", "numpy", "pycocotools", "faster_coco_eval"),
         never=("scene_ir", "drivesem.attacks"),
     ),
     Rule(

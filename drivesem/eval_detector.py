@@ -1,0 +1,160 @@
+"""`drivesem eval --detector`: a detector's precision and recall on a data set's photographs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from detectors.base import DetectorError, Predictor, predict
+from detectors.registry import load_predictor
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.config import Eval, UsageError
+from drivesem.data.classes import KITTI, ClassMap
+from drivesem.data.coco import COCO_ROAD_USERS
+from drivesem.data.registry import Dataset, open_dataset
+from drivesem.eval_report import percent
+from drivesem.evaluation import coco
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.types import Labels
+
+HEADLINE = "Car"
+DEFAULT_T_STAR = 0.3
+"""The score at which recall is also given where a detector has no threshold of its own."""
+_BOTH = ClassMap(
+    classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
+)
+"""KITTI's types and COCO's classes: they differ in letter case at least."""
+
+
+def run(config: Eval) -> int:
+    """Run the detector over the frames, count, report; exit code 0. UsageError or SceneError for bad input."""
+    dataset = open_dataset(config.dataset, Path(config.root or ""))
+    detector = _detector(config)
+    names = dataset.identifiers[: config.limit]
+    found, targets = _look(config, dataset, detector, names)
+    t_star = float(getattr(detector, "t_star", DEFAULT_T_STAR))
+    scores = coco.evaluate(targets, found, _judged(detector), t_star, HEADLINE)
+    data: dict[str, Any] = {
+        "detector": config.detector,
+        "dataset": config.dataset,
+        "frames": len(names),
+        "headline": HEADLINE,
+        "t_star": t_star,
+        "min_height": config.min_height,
+        "max_occlusion": config.max_occlusion,
+        "tiles": config.tiles,
+        **scores.to_json(),
+    }
+    if config.out is not None:
+        _write(Path(config.out), data, names, found, _judged(detector))
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    _print(scores.per_class, data, Console(stderr=True))
+    return 0
+
+
+def _detector(config: Eval) -> Predictor:
+    try:
+        detector = load_predictor(config.detector or "", config.device, config.tiles)
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    if HEADLINE not in detector.classes:
+        raise UsageError("--detector", f"one that knows {HEADLINE}", ", ".join(detector.classes))
+    return detector
+
+
+def _judged(detector: Predictor) -> tuple[str, ...]:
+    """The detector's classes that the labels have too; what it says of others counts nowhere."""
+    return tuple(name for name in CLASSES if name in detector.classes)
+
+
+def _look(
+    config: Eval, dataset: Dataset, detector: Predictor, names: Sequence[str]
+) -> tuple[list[Detections], list[Targets]]:
+    judged = _judged(detector)
+    places = torch.tensor([judged.index(name) if name in judged else -1 for name in detector.classes])
+    found: list[Detections] = []
+    targets: list[Targets] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        for name in progress.track(names, description="frames"):
+            frame = dataset.frame(name)
+            if frame.labels is None:
+                raise FormatError(f"frame {name}", "labels", "none")
+            seen = predict(detector, frame.photograph[None].to(config.device))[0]
+            label = places[seen.labels.cpu()]
+            kept = label >= 0
+            found.append(Detections(seen.boxes_xyxy.cpu()[kept], label[kept], seen.scores.cpu()[kept]))
+            targets.append(_targets(frame.labels, config, judged))
+    return found, targets
+
+
+def _targets(labels: Labels, config: Eval, judged: Sequence[str]) -> Targets:
+    """What is judged, with labels among `judged`. Lower or more hidden objects, and other classes, are regions to
+    ignore, for each class that is judged.
+    """
+    named = _BOTH.targets(labels)
+    objects = len(labels.kind)
+    boxes, ignore = named.boxes_xyxy, named.ignore.clone()
+    height = boxes[:objects, 3] - boxes[:objects, 1]
+    ignore[:objects] |= (height < config.min_height) | (labels.occlusion > config.max_occlusion)
+    places = torch.tensor([judged.index(name) if name in judged else -1 for name in CLASSES])
+    own = places[named.labels]
+    # an object of its own class that is not judged, a neighbour of a class, or a region: said for every class
+    every = ignore | (own < 0)
+    rows = torch.cat([torch.arange(len(ignore))[~every], torch.arange(len(ignore))[every].repeat(len(judged))])
+    label = torch.cat([own[~every], torch.arange(len(judged)).repeat_interleave(int(every.sum()))])
+    return Targets(boxes[rows], label, torch.cat([ignore[~every], torch.ones(int(every.sum()) * len(judged)) > 0]))
+
+
+def _write(
+    out: Path, data: Mapping[str, Any], names: Sequence[str], found: Sequence[Detections], judged: Sequence[str]
+) -> None:
+    """metrics.json, and the detections as KITTI's results, which drivesem eval --pred reads."""
+    from drivesem.data.kitti import write_labels
+
+    files.write_json(out / "metrics.json", data)
+    for name, one in zip(names, found, strict=True):
+        # KITTI's lines cannot hold a box without an area
+        kept = ((one.boxes_xyxy[:, 2:] - one.boxes_xyxy[:, :2]) >= 0.01).all(dim=1)
+        n = int(kept.sum())
+        unknown = torch.full((n, 3), torch.nan)
+        labels = Labels(
+            kind=tuple(judged[int(k)] for k in one.labels[kept]),
+            boxes_xyxy=one.boxes_xyxy[kept],
+            truncation=unknown[:, 0],
+            occlusion=torch.full((n,), 3, dtype=torch.int64),
+            translation=unknown,
+            yaw=unknown[:, 0],
+            size_lhw=unknown,
+            ignore_xyxy=torch.zeros(0, 4),
+        )
+        path = out / "detections" / f"{name.replace('/', '_')}.txt"
+        write_labels(path, labels, one.scores[kept])
+
+
+def _print(per_class: Mapping[str, coco.ClassScores], data: Mapping[str, Any], console: Console) -> None:
+    table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
+    table.add_column("class")
+    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*", "objects"):
+        table.add_column(title, justify="right")
+    for name, scores in per_class.items():
+        row = asdict(scores)
+        cells = [percent(row[key]) for key in ("ap50", "ap70", "ap", "recall", "recall_at_t_star")]
+        table.add_row(name, *cells, str(scores.objects))
+    console.print(table)
+    console.print(
+        f"{data['frames']} frames; judged: at least {data['min_height']:g} px high, occlusion at most "
+        f"{data['max_occlusion']}; t* {data['t_star']:.3f}",
+        soft_wrap=True,
+    )

@@ -1,0 +1,89 @@
+"""Bootstrap and paired test: what they must give where the answer is known."""
+
+import numpy as np
+import pytest
+
+from drivesem.evaluation.curves import Tally
+from drivesem.evaluation.kitti import evaluate
+from drivesem.evaluation.resampling import Averaged, Figure, Sampled, differences, intervals
+
+KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
+
+
+def _tally(found: np.ndarray, frames: int, per_frame: int = 5) -> Tally:
+    """Objects of which found[i] of `per_frame` are found in frame i, at falling scores, with no misfire."""
+    frame = np.repeat(np.arange(frames), found)
+    return Tally(
+        score=np.linspace(1, 0, len(frame)),
+        frame=frame,
+        hits=np.ones(len(frame)),
+        misfires=np.zeros(len(frame)),
+        objects=np.full(frames, float(per_frame)),
+    )
+
+
+def _figure(found: np.ndarray) -> Figure:
+    return Figure("AP", (Averaged(_tally(found, len(found)), "voc"),))
+
+
+def test_an_interval_is_that_of_the_mean_where_ap_is_recall():
+    draw = np.random.default_rng(0)
+    found = draw.binomial(5, 0.6, 200)
+    (one,) = intervals([_figure(found)], 200, 400, draw)
+    mean, error = found.mean() / 5, found.std() / 5 / np.sqrt(200)
+    assert one.value == pytest.approx(mean)
+    assert one.low == pytest.approx(mean - 1.96 * error, abs=0.3 * error)
+    assert one.high == pytest.approx(mean + 1.96 * error, abs=0.3 * error)
+
+
+def test_the_same_seed_gives_the_same_interval():
+    figure = _figure(np.random.default_rng(1).binomial(5, 0.5, 30))
+    first = intervals([figure], 30, 50, np.random.default_rng(3))
+    assert first == intervals([figure], 30, 50, np.random.default_rng(3))
+    assert first != intervals([figure], 30, 50, np.random.default_rng(4))
+
+
+def test_equal_detectors_do_not_differ_and_unequal_ones_do():
+    draw = np.random.default_rng(2)
+    worse = draw.binomial(5, 0.5, 60)
+    better = np.minimum(worse + draw.integers(0, 2, 60), 5)
+    (same,) = differences([_figure(worse)], [_figure(worse)], 60, 100, draw)
+    assert (same.difference, same.low, same.high, same.p) == (0, 0, 0, 1)
+    (other,) = differences([_figure(worse)], [_figure(better)], 60, 300, draw)
+    assert other.difference == pytest.approx((better.mean() - worse.mean()) / 5)
+    assert other.low is not None
+    assert other.low > 0
+    assert other.p is not None
+    assert other.p == pytest.approx(1 / 301)
+
+
+def test_p_is_uniform_where_nothing_differs():
+    draw = np.random.default_rng(5)
+    values = []
+    for _ in range(60):
+        a, b = draw.binomial(5, 0.5, 40), draw.binomial(5, 0.5, 40)
+        (one,) = differences([_figure(a)], [_figure(b)], 40, 40, draw)
+        assert one.p is not None
+        values.append(one.p)
+    assert 0.35 < np.mean(values) < 0.65
+    assert np.mean(np.array(values) < 0.1) < 0.25
+
+
+def test_kitti_curves_side_by_side_weigh_as_each_alone(make_truths, make_found, draw_rows):
+    truth, found = draw_rows(7, 8, True)
+    other = draw_rows(7, 8, True)[1][::2]
+    first = evaluate(make_truths(truth, 8), make_found(found), KINDS)
+    second = evaluate(make_truths(truth, 8), make_found(other), KINDS)
+    ones, none = np.ones(8), np.zeros(8)
+    for a, b in zip(first, second, strict=True):
+        both = Figure("R40", (Sampled(a),)).beside(Figure("R40", (Sampled(b),)))
+        assert both.value(np.concatenate([ones, none])) == a.r40()
+        assert both.value(np.concatenate([none, ones])) == b.r40()
+
+
+def test_figures_without_objects():
+    empty = Figure("AP", (Averaged(_tally(np.zeros(3, int), 3, per_frame=0), "coco"),))
+    (one,) = intervals([empty], 3, 10, np.random.default_rng(0))
+    assert (one.value, one.low, one.high) == (None, None, None)
+    (pair,) = differences([empty], [empty], 3, 10, np.random.default_rng(0))
+    assert pair.p is None

@@ -1,0 +1,223 @@
+"""`drivesem convert`: there and back between layouts, and what it says is lost."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from drivesem.cli import main
+from drivesem.data.coco import CocoDataset
+from drivesem.data.kitti import KittiDataset, read_labels
+from drivesem.data.vkitti1 import Vkitti1Dataset
+from drivesem.data.vkitti2 import Vkitti2Dataset
+from drivesem.data.yolo import YoloDataset
+
+Convert = Callable[..., str]
+LABELS = """\
+Car 0.00 0 -1.57 100.41 106.40 229.75 189.25 1.55 1.63 3.89 -2.85 1.63 12.34 -1.80
+Van 0.35 3 1.85 0.00 100.02 81.33 200.50 2.11 1.90 5.08 -8.40 1.70 11.02 1.12
+Pedestrian 0.00 1 0.21 300.15 120.00 320.99 180.07 1.72 0.50 0.80 1.84 1.47 20.123 0.30
+DontCare -1 -1 -10 240.79 112.01 260.53 118.90 -1 -1 -1 -1000 -1000 -1000 -10
+"""
+CALIB = "P2: 721.5377 0 180.5593 44.85728 0 721.5377 100.854 0.2163791 0 0 1 0.002745884\n"
+
+
+@pytest.fixture
+def convert(capsys: pytest.CaptureFixture[str]) -> Convert:
+    def call(*words: object) -> str:
+        assert main(["convert", *map(str, words)]) == 0
+        return capsys.readouterr().err
+
+    return call
+
+
+@pytest.fixture
+def kitti(tmp_path: Path) -> Path:
+    """A KITTI folder of two frames, the second without objects."""
+    training = tmp_path / "kitti" / "training"
+    for name in ("image_2", "label_2", "calib"):
+        (training / name).mkdir(parents=True)
+    draw = np.random.default_rng(0)
+    for name, text in (("000003", LABELS), ("000011", "")):
+        Image.fromarray(draw.integers(0, 255, (210, 360, 3)).astype(np.uint8)).save(
+            training / f"image_2/{name}.png"
+        )
+        (training / f"label_2/{name}.txt").write_text(text)
+        (training / f"calib/{name}.txt").write_text(CALIB)
+    return tmp_path / "kitti"
+
+
+def _labels(folder: Path) -> dict[str, list[list[str]]]:
+    return {p.name: [line.split() for line in p.read_text().splitlines()] for p in sorted(folder.glob("*.txt"))}
+
+
+def test_kitti_to_coco_and_back(convert: Convert, kitti: Path, tmp_path: Path):
+    text = convert(kitti, "--to", "coco", "--out", tmp_path / "coco", "--copy-images")
+    assert "nothing lost" in text
+    dataset = CocoDataset(tmp_path / "coco")
+    ours, theirs = dataset.frame("000003"), KittiDataset(kitti).frame("000003")
+    assert ours.labels is not None
+    assert theirs.labels is not None
+    assert ours.labels.kind == theirs.labels.kind
+    assert torch.allclose(ours.labels.boxes_xyxy, theirs.labels.boxes_xyxy)
+    assert ours.camera.matrix.tolist() == theirs.camera.matrix.tolist()
+    assert len(ours.labels.ignore_xyxy) == 1
+    assert "nothing lost" in convert(
+        tmp_path / "coco", "--to", "kitti", "--out", tmp_path / "back", "--copy-images"
+    )
+    back = tmp_path / "back/training"
+    assert (back / "label_2/000003.txt").read_text().replace("-1.00", "-1") == LABELS
+    assert (back / "label_2/000011.txt").read_text() == ""
+    assert (back / "image_2/000003.png").read_bytes() == (kitti / "training/image_2/000003.png").read_bytes()
+    assert KittiDataset(tmp_path / "back").frame("000003").camera.matrix.tolist() == theirs.camera.matrix.tolist()
+
+
+def test_coco_keeps_its_ids_and_keys(convert: Convert, tmp_path: Path):
+    content = {
+        "images": [{"id": 42, "file_name": "b.jpg", "width": 640, "height": 480}],
+        "annotations": [
+            {"id": 7, "image_id": 42, "category_id": 18, "bbox": [1.25, 2.5, 30.125, 40], "area": 600.5,
+             "iscrowd": 0, "segmentation": [[1, 2, 30, 2, 30, 40]]},
+            {"id": 9, "image_id": 42, "category_id": 3, "bbox": [0, 0, 30, 40], "area": 1200, "iscrowd": 1},
+        ],
+        "categories": [{"id": 3, "name": "car"}, {"id": 18, "name": "dog"}],
+    }  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    assert "nothing lost" in convert(tmp_path / "a.json", "--to", "coco", "--out", tmp_path / "b.json")
+    written = json.loads((tmp_path / "b.json").read_text())
+    assert written["annotations"] == content["annotations"]
+    assert [(c["id"], c["name"]) for c in written["categories"]] == [(3, "car"), (18, "dog")]
+    text = convert(tmp_path / "a.json", "--to", "yolo", "--out", tmp_path / "yolo")
+    assert "lost: area of the mask of 1, crowd of 1, segmentation of 1" in text
+    assert (tmp_path / "yolo/data.yaml").exists()
+    text = convert(tmp_path / "a.json", "--to", "kitti", "--map", "dog=-", "--out", tmp_path / "kitti")
+    assert "crowd of 1" in text
+    assert (tmp_path / "kitti/b.txt").read_text().startswith("DontCare -1 -1 -10 -0.50 -0.50 29.50 39.50 -1")
+
+
+def test_kitti_to_yolo_and_back(convert: Convert, kitti: Path, tmp_path: Path):
+    text = convert(kitti, "--to", "yolo", "--out", tmp_path / "yolo", "--copy-images")
+    assert "lost: 3D box of 3, alpha of 3, occlusion of 3, region of 1, truncation of 3" in text
+    frame = YoloDataset(tmp_path / "yolo").frame("000003")
+    assert frame.labels is not None
+    assert frame.labels.kind == ("Car", "Van", "Pedestrian")
+    text = convert(tmp_path / "yolo", "--from", "yolo", "--to", "kitti", "--out", tmp_path / "back")
+    assert "nothing lost; assumed: occlusion (3, unknown) of 3, truncation (0) of 3" in text
+    rows = _labels(tmp_path / "back")["000003.txt"]
+    assert len(read_labels(tmp_path / "back/000003.txt").kind) == 3
+    # boxes come back to the last decimal; what YOLO has no place for is unknown
+    assert [row[0] for row in rows] == ["Car", "Van", "Pedestrian"]
+    assert [row[4:8] for row in rows] == [line.split()[4:8] for line in LABELS.splitlines()[:3]]
+    assert rows[0][8:] == ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
+
+
+@pytest.mark.parametrize("layout", ["vkitti1", "vkitti2"])
+def test_kitti_to_virtual_kitti_and_back(convert: Convert, kitti: Path, tmp_path: Path, layout: str):
+    text = convert(kitti, "--to", layout, "--out", tmp_path / "virtual", "--copy-images")
+    assert "fraction of a pixel of 3" in text
+    assert "region of 1" in text
+    assert "track of 3" in text.partition("assumed: ")[2]
+    dataset = Vkitti1Dataset(tmp_path / "virtual") if layout == "vkitti1" else Vkitti2Dataset(tmp_path / "virtual")
+    name = next(n for n in dataset.identifiers if n.endswith("00003"))
+    labels = dataset.labels(name)
+    assert labels.kind == ("Car", "Van", "Pedestrian")
+    assert labels.occlusion.tolist() == [0, 2 if layout == "vkitti1" else 3, 1]
+    assert labels.truncation.tolist() == pytest.approx([0, 0.35, 0])
+    assert labels.boxes_xyxy[0].tolist() == [100, 106, 230, 189]
+    text = convert(tmp_path / "virtual", "--to", "kitti", "--out", tmp_path / "back")
+    rows = next(iter(_labels(tmp_path / "back").values()))
+    assert [row[8:15] for row in rows] == [line.split()[8:15] for line in LABELS.splitlines()[:3]]
+    assert "model of 3" in text
+    assert "/ in frame names of" in text
+    # and once more into its own layout: everything is there
+    again = convert(tmp_path / "virtual", "--to", layout, "--out", tmp_path / "again", "--copy-images")
+    assert "nothing lost" in again
+    for path in sorted((tmp_path / "virtual").rglob("*.txt")):
+        relative = path.relative_to(tmp_path / "virtual")
+        if "extrinsic" not in path.name and "intrinsic" not in path.name:
+            assert (tmp_path / "again" / relative).read_text() == path.read_text(), relative
+
+
+def test_no_digit_is_lost_through_coco_and_yolo(convert: Convert, tmp_path: Path):
+    draw = np.random.default_rng(4)
+    (tmp_path / "in").mkdir()
+    lines = []
+    for _ in range(300):
+        left, top = draw.uniform(0, 1000), draw.uniform(0, 300)
+        box = (left, top, left + draw.uniform(0.5, 200), top + draw.uniform(0.5, 70))
+        numbers = " ".join(
+            f"{v:.2f}" for v in (*box, *draw.uniform(0.5, 9, 3), *draw.normal(0, 20, 2), 15.25, 0.5)
+        )
+        lines.append(f"Car {draw.uniform(0, 1):.2f} {draw.integers(0, 4)} {draw.uniform(-3, 3):.2f} {numbers}\n")
+    (tmp_path / "in/000000.txt").write_text("".join(lines))
+    size = ("--image-size", "1242x375")
+    convert(tmp_path / "in", "--to", "coco", "--out", tmp_path / "a.json", *size)
+    convert(tmp_path / "a.json", "--to", "kitti", "--out", tmp_path / "back")
+    assert (tmp_path / "back/000000.txt").read_text() == "".join(lines)
+    convert(tmp_path / "a.json", "--to", "yolo", "--out", tmp_path / "yolo")
+    (tmp_path / "yolo/images/train").mkdir(parents=True)
+    Image.new("RGB", (1242, 375)).save(tmp_path / "yolo/images/train/000000.png")
+    convert(tmp_path / "yolo", "--to", "kitti", "--out", tmp_path / "boxes")
+    boxes = [row[4:8] for row in _labels(tmp_path / "boxes")["000000.txt"]]
+    assert boxes == [line.split()[4:8] for line in lines]
+
+
+def test_results_keep_their_scores(convert: Convert, tmp_path: Path):
+    (tmp_path / "results").mkdir()
+    line = "Car -1 -1 -10 100.41 106.40 229.75 189.25 -1 -1 -1 -1000 -1000 -1000 -10 0.123456789"
+    (tmp_path / "results/000000.txt").write_text(line + "\n")
+    words = ("--scores", "--image-size", "1242x375")
+    convert(tmp_path / "results", "--to", "coco", "--out", tmp_path / "r.json", *words)
+    assert json.loads((tmp_path / "r.json").read_text())["annotations"][0]["score"] == 0.123456789
+    convert(tmp_path / "r.json", "--to", "kitti", "--out", tmp_path / "back", "--scores")
+    assert (tmp_path / "back/000000.txt").read_text() == line + "\n"
+
+
+def test_json(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["convert", str(kitti), "--to", "yolo", "--out", str(tmp_path / "yolo"), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["lost"]["3D box"] == 3
+    assert data["assumed"] == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["{kitti}", "--to", "coco", "--out", "{out}", "--image-size", "big"],
+            "--image-size: expected WIDTHxHEIGHT",
+        ),
+        (["{kitti}", "--to", "yolo", "--out", "{out}.json"], "--out: expected a folder for yolo"),
+        (["{kitti}", "--to", "yolo", "--out", "{kitti}"], "--out: expected a new or empty folder"),
+        (["{kitti}", "--to", "coco", "--out", "{out}", "--map", "Car"], "--map: expected NAME=CLASS with commas"),
+        (["{kitti}", "--to", "coco", "--out", "{out}", "--map", "Bus=Car"], "--map: expected some of Car, "),
+        (["{kitti}/nothing", "--to", "coco", "--out", "{out}"], "nothing there"),
+        (
+            ["{flat}", "--to", "coco", "--out", "{out}"],
+            "coco: image sizes: expected --images FOLDER or --image-size",
+        ),
+        (["{flat}", "--to", "vkitti2", "--out", "{out}"], "3D box: expected one of every object, found none of 1"),
+        (["{dog}", "--to", "kitti", "--out", "{out}"], "class 'dog': expected one of Car, "),
+    ],
+)
+def test_one_line_and_exit_code_2(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+):
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    (flat / "000000.txt").write_text("Car 0 0 -10 1 2 30 40 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    dog = {
+        "images": [{"id": 1, "width": 9, "height": 9}],
+        "annotations": [{"image_id": 1, "category_id": 1, "bbox": [1, 1, 2, 2]}],
+        "categories": [{"id": 1, "name": "dog"}],
+    }
+    (tmp_path / "dog.json").write_text(json.dumps(dog))
+    places = {"kitti": kitti, "flat": flat, "dog": tmp_path / "dog.json", "out": tmp_path / "new"}
+    assert main(["convert", *(word.format(**places) for word in words)]) == 2
+    text = capsys.readouterr().err
+    assert len(text.splitlines()) == 1
+    assert message in text
