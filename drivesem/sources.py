@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drivesem.config import DEMO, Attack, Derender
 from scene_ir.types import Frame, SceneIR
 
+if TYPE_CHECKING:
+    from scene_ir.derender.derender import DerenderSettings
+
 DEMO_SCENES = 10
+_MOST_FACES = 5000
+"""Of a user's mesh, as of the heaviest template: more show in no photograph, and cost time in every fit."""
 
 
 class SceneSource(Protocol):
@@ -52,11 +58,10 @@ class PhotographSource:
 
     def __init__(self, config: Attack | Derender) -> None:
         from drivesem.data.registry import open_dataset
-        from scene_ir.derender.derender import DerenderSettings
 
         points = isinstance(config, Derender) and config.velodyne
         self._dataset = open_dataset(config.dataset, Path(config.root or ""), with_points=points)
-        self._settings = DerenderSettings(fit=config.fit)
+        self._settings = _settings(config)
 
     def identifiers(self) -> Iterator[str]:
         return iter(self._dataset.identifiers)
@@ -77,11 +82,10 @@ class PlainPhotograph:
 
     def __init__(self, path: Path, config: Derender) -> None:
         from drivesem.label_free import focal_of, settings_for
-        from scene_ir.derender.derender import DerenderSettings
 
         self._path = path
         self.focal = focal_of(path, config.focal)
-        self._settings = settings_for(DerenderSettings(fit=config.fit))
+        self._settings = settings_for(_settings(config))
 
     def identifiers(self) -> Iterator[str]:
         return iter([self._path.stem])
@@ -101,6 +105,28 @@ class PlainPhotograph:
 
         frame = photograph(self._path, self.focal.length_px if self.focal.source == "given" else None)
         return label_free(frame, detect(frame))
+
+
+def _settings(config: Attack | Derender) -> DerenderSettings:
+    """How frames are to be taken apart. Raises FormatError for a folder of meshes or a segmenter that cannot be
+    read."""
+    from scene_ir.derender.derender import DerenderSettings
+    from scene_ir.derender.silhouette import OwnMesh
+
+    settings = DerenderSettings(fit=config.fit)
+    if not isinstance(config, Derender):
+        return settings
+    if config.segmenter is not None:
+        from drivesem.segmenter import OnnxSegmenter
+
+        settings = replace(settings, segmenter=OnnxSegmenter(Path(config.segmenter)))
+    if config.meshes is not None:
+        from drivesem.synth.assets import meshes_in
+        from scene_ir.meshes.lod import simplify
+
+        own = (OwnMesh(simplify(v.mesh, _MOST_FACES), v.kind, v.size_lhw) for v in meshes_in(config.meshes))
+        settings = replace(settings, meshes=tuple(own))
+    return settings
 
 
 def open_source(config: Attack | Derender) -> SceneSource:

@@ -14,6 +14,10 @@ from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import Layout
 from scene_ir.raster.verbs import Backend
 from scene_ir.texture import SATURATED
+from scene_ir.types import Front
+
+_STANDING_M = 0.4
+"""Width of what stands in front of vehicles, on the ground: about a person's."""
 
 Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
@@ -162,13 +166,16 @@ class _Blend(torch.autograd.Function):
         return grad, to_shadow, to_colour, to_opacity, None
 
 
-def paint_order(size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tensor) -> list[int]:
+def paint_order(
+    size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tensor, standing: np.ndarray | None = None
+) -> list[int]:
     """Indices of the objects from the farthest to the nearest, as a painter lays them down; not differentiated.
 
     size_lhw (N, 3) m, yaw (N,) rad, translation (N, 3) m; centre (3,) m, where the camera stands. Of two
     footprints apart, the one on the camera's side of the line between them is in front (a car beside a long truck
     may be farther by its middle and yet hide it); where that says nothing, or in a cycle, the nearest point
-    decides.
+    decides. standing: (K, 4, 2) m, footprints of things that are no objects, see `standing_footprints`: they are
+    N, N + 1, ..., and come right after the last object that they can hide, so that the objects keep their order.
     """
     count = int(translation.shape[0])
     corners = ground_footprint(size_lhw.detach(), yaw.detach(), translation.detach()).cpu().double().numpy()
@@ -187,7 +194,38 @@ def paint_order(size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tens
         ]  # the first that hides none of the others; in a cycle, the first
         order.append(chosen)
         remaining.remove(chosen)
-    return order
+    return order if standing is None or not len(standing) else _with_standing(order, corners, standing, eye)
+
+
+def _with_standing(order: list[int], corners: np.ndarray, standing: np.ndarray, eye: np.ndarray) -> list[int]:
+    """The order of N objects with K standing things among them. corners (N, 4, 2), standing (K, 4, 2), eye (2,),
+    m."""
+    count, things = len(corners), len(standing)
+    first, second = np.repeat(np.arange(things), count), np.tile(np.arange(count), things)
+    nearest, near = _nearest_distance(corners, eye), _nearest_distance(standing, eye)
+    hides = _in_front(standing[first], corners[second], eye, nearest[second] - near[first]) > 0
+    place = np.argsort(order)
+    after = np.where(hides.reshape(things, count), place[None], -1).max(axis=1, initial=-1)
+    slots: list[list[int]] = [[] for _ in range(count + 1)]
+    for k in np.argsort(-near, kind="stable"):
+        slots[int(after[k]) + 1].append(count + int(k))
+    found = list(slots[0])
+    for i, there in zip(order, slots[1:], strict=True):
+        found += [i, *there]
+    return found
+
+
+def standing_footprints(front: Sequence[Front], matrix: Tensor) -> np.ndarray:
+    """Corners (K, 4, 2) m, (x, z), of small squares where things stand. matrix: (3, 4) of the camera."""
+    inverse = np.linalg.inv(matrix[:, :3].detach().cpu().double().numpy())
+    centre = -inverse @ matrix[:, 3].detach().cpu().double().numpy()
+    places = []
+    for thing in front:
+        height, width = thing.foreground.values.shape[1:]
+        foot = np.array([thing.foreground.x0 + (width - 1) / 2, thing.foreground.y0 + height - 1.0, 1.0])
+        places.append((centre + inverse @ foot * thing.depth_m)[[0, 2]])
+    square = _STANDING_M / 2 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return np.array(places).reshape(-1, 1, 2) + square
 
 
 def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray) -> np.ndarray:

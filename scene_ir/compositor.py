@@ -17,17 +17,18 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir import blend, fused, surfaces, texture
+from scene_ir import blend, finish, fused, surfaces, texture
 from scene_ir.environment import apply_foliage, apply_weather, shadow_softening, sky_colour
 from scene_ir.errors import ShapeError
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.surfaces import Fleet, Surface
-from scene_ir.texture import Texels, smoothstep
-from scene_ir.types import Crop, Objects, Render, SceneIR
+from scene_ir.texture import Regions, Texels, smoothstep
+from scene_ir.types import Crop, Objects, Render, SceneIR, Source
 
 T = TypeVar("T")
 
@@ -68,6 +69,51 @@ class Layers:
     shadow: Tensor
 
 
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """What stands in front of vehicles, as layers after theirs. footprints (K, 4, 2) m, see `blend`; layout,
+    colour (T, 4), opacity (T,), depth (T,) m as in `Layers`; pixel (T,) int64: of the frame, for each of theirs.
+    """
+
+    footprints: np.ndarray
+    layout: verbs.Layout
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    pixel: Tensor
+
+    @classmethod
+    def of(cls, scene: SceneIR, like: Tensor) -> _Standing:
+        """Of a scene's `front`. `like`: a tensor of the dtype and device to work in."""
+        texels = Texels.pack([f.foreground for f in scene.front], like)
+        layout = verbs.Layout.of(texels.rects)
+        rgba, draw = texels.values, layout.draw()
+        depth = like.new_tensor([f.depth_m for f in scene.front])[draw]
+        colour = torch.cat([rgba[:, :3], rgba[:, 3:] / depth[:, None]], dim=1)
+        x, y = layout.pixels().unbind(1)
+        footprints = blend.standing_footprints(scene.front, scene.camera.matrix)
+        return cls(footprints, layout, colour, rgba[:, 3], depth, y * scene.camera.width + x)
+
+    def before(self, layers: Layers | None, change: Tensor | None) -> Layers:
+        """Layers of objects, if there are any, and these after them. change: (3, H, W), what the season does to
+        the background, and so to these."""
+        colour = self.colour
+        if change is not None:
+            moved = change.flatten(1)[:, self.pixel].T * self.opacity[:, None]
+            colour = torch.cat([colour[:, :3] + moved, colour[:, 3:]], dim=1)
+        if layers is None:
+            nothing = verbs.Layout.of(self.layout.rects[:0])
+            return Layers(self.layout, colour, self.opacity, self.depth, nothing, colour[:0, :3])
+        return Layers(
+            verbs.Layout.of(torch.cat([layers.layout.rects, self.layout.rects])),
+            torch.cat([layers.colour, colour]),
+            torch.cat([layers.opacity, self.opacity]),
+            torch.cat([layers.depth, self.depth]),
+            layers.shadow_layout,
+            layers.shadow,
+        )
+
+
 def scene_to(value: T, dtype: torch.dtype, device: torch.device | str | None = None) -> T:
     """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`."""
     return _convert(value, dtype, device)
@@ -95,12 +141,14 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the camera;
-    ground_clip (4N, 3) of the shadows' patches."""
+    """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
+    camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.brightened`, by what the
+    objects turned since the photograph."""
 
     clip: Tensor
     cos: Tensor
     ground_clip: Tensor
+    brighter: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +274,8 @@ class Compositor:
         self._air = sky_colour(scene.photograph, scene.environment.sky)
         inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
         self._canvas = torch.cat([scene.background, inverse.to(self._like)[None]])
+        self._standing = _Standing.of(scene, self._like) if scene.front else None
+        self._footprints = None if self._standing is None else self._standing.footprints
         with torch.no_grad():
             self._prepare(scene.objects, hidden)
 
@@ -247,15 +297,22 @@ class Compositor:
         self._corners = surfaces.shadow_corners(base.size_lhw, self._sun_offset)
         if objects.source and not self._whole_patches:
             self._corners = self._trimmed_corners(objects, base)
+        self._outwards = surfaces.outwards(self._corners, base.size_lhw, self._sun_offset)
+        self._lit: Tensor | None = None
+        self._base_yaw = base.yaw
+        self._sunlight = self._like.new_tensor(
+            [s.sunlight for s in objects.source] or [texture.SUNLIGHT] * len(base)
+        )
         self._size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
         # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
         self._pack = _Pack([weakref.proxy(self)])
         self._base = self._place(base)
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
-        self._texels, self._shadows, self.fixed = None, None, None
-        ones = torch.ones_like(base.translation)
-        self.repaint(torch.stack([s.paint for s in objects.source]) if objects.source else ones)
+        self._texels, self._shadows, self.regions = None, None, None
+        self._finish: Tensor | None = None
+        self._fixed: fused.Fixed | None = None
+        self.paint_lightness = self._base_lightness(objects)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
 
@@ -307,8 +364,9 @@ class Compositor:
             self._smooth * self._like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.fleet.owner]
         )
         self._mirror_cos = surfaces.facing(mirrored, flipped, self._centre)
-        order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self._centre)
-        mattes = [replace(s.foreground, values=s.foreground.values[3:]) for s in objects.source]
+        order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self._centre, self._footprints)
+        nearer = [thing.foreground for thing in (*objects.source, *self.scene.front)]
+        mattes = [replace(crop, values=crop.values[3:]) for crop in nearer]
         crops = []
         rects = drawn.mesh.layout.rects.tolist()
         for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
@@ -322,8 +380,35 @@ class Compositor:
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self._frame_hw))
         self._texels = Texels.pack(crops + crops, self._like)
         self._shadows = Texels.pack([_darkness(s.shadow, self._frame_hw) for s in objects.source], self._like)
-        if self.settings.backend == "warp":
-            self.fixed = self._fuse()
+        blank = Crop(self._like.new_zeros(1, 0, 0), 0, 0)
+        self.regions = Regions(
+            Texels.pack([s.region or blank for s in objects.source], self._like),
+            torch.tensor([s.region is not None for s in objects.source], device=self._like.device),
+        )
+
+    @property
+    def fixed(self) -> fused.Fixed | None:
+        """What the fast kernels read, gathered on first use; None where they are not used."""
+        if self._fixed is None and self._texels is not None and self.settings.backend == "warp":
+            with torch.no_grad():
+                self._fixed = self._fuse()
+        return self._fixed
+
+    @property
+    def finish(self) -> Tensor:
+        """(V, 4): gains (3) and lift that make the templates' colours the vehicles'; found on first use."""
+        if self._finish is None:
+            parts = zip(self.fleet.surfaces, self.samples(), strict=True)
+            found = [torch.from_numpy(finish.fitted(surface, samples)) for surface, samples in parts]
+            self._finish = torch.cat(found).to(self._like)
+        return self._finish
+
+    def refinish(self, sources: Sequence[Source]) -> None:
+        """Take over the paint and the sunlight of one source an object."""
+        self.scene = replace(self.scene, objects=replace(self.scene.objects, source=tuple(sources)))
+        self._sunlight = self._like.new_tensor([s.sunlight for s in sources])
+        self.paint_lightness = self._base_lightness(self.scene.objects)
+        self._finish, self._fixed, self._lit = None, None, None
 
     def _fuse(self) -> fused.Fixed:
         """What the fast kernels read, gathered."""
@@ -331,12 +416,13 @@ class Compositor:
         assert self._texels is not None
         assert self._shadows is not None
         own = (fleet.colours, self._sharp, fleet.paint[:, None], fleet.glass[:, None], self._height[:, None])
+        mirror = (self._mirror_clip, self._mirror_cos[:, None])
         height, width = self._frame_hw
         return fused.Fixed(
             faces=fleet.faces.to(torch.int32).contiguous(),
             base_clip=base.clip,
             base=torch.stack([base.cos, fleet.paint, self._height], dim=1),
-            own=torch.cat([*own, self._mirror_clip, self._mirror_cos[:, None]], dim=1),
+            own=torch.cat([*own, *mirror, self.finish], dim=1),
             texels=(
                 self._texels.values[: int(self._texels.offsets[count])],
                 self._texels.rects[:count],
@@ -345,22 +431,36 @@ class Compositor:
             patches=fused.patches(base.ground_clip),
             dark=(self._shadows.values, self._shadows.rects, self._shadows.offsets),
             frame_wh=self._like.new_tensor([width, height]).expand(count, 2).contiguous(),
-            sun=self.scene.environment.sun.to(self._like).expand(count, 3).contiguous(),
+            sun=torch.cat(
+                [self.scene.environment.sun.to(self._like).expand(count, 3), self._sunlight[:, None]], dim=1
+            ),
             unproject=self._unproject.expand(count, 3, 3).contiguous(),
         )
 
-    def repaint(self, paint: Tensor) -> None:
-        """Give the templates, which complete what the photograph did not see, the paint (N, 3)."""
-        self.paint = paint.to(self._like)
-        self.paint_lightness = self._base_lightness()
-
-    def _base_lightness(self) -> Tensor:
+    def _base_lightness(self, objects: Objects) -> Tensor:
         """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
+        if objects.source:
+            paint = torch.stack([s.paint for s in objects.source]).to(self._like)
+        else:
+            paint = self._template_paint()
+        return texture.lab(paint.clamp(0.0, 1.0))[:, 0]
+
+    def _template_paint(self) -> Tensor:
+        """The mean colour (N, 3) of the templates' paint."""
         fleet = self.fleet
-        total = torch.zeros_like(self.paint).index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
-        count = self.paint.new_zeros(len(self.paint)).index_add(0, fleet.owner, fleet.paint)
-        mean = total / count.clamp(min=1e-3)[:, None]
-        return texture.lab((mean * self.paint).clamp(0.0, 1.0))[:, 0]
+        total = self._size.new_zeros(len(self._size), 3)
+        total = total.index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
+        count = total.new_zeros(len(total)).index_add(0, fleet.owner, fleet.paint)
+        return total / count.clamp(min=1e-3)[:, None]
+
+    def base_paint(self) -> Tensor:
+        """The paint (N, 3) of the objects as the photograph shows it; the templates' where it shows none."""
+        paint = self._template_paint()
+        for i, (surface, samples) in enumerate(zip(self.fleet.surfaces, self.samples(), strict=True)):
+            found = finish.base_paint(surface, samples)
+            if found is not None:
+                paint[i] = found.to(paint)
+        return paint
 
     def _place(self, objects: Objects) -> _Geometry:
         return self._pack.place([objects])
@@ -374,10 +474,36 @@ class Compositor:
         bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
         return self.fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
 
+    def brighter(self, objects: Objects) -> Tensor:
+        """By how much (V,) the surfaces are brighter than in the photograph, since they turned: see
+        `texture.brightened`."""
+        turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self._base_yaw)
+        if not objects.source or not turned:
+            return self._like.new_zeros(self.fleet.owner.shape[0])
+        if self._lit is None:
+            self._lit = self._sun_on(self._base_yaw)
+        sunlight = self.fleet.spread(self._sunlight)
+        then = texture.AMBIENT[0] + texture.AMBIENT[1] * (0.5 - 0.5 * self._smooth[:, 1]) + sunlight * self._lit
+        return texture.brightened(sunlight * (self._sun_on(objects.yaw) - self._lit) / then, self.fleet.paint)
+
+    def _sun_on(self, yaw: Tensor) -> Tensor:
+        """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
+        sun = self.scene.environment.sun.to(self._like).expand(len(yaw), 3)
+        x, y, z = self.fleet.spread(surfaces.rotate(sun, -yaw)).unbind(-1)
+        # Written out: sums along an axis may differ in their last bit with the number of rows.
+        soft = self._smooth[:, 0] * x + self._smooth[:, 1] * y + self._smooth[:, 2] * z
+        return texture.sunward(soft)
+
     def ground(self, objects: Objects) -> Tensor:
-        """Clip coordinates (4N, 3) of the corners of the shadows' patches."""
+        """Clip coordinates (4N, 3) of the corners of the shadows' patches.
+
+        A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
+        sun: the patch is sheared the more, the farther out.
+        """
         ground = self.scene.environment.ground
-        corners = surfaces.place_on_ground(self._corners, objects.yaw, objects.translation, ground)
+        offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self._size[:, 1])
+        corners = self._corners + self._outwards[..., None] * (offset - self._sun_offset)[:, None]
+        corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
 
     def shadowless(self) -> list[bool]:
@@ -405,7 +531,7 @@ class Compositor:
             shaded = self._photographed_rows(objects, drawn, rows)
         else:
             own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
-            colour = self._own_colour(rows, own, None)
+            colour = self._own_colour(rows, own, None).clamp(0.0, 1.0)
             shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
         colour, depth = shaded.colour, shaded.depth
         if _active(objects.texture_code):
@@ -462,26 +588,30 @@ class Compositor:
     def _photographed_rows(self, objects: Objects, drawn: Drawn, rows: _Rows) -> _Shaded:
         """All rows, coloured by the photograph, and completed where it did not see the mesh."""
         geometry, base, fleet, m = drawn.geometry, self._base, self.fleet, rows.mesh_rows
-        turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, self._height], dim=1)
+        turn = torch.stack(
+            [geometry.cos - base.cos, base.cos, fleet.paint, self._height, geometry.brighter], dim=1
+        )
 
         attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
         dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, self.settings.backend)
         mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
-        move, rest = torch.cat([mesh, mesh.index_select(0, rows.anchor)]).split([2, 6], dim=1)
-        z_then, z_now, turned, cos_then, paint, up = rest.unbind(1)
+        move, rest = torch.cat([mesh, mesh.index_select(0, rows.anchor)]).split([2, 7], dim=1)
+        z_then, z_now, turned, cos_then, paint, up, brighter = rest.unbind(1)
 
         assert self._texels is not None
         uv = rows.xy + move
         seen = self._texels.sample(uv, rows.counts, self.settings.backend, "clamp")
         rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
         alpha, hidden, outline, z_seen, support = rest.unbind(1)
+        rgb = texture.relit(rgb, brighter)
         clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
         inside = texture.inside_weight(uv, *self._frame_hw)
         visible = inside * clear
-        weight = texture.facing_weight(turned, cos_then) * visible
+        facing = texture.facing_weight(turned, cos_then, paint)
+        weight = facing * visible
         if bool((inside.detach() < 1.0).any()):
             near = texture.inside_weight(uv, *self._frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
-            weight = weight + texture.facing_weight(turned, cos_then) * (1.0 - inside) * near * clear
+            weight = weight + facing * (1.0 - inside) * near * clear
         weight = weight * (1.0 - smoothstep(z_then - z_seen, *texture.DEPTH_TOLERANCE_M))
         kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
         weight = torch.cat([weight[:m], weight[m:] * kept])
@@ -500,6 +630,11 @@ class Compositor:
             completed = self._completion(objects, drawn, rows, need, cos_then[:m] + turned[:m])
             colour = colour.index_add(0, need, filled[:, None] * completed)
             opacity = opacity.index_add(0, need, filled)
+        assert self.regions is not None
+        if _active(objects.texture_code) and bool(self.regions.known.any()):
+            unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
+            found = self.regions.texels.sample_parts(uv, rows.counts, self.settings.backend)[:, 0]
+            paint = texture.paint_share(paint, found, unseen, self.regions.known[rows.owner])
         return _Shaded(colour, opacity, z_now, paint, up)
 
     def _own_attributes(self, objects: Objects, geometry: _Geometry) -> Tensor:
@@ -509,29 +644,28 @@ class Compositor:
         parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self._height)
         return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
 
-    def _own_colour(self, rows: _Rows, own: Tensor, need: Tensor | None, paint: Tensor | None = None) -> Tensor:
-        """The templates' colours (K, 3) in daylight, for the rows `need` or all; paint: (N, 3) that tints the
-        paint."""
+    def _own_colour(self, rows: _Rows, own: Tensor, need: Tensor | None) -> Tensor:
+        """The templates' colours (K, 3) in daylight, not clamped, for the rows `need` or all."""
         xy, owner = (rows.xy, rows.owner) if need is None else (rows.xy[need], rows.owner[need])
+        sunlight = self._sunlight.index_select(0, owner)
         albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
-        if paint is not None:
-            albedo = albedo * (1.0 + sheen[:, :1] * (paint[owner] - 1.0))
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self._unproject.T
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
         to_eye = -torch.nn.functional.normalize(ray, dim=-1)
         sun = self.scene.environment.sun.to(self._like)
-        return texture.shade(normal, to_eye, albedo, sheen, height, sun)
+        return texture.shade(normal, to_eye, albedo, sheen, height, sun, sunlight)
 
     def _completion(self, objects: Objects, drawn: Drawn, rows: _Rows, need: Tensor, cos_now: Tensor) -> Tensor:
         """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
-        template.
+        template in the car's own finish.
 
         cos_now: (Rm,) towards the camera.
         """
         own = self._own_attributes(objects, drawn.geometry)
         mirror = torch.cat([self._mirror_clip, self._mirror_cos[:, None]], dim=1)
-        both = self._mesh_attributes(drawn, rows, torch.cat([own, mirror], dim=1))[need]
-        colour = self._own_colour(rows, both[:, :10], need, self.paint)
+        both = self._mesh_attributes(drawn, rows, torch.cat([own, mirror, self.finish], dim=1))[need]
+        gain, lift = both[:, 14:17], both[:, 17:]
+        colour = texture.finished(self._own_colour(rows, both[:, :10], need), gain, lift)
         clip, cos_then = both[:, 10:13], both[:, 13]
         z = clip[:, 2]
         safe = z.clamp(min=0.1)
@@ -545,25 +679,63 @@ class Compositor:
             * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
             * smoothstep(seen[:, 3], 0.5, 0.95)
             * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
-            * texture.facing_weight(cos_now[need] - cos_then, cos_then)
+            * texture.facing_weight(cos_now[need] - cos_then, cos_then, both[:, 6])
             * smoothstep(cos_then, 0.05, 0.2)
         )
         straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
         return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
 
-    def paint_samples(self, objects: Objects) -> tuple[Tensor, Tensor, Tensor]:
-        """How the templates would look in white paint, beside the photograph: to find the paint of each object.
-
-        -> template RGB (K, 3), photographed RGB (K, 3), owner (K,) int64, at pixels that show nothing but paint.
-        """
+    @torch.no_grad()
+    def photographed_paint(self) -> list[Crop]:
+        """For each object, where its foreground is: Crop (1, h, w), 1 where the mesh at its place in the
+        photograph is paint, 0 where not; beyond the mesh as at its nearest pixel."""
+        objects = _photographed(self.scene.objects)
         drawn = self.draw(objects)
-        rows = self._rows(drawn, False)
-        own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
+        dense = verbs.interpolate(
+            drawn.mesh, drawn.geometry.clip, self.fleet.faces, self.fleet.paint[:, None], self.settings.backend
+        )
+        out = []
+        for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
+            place = objects.source[i].foreground
+            h, w = place.values.shape[1:]
+            x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
+            known = (drawn.mesh.face[packed] >= 0).reshape(size)
+            if not h or not w or not bool(known.any()):
+                out.append(Crop(self._like.new_zeros(1, h, w), place.x0, place.y0))
+                continue
+            values = texture.continued(dense[packed].T.reshape(1, *size), known)
+            rows = (torch.arange(h) + place.y0 - y0).clamp(0, size[0] - 1)
+            columns = (torch.arange(w) + place.x0 - x0).clamp(0, size[1] - 1)
+            out.append(Crop(values[:, rows][:, :, columns], place.x0, place.y0))
+        return out
+
+    @torch.no_grad()
+    def samples(self) -> list[finish.Samples]:
+        """What the photograph shows of each object, beside its template in daylight: a row a pixel."""
+        objects = _photographed(self.scene.objects)
+        drawn = self.draw(objects)
+        geometry, rows = drawn.geometry, self._rows(drawn, False)
+        own = torch.cat([self._own_attributes(objects, geometry), geometry.cos[:, None]], dim=1)
+        own = self._mesh_attributes(drawn, rows, own)
         assert self._texels is not None
         counts = torch.cat([rows.counts, torch.zeros_like(rows.counts)])
         seen = self._texels.sample(rows.xy, counts, self.settings.backend, "clamp")
-        clear = (own[:, 6] > 0.9) & (seen[:, 3] > 0.95) & (seen[:, 4] < 0.01)
-        return self._own_colour(rows, own, None)[clear], seen[clear, :3], rows.owner[clear]
+        template = self._own_colour(rows, own[:, :10], None)
+        weight = smoothstep(own[:, 10], *texture.SQUARE) * smoothstep(seen[:, 3], 0.9, 0.99)
+        weight = weight * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0)) * (1.0 - smoothstep(seen[:, 5], 0.0, 1.0))
+        face = drawn.mesh.face.index_select(0, rows.pixel).long()
+        kept = (weight > 0.0) & (face >= 0)
+        owner, corner = rows.owner[kept], self.fleet.faces[face[kept]]
+        share = surfaces.weights_at(geometry.clip[corner], rows.xy[kept])
+        normal = torch.nn.functional.normalize(own[kept, 3:6], dim=-1, eps=1e-6)
+        sun = self.scene.environment.sun.to(self._like)
+        sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
+        columns = (corner, share, template[kept], seen[kept, :3], sky, lit - sky, weight[kept])
+        out = []
+        for i, (start, _) in enumerate(self.fleet.vertex_ranges.tolist()):
+            vertex, *values = (c[owner == i].cpu().numpy() for c in columns)
+            out.append(finish.Samples(vertex - start, *(v.astype(np.float64) for v in values)))
+        return out
 
     def _shadow_factors(self, objects: Objects, drawn: Drawn) -> Tensor:
         """Factors (Ts, 3) on the ground, of all patches."""
@@ -626,6 +798,8 @@ class Compositor:
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self._like))
             canvas = torch.cat([apply_foliage(canvas[:3], changed, self._air, backend), canvas[3:]])
+        if self._standing is not None:
+            layers = self._standing.before(layers, canvas[:3] - self._canvas[:3] if foliage else None)
         if layers is None:
             with torch.no_grad():
                 depth = self.scene.depth.clone()
@@ -635,16 +809,19 @@ class Compositor:
             factors = layers.shadow
             if weather:
                 factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self._like))
-            order = blend.paint_order(objects.size_lhw, objects.yaw, objects.translation, self._centre)
+            order = blend.paint_order(
+                objects.size_lhw, objects.yaw, objects.translation, self._centre, self._footprints
+            )
             plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
+            number = number if self._standing is None else number.masked_fill(number > len(objects), 0)
             opacity = tuple(
                 Crop(crop.reshape(1, *size), window[1].start, window[0].start)
                 for crop, (_, window, size) in zip(
                     layers.opacity.clamp(0.0, 1.0).split(plan.sizes), plan.spans, strict=True
                 )
-            )
+            )[: len(objects)]
         image = canvas
         if weather:
             changed = replace(self.scene.environment, weather=environment.weather.to(self._like))
@@ -689,7 +866,8 @@ class _Pack:
             clip, cos = fused.place(self._rig, local, yaw, translation)
         else:
             clip, cos = fused.reference_place(self._rig, local, yaw, translation)
-        return _Geometry(clip, cos, ground)
+        brighter = _joined([m.brighter(o) for m, o in zip(self._members, objects, strict=True)])
+        return _Geometry(clip, cos, ground, brighter)
 
     def reach_px(self, objects: Sequence[Objects]) -> list[float]:
         """How far the halo of each object reaches beyond its mesh."""
@@ -727,13 +905,15 @@ class _Pack:
         drawn = self.draw(objects, with_ground=False)
         code = None
         if any(_active(o.texture_code) for o in objects):
-            code = (
+            regions = [m.regions for m in self._members]
+            code = fused.Code(
                 _joined([o.texture_code for o in objects]),
                 _joined([m.paint_lightness for m in self._members]),
+                Regions.joined([r for r in regions if r is not None]),
             )
-        yaw, tint = _joined([o.yaw for o in objects]), _joined([m.paint for m in self._members])
+        yaw = _joined([o.yaw for o in objects])
         whole = self._fixed or known[0]
-        colour, opacity, depth, shadow = fused.photographed(whole, drawn, drawn.reach_px, yaw, tint, code)
+        colour, opacity, depth, shadow = fused.photographed(whole, drawn, drawn.reach_px, yaw, code)
         if len(self._members) == 1:
             return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
         layouts, grounds = (

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from scene_ir import surfaces, texture
+from scene_ir.raster import verbs
 from scene_ir.surfaces import Fleet
 
 if TYPE_CHECKING:
@@ -64,10 +65,10 @@ class Rig:
 @dataclass(frozen=True, slots=True)
 class Fixed:
     """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the
-    camera then, paint, height; own (V, 13): colours (3), local normal (3), paint, glass, height, mirror clip (3),
-    mirror cosine; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches (N, 3, 3)
-    float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then; frame_wh (N, 2)
-    px; sun (N, 3); unproject (N, 3, 3).
+    camera then, paint, height; own (V, 17): colours (3), local normal (3), paint, glass, height, mirror clip (3),
+    mirror cosine, gain (3), lift; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches
+    (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
+    frame_wh (N, 2) px; sun (N, 4): direction, strength; unproject (N, 3, 3).
     """
 
     faces: Tensor
@@ -108,6 +109,15 @@ def _packed(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Ten
     return torch.cat([c[0] for c in crops]), torch.cat([c[1] for c in crops]), offsets
 
 
+@dataclass(frozen=True, slots=True)
+class Code:
+    """Texture codes (N, 5), CIE L* (N,) of the objects' paint, and where they are paint."""
+
+    values: Tensor
+    lightness: Tensor
+    regions: texture.Regions
+
+
 def place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
     """Clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals to the camera."""
     from scene_ir.raster import shading
@@ -133,25 +143,38 @@ def photographed(
     drawn: Drawn,
     reach_px: Sequence[float],
     yaw: Tensor,
-    tint: Tensor,
-    code: tuple[Tensor, Tensor] | None,
+    code: Code | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors
     (Ts, 3) by which their shadows darken the ground.
 
-    reach_px: of each halo; tint (N, 3): the templates' paint; code: texture codes (N, 5) and CIE L* of the paint
-    (N,), if there are any.
+    reach_px: of each halo; code: texture codes, if there are any.
     """
     from scene_ir.raster import shading
 
     def paint(
-        mesh: Tensor, halo: Tensor, look: Tensor, values: Tensor, table: Tensor, nearest: Tensor
+        mesh: Tensor, halo: Tensor, look: Tensor, fill: Tensor, values: Tensor, table: Tensor, nearest: Tensor
     ) -> tuple[Tensor, Tensor]:
         assert code is not None
         draw = table[:, 0].long()
-        rows, lightness = values.index_select(0, draw), code[1].index_select(0, draw)
+        rows, lightness = values.index_select(0, draw), code.lightness.index_select(0, draw)
+        texels, known = code.regions.texels, code.regions.known.index_select(0, draw)
         anchor = look.index_select(0, nearest.clamp(min=0))
-        return _painted(mesh, look, rows, lightness), _painted(halo, anchor, rows, lightness)
+
+        def painted(rgba: Tensor, looked: Tensor, unseen: Tensor) -> Tensor:
+            paint = looked[:, 6]
+            if texels.values.numel():
+                uv = table[:, 1:3].to(looked) + looked[:, :2]
+                found = verbs.texture_packed(
+                    texels.values, texels.rects, texels.offsets, drawn.mesh.layout, uv, "warp", "zero"
+                )
+                paint = texture.paint_share(paint, found[:, 0], unseen, known)
+            colour = texture.apply_texture_code(
+                rgba[:, :3], rgba[:, 3], rows, paint, looked[:, 7], lightness, "warp"
+            )
+            return torch.cat([colour, rgba[:, 3:]], dim=1)
+
+        return painted(mesh, look, fill), painted(halo, anchor, torch.zeros_like(fill))
 
     inside = torch.linalg.inv_ex(patches(drawn.geometry.ground_clip)).inverse
     then = fixed.patches @ inside
@@ -160,21 +183,17 @@ def photographed(
         ground=drawn.ground_layout,
         inside=inside.detach().contiguous(),
         reach_px=reach_px,
-        tint=tint.contiguous(),
         painter=paint if code is not None else None,
         **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
     )
     geometry = drawn.geometry
-    codes = code[0] if code is not None else yaw.new_zeros(0)
-    return shading.Photographed.apply(geometry.clip, geometry.cos, drawn.coverage, yaw, then, codes, setting)
+    codes = code.values if code is not None else yaw.new_zeros(0)
+    return shading.Photographed.apply(
+        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, setting
+    )
 
 
 def patches(clip: Tensor) -> Tensor:
     """(N, 3, 3) float64: from a patch's (s, t, 1) to clip coordinates, of corners (4N, 3) one after the other."""
     first, second, _, last = clip.reshape(-1, 4, 3).double().unbind(dim=1)
     return torch.stack([second - first, last - first, first], dim=2)
-
-
-def _painted(rgba: Tensor, look: Tensor, code: Tensor, lightness: Tensor) -> Tensor:
-    colour = texture.apply_texture_code(rgba[:, :3], rgba[:, 3], code, look[:, 6], look[:, 7], lightness, "warp")
-    return torch.cat([colour, rgba[:, 3:]], dim=1)

@@ -1,9 +1,9 @@
 """A scene as a folder on disk: `scene.json`, images, arrays, meshes. No pickle; load(save(x)) == x, to the bit.
 
-    scene.json        schema version, camera, objects, sources, environment, provenance
+    scene.json        schema version, camera, objects, sources, what stands in front, environment, provenance
     photograph.png    8-bit RGB, where the tensor holds exactly k / 255; else in arrays.npz
     background.png    likewise
-    arrays.npz        depth, maps, and the crops of what the photograph saw of each object
+    arrays.npz        depth, maps, and the crops of what the photograph saw of each object, and in front of them
     meshes/0.glb      see `scene_ir.meshes.load`: opens in any viewer, keeps every bit of float32
 
 A folder that was written by another version of the schema is refused, not guessed at.
@@ -32,6 +32,7 @@ from scene_ir.types import (
     Camera,
     Crop,
     Environment,
+    Front,
     Mesh,
     Objects,
     SceneIR,
@@ -40,7 +41,7 @@ from scene_ir.types import (
 )
 
 SCHEMA = "drivesem.scene"
-VERSION = 1
+VERSION = 2
 """Raise it with every change that an older reader would misread."""
 
 _T = TypeVar("_T")
@@ -104,6 +105,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "meshes": len(scene.meshes),
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
+            "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.front)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
             "ignore": _numbers(scene.ignore),
         }
@@ -137,6 +139,7 @@ def load_scene(folder: Path) -> SceneIR:
     arrays = _Arrays(folder / "arrays.npz")
     images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
     sources = tuple(_load_source(i, node, arrays) for i, node in enumerate(root["sources"].items()))
+    front = tuple(_load_front(i, node, arrays) for i, node in enumerate(root["front"].items()))
     objects_node, environment_node = root["objects"], root["environment"]
     count = objects_node["translation"].rows()
     objects = objects_node.build(
@@ -168,6 +171,7 @@ def load_scene(folder: Path) -> SceneIR:
             depth=arrays.tensor("depth", *size),
             ignore=ignore.tensor(ignore.rows(), 4),
             provenance=provenance,
+            front=front,
         )
     )
 
@@ -238,12 +242,20 @@ def _source_record(index: int, source: Source, arrays: dict[str, np.ndarray]) ->
     arrays[f"source.{index}.foreground"] = _array(source.foreground.values)
     record: dict[str, Any] = {name: _numbers(getattr(source, name)) for name in _SOURCE_FIELDS}
     record["inflation"] = source.inflation
+    record["sunlight"] = source.sunlight
     record["foreground"] = {"x0": source.foreground.x0, "y0": source.foreground.y0}
-    record["shadow"] = None
-    if source.shadow is not None:
-        arrays[f"source.{index}.shadow"] = _array(source.shadow.values)
-        record["shadow"] = {"x0": source.shadow.x0, "y0": source.shadow.y0}
+    for name, crop in (("shadow", source.shadow), ("region", source.region)):
+        record[name] = None
+        if crop is not None:
+            arrays[f"source.{index}.{name}"] = _array(crop.values)
+            record[name] = {"x0": crop.x0, "y0": crop.y0}
     return record
+
+
+def _front_record(index: int, front: Front, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON part of one thing in front; its crop goes into `arrays`."""
+    arrays[f"front.{index}.foreground"] = _array(front.foreground.values)
+    return {"depth_m": front.depth_m, "x0": front.foreground.x0, "y0": front.foreground.y0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,7 +390,16 @@ def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
             foreground=crop("foreground", 4),
             shadow=None if node["shadow"].value is None else crop("shadow", 3),
             inflation=node["inflation"].number(),
+            sunlight=node["sunlight"].number(),
+            region=None if node["region"].value is None else crop("region", 1),
         )
+    )
+
+
+def _load_front(index: int, node: _Node, arrays: _Arrays) -> Front:
+    values = arrays.tensor(f"front.{index}.foreground", 4, None, None)
+    return node.build(
+        lambda: Front(Crop(values, node["x0"].integer(), node["y0"].integer()), node["depth_m"].number())
     )
 
 

@@ -15,7 +15,7 @@ import scipy.ndimage
 import torch
 from torch import Tensor
 
-from scene_ir import blend, surfaces, texture
+from scene_ir import blend, finish, surfaces, texture
 from scene_ir.compositor import Compositor, Drawn, RenderSettings
 from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
@@ -33,6 +33,10 @@ _SOLID = 0.95
 _COLOUR_SLACK = 0.1
 """How far a foreground colour may leave the range between photograph and vehicle: thin trims do; what a wrong
 matte or background asks for goes farther, and would travel with the vehicle as dark or bright specks."""
+_SHADED = 0.3
+"""Sunlight to expect of a vehicle without shadow: between an overcast sky's and a clear one's."""
+_OPEN = 0.9
+"""Share of the light of the sky, in display values, that reaches the ground beside a vehicle."""
 _LEVELS = 255.0
 """Backgrounds are stored with 8 bit."""
 
@@ -63,7 +67,7 @@ def solve_sources(
     h, w) an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one
     Crop (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the
     background, it becomes the photograph (freed of the shadows). margins_px: for each object instead of
-    `settings.margin_px`.
+    `settings.margin_px`. Of what stands in front, `scene.front`, the opacity is taken, and the colours are solved.
     """
     settings = settings or SolveSettings()
     count = len(scene.objects)
@@ -102,7 +106,9 @@ def _solve(
     compositor = Compositor(staged, RenderSettings(settings.backend), whole_patches=True)
     drawn = compositor.draw(compositor.scene.objects)
     nearest = drawn.nearest()
-    mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(len(objects))]
+    count = len(objects)
+    mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(count)]
+    mattes += [replace(f.foreground, values=f.foreground.values[3:].to(image)) for f in scene.front]
     covered = torch.zeros(frame_hw, dtype=torch.bool)
     for matte in mattes:
         _window(covered[None], matte)[0] |= matte.values[0] > 0
@@ -113,28 +119,40 @@ def _solve(
     for factor in factors:
         _window(canvas, factor).mul_(factor.values)
     order = blend.paint_order(
-        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)
+        objects.size_lhw,
+        objects.yaw,
+        objects.translation,
+        surfaces.camera_centre(scene.camera.matrix),
+        blend.standing_footprints(scene.front, scene.camera.matrix),
     )
     solved: dict[int, Source] = {}
+    front = list(scene.front)
     for place, i in enumerate(order):
         hidden = texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
         nearer = torch.zeros(frame_hw, dtype=torch.bool)
         for j in order[place + 1 :]:
             _window(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
+        if i >= count:
+            bare = replace(mattes[i], values=torch.zeros_like(mattes[i].values))
+            standing = _foreground(mattes[i], image, canvas, nearer, bare)
+            behind = _window(canvas, standing)
+            behind.copy_(standing.values[:3] + (1.0 - standing.values[3:]) * behind)
+            front[i - count] = replace(front[i - count], foreground=standing)
+            continue
         packed, size = drawn.mesh.layout.spans()[i]
         x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
         coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
         foreground = _foreground(mattes[i], image, canvas, nearer, coverage)
         shadow = factors[i] if shadows[i] is not None else None
         source = replace(blank[i], foreground=foreground, shadow=shadow)
-        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)))
+        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), front=())
         alone = Compositor(one, RenderSettings(settings.backend), hidden=[hidden])
-        source = replace(source, paint=_paint_of(alone))
-        alone.repaint(source.paint[None])
+        source = replace(source, paint=alone.base_paint()[0], sunlight=_sunlight(alone, shadow))
+        alone.refinish([source])
         canvas = _with_layer(alone)
         solved[i] = source
-    sources = tuple(solved[i] for i in range(len(objects)))
-    return replace(scene, background=background, objects=replace(objects, source=sources))
+    sources = tuple(solved[i] for i in range(count))
+    return replace(scene, background=background, objects=replace(objects, source=sources), front=tuple(front))
 
 
 def _source(
@@ -148,7 +166,7 @@ def _source(
     alpha_rgba = torch.cat([torch.zeros_like(alpha.values).expand(3, -1, -1), alpha.values])
     return Source(
         translation, objects.yaw[index], objects.size_lhw[index], objects.ffd[index],
-        replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation),
+        replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation), texture.SUNLIGHT,
     )  # fmt: skip
 
 
@@ -316,13 +334,17 @@ def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
     return low, (torch.maximum(goal, inside) + _COLOUR_SLACK).clamp(max=1.0)
 
 
-def _paint_of(alone: Compositor) -> Tensor:
-    """The paint (3,) for which the template's own colours look as the photograph shows them, by the median."""
-    template, photographed, _ = alone.paint_samples(alone.scene.objects)
-    if template.shape[0] < 8:
-        return template.new_ones(3)
-    ratio = photographed.median(dim=0).values / template.median(dim=0).values.clamp(min=0.02)
-    return ratio.clamp(0.02, 2.5)
+def _sunlight(alone: Compositor, shadow: Crop | None) -> float:
+    """How strongly the sun lights the object: what its shadow takes away, and its paint shows on several sides."""
+    expected = _SHADED
+    dark = shadow.values.mean(dim=0) if shadow is not None and shadow.values.numel() else None
+    if dark is not None and bool((dark < 1.0).any()):
+        core = 1.0 - dark
+        left = 1.0 - float(core[core > 0.5 * core.max()].median())
+        level = sum(texture.AMBIENT)
+        rise = max(-float(alone.scene.environment.sun[1]), 0.3)
+        expected = (_OPEN * level / max(left, 0.05) - level) / rise
+    return finish.sunlight(alone.fleet.surfaces[0], alone.samples()[0], expected)
 
 
 def _with_layer(alone: Compositor) -> Tensor:

@@ -26,7 +26,7 @@ CREASE_RAD = 0.7
 tools."""
 SHADOW_MARGIN_M = 0.8
 """How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
-SUN_OFFSET_MAX_M = 2.2
+SUN_OFFSET_MAX_M = 4.0
 """Longest cast shadow that is kept: beyond it the penumbra of a low sun is too faint to be worth its pixels."""
 _WELD = 1e-5
 """Vertices of the unit box nearer than this are one point."""
@@ -38,7 +38,7 @@ class Surface:
 
     unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its
     mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0,
-    1]; closed: whether its faces bound volumes and look outwards.
+    1]; part (V,) int64, a `Part` of a face around it; closed: whether its faces bound volumes and look outwards.
     """
 
     unit: Tensor
@@ -49,6 +49,7 @@ class Surface:
     colours: Tensor
     paint: Tensor
     glass: Tensor
+    part: Tensor
     closed: bool
 
     @classmethod
@@ -76,6 +77,9 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
         unit, new_faces, lattice_weights(unit), lattice_weights(mirror), torch.as_tensor(weld)[origin],
         grey[origin].to(dtype),
         _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
+        torch.zeros(len(first), dtype=torch.int64).index_copy(
+            0, new_faces.reshape(-1).flip(0), kinds.repeat_interleave(3).flip(0)
+        ),
     )  # fmt: skip
     return Surface(*(t.to(vertices.device) for t in tensors), closed=_closed(points[triangles], weld[triangles]))
 
@@ -268,6 +272,15 @@ def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
     return rectangle(-half + offset.clamp(max=0.0), half + offset.clamp(min=0.0))
 
 
+def outwards(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
+    """How far out (N, K) along their shadows' offsets (N, 2) m points (N, K, 2) m lie: 0 in the objects' middle, 1
+    where the shadow of the roof's far edge ends. Linear in the points, which are (x, z) in the objects' frames."""
+    length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    along = offset / length
+    edge = (along.abs() * size_lhw[:, [0, 2]] / 2).sum(dim=-1, keepdim=True)
+    return (points * along[:, None]).sum(dim=-1) / (edge + length)
+
+
 def rectangle(low: Tensor, high: Tensor) -> Tensor:
     """Corners (..., 4, 2), one after the other, of rectangles from low to high (..., 2)."""
     x = torch.stack([low[..., 0], high[..., 0], high[..., 0], low[..., 0]], dim=-1)
@@ -416,6 +429,15 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     numbers = np.asarray(labels, dtype=np.int64)
     pixel_of[numbers[mask]] = where
     return np.asarray(distance), pixel_of[numbers]
+
+
+def weights_at(corners: Tensor, xy: Tensor) -> Tensor:
+    """Perspective-correct weights (K, 3) of corners, clip coordinates (K, 3, 3) of triangles, at pixels xy."""
+    ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1).double()
+    a, b, c = corners.double().unbind(dim=1)
+    edges = [torch.linalg.cross(p, q) for p, q in ((b, c), (c, a), (a, b))]
+    value = torch.stack([(edge * ray).sum(dim=1) for edge in edges], dim=1)
+    return value / value.sum(dim=1, keepdim=True)
 
 
 def project_vertices(points: Tensor, camera: Camera) -> Tensor:

@@ -23,8 +23,16 @@ from scene_ir.types import Crop, Source
 DEPTH_TOLERANCE_M = (0.25, 0.6)
 """A point this much behind the photographed surface begins to be, and is, unseen: thicker than a mirror or a
 seat."""
-TURN_TOLERANCE = (0.08, 0.25)
-"""Growth of the cosine towards the camera, beyond what the photograph saw, at which its texels begin to smear."""
+STRETCH = (1.0, 2.2)
+"""Growth of the cosine towards the camera, in units of what the photograph saw, at which its texels begin to
+smear, and at which what stands for unseen parts looks better: drawn out to twice and three times their width."""
+GRAZING = (0.14, 0.04)
+"""Cosine added to what the photograph saw, of all but paint and of paint: at its very outline a surface would
+else have none. Tyres, arches and trims are small and curved; drawn out a little they look better than their
+templates, whose dark edges lie where the mesh has them."""
+SQUARE = (0.15, 0.4)
+"""Cosine towards the camera from which on, and beyond which wholly, a pixel tells of the finish there: near the
+outline, pixels mix with the background, and a mesh that is off by a little shows another part."""
 OPEN_TURN = (0.02, 0.1)
 """Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
 OPEN_ALPHA = (0.2, 0.5)
@@ -110,6 +118,44 @@ class Texels:
         layout = verbs.Layout.of(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
         return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
 
+    def sample_parts(self, uv: Tensor, counts: Tensor, backend: verbs.Backend) -> Tensor:
+        """As `sample`, 0 beyond the crops, with counts (2N,): rows of the objects' meshes, then of their halos."""
+        twice = Texels(
+            torch.cat([self.values, self.values]),
+            torch.cat([self.rects, self.rects]),
+            torch.cat([self.offsets, self.offsets[1:] + self.values.shape[0]]),
+        )
+        return twice.sample(uv, counts, backend, "zero")
+
+
+@dataclass(frozen=True, slots=True)
+class Regions:
+    """Where N objects are paint, by the photograph. texels: of one channel, empty where known (N,) is false."""
+
+    texels: Texels
+    known: Tensor
+
+    @classmethod
+    def joined(cls, parts: Sequence[Regions]) -> Regions:
+        """Those of several scenes' objects, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        starts = np.cumsum([0] + [p.texels.values.shape[0] for p in parts])
+        offsets = [p.texels.offsets[:-1] + int(start) for p, start in zip(parts, starts[:-1], strict=True)]
+        end = parts[0].texels.offsets.new_tensor([int(starts[-1])])
+        texels = Texels(
+            torch.cat([p.texels.values for p in parts]),
+            torch.cat([p.texels.rects for p in parts]),
+            torch.cat([*offsets, end]),
+        )
+        return cls(texels, torch.cat([p.known for p in parts]))
+
+
+def paint_share(mesh: Tensor, region: Tensor, unseen: Tensor, known: Tensor) -> Tensor:
+    """How much of each pixel (R,) is paint: by the photograph's region where it was seen, by the mesh's parts
+    where it was not, or where no region is known (R,)."""
+    return torch.where(known, region + unseen * (mesh - region), mesh)
+
 
 def crop_of(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tensor:
     """The values (C, h, w) of `crop` seen through `rect` (x0, y0, x1, y1), which may reach beyond the frame.
@@ -143,7 +189,7 @@ def source_texels(
     covered = torch.isfinite(mesh_depth.values)
     padded = crop_of(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
     finite = torch.where(covered, mesh_depth.values, torch.zeros_like(mesh_depth.values)).to(rgba)
-    depth = _continued(crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
+    depth = continued(crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
     depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -154,7 +200,7 @@ def source_texels(
     return Crop(values, x0, y0)
 
 
-def _continued(values: Tensor, known: Tensor) -> Tensor:
+def continued(values: Tensor, known: Tensor) -> Tensor:
     """Values (C, h, w) where `known` (h, w), elsewhere those of the nearest known pixel; unchanged if none is."""
     mask = known.cpu().numpy()
     if not mask.any():
@@ -181,14 +227,14 @@ def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
     return smoothstep(torch.from_numpy(distance).to(like), *HIDDEN_PX)
 
 
-def facing_weight(turned: Tensor, cos_source: Tensor) -> Tensor:
+def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:
     """1 where a texel was seen squarely enough for how squarely it is shown now, 0 where it would smear.
 
-    turned: cosine towards the camera now minus then; cos_source: then. Exactly 1, with zero slope, where nothing
-    turned.
+    turned: cosine towards the camera now minus then; cos_source: then; paint: share of the mesh. Exactly 1, with
+    zero slope, where nothing turned.
     """
     positive = 0.5 * (cos_source + (cos_source.square() + 1e-4).sqrt())
-    return 1.0 - smoothstep(turned - positive, *TURN_TOLERANCE)
+    return 1.0 - smoothstep(turned / (positive + GRAZING[0] + (GRAZING[1] - GRAZING[0]) * paint), *STRETCH)
 
 
 def outline_weight(turned: Tensor) -> Tensor:
@@ -261,27 +307,58 @@ def rgb_of(lab_rows: Tensor) -> Tensor:
     Colours out of gamut bend back softly; so near black and white the result is not the inverse of `lab`: take
     differences of two results.
     """
-    rgb = kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
+    rgb = rgb_exact(lab_rows)
     softplus = torch.nn.functional.softplus
     return softplus(rgb, beta=GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=GAMUT_SHARPNESS)
 
 
-GROUND_RGB, HORIZON_RGB, ZENITH_RGB = (0.30, 0.29, 0.28), (0.86, 0.88, 0.90), (0.52, 0.66, 0.86)
+def rgb_exact(lab_rows: Tensor) -> Tensor:
+    """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `lab`, out of [0, 1] where no display shows
+    it."""
+    return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
 
 
-def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height: Tensor, sun: Tensor) -> Tensor:
-    """Daylight on a vehicle's own colours: RGB (R, 3), the template's look where no photograph helps.
+GROUND_RGB, HORIZON_RGB, ZENITH_RGB = (0.30, 0.29, 0.28), (0.46, 0.47, 0.47), (0.52, 0.66, 0.86)
+"""What surfaces mirror. Level with them stand houses, hedges and other cars, not the sky."""
+AMBIENT = (0.30, 0.38)
+"""Light from all around, and what the sky adds to a surface that looks up; in display values, as all here."""
+RELIT = (0.3, 0.6)
+"""Share of the change of light that a photographed colour follows, of all but paint and of paint: glass and rubber
+show less of it, and the sun that the shading knows may be behind a tree. Held against generated truth."""
+RELIT_MOST = 0.5
+"""Largest share by which a photographed colour brightens or darkens as its surface turns."""
+SUNLIGHT = 0.62
+"""What the sun adds to a surface that faces it, on a clear day with some haze."""
+
+
+def daylight(normal: Tensor, sun: Tensor, sunlight: Tensor | float) -> Tensor:
+    """Light (R,) on surfaces in the open: sky dome and ground bounce, and a sun of a strength (R,). normal (R, 3),
+    sun (3,) unit; sun (R, 3) too."""
+    return (AMBIENT[0] + AMBIENT[1] * (0.5 - 0.5 * normal[:, 1])) + sunlight * sunward((normal * sun).sum(-1))
+
+
+def sunward(cos: Tensor) -> Tensor:
+    """How squarely the sun meets a surface whose normal has this cosine to it: 0 from behind, smooth."""
+    return 0.5 * (cos + (cos.square() + 0.01).sqrt())
+
+
+def shade(
+    normal: Tensor,
+    to_eye: Tensor,
+    albedo: Tensor,
+    sheen: Tensor,
+    height: Tensor,
+    sun: Tensor,
+    sunlight: Tensor | float = SUNLIGHT,
+) -> Tensor:
+    """Daylight on a vehicle's own colours: RGB (R, 3), not clamped, the template's look where no photograph helps.
 
     normal, to_eye (R, 3) unit; albedo (R, 3); sheen (R, 2): paint, glass in [0, 1]; height (R,) 0 at the foot, 1
-    at the roof; sun (3,) unit. Sky dome and ground bounce, a sun with a highlight, and a Fresnel reflection of a
-    plain sky.
+    at the roof; sun (3,) unit; sunlight (R,). Sky dome and ground bounce, a sun with a highlight, and a Fresnel
+    reflection of a plain street and sky.
     """
-    up = -normal[:, 1]
-    dome = 0.5 + 0.5 * up
-    soft = (normal * sun).sum(-1)
-    direct = 0.5 * (soft + (soft.square() + 0.01).sqrt())
     occluded = 0.45 + 0.55 * smoothstep(height, -0.05, 0.4)
-    diffuse = ((0.30 + 0.38 * dome) + 0.62 * direct) * occluded
+    diffuse = daylight(normal, sun, sunlight) * occluded
     cos = (normal * to_eye).sum(-1).clamp(0.0, 1.0)
     mirror = 2.0 * cos[:, None] * normal - to_eye
     sky_up = -mirror[:, 1]
@@ -293,4 +370,27 @@ def shade(normal: Tensor, to_eye: Tensor, albedo: Tensor, sheen: Tensor, height:
     strength = (0.55 * paint * fresnel + glass * (0.10 + 0.75 * fresnel)) * (0.5 + 0.5 * occluded)
     glint = ((mirror * sun).sum(-1).clamp(0.0, 1.0)).pow(40) * (0.35 * paint + 0.5 * glass)
     lit = albedo * diffuse[:, None]
-    return (lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)).clamp(0.0, 1.0)
+    return lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)
+
+
+def brightened(ratio: Tensor, paint: Tensor) -> Tensor:
+    """How much brighter a surface is after it turned: a share of what it was, within `RELIT_MOST`.
+
+    ratio: by how much the light on it grew, relative, above -1; paint: share of it. 0 for 0.
+    """
+    share = RELIT[0] + (RELIT[1] - RELIT[0]) * paint
+    return share * ratio / (1.0 + (ratio / RELIT_MOST).square()).sqrt()
+
+
+def relit(rgb: Tensor, brighter: Tensor) -> Tensor:
+    """Photographed colours (R, 3) in other light: brighter (R,) as by `brightened`. The same bits where it is 0.
+
+    What is white in the photograph hardly changes: film saturates.
+    """
+    return rgb * (1.0 + brighter[:, None] * (1.0 - rgb * rgb))
+
+
+def finished(light: Tensor, gain: Tensor, lift: Tensor) -> Tensor:
+    """Light (R, 3) of a template as a photograph shows the vehicle: gain (R, 3), and lift (R, 1) that the darkest
+    has. Bright light saturates as on film: 1 is never reached."""
+    return 1.0 - (1.0 - lift) * torch.exp(-(light * gain))

@@ -151,7 +151,9 @@ class Source:
     foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity (the matte), in [0, 1].
     shadow: Crop of (3, h, w): the factor in [0, 1] by which the object darkens the ground at each pixel, or None.
     inflation: m beyond the mesh within which the matte may reach: its halo, which moves with the outline.
-    paint: (3,) RGB, the base colour of the paint.
+    paint: (3,) RGB, the base colour of the paint. sunlight: how strongly the sun lights the object, see
+    `texture.shade`. region: Crop of (1, h, w) in [0, 1], how much of each pixel is paint, nothing beyond it; None
+    where that is known by the mesh's parts alone.
     """
 
     translation: Tensor
@@ -162,6 +164,8 @@ class Source:
     shadow: Crop | None
     inflation: float
     paint: Tensor
+    sunlight: float
+    region: Crop | None = None
 
     def __post_init__(self) -> None:
         check_shape("source.translation", self.translation, 3)
@@ -172,6 +176,27 @@ class Source:
         if self.shadow is not None:
             check_shape("source.shadow", self.shadow.values, 3, None, None)
         check_shape("source.paint", self.paint, 3)
+        if not 0 <= self.sunlight < float("inf"):
+            raise RangeError("source.sunlight", "at least 0", self.sunlight)
+        if self.region is not None:
+            check_shape("source.region", self.region.values, 1, None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Front:
+    """Something that is no vehicle and may stand in front of one: a person, a pole, a trunk. It never moves.
+
+    foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity, in [0, 1]. depth_m: along the optical
+    axis, to where it stands.
+    """
+
+    foreground: Crop
+    depth_m: float
+
+    def __post_init__(self) -> None:
+        check_shape("front.foreground", self.foreground.values, 4, None, None)
+        if not 0 < self.depth_m < float("inf"):
+            raise RangeError("front.depth_m", "positive metres", self.depth_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,6 +276,7 @@ class SceneIR:
     """One frame, taken apart. photograph, background: (3, H, W) RGB in [0, 1], the background without the cars and
     their shadows, and equal to the photograph elsewhere; depth: (H, W) m of the background, inf in the sky.
     ignore: (K, 4) px, xyxy, regions no detection is judged in (DontCare). provenance: where it came from.
+    front: what may stand in front of vehicles: drawn over those behind it, and part of the background too.
     """
 
     camera: Camera
@@ -262,6 +288,7 @@ class SceneIR:
     depth: Tensor
     ignore: Tensor
     provenance: Mapping[str, str] = field(default_factory=dict)
+    front: tuple[Front, ...] = ()
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width

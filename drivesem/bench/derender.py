@@ -78,6 +78,8 @@ _DEPTH_TOLERANCE_M = 0.12
 """Between a surface point and the depth map at its pixel, the neighbours' included: slopes are steep at grazing
 angles."""
 _RAISED_M = 0.02
+_SHADED = 0.85
+"""Share of its brightness without vehicles below which ground counts as shaded by them."""
 _ATTEMPTS = 200
 _STREAM = 0xDE4E
 """Keeps this benchmark's random numbers apart from the generator's."""
@@ -154,8 +156,9 @@ class Edited:
 @dataclass(frozen=True, slots=True)
 class Row:
     """What was found of one frame. identity_db: in the objects' boxes; exact: whether all pixels that no matte and
-    no shadow reaches are the photograph's. withheld: shapes where no vehicle's own kind of template may be chosen.
-    ablations: PSNR of move and removal with a part replaced by the truth.
+    no shadow reaches are the photograph's. shadow_iou, sun_deg: see `shadows`; no sun but under a clear sky.
+    withheld: shapes where no vehicle's own kind of template may be chosen. ablations: PSNR of move and removal
+    with a part replaced by the truth.
     """
 
     index: int
@@ -176,6 +179,8 @@ class Row:
     peak_mb: float | None
     withheld: tuple[Shape, ...] = ()
     ablations: dict[str, dict[str, float]] = field(default_factory=dict)
+    shadow_iou: float | None = None
+    sun_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,6 +431,7 @@ def judge(
     cleared = _picture(scene.background)
     hole = changed_region(before, empty, gone)
     removed = _edited(cleared, before.image, empty.image, hole)
+    shade, sun = shadows(scene, before, empty, gone)
     truth = next(t for t in before.truths if t.actor.track == move.track)
     row = Row(
         index=index,
@@ -444,6 +450,8 @@ def judge(
         derender_s=0.0,
         cpu_s=0.0,
         peak_mb=None,
+        shadow_iou=round(shade, 4),
+        sun_deg=round(sun, 2) if before.manifest["weather"] == "sun" else None,
     )
     told = f"{truth.actor.kind} moved {move.shift_m[0]:+.1f} {move.shift_m[1]:+.1f} m, {row.turn_deg:+.0f} deg"
     strips = [
@@ -451,6 +459,29 @@ def judge(
         Strip(before.image, cleared, empty.image, hole, f"all removed: {removed.psnr_db:.1f} dB"),
     ]
     return row, strips
+
+
+def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequence[int]) -> tuple[float, float]:
+    """Of the shadows that a scene's vehicles cast: IoU of where they darken the ground beside the vehicles, with
+    the truth; and degrees between the sun's azimuths. gone: tracks of the vehicles that `empty` lacks."""
+    seen = np.zeros(before.image.shape[:2], bool)
+    for track in gone:
+        seen |= share_of(before, track) > 0
+    beside = ~silhouette.grow(seen, _GROW_PX)
+    bright = [frame.image.max(axis=2).astype(np.float32) + 1 for frame in (before, empty)]
+    true = (bright[0] < _SHADED * bright[1]) & beside
+    factor = np.ones(seen.shape, np.float32)
+    for source in scene.objects.source:
+        if source.shadow is not None and source.shadow.values.numel():
+            crop = source.shadow
+            h, w = crop.values.shape[1:]
+            factor[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] *= crop.values.amax(dim=0).numpy()
+    ours = (factor < _SHADED) & beside
+    either = np.count_nonzero(true | ours)
+    suns = (scene.environment.sun, before.environment.sun)
+    azimuths = [math.atan2(float(sun[2]), float(sun[0])) for sun in suns]
+    apart = math.degrees(abs(math.remainder(azimuths[0] - azimuths[1], 2 * math.pi)))
+    return np.count_nonzero(true & ours) / either if either else 1.0, apart
 
 
 def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
@@ -529,7 +560,8 @@ def _picture(image: Tensor) -> Picture:
 
 
 def _identity(compositor: Compositor) -> tuple[float, bool]:
-    """PSNR, dB, of the unperturbed render in the objects' boxes; whether it is exact beyond mattes and shadows."""
+    """PSNR, dB, of the unperturbed render in the objects' boxes; whether it is exact beyond mattes, shadows and
+    what stands in front."""
     scene = compositor.scene
     image = compositor.render(scene).image
     height, width = image.shape[1:]
@@ -543,6 +575,9 @@ def _identity(compositor: Compositor) -> tuple[float, bool]:
         for crop, where in reached:
             h, w = where.shape
             touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= where.numpy()
+    for crop in (thing.foreground for thing in scene.front):
+        h, w = crop.values.shape[1:]
+        touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= crop.values[3].numpy() > 0
     apart = (image - scene.photograph).double().numpy().transpose(1, 2, 0)
     mean = float(np.mean(apart[boxes] ** 2)) if boxes.any() else 0.0
     identity_db = EXACT_DB if mean == 0 else min(-10 * math.log10(mean), EXACT_DB)
@@ -782,6 +817,8 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
         _line("remove, PSNR, dB", [r.remove.psnr_db for r in rows], goal="median 28"),
         _line("remove, unchanged, PSNR, dB", [r.remove.unchanged_db for r in rows]),
         _line(f"remove, {PERCEPTUAL}", [r.remove.perceptual for r in rows], False),
+        _line("shadows, IoU", [r.shadow_iou for r in rows]),
+        _line("sun's azimuth under a clear sky, error, degrees", [r.sun_deg for r in rows], False),
         _line("identity in boxes, PSNR, dB", [r.identity_db for r in rows], goal="each 45"),
         _line("identity exact elsewhere, share", [float(r.exact) for r in rows], goal="each 1"),
         _line("time, s", [r.derender_s for r in rows], False, goal="each 8"),

@@ -35,7 +35,8 @@ class FillSettings:
     full image, then in px of each level; ground_weight: cost of showing no ground where ground must be; guessed:
     weight of a pixel in the hole against one outside, when patches are compared; guide_weight: cost of a source
     whose surroundings, blurred by guide_px, have not the guide's colour; settle_px: over which distance the fill's
-    mean colour is brought to the guide's.
+    mean colour is brought to the guide's; grain_px: finer detail is each pixel's own source's; keep: a source that
+    was drawn by chance must cost less by this factor, so that neighbours keep copying neighbours.
     """
 
     coarsest_radius: float = 4.0
@@ -50,6 +51,8 @@ class FillSettings:
     guide_weight: float = 3.0
     guide_px: float = 2.5
     settle_px: float = 6.0
+    grain_px: float = 1.5
+    keep: float = 0.85
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,10 +128,11 @@ def fill(
     for index in reversed(range(len(pyramid))):
         level_image, level_hole, level_forbidden = pyramid[index]
         level_guide = guides[index]
-        if source is None and level_guide is not None:
-            start = level_guide
-        elif source is None:
+        if source is None:
             start = level_image[first_guess(level_forbidden, grounds[index])]
+            if level_guide is not None:
+                sigma = max(settings.settle_px / 2**index, 1.0)
+                start = start + mean_inside(level_guide - start, level_hole, sigma)
         else:
             size = (level_image.shape[1], level_image.shape[0])
             start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
@@ -139,13 +143,27 @@ def fill(
         if level_guide is not None:
             level.follow(level_guide)
         current, source = level.run(source, rounds, rng)
+    assert source is not None
+    current = _with_grain(current, image, hole, forbidden, source, settings.grain_px)
     if guide is not None:
-        current = current + _mean_inside(guide - current, hole, settings.settle_px)
+        current = current + mean_inside(guide - current, hole, settings.settle_px)
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
 
 
-def _mean_inside(values: Image, mask: Mask, sigma: float) -> Image:
-    """Gaussian mean (H, W, 3) of the values in the mask."""
+def _with_grain(
+    current: Image, image: Image, hole: Mask, forbidden: Mask, source: NDArray[np.int64], sigma: float
+) -> Image:
+    """The fill with fine detail as it is at each pixel's own source: the mean of several sources has lost it."""
+    detail = image - mean_inside(image, ~forbidden, sigma)
+    smooth = mean_inside(current, np.ones_like(hole), sigma)
+    rows, columns = source[hole].T
+    result = current.copy()
+    result[hole] = smooth[hole] + detail[rows, columns]
+    return result
+
+
+def mean_inside(values: Image, mask: Mask, sigma: float) -> Image:
+    """Gaussian mean (H, W, 3), sigma px, of the values (H, W, 3) in the mask (H, W)."""
     weight = mask.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
@@ -247,7 +265,7 @@ class _Level:
         """Prefer sources that look like the guide (H, W, 3) at the place that they are copied to."""
         self.guide = guide[self.rows, self.columns]
         image = self.padded[self.pad : -self.pad, self.pad : -self.pad]
-        self.blurred = _mean_inside(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
+        self.blurred = mean_inside(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
 
     def _flat(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
         return (rows + self.pad) * self.stride + columns + self.pad
@@ -271,15 +289,17 @@ class _Level:
             cost = cost + self.settings.guide_weight * np.einsum("pk,pk->p", apart, apart)
         return np.where(self.allowed[rows, columns], cost, np.inf).astype(np.float32)
 
-    def _try(self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
-        """Take the proposed sources where they are better."""
+    def _try(
+        self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64], gain: float = 1.0
+    ) -> None:
+        """Take the proposed sources where their cost is below `gain` times the current one."""
         rows = np.clip(rows, 0, self.height - 1)
         columns = np.clip(columns, 0, self.width - 1)
         current = self.source[which]
         new = self.allowed[rows, columns] & ((rows != current[:, 0]) | (columns != current[:, 1]))
         which, rows, columns = which[new], rows[new], columns[new]
         cost = self._cost(which, rows, columns)
-        better = cost < self.best[which]
+        better = cost < gain * self.best[which]
         chosen = which[better]
         self.source[chosen, 0], self.source[chosen, 1] = rows[better], columns[better]
         self.best[chosen] = cost[better]
@@ -310,12 +330,13 @@ class _Level:
             )
             which = everything[neighbour >= 0]
             near = neighbour[which]
-            self._try(which, self.source[near, 0] - dy, self.source[near, 1] - dx)
+            self._try(which, self.source[near, 0] - dy, self.source[near, 1] - dx, 1 / self.settings.keep)
         while radius >= 1:
             spread_y = np.minimum(radius, 0.5 * self.reach + 2)
             rows = self.source[:, 0] + rng.uniform(-1, 1, self.rows.size) * spread_y
             columns = self.source[:, 1] + rng.uniform(-1, 1, self.rows.size) * radius
-            self._try(everything, np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
+            drawn = np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64)
+            self._try(everything, *drawn, self.settings.keep)
             radius /= 3
 
     def _vote(self) -> None:

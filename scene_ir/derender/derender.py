@@ -11,12 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from scene_ir.derender import background as fills
-from scene_ir.derender import maps, shadow, silhouette, street
-from scene_ir.derender.matte import matte
-from scene_ir.derender.settle import settle
+from scene_ir.derender import cutout as cutouts
+from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand, street, upright
+from scene_ir.derender.cutout import Cutout
+from scene_ir.derender.matte import opacity_of
 from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import project_boxes
+from scene_ir.geometry import project_boxes, to_clip
 from scene_ir.raster import verbs
 from scene_ir.sources import SolveSettings, solve_sources
 from scene_ir.types import (
@@ -43,16 +44,21 @@ VEHICLES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 
 _FADE = (0.08, 0.45)
 """Opacity up to which the photograph is taken for what is behind a car, and from which on that is all filled."""
-_TRUSTED = 0.85
-"""Agreement of mask and fitted outline from which on the outline may add to the mask."""
-_EDGE = 0.03
-"""How far the outline may add to the mask, as a fraction of the car's height: more is a mesh that is too large."""
+_FADE_FRONT = 0.98
+"""Opacity of what stands in front from which on a pixel is all of it."""
 _CLOSE = 0.015
 """How far the mask of a car that fills its 2D box may lie from its outline, as a fraction of its height."""
 _SAME_PX, _SAME_SHARE = 1.0, 0.015
 """How near to the picture of its 3D box, px and share of the height, a label's 2D box is that picture."""
+_EDGES = 0.3
+"""Weight in the choice of a template of its edges' distance from the photograph's, against its mask's agreement:
+among the templates of one car the former varies about three times as much."""
+_STOOD_M = 0.3
+"""How far around a vehicle's footprint there is ground."""
+_SURELY = 0.8
+"""How much a pixel must look like an unlabelled vehicle or person not to be copied."""
 _LARGE_HOLE_PX = 60_000
-"""Holes beyond are searched with one round less at full size: half the time, a little less grain."""
+"""Holes beyond are not searched at full size: a third of the time less, hardly to be seen."""
 _UNDERBODY = 0.3
 """Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
@@ -62,7 +68,9 @@ class DerenderSettings:
     """fit: move templates until their outlines meet the masks. min_height_px: smaller vehicles stay background.
     min_iou: below this agreement of mask and template the template's outline is the mask. max_inflation: of the
     halo that carries the matte, as a fraction of the car's height. min_reach_px: how far it reaches at least.
-    seed: of the fill's random search. backend: of the renderer.
+    seed: of the fill's random search. backend: of the renderer. meshes: a user's, to choose from beside the
+    templates. segmenter: a user's, instead of the shipped network. withheld: for each label a kind of template
+    that it may not be, "" for none; empty: none for all.
     """
 
     fit: bool = True
@@ -73,11 +81,15 @@ class DerenderSettings:
     seed: int = 0
     backend: verbs.Backend = "warp"
     fitting: silhouette.FitSettings = field(default_factory=silhouette.FitSettings)
+    meshes: tuple[silhouette.OwnMesh, ...] = ()
+    segmenter: segment.Segmenter | None = None
+    withheld: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Cut:
-    """One car cut out: its label's row, the fitted placement, the mask, and how well they agree."""
+    """One car cut out: its label's row, the fitted placement, the mask, what hides it, the placement's outline,
+    how well the two agree, and shares of pixels."""
 
     row: int
     placement: Placement
@@ -85,16 +97,83 @@ class _Cut:
     unknown: Mask
     outline: Mask
     agreement: float
+    seen: Cutout
+
+
+@dataclass(frozen=True, slots=True)
+class _Looks:
+    """How vehicles are told from what is around them: by the data set's masks where it has any, else by the
+    network. image (H, W, 3); ground (4,): the plane."""
+
+    image: NDArray[np.uint8]
+    frame: Frame
+    ground: torch.Tensor
+    settings: DerenderSettings
+
+    def at(self, row: int, placement: Placement, hidden: Mask) -> tuple[Mask, Mask]:
+        """Pixels (H, W) of a label's vehicle, and of what else stands in front of it. hidden (H, W): what is known
+        to be in front."""
+        if self.frame.masks is not None:
+            return (self.frame.masks[row] > 0.5).numpy() & ~hidden, hidden
+        seen = self._seen(row, placement, hidden, False)
+        return _pixels(seen, hidden), seen.whole("front", hidden.shape) >= 0.5
+
+    def cut(self, row: int, placement: Placement, outline: Mask, hidden: Mask, told: bool) -> _Cut:
+        """A vehicle cut out about its placement. outline (H, W): of it; told: whether it fills its label's box."""
+        if self.frame.masks is not None:
+            mask = (self.frame.masks[row] > 0.5).numpy() & ~hidden
+            seen = cutouts.of_mask(self.image, mask, hidden)
+        else:
+            seen = self._seen(row, placement, hidden, True)
+            if told:
+                seen = _close_to(outline & ~hidden, seen)
+            mask = _pixels(seen, hidden)
+            front = hidden | (seen.whole("front", hidden.shape) >= 0.5)
+            if silhouette.iou(mask, outline, front) >= self.settings.min_iou:
+                hidden = front
+            else:
+                mask = outline & ~hidden
+                seen = cutouts.of_mask(self.image, mask, hidden)
+        return _Cut(row, placement, mask, hidden, outline, silhouette.iou(mask, outline, hidden), seen)
+
+    def _seen(self, row: int, placement: Placement, hidden: Mask, again: bool) -> Cutout:
+        camera, labels, backend = self.frame.camera, self.frame.labels, self.settings.backend
+        assert labels is not None
+        found = cutouts.cut_out(
+            self.image, [placement], [hidden], self.ground, camera, backend=backend, again=again
+        )
+        outline = silhouette.silhouettes([placement], camera, backend)[0]
+        seen = cutouts.believed(cutouts.tidy(found[0]), outline, hidden)
+        return replace(seen, visible=seen.visible * _label_box(labels, row, hidden.shape)[seen.window])
+
+
+def _close_to(outline: Mask, seen: Cutout) -> Cutout:
+    """A cut-out whose border lies along the outline (H, W): one that fills its box is right to a pixel or two,
+    whatever the colours say."""
+    if not outline.any():
+        return seen
+    apart = _CLOSE * _height(outline)
+    far = silhouette.grow(outline, apart + 1)[seen.window]
+    inner = silhouette.grow(outline, -apart - 0.7)[seen.window]
+    return replace(seen, visible=np.where(inner, 1 - seen.front, seen.visible * far).astype(np.float32))
+
+
+def _pixels(seen: Cutout, hidden: Mask) -> Mask:
+    """Pixels (H, W) that show a vehicle more than anything else."""
+    return (seen.whole("visible", hidden.shape) >= 0.5) & ~hidden
 
 
 @dataclass(frozen=True, slots=True)
 class _Surroundings:
-    """horizon: its row, px; ground (4,): the plane; others (H, W): labelled things that are no vehicles."""
+    """horizon: its row, px; ground (4,): the plane; others (H, W): labelled things that are no vehicles; front
+    (H, W): how much of each pixel shows things in front of vehicles; seen: the photograph's maps."""
 
     horizon: float
     ground: torch.Tensor
     camera: Camera
     others: Mask
+    front: Array
+    seen: segment.Segmentation
 
 
 def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
@@ -111,24 +190,42 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     rows = _vehicle_rows(frame.identifier, labels, camera, settings)
     image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     ground = maps.fit_ground(labels, _posed_rows(labels))
-    cuts = _cut_out(image, frame, rows, settings)
+    others = [row for row in _posed_rows(labels) if labels.kind[row] not in VEHICLES]
+    things = front.labelled(_bytes(image), frame, rows, others)
+    cuts = _cut_out(image, frame, rows, settings, things)
+    things += _unlabelled(frame, cuts, things, ground)
+    things.sort(key=lambda thing: thing.depth_m)
+    cuts = _behind(cuts, things, camera)
+    opacities = front.opacities(image, things)
     views = [shadow.ground_view(cut.placement, ground, camera) for cut in cuts]
     cuts = [_without_underbody(cut, view) for cut, view in zip(cuts, views, strict=True)]
     vehicles = np.zeros(image.shape[:2], bool)
     for cut in cuts:
         vehicles |= silhouette.grow(cut.mask, 2)
     horizon = maps.horizon_row(ground, camera)
-    road = maps.road_map(image, horizon, vehicles)
+    seen = segment.of_frame(frame, segment.segment(image, ground, camera, settings.segmenter))
+    road = np.where(vehicles, 0, seen.road).astype(np.float32)
     background, mattes, shadows, sun = _layers(
         image,
         cuts,
         views,
         vehicles,
         road,
-        _Surroundings(horizon, ground, camera, _people(labels, camera)),
+        _Surroundings(
+            horizon,
+            ground,
+            camera,
+            _people(labels, camera),
+            sum(opacities, np.zeros(image.shape[:2], np.float32)),
+            seen,
+        ),
         settings.seed,
     )
-    environment, depth = _environment(background, ground, sun, horizon, camera, vehicles)
+    if cuts:
+        # What stands behind the vehicles no classes tell.
+        behind = segment.segment(background, ground, camera, settings.segmenter)
+        seen = segment.of_frame(frame, behind).within((background != image).any(-1), behind)
+    environment, depth = _environment(seen, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
         # What stands behind the vehicles was never measured: there the estimate stays.
         depth = torch.where(torch.from_numpy(vehicles), depth, frame.depth.float())
@@ -136,6 +233,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     provenance = dict(frame.provenance) | {"frame": frame.identifier, "derender": "template fit and patch fill"}
     for index, cut in enumerate(cuts):
         provenance[f"objects[{index}].label"] = str(cut.row)
+        provenance[f"objects[{index}].mesh"] = cut.placement.mesh.name
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
     picture = torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1)))
     scene = SceneIR(
@@ -148,17 +246,63 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         depth,
         labels.ignore_xyxy,
         provenance,
+        tuple(front.layer(a, thing.depth_m) for a, thing in zip(opacities, things, strict=True) if a.any()),
     )
     if not cuts:
         return scene
     margins = [_reach_px(cut, opacity, settings) for cut, opacity in zip(cuts, mattes, strict=True)]
-    return solve_sources(
+    solved = solve_sources(
         scene,
         [_crop(a[None]) for a in mattes],
         [_crop(1 - f.transpose(2, 0, 1), inverted=True) for f in shadows],
         SolveSettings(backend=settings.backend),
         margins,
     )
+    return paint.with_regions(solved, settings.backend)
+
+
+def _bytes(image: Array) -> NDArray[np.uint8]:
+    """An image (H, W, 3) in [0, 1] with 8 bit."""
+    return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+
+
+def _unlabelled(
+    frame: Frame, cuts: list[_Cut], things: list[front.Thing], ground: torch.Tensor
+) -> list[front.Thing]:
+    """Things in front of vehicles that no label tells of: by the frame's depth, where it has one."""
+    if frame.depth is None or not cuts:
+        return []
+    known = _union([cut.mask for cut in cuts] + [thing.mask for thing in things], cuts[0].mask.shape)
+    if frame.masks is not None:
+        known = known | (frame.masks > 0.5).any(dim=0).numpy()
+    nearest = [(cut.outline, front.nearest_corner(cut.placement, frame.camera)) for cut in cuts]
+    depth = frame.depth.float().numpy()
+    return front.measured(depth, maps.height_above(depth, ground, frame.camera), known, nearest)
+
+
+def _behind(cuts: list[_Cut], things: list[front.Thing], camera: Camera) -> list[_Cut]:
+    """The cuts without what stands in front of them. One of which nothing is left stays as it was."""
+    found = []
+    for cut in cuts:
+        depth = float(to_clip(cut.placement.translation.detach()[None], camera.matrix)[0, 2])
+        hidden = front.before(things, depth, cut.mask.shape)
+        rest = cut.mask & ~hidden
+        found.append(replace(cut, mask=rest, unknown=cut.unknown | hidden) if rest.any() else cut)
+    return found
+
+
+def placements(frame: Frame, settings: DerenderSettings | None = None) -> dict[int, Placement]:
+    """Where the vehicles of a photograph are and of what shape, by row of their labels: of `derender` the
+    geometric branch alone. Raises as `derender` does."""
+    settings = settings or DerenderSettings()
+    if frame.labels is None:
+        raise ShapeError(f"frame {frame.identifier}: labels", "labels with 3D boxes", "none")
+    labels = frame.labels
+    rows = _vehicle_rows(frame.identifier, labels, frame.camera, settings)
+    image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
+    others = [row for row in _posed_rows(labels) if labels.kind[row] not in VEHICLES]
+    things = front.labelled(_bytes(image), frame, rows, others)
+    return {cut.row: cut.placement for cut in _cut_out(image, frame, rows, settings, things)}
 
 
 def _posed_rows(labels: Labels) -> list[int]:
@@ -183,80 +327,77 @@ def _vehicle_rows(identifier: str, labels: Labels, camera: Camera, settings: Der
     return kept
 
 
-def _cut_out(image: Array, frame: Frame, rows: list[int], settings: DerenderSettings) -> list[_Cut]:
+def _cut_out(
+    image: Array, frame: Frame, rows: list[int], settings: DerenderSettings, things: list[front.Thing]
+) -> list[_Cut]:
     """Masks and fitted placements, near to far, so that what a nearer car hides is known to be hidden."""
     labels, camera = frame.labels, frame.camera
     assert labels is not None
-    bytes_image = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+    bytes_image = _bytes(image)
     order = sorted(rows, key=lambda row: (float(labels.translation[row, [0, 2]].norm()), row))
-    unknown = _hidden_by_others(labels, order, camera)
+    depth = to_clip(labels.translation, camera.matrix.to(labels.translation))[:, 2].tolist()
+    unknown = {row: front.before(things, depth[row], image.shape[:2]) for row in order}
+    looks = _Looks(bytes_image, frame, maps.fit_ground(labels, _posed_rows(labels)), settings)
     chosen: list[Placement] = []
     masks: list[Mask] = []
     boxes = _boxes(labels, rows, camera)
     told = {row: int(np.count_nonzero(boxes.trust[i])) >= 2 for i, row in enumerate(rows)}
     hidden: list[Mask] = []
     kept: list[int] = []
+    held: list[bool] = []
     for row in order:
-        size = labels.size_lhw[row]
-        kinds = silhouette.candidates(labels.kind[row], size.tolist())
-        options = [silhouette.placed(k, labels.translation[row], labels.yaw[row], size) for k in kinds]
-        if told[row]:
-            options, _ = settle(options, _repeat(boxes, rows.index(row), len(options)), camera)
-        outlines = silhouette.silhouettes(options, camera, settings.backend)
-        if not outlines[0].any():
-            continue
+        options, by_laser = _options(frame, labels, row, settings)
         mine = unknown[row] | _union(masks, image.shape[:2])
-        height = _height(outlines[0])
-        if frame.masks is not None:
-            mask = (frame.masks[row] > 0.5).numpy() & ~mine
-        else:
-            band = (0.10 * height + 1.0, 0.05 * height + 1.5, 0.11 * height + 1.5)
-            if told[row]:
-                band = (0.05 * height + 1.0, 0.04 * height + 1.5, 0.05 * height + 1.5)
-            mask = silhouette.instance_mask(bytes_image, outlines[0], mine, band)
-            mask &= _label_box(labels, row, mask.shape)
+        box = boxes.row(rows.index(row)) if told[row] else None
+        view = stand.View(bytes_image, mine, camera, settings.backend)
+        options, edges = stand.likely(options, box, view, by_laser)
+        outlines = silhouette.silhouettes(options, camera, settings.backend)
+        likeliest = int(np.argmin(edges))
+        if not outlines[likeliest].any():
+            continue
+        mask, in_front = looks.at(row, options[likeliest], mine)
+        mine = mine | in_front
         scores = [silhouette.iou(outline, mask, mine) for outline in outlines]
-        best = int(np.argmax(scores))
+        best = int(np.argmax(np.subtract(scores, _EDGES * edges)))
         if scores[best] < settings.min_iou:
             mask = outlines[best] & ~mine
         if not mask.any():
             continue
         kept.append(row)
+        held.append(by_laser or stand.shown(options[best], view) < stand.LEAST_SHOWN)
         chosen.append(options[best])
         masks.append(mask)
         hidden.append(mine)
     if settings.fit:
-        chosen = silhouette.fit(
-            chosen, masks, hidden, _boxes(labels, kept, camera), camera, settings.fitting, settings.backend
-        )
+        reliable, beside = _boxes(labels, kept, camera), silhouette.Evidence(bytes_image, held)
+        fitting, backend = settings.fitting, settings.backend
+        chosen = silhouette.fit(chosen, masks, hidden, reliable, camera, fitting, backend, beside)
     outlines = silhouette.silhouettes(chosen, camera, settings.backend)
     cuts: list[_Cut] = []
     for index, row in enumerate(kept):
         mine = unknown[row] | _union([c.mask for c in cuts], image.shape[:2])
-        mask, outline = masks[index] & ~mine, outlines[index]
-        if frame.masks is None and settings.fit:
-            height = _height(outline)
-            band = (0.03 * height + 1.5, 0.02 * height + 1.5, 0.03 * height + 1.5)
-            around = outline | masks[index]
-            if told[row]:
-                around = outline
-                band = (_CLOSE * height + 1.0, _CLOSE * height + 0.7, _CLOSE * height + 1.0)
-            closer = silhouette.instance_mask(bytes_image, around, mine, band)
-            closer &= _label_box(labels, row, mask.shape)
-            if silhouette.iou(closer, outline, mine) >= settings.min_iou:
-                mask = closer
-            # Bright edges of roofs and pillars look like sky to GrabCut; the fitted mesh knows better, nearby.
-            if silhouette.iou(mask, outline, mine) >= _TRUSTED:
-                near = silhouette.grow(mask, _EDGE * height + 1)
-                mask = mask | (silhouette.grow(outline, -1) & near & ~mine)
-            # An outline that fills its box is right to a pixel or two, whatever the colours say.
-            if told[row]:
-                inner = silhouette.grow(outline, -_CLOSE * height - 0.7) & ~mine
-                mask = (mask & silhouette.grow(outline, _CLOSE * height + 1)) | inner
-        if mask.any():
-            agreement = silhouette.iou(mask, outline, mine)
-            cuts.append(_Cut(row, chosen[index], mask, mine, outline, agreement))
+        whole = outlines[index] if frame.masks is None else (frame.masks[row] > 0.5).numpy()
+        if not (whole & ~mine).any():
+            continue
+        cut = looks.cut(row, chosen[index], outlines[index], mine, told[row])
+        if cut.mask.any():
+            cuts.append(cut)
     return sorted(cuts, key=lambda cut: cut.row)
+
+
+def _options(frame: Frame, labels: Labels, row: int, settings: DerenderSettings) -> tuple[list[Placement], bool]:
+    """The meshes that may stand for a label, where it says or, with enough of a laser's points, where those are;
+    and whether it was those."""
+    size = labels.size_lhw[row]
+    withheld = settings.withheld[row] if settings.withheld else ""
+    kinds = silhouette.candidates(labels.kind[row], size.tolist(), withheld)
+    own = silhouette.own_candidates(labels.kind[row], size.tolist(), settings.meshes)
+    options = [silhouette.placed(m, labels.translation[row], labels.yaw[row], size) for m in (*kinds, *own)]
+    if frame.points is None:
+        return options, False
+    met = [icp.to_points(option, frame.points, frame.camera) for option in options]
+    found = [placement for placement in met if placement is not None]
+    return (found, True) if len(found) == len(options) else (options, False)
 
 
 def _without_underbody(cut: _Cut, view: shadow.GroundView) -> _Cut:
@@ -265,24 +406,6 @@ def _without_underbody(cut: _Cut, view: shadow.GroundView) -> _Cut:
     low = np.arange(cut.outline.shape[0])[:, None] > bottom - _UNDERBODY * (bottom - top)
     beneath = low & (view.distance < 0.4) & ~silhouette.grow(cut.outline, 1.5)
     return replace(cut, mask=cut.mask & ~beneath) if (cut.mask & ~beneath).any() else cut
-
-
-def _hidden_by_others(labels: Labels, rows: list[int], camera: Camera) -> dict[int, Mask]:
-    """For each vehicle the pixels of nearer people and the like, ellipses in their boxes: the car cannot own
-    them."""
-    shape = (camera.height, camera.width)
-    people = [i for i in _posed_rows(labels) if labels.kind[i] not in VEHICLES]
-    hidden = {}
-    for row in rows:
-        mask = np.zeros(shape, bool)
-        for other in people:
-            if float(labels.translation[other, 2]) < float(labels.translation[row, 2]):
-                x0, y0, x1, y1 = labels.boxes_xyxy[other].tolist()
-                v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-                across, down = (2 * u - x0 - x1) / max(x1 - x0, 1), (2 * v - y0 - y1) / max(y1 - y0, 1)
-                mask |= across**2 + down**2 <= 1
-        hidden[row] = mask
-    return hidden
 
 
 def _people(labels: Labels, camera: Camera) -> Mask:
@@ -321,11 +444,6 @@ def _boxes(labels: Labels, rows: list[int], camera: Camera) -> silhouette.Boxes:
     return silhouette.Boxes(xyxy, sure * (labels.occlusion[rows] <= 1)[:, None] * inside)
 
 
-def _repeat(boxes: silhouette.Boxes, index: int, count: int) -> silhouette.Boxes:
-    """One of the boxes, `count` times."""
-    return silhouette.Boxes(boxes.xyxy[index].expand(count, 4), boxes.trust[index].expand(count, 4))
-
-
 def _union(masks: Sequence[Mask], shape: tuple[int, ...]) -> Mask:
     """Pixels of any of the masks."""
     return np.logical_or.reduce(masks) if masks else np.zeros(shape, bool)
@@ -349,20 +467,17 @@ def _layers(
     """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (H, W, 3), sun."""
     if not cuts:
         return image, [], [], maps.sun_direction()
-    placements = [cut.placement for cut in cuts]
-    tight = _union([cut.mask for cut in cuts], vehicles.shape)
+    near = np.stack([view.distance for view in views]).min(0)
+    in_front = surroundings.front > 0
     lighting = shadow.light(
-        image, road, vehicles, views, behind=lambda zone: _continued(image, zone, road, surroundings)[0].image
+        image, road, vehicles, views, behind=lambda zone: _continued(image, zone, near, surroundings).image
     )
-    sun = shadow.estimate_sun(lighting, vehicles, placements, views, maps.sun_direction())
-    allowed = [shadow.reachable(placement, view, sun) for placement, view in zip(placements, views, strict=True)]
-    shaded = shadow.find(lighting, tight, views, allowed)
+    sun, shaded = _shaded(lighting, cuts, views, vehicles, in_front)
     hole = vehicles.copy()
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4) | (view.distance < 0.2)
-    near = np.stack([view.distance for view in views])
-    filled = _filled(image, hole, near.min(0), road, surroundings, seed)
-    mattes = [matte(image, cut.mask, cut.unknown, near.min(0) < 0.6) for cut in cuts]
+    filled = _filled(image, hole, near, surroundings, seed)
+    mattes = [opacity_of(cut.seen, cut.mask, cut.unknown) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
     for region in shaded:
@@ -374,53 +489,87 @@ def _layers(
     # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
     only_shadow = (opaque == 0)[..., None]
     mixed = np.where(only_shadow, np.maximum(mixed, image), mixed)
+    # What stands in front is in the background too; only its border lets through what is behind.
+    mixed = np.where(surroundings.front[..., None] >= _FADE_FRONT, image, mixed)
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
-    owner = near.argmin(0)
+    owner = np.stack([view.distance for view in views]).argmin(0)
     factors = [
-        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5))
+        shadow.factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5) & ~in_front)
         for i in range(len(cuts))
     ]
     return background, mattes, factors, sun
 
 
-def _filled(image: Array, hole: Mask, near: Array, road: Array, surroundings: _Surroundings, seed: int) -> Array:
+def _shaded(
+    lighting: shadow.Light, cuts: list[_Cut], views: list[shadow.GroundView], vehicles: Mask, in_front: Mask
+) -> tuple[torch.Tensor, list[Mask]]:
+    """The direction towards the sun (3,), and the ground (H, W) that each car shades. in_front (H, W): pixels of
+    what stands in front of cars."""
+    placements = [cut.placement for cut in cuts]
+    tight = _union([cut.mask for cut in cuts], vehicles.shape) | in_front
+    sun = shadow.estimate_sun(lighting, vehicles | in_front, placements, views, maps.sun_direction())
+    best: tuple[int, torch.Tensor, list[Mask]] | None = None
+    for factor in shadow.STRETCHES:
+        lower = shadow.stretched(sun, factor)
+        allowed = [shadow.reachable(p, view, lower) for p, view in zip(placements, views, strict=True)]
+        casts = [shadow.cast(p, view, lower) for p, view in zip(placements, views, strict=True)]
+        found, beyond = shadow.find(lighting, tight, views, allowed, casts)
+        if best is None or beyond < shadow.LESS * best[0]:
+            best = beyond, lower, found
+        if not best[0]:
+            break
+    assert best is not None
+    return best[1], best[2]
+
+
+def _filled(image: Array, hole: Mask, near: Array, surroundings: _Surroundings, seed: int) -> Array:
     """The image (H, W, 3) without what is in the hole. near (H, W) m: distance from the cars' footprints."""
+    seen = surroundings.seen
     forbidden = silhouette.grow(hole, 2)
-    guide, like = _continued(image, forbidden, road, surroundings)
-    ground = fills.Ground((near < 0.3) | guide.ground, like)
-    forbidden = forbidden | surroundings.others
-    quick = fills.FillSettings(iterations=(8, 1))
-    settings = quick if np.count_nonzero(hole) > _LARGE_HOLE_PX else fills.FillSettings()
-    return fills.fill(image, hole, forbidden, surroundings.horizon, ground, seed, settings, guide.image)
+    guide = _continued(image, forbidden, near, surroundings)
+    forbidden = forbidden | _not_copied(surroundings)
+    like = np.where(forbidden, 0, seen.ground).astype(np.float32)
+    standing = upright.copied(image, hole, forbidden | (like > 0.5), guide, surroundings.horizon)
+    rest, forbidden = hole & ~standing.done, forbidden & ~standing.done
+    ground = fills.Ground((near < _STOOD_M) | guide.ground, like)
+    quick = fills.FillSettings(iterations=(8, 0))
+    settings = quick if np.count_nonzero(rest) > _LARGE_HOLE_PX else fills.FillSettings()
+    return fills.fill(standing.image, rest, forbidden, surroundings.horizon, ground, seed, settings, guide.image)
 
 
-def _continued(
-    image: Array, unknown: Mask, road: Array, surroundings: _Surroundings
-) -> tuple[street.Continued, Array]:
-    """The street behind unknown pixels, and how much (H, W) each known pixel looks like ground."""
-    unknown = unknown | surroundings.others
-    like = np.where(unknown, 0, road).astype(np.float32)
+def _continued(image: Array, unknown: Mask, near: Array, surroundings: _Surroundings) -> street.Continued:
+    """The street behind unknown pixels. near (H, W) m: distance from the cars' footprints."""
+    seen = surroundings.seen
+    unknown = unknown | _not_copied(surroundings)
     plane = street.plane_view(surroundings.ground, surroundings.camera)
-    return street.continued(image, unknown, like, plane, surroundings.horizon), like
+    shares = street.Shares(seen.ground, seen.sky, unknown & (near < _STOOD_M))
+    return street.continued(image, unknown, shares, plane, surroundings.horizon)
+
+
+def _not_copied(surroundings: _Surroundings) -> Mask:
+    """Pixels (H, W) that show no street: people and vehicles, also those that nobody labelled."""
+    seen = surroundings.seen
+    return surroundings.others | (np.maximum(seen.vehicle, seen.person) > _SURELY)
 
 
 def _environment(
-    background: Array, ground: torch.Tensor, sun: torch.Tensor, horizon: float, camera: Camera, vehicles: Mask
+    seen: segment.Segmentation,
+    ground: torch.Tensor,
+    sun: torch.Tensor,
+    horizon: float,
+    camera: Camera,
+    vehicles: Mask,
 ) -> tuple[Environment, torch.Tensor]:
     """Maps and depth of the background."""
-    nothing = np.zeros(vehicles.shape, bool)
-    sky = maps.sky_map(background, horizon, nothing)
-    road = maps.road_map(background, horizon, nothing)
-    foliage = maps.foliage_map(background, sky, road, nothing)
-    depth = maps.depth_map(maps.plane_depth(ground, camera), road, sky, horizon)
-    # Vehicles cover both: their pixels must not change with season or weather of what is behind them.
-    sky, foliage = np.where(vehicles, 0, sky), np.where(vehicles, 0, foliage)
+    depth = maps.depth_map(maps.plane_depth(ground, camera), seen.ground, seen.sky, horizon)
+    # Weather changes the finished picture: a vehicle before the sky is none. Leaves change before it is drawn.
+    sky = np.where(vehicles, 0, seen.sky)
     environment = Environment(
         torch.zeros(WEATHER_DIM),
         torch.zeros(FOLIAGE_DIM),
         sun,
         ground,
-        *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, foliage, road)),
+        *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, seen.foliage, seen.road)),
     )
     return environment, torch.from_numpy(depth)
 
@@ -430,11 +579,11 @@ def _objects(labels: Labels, cuts: list[_Cut]) -> tuple[Objects, tuple[Mesh, ...
     meshes: list[Mesh] = []
     index = []
     for cut in cuts:
-        names = [m.name for m in meshes]
-        if cut.placement.mesh.name not in names:
+        known = [m is cut.placement.mesh for m in meshes]
+        if not any(known):
             meshes.append(cut.placement.mesh)
-            names.append(cut.placement.mesh.name)
-        index.append(names.index(cut.placement.mesh.name))
+            known.append(True)
+        index.append(known.index(True))
     rows = [cut.row for cut in cuts]
     count = len(cuts)
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.silhouette import extent
 
 Array = NDArray[np.float32]
@@ -35,6 +36,17 @@ class MatteSettings:
     contrast: float = 0.06
     odd: tuple[float, float] = (1.8, 3.2)
     unlike: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class ShareSettings:
+    """nothing: shares up to which a pixel is background; gain: by which larger ones are raised; border_px: how far
+    beyond the mask shares are its border's; under_px: how far the matte runs on under what is nearer."""
+
+    nothing: float = 0.04
+    gain: float = 1.25
+    border_px: float = 3.0
+    under_px: float = 2.0
 
 
 def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None) -> Array:
@@ -81,6 +93,27 @@ def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: Matte
     result = np.clip(mixed, low, high)
     result = np.where(hidden, np.maximum(result, prior), result)
     opacity[window] = np.where(result < 0.02, 0, np.where(result > 0.98, 1, result))
+    return opacity
+
+
+def opacity_of(cutout: Cutout, mask: Mask, hidden: Mask, settings: ShareSettings | None = None) -> Array:
+    """Opacity (H, W) in [0, 1] of the car of a cut-out. mask (H, W): its pixels; hidden (H, W): of nearer things.
+
+    A little more than what is seen of it: some road that travels with a car shows less than an edge of car that is
+    left behind.
+    """
+    settings = settings or ShareSettings()
+    opacity = np.zeros(mask.shape, np.float32)
+    if not mask.any():
+        return opacity
+    window = cutout.window
+    raised = np.clip((cutout.visible - settings.nothing) * settings.gain, 0, 1)
+    car = mask[window]
+    depth = _signed_distance(car)
+    under = np.clip(depth + settings.under_px, 0, 1)
+    # Beyond the mask shares of a pixel belong to its border; farther off they are of nothing that is cut out.
+    raised = np.where(hidden[window], under, raised * (depth > -settings.border_px))
+    opacity[window] = raised
     return opacity
 
 

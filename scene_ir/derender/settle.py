@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from scene_ir.derender.silhouette import Boxes, Placement
-from scene_ir.types import Camera
+from scene_ir.types import Camera, Mesh
 
 _STEPS = 6
 _DELTA = 1e-3
@@ -49,8 +50,12 @@ def settle(
     """
     settings = settings or SettleSettings()
     settled, costs = [], np.zeros(len(placements))
+    shapes: dict[int, _Shape] = {}
     for i, (placement, box, trust) in enumerate(zip(placements, boxes.xyxy, boxes.trust, strict=True)):
-        code, costs[i] = _solve(placement, box.double().numpy(), trust.double().numpy(), camera, settings)
+        shape = shapes.get(id(placement.mesh)) or _Shape.of(placement.mesh)
+        shapes[id(placement.mesh)] = shape
+        sides = box.double().numpy(), trust.double().numpy()
+        code, costs[i] = _solve(placement, shape, sides, camera, settings)
         settled.append(_moved(placement, code * _spread(settings)))
     return settled, costs
 
@@ -60,12 +65,14 @@ def _extent(
 ) -> NDArray[np.float64]:
     """Box xyxy (4,) px of what lies inside the image of a mesh with vertices (3, V) and edges (E, 2);
     `otherwise` where nothing does."""
-    right, low = camera.width - 1.0, camera.height - 1.0
-    u, v, w = clip
-    planes = np.stack([w - _NEAR_M, u, right * w - u, v, low * w - v])
+    planes = _planes(clip, camera)
     if (planes >= 0).all():
         points = clip
     else:
+        # What lies inside counts; of edges, those that cross a border, and none that is beyond one as a whole.
+        beyond = (planes < 0).T @ (1 << np.arange(len(planes)))
+        a, b = beyond[edges].T
+        edges = edges[((a | b) > 0) & ((a & b) == 0)]
         # Liang and Barsky 1984: what every half-space leaves of each edge.
         first, second = planes[:, edges[:, 0]], planes[:, edges[:, 1]]
         across = second - first
@@ -74,11 +81,22 @@ def _extent(
         start = np.where(first < 0, np.where(across > 0, cut, 2.0), 0.0).max(0)
         end = np.where(second < 0, np.where(across < 0, cut, -1.0), 1.0).min(0)
         left = start <= end
-        if not left.any():
+        if not left.any() and beyond.all():
             return otherwise
         a, b = clip[:, edges[left, 0]], clip[:, edges[left, 1]]
-        points = np.concatenate([a + start[left] * (b - a), a + end[left] * (b - a)], 1)
-    pixels = points[:2] / points[2]
+        points = np.concatenate([clip[:, beyond == 0], a + start[left] * (b - a), a + end[left] * (b - a)], 1)
+    return _bounds(points)
+
+
+def _planes(clip: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """How far (5, V) points lie inside the near plane and the image's four sides; negative beyond."""
+    right, low = camera.width - 1.0, camera.height - 1.0
+    u, v, w = clip
+    return np.stack([w - _NEAR_M, u, right * w - u, v, low * w - v])
+
+
+def _bounds(clip: NDArray[np.float64]) -> NDArray[np.float64]:
+    pixels = clip[:2] / clip[2]
     return np.concatenate([pixels.min(1), pixels.max(1)])
 
 
@@ -97,17 +115,31 @@ def _moved(placement: Placement, change: NDArray[np.float64]) -> Placement:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape:
+    """Of a mesh: vertices (V, 3); edges (E, 2); the vertices of its hull (K, 3), a tenth of them, which tell how
+    far a car reaches that lies inside the image."""
+
+    vertices: NDArray[np.float64]
+    edges: NDArray[np.int64]
+    hull: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> _Shape:
+        faces, vertices = mesh.faces.numpy(), mesh.vertices.double().numpy()
+        edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+        return cls(vertices, edges, vertices[ConvexHull(vertices).vertices])
+
+
 def _solve(
     placement: Placement,
-    box: NDArray[np.float64],
-    trust: NDArray[np.float64],
+    shape: _Shape,
+    sides: tuple[NDArray[np.float64], NDArray[np.float64]],
     camera: Camera,
     settings: SettleSettings,
 ) -> tuple[NDArray[np.float64], float]:
-    mesh = placement.mesh
-    faces = mesh.faces.numpy()
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    unit = mesh.vertices.double().numpy()
+    """sides: the box (4,) px, and the trust in each of its sides (4,)."""
+    box, trust = sides
     matrix = camera.matrix.double().numpy()
     place, yaw = placement.translation.double().numpy(), float(placement.yaw)
     size = placement.size_lhw.double().numpy()
@@ -116,13 +148,20 @@ def _solve(
 
     def residual(code: NDArray[np.float64]) -> NDArray[np.float64]:
         change = code * spread
-        local = unit * (size * np.exp(change[4:]))
         cos, sin = np.cos(yaw + change[3]), np.sin(yaw + change[3])
-        x = cos * local[:, 0] + sin * local[:, 2] + place[0] + change[0]
-        z = cos * local[:, 2] - sin * local[:, 0] + place[2] + change[2]
-        point = np.stack([x, local[:, 1] + place[1] + change[1], z, np.ones_like(x)])
-        clip = matrix @ point
-        return trust * (_extent(clip, edges, camera, box) - box) / sigma
+
+        def clip(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            local = points * (size * np.exp(change[4:]))
+            x = cos * local[:, 0] + sin * local[:, 2] + place[0] + change[0]
+            z = cos * local[:, 2] - sin * local[:, 0] + place[2] + change[2]
+            return matrix @ np.stack([x, local[:, 1] + place[1] + change[1], z, np.ones_like(x)])
+
+        around = clip(shape.hull)
+        if (_planes(around, camera) >= 0).all():
+            found = _bounds(around)
+        else:
+            found = _extent(clip(shape.vertices), shape.edges, camera, box)
+        return trust * (found - box) / sigma
 
     code = np.zeros(7)
     r = residual(code)

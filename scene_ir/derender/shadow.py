@@ -20,26 +20,44 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _AZIMUTHS = 24
-_LENGTHS = (0.25, 0.5, 0.8, 1.2)
-"""Lengths of a shadow over the height of what throws it that are tried: a sun of 76 to 40 degrees."""
+_LENGTHS = (0.25, 0.5, 0.8, 1.2, 1.7, 2.3)
+"""Lengths of a shadow over the height of what throws it that are tried: a sun of 76 to 23 degrees."""
+_FINER = 3
+"""How often azimuth and length are searched again around the best ones, each time in steps half as large."""
+_LOW = 0.04
+"""How much better than a sun of 40 degrees one must explain the darkness whose shadows are longer by a height:
+long ones meet more that is dark for other reasons."""
+STRETCHES = (1.0, 1.25, 1.5)
+"""Of a sun's shadows, tried in turn where theirs go on beyond what was expected."""
+LESS = 0.5
+"""Share of the dark pixels beyond reach that may be left for longer shadows to be believed."""
+_CAST = 0.12
+"""Darkness of the box shadow from which on a pixel counts as shaded by it."""
+_CORE = 0.4
+"""Darkness of the box shadow from which on dark ground is the car's without hanging together with its foot."""
 _SAMPLES = 6000
 """Ground pixels a car that vote on the sun."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShadowSettings:
-    """reach_m: how far from the footprint a shadow is looked for; contact_m: width of the strip around the
-    footprint that counts as touching; dark: share of the lit ground's brightness below which ground is shaded;
-    gain: by how much an estimated sun must explain the darkness better than the assumed one; rim_m: how far beyond
-    the reach shade is followed; open_share: a shadow of which more than this lies out of reach is not a car's.
+    """reach_m: how far from the footprint most shadows end, so that the ground beyond tells how bright it is lit;
+    far_m: how far from it a shadow is looked for; contact_m: width of the strip around the footprint that counts
+    as touching; dark: share of the lit ground's brightness below which ground is shaded; soft: likewise, of the
+    rim of a shadow; gain: by how much an estimated sun must explain the darkness better than the assumed one;
+    rim_m: how far beyond the reach shade is followed; open_share: a shadow of which more than this lies out of
+    reach is not a car's; loose_m: how far true shadows leave that of a box.
     """
 
     reach_m: float = 2.6
+    far_m: float = 4.0
     contact_m: float = 0.25
     dark: float = 0.72
     gain: float = 0.03
+    soft: float = 0.86
     rim_m: float = 0.8
     open_share: float = 0.08
+    loose_m: float = 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,38 +130,62 @@ def light(
     return Light(grey, lit)
 
 
+def cast(placement: Placement, view: GroundView, sun: torch.Tensor) -> Array:
+    """How dark (H, W), in [0, 1], the car's box makes the ground in this sun; 0 where it cannot reach."""
+    dark = np.zeros(view.distance.shape, np.float32)
+    near = reachable(placement, view, sun)
+    local = torch.from_numpy(view.local[near])
+    size = placement.size_lhw.detach().expand(len(local), 3)
+    offset = sun_offset(sun, placement.yaw.detach().expand(len(local)), size[:, 1])
+    dark[near] = shadow_density(local, size, offset).numpy()
+    return dark
+
+
 def find(
     lighting: Light,
     vehicles: Mask,
     views: Sequence[GroundView],
     allowed: Sequence[Mask],
+    casts: Sequence[Array],
     settings: ShadowSettings | None = None,
-) -> list[Mask]:
-    """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot.
+) -> tuple[list[Mask], int]:
+    """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot; and
+    how many dark pixels go on beyond reach.
 
-    allowed: ground that each car's shadow can reach. Shade that goes on beyond it is a house's or a tree's: then
-    only what is darker than that shade counts.
+    allowed: ground that each car's shadow can reach; casts: how dark (H, W) each car's box makes it. Shade that
+    goes on beyond reach is a house's or a tree's: then only what is darker than it counts, and what is dark in the
+    box's shadow but lit around it.
     """
     settings = settings or ShadowSettings()
     if not views:
-        return []
+        return [], 0
     near = np.stack([view.distance for view in views])
     owner, nearest = near.argmin(0), near.min(0)
-    around = (nearest < settings.reach_m + settings.rim_m) & ~vehicles
-    dark = around & (lighting.grey < settings.dark * lighting.lit)
-    within = np.logical_or.reduce(allowed) & (nearest < settings.reach_m)
-    found = []
+    around = (nearest < settings.far_m + settings.rim_m) & ~vehicles
+    free = around & (np.max(casts, axis=0) < _CAST) & (nearest > settings.loose_m)
+    open_light = push_pull(np.ascontiguousarray(lighting.grey[..., None]), free.astype(np.float32))[..., 0]
+    dark = around & (lighting.grey < settings.dark * np.maximum(lighting.lit, open_light))
+    stands_out = dark & (lighting.grey < settings.dark * open_light)
+    within = np.logical_or.reduce(allowed) & (nearest < settings.far_m)
+    soft = around & (lighting.grey < settings.soft * lighting.lit) & (lighting.grey < settings.soft * open_light)
+    found, spilled = [], 0
     for index, view in enumerate(views):
         touching = (view.distance < settings.contact_m) & ~vehicles & (owner == index)
+        core = stands_out & (casts[index] > _CORE)
         own = _joined(dark, touching)
         beyond = own & ~within
         if np.count_nonzero(beyond) > settings.open_share * max(np.count_nonzero(own), 1):
             shade = float(np.median(lighting.grey[beyond]))
             own = _joined(dark & (lighting.grey < settings.dark * shade), touching)
+            own |= _joined(stands_out & (casts[index] > _CAST), core)
+            spilled += int(np.count_nonzero(beyond))
+        else:
+            own |= _joined(stands_out, core)
+        own |= _joined(soft & (casts[index] > _CAST), own)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
         closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-        found.append(closed & ~vehicles & allowed[index] & (owner == index) & (nearest < settings.reach_m))
-    return found
+        found.append(closed & ~vehicles & allowed[index] & (owner == index) & (nearest < settings.far_m))
+    return found, spilled
 
 
 def _joined(candidates: Mask, seeds: Mask) -> Mask:
@@ -189,16 +231,41 @@ def estimate_sun(
         rest = (observed - strength.clamp(0.0, 1.2) * model).square().sum()
         return 1 - float(rest / observed.square().sum().clamp(min=1e-6))
 
-    best, score = assumed, explained(assumed) + settings.gain
+    score, best = explained(assumed) + settings.gain, None
     for length in _LENGTHS:
         for step in range(_AZIMUTHS):
             angle = 2 * math.pi * step / _AZIMUTHS
-            sun = torch.tensor([length * math.cos(angle), -1.0, length * math.sin(angle)])
-            sun = sun / sun.norm()
-            value = explained(sun)
+            value = explained(_sun(length, angle)) - _LOW * max(length - 1.2, 0.0)
             if value > score:
-                best, score = sun, value
-    return best
+                score, best = value, (length, angle)
+    if best is None:
+        return assumed
+    turn, stretch = math.pi / _AZIMUTHS, 1.2
+    for _ in range(_FINER):
+        length, angle = best
+        for near in (
+            (length * stretch, angle),
+            (length / stretch, angle),
+            (length, angle + turn),
+            (length, angle - turn),
+        ):
+            value = explained(_sun(*near)) - _LOW * max(near[0] - 1.2, 0.0)
+            if value > score:
+                score, best = value, near
+        turn, stretch = turn / 2, math.sqrt(stretch)
+    return _sun(*best)
+
+
+def stretched(sun: torch.Tensor, factor: float) -> torch.Tensor:
+    """Towards the sun (3,) whose shadows are `factor` times as long as those of `sun` (3,)."""
+    lower = sun * sun.new_tensor([factor, 1.0, factor])
+    return lower / lower.norm()
+
+
+def _sun(length: float, angle: float) -> torch.Tensor:
+    """Towards a sun (3,) that throws shadows of `length` heights; angle: rad from x to z."""
+    sun = torch.tensor([length * math.cos(angle), -1.0, length * math.sin(angle)])
+    return sun / sun.norm()
 
 
 def reachable(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir import ffd as lattice
+from scene_ir.derender import borders
 from scene_ir.geometry import place, to_clip
 from scene_ir.meshes.templates import template
 from scene_ir.raster import verbs
@@ -32,10 +33,24 @@ _BAND = 0.12
 
 _FREE = 0.5
 """How far single points of the lattice move where the shaped modes move by 1."""
+_HELD = 0.25
+"""How far pose and size of what is held move, as a share of how far others' do."""
+_LOOK_AGAIN = 10
+"""Steps after which the edges that are seen are found anew."""
 _COVER = 2.0
 """How much more a pixel of the mask that the mesh leaves out weighs than one that it covers in vain."""
 _ADAM = (0.9, 0.999)
 """Decay of the means of gradients and of their squares, as its authors recommend."""
+_BODIES = {
+    "Car": ("sedan", "hatchback", "estate", "suv", "pickup"),
+    "Van": ("van", "suv"),
+    "Truck": ("truck", "bus"),
+}
+"""Kinds of templates that a label's type may mean."""
+_STAND_IN = {"van": ("suv",)}
+"""What is left to choose where a kind that is alone is withheld."""
+_MOST_OWN = 6
+"""Of the user's meshes, tried for one label: each costs a draw."""
 _LOW_PART = 0.3
 """Lower part of a car, as a fraction of its height, beside which its shadow lies."""
 
@@ -60,7 +75,7 @@ class Placement:
 @dataclass(frozen=True, slots=True)
 class FitSettings:
     """steps of Adam at `rate` (in units of the standard deviations below); then bounds around the label, and the
-    weights of staying there (prior) and of filling the label's 2D box (box).
+    weights of staying there (prior), of filling the label's 2D box (box), and of the picture's edges (edges).
     """
 
     steps: int = 40
@@ -71,6 +86,16 @@ class FitSettings:
     max_offset: float = 0.08
     prior: float = 0.004
     box: float = 15.0
+    edges: float = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What a fit may know beside masks and boxes. picture (H, W, 3) RGB; held: one a placement, whether
+    it is to stay nearly where it stands: a laser measured it, or hardly anything of it shows; empty: none."""
+
+    picture: NDArray[np.uint8] | None = None
+    held: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,21 +106,48 @@ class Boxes:
     xyxy: Tensor
     trust: Tensor
 
+    def row(self, index: int) -> Boxes:
+        """One of them, as one row."""
+        return Boxes(self.xyxy[index : index + 1], self.trust[index : index + 1])
 
-def candidates(kind: str, size_lhw: Sequence[float]) -> tuple[str, ...]:
-    """Template kinds that may stand for a label of type `kind`, the likeliest by its proportions first."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnMesh:
+    """A user's mesh to choose from. kind: of the templates' kinds, its body's; size_lhw: its usual size, m."""
+
+    mesh: Mesh
+    kind: str
+    size_lhw: tuple[float, float, float]
+
+
+def candidates(kind: str, size_lhw: Sequence[float], withheld: str = "") -> tuple[str, ...]:
+    """Template kinds that may stand for a label of type `kind`, the likeliest by its proportions first; without
+    `withheld`, where that leaves any."""
     length, height, _width = size_lhw
     if kind == "Truck":
-        return ("truck", "bus") if length < 10 else ("bus", "truck")
-    if kind == "Van":
-        return ("van", "suv") if height < 2.4 else ("van",)
-    if height > 1.75:
-        return ("suv", "van", "hatchback")
-    if height > 1.6:
-        return ("suv", "hatchback", "estate")
-    if length < 4.05:
-        return ("hatchback", "sedan", "suv")
-    return ("sedan", "estate", "hatchback")
+        found = ("truck", "bus") if length < 10 else ("bus", "truck")
+    elif kind == "Van":
+        found = ("van", "suv") if height < 2.4 else ("van",)
+    elif height > 1.75:
+        found = ("suv", "van", "hatchback", "pickup", "estate", "sedan")
+    elif height > 1.6:
+        found = ("suv", "hatchback", "estate", "sedan", "pickup")
+    elif length < 4.05:
+        found = ("hatchback", "sedan", "suv", "estate")
+    else:
+        found = ("sedan", "estate", "hatchback", "suv", "pickup")
+    return tuple(k for k in found if k != withheld) or _STAND_IN.get(withheld, found)
+
+
+def own_candidates(kind: str, size_lhw: Sequence[float], own: Sequence[OwnMesh]) -> tuple[Mesh, ...]:
+    """The user's meshes that may stand for a label of type `kind`: of a body that is called so, and those whose
+    usual size is nearest to the label's first, not more than a few."""
+
+    def apart(choice: OwnMesh) -> float:
+        return float(np.square(np.log(np.divide(choice.size_lhw, size_lhw))).sum())
+
+    fitting = [choice for choice in own if choice.kind in _BODIES[kind]]
+    return tuple(choice.mesh for choice in sorted(fitting, key=apart)[:_MOST_OWN])
 
 
 def silhouettes(placements: Sequence[Placement], camera: Camera, backend: verbs.Backend = "warp") -> list[Mask]:
@@ -213,18 +265,21 @@ def fit(
     camera: Camera,
     settings: FitSettings,
     backend: verbs.Backend = "warp",
+    beside: Evidence | None = None,
 ) -> list[Placement]:
     """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at
     nothing.
 
-    boxes: what the labels' boxes say of the outlines' extent, which no reflection can mislead.
+    boxes: what the labels' boxes say of the outlines' extent, which no reflection can mislead. beside: what else
+    is known. With a picture, edges between the meshes' parts, and outlines, are drawn to its edges.
 
     Minimises the signed distance to the mask, cut at +-band, summed over what the mesh covers: its gradient moves
     each piece of outline towards the mask's border from as far as the band reaches (Chan and Vese 2001).
     """
     if not placements or settings.steps == 0:
         return list(placements)
-    windows = [_window(mask, hidden, outline) for mask, hidden, outline in
+    beside = beside or Evidence()
+    windows = [_window(mask, hidden, outline, beside.picture) for mask, hidden, outline in
                zip(masks, unknown, silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
     layout = verbs.Layout.of(rects)
@@ -234,14 +289,19 @@ def fit(
     weights = [lattice.lattice_weights(p.mesh.vertices) for p in placements]
     modes = _modes()
     spread, bound = _units(settings, len(modes))
-    code = torch.zeros(len(placements), spread.numel(), requires_grad=True)
+    spread, bound = spread.repeat(len(placements), 1), bound.repeat(len(placements), 1)
+    for row, held in enumerate(beside.held):
+        if held:
+            spread[row, :7], bound[row, :7] = _HELD * spread[row, :7], _HELD * bound[row, :7]
+    code = torch.zeros_like(spread, requires_grad=True)
     mean, square = torch.zeros_like(code), torch.zeros_like(code)
     best = torch.full((len(placements),), torch.inf)
     best_code = code.detach().clone()
+    followed: list[borders.Followed] = []
     for step in range(settings.steps + 1):
         clips = []
         for i, (placement, weight, matrix) in enumerate(zip(placements, weights, matrices, strict=True)):
-            moved = _apply(placement, code[i] * spread, modes)
+            moved = _apply(placement, code[i] * spread[i], modes)
             unit = lattice.deform(placement.mesh.vertices, weight, moved.ffd)
             clips.append(to_clip(place(unit, moved.size_lhw, moved.yaw, moved.translation), matrix))
         clip = torch.cat(clips)
@@ -251,6 +311,13 @@ def fit(
         apart = [_apart(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
         filling = (torch.stack(apart) * boxes.trust).sum(1)
         loss = energy + settings.prior * code.square().sum(1) + settings.box * filling
+        if beside.picture is not None and settings.edges > 0:
+            if step % _LOOK_AGAIN == 0:
+                followed = _followed(placements, windows, clips, fragments)
+                # Other edges make another sum: what was found with the last ones does not compare.
+                best = torch.full_like(best, torch.inf)
+            inner = [borders.apart(w.edges, f, c) for w, f, c in zip(windows, followed, clips, strict=True)]
+            loss = loss + settings.edges * torch.stack(inner)
         better = loss.detach() < best
         best = torch.where(better, loss.detach(), best)
         best_code = torch.where(better[:, None], code.detach(), best_code)
@@ -266,7 +333,51 @@ def fit(
             scale = (square / (1 - _ADAM[1] ** (step + 1))).sqrt() + 1e-8
             code -= settings.rate * mean / (1 - _ADAM[0] ** (step + 1)) / scale
             code.clamp_(-bound / spread, bound / spread)
-    return [_apply(p, c * spread, modes) for p, c in zip(placements, best_code, strict=True)]
+    return [_apply(p, c, modes) for p, c in zip(placements, best_code * spread, strict=True)]
+
+
+def edge_distances(
+    placements: Sequence[Placement],
+    unknown: Mask,
+    picture: NDArray[np.uint8],
+    camera: Camera,
+    backend: verbs.Backend = "warp",
+) -> list[float]:
+    """How far the edges of each placed mesh are from those of the picture (H, W, 3), in [0, 1]: which of several
+    meshes at one place is the likeliest. 1 where nothing of it is seen."""
+    outlines = silhouettes(placements, camera, backend)
+    seen = np.logical_or.reduce(outlines)
+    if not seen.any():
+        return [1.0] * len(placements)
+    windows = [_window(seen, unknown, seen, picture)] * len(placements)
+    height, width = windows[0].known.shape
+    layout = verbs.Layout.of(torch.tensor([[0, 0, width, height]] * len(placements)))
+    clip, faces, vertex_ranges, face_ranges = _pack(placements, windows[0].zoom @ camera.matrix)
+    fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
+    clips = [clip[start:end] for start, end in vertex_ranges.tolist()]
+    followed = _followed(placements, windows, clips, fragments)
+    found = [float(borders.apart(w.edges, f, c)) for w, f, c in zip(windows, followed, clips, strict=True)]
+    return [d if len(f.channel) else 1.0 for d, f in zip(found, followed, strict=True)]
+
+
+def _followed(
+    placements: Sequence[Placement],
+    windows: Sequence[_Window],
+    clips: Sequence[Tensor],
+    fragments: verbs.Fragments,
+) -> list[borders.Followed]:
+    """The edges of each placed mesh that are seen in its window as it stands."""
+    found = []
+    spans = fragments.layout.spans()
+    start = 0
+    for placement, window, clip, (span, shape) in zip(placements, windows, clips, spans, strict=True):
+        mesh = placement.mesh
+        face = fragments.face[span].reshape(shape).long()
+        face = torch.where(face >= 0, face - start, face)
+        depth = fragments.depth[span].reshape(shape)
+        found.append(borders.follow(face, depth, clip, mesh.faces, mesh.part, window.known))
+        start += len(mesh.faces)
+    return found
 
 
 def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
@@ -286,16 +397,19 @@ def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
 @dataclass(frozen=True, slots=True)
 class _Window:
     """pull (h, w): signed distance to the mask over the band, in [-1, 1], 0 where unknown; length: px of outline;
-    zoom (3, 3): image pixels to window pixels; frame (4,): the image's border xyxy in window pixels.
+    zoom (3, 3): image pixels to window pixels; frame (4,): the image's border xyxy in window pixels; edges
+    (C, h, w): distance to the picture's edges; known (h, w): that nothing hides.
     """
 
     pull: NDArray[np.float32]
     length: float
     zoom: Tensor
     frame: Tensor
+    edges: Tensor
+    known: Mask
 
 
-def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
+def _window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8] | None) -> _Window:
     height, width = mask.shape
     both = mask | outline
     x0, y0, x1, y1 = extent(both) if both.any() else (0, 0, 1, 1)
@@ -326,11 +440,19 @@ def _window(mask: Mask, unknown: Mask, outline: Mask) -> _Window:
         pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
     corners = torch.tensor([[0.0, 0.0, 1.0], [width - 1.0, height - 1.0, 1.0]]) @ zoom.T
+    known = cv2.resize(shown.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).reshape(size[::-1]) > 0
+    edges = torch.zeros(0)
+    if picture is not None:
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        crop = cv2.resize(picture[y0:y1, x0:x1], size, interpolation=method)
+        edges = borders.edge_field(np.asarray(crop, np.uint8).reshape(*size[::-1], 3), grow(~known, 1))
     return _Window(
         np.asarray(resized, np.float32).reshape(size[::-1]),
         2.0 * (size[0] + size[1]),
         zoom,
         corners[:, :2].reshape(4),
+        edges,
+        known,
     )
 
 
@@ -393,6 +515,7 @@ def _apply(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
     )
 
 
-def placed(kind: str, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
-    """The canonical template of `kind` at a label's place and size."""
-    return Placement(template(kind), translation, yaw, size_lhw, torch.zeros(LATTICE_POINTS, 3))
+def placed(mesh: str | Mesh, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
+    """A mesh, or the canonical template of a kind, at a label's place and size."""
+    shape = template(mesh) if isinstance(mesh, str) else mesh
+    return Placement(shape, translation, yaw, size_lhw, torch.zeros(LATTICE_POINTS, 3))

@@ -2,8 +2,9 @@
 
 The ground is laid out in metres, straightened along the road, whose heading and bend the edges on the ground vote
 for. What stays the same along the road is a profile across it; what is left is continued sideways, row by row.
-The result is smooth but has the street's structure: `background.fill` adds the texture. Huang et al. (SIGGRAPH
-2014) guide completion by planes and their translations in a like way.
+What stands on the ground, and the sky, go on by themselves: no colours run over the ground's end. The result is
+smooth but has the street's structure: `upright.copied` and `background.fill` add the texture. Huang et al.
+(SIGGRAPH 2014) guide completion by planes and their translations in a like way.
 """
 
 from __future__ import annotations
@@ -35,23 +36,48 @@ _EDGE = 0.08
 _ACROSS_M, _ALONG = 0.07, 0.03
 """Cells of the profile: m across, and natural logarithm of the distance."""
 _COLUMNS, _ROWS = 700, 160
+_AROUND = 12.0
+"""Columns of the profile: 0.8 m, wider than lines and narrower than a shadow's two sides."""
 _TINT = 0.15
 """Difference in tint from the street's colour at which a cell of the ground counts half."""
 _SQUASH = 8
 """Columns that become one before colours are continued: so they go on sideways rather than up and down."""
+
+_DOUBT = 1.0
+"""Splits of a column that are worse by as many px of the wrong class are as good."""
+_BESIDE_M = 2.5
+"""How far beyond what is surely ground, as parked cars' places, walls and hedges stand: a pavement."""
+_FARTHEST_M = 7.0
+"""So much ground lies hidden at most where one side tells only how far it goes there."""
+_FIT_PX, _LEAST_COLUMNS = 100, 20
+"""Columns beside a hidden stretch that tell where the foot goes on, and how many at least."""
+_FAR_PX = 60
+"""So near to the vanishing point a foot is the road's far end and tells nothing of walls beside it."""
+_SURE_PX = 8
+"""Range of good splits up to which a column counts as known."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreetSettings:
     """far_m: ground beyond is not told apart from what stands on it; vote_m: edges nearer than this vote for the
     road's course; robust: difference of colour from the profile at which a pixel counts half; marking: difference
-    from the street's colour at which a pixel of the ground counts half when colours are continued sideways.
+    from the ground around it at which a pixel of the ground counts half when colours are continued sideways.
     """
 
     far_m: float = 90.0
     vote_m: float = 45.0
     robust: float = 0.04
     marking: float = 0.08
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """ground, sky (H, W) in [0, 1]: how much each known pixel looks like it; stood (H, W): where vehicles stood,
+    which is ground though it is hidden."""
+
+    ground: NDArray[np.float32]
+    sky: NDArray[np.float32]
+    stood: Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +92,13 @@ class Plane:
 @dataclass(frozen=True, slots=True)
 class Continued:
     """image (H, W, 3): known pixels and their smooth continuation; ground (H, W): pixels that see ground, the
-    hidden ones by interpolation; heading, bend: of the road, slope and 1/m."""
+    hidden ones by interpolation; heading, bend: of the road, slope and 1/m; foot (W,): row of the ground's end."""
 
     image: Image
     ground: Mask
     heading: float
     bend: float
+    foot: NDArray[np.float64]
 
 
 def plane_view(ground: torch.Tensor, camera: Camera) -> Plane:
@@ -94,50 +121,139 @@ def plane_view(ground: torch.Tensor, camera: Camera) -> Plane:
 def continued(
     image: Image,
     unknown: Mask,
-    road: NDArray[np.float32],
+    share: Shares,
     plane: Plane,
     horizon: float,
     settings: StreetSettings | None = None,
 ) -> Continued:
     """What the known pixels say of the unknown ones.
 
-    image (H, W, 3) in [0, 1]; unknown (H, W): must not be used; road (H, W) in [0, 1]: how much known pixels look
-    like road; horizon: its row, px.
+    image (H, W, 3) in [0, 1]; unknown (H, W): must not be used; share: what known pixels look like; horizon: its
+    row, px.
     """
     settings = settings or StreetSettings()
-    foot = foot_rows(road, unknown, horizon)
-    below = np.arange(image.shape[0])[:, None] >= foot[None]
+    rows = np.arange(image.shape[0])[:, None]
+    seen = ~unknown & (share.ground > 0.5)
+    heading, bend = course(image, seen & (plane.along < settings.vote_m), plane)
+    level = np.where(share.stood, 1, share.ground).astype(np.float32)
+    foot = foot_rows(level, unknown & ~share.stood, plane, horizon, _column_ahead(plane, heading))
+    below = rows >= foot[None]
     ground = below & (plane.along < settings.far_m)
-    heading, bend = course(image, ~unknown & ground & (plane.along < settings.vote_m), plane)
-    along = np.where(ground, plane.along, 1.0)
+    sky = (rows < top_rows(share.sky, unknown, horizon)[None]) & ~below
+    upright = ~ground & ~sky
+    # What is known is what it looks like: trees before the sky, signs on the verge.
+    flat = np.where(unknown, ground, ground & (share.ground > 0.5))
+    clear = np.where(unknown, sky, share.sky > 0.5)
+    along = np.where(flat, plane.along, 1.0)
     straight = plane.across - heading * along - bend * along**2 / 2
     column = np.rint(straight / _ACROSS_M).astype(np.int64) + _COLUMNS // 2
     row = np.rint(np.log(np.maximum(along, 1.0)) / _ALONG).astype(np.int64)
-    laid_out = ground & (column >= 0) & (column < _COLUMNS) & (row < _ROWS)
+    laid_out = flat & (column >= 0) & (column < _COLUMNS) & (row < _ROWS)
     cell = np.where(laid_out, row * _COLUMNS + column, 0)
-    street, profile = _profile(image, cell, laid_out & ~unknown, settings.robust)
-    street = np.where(laid_out[..., None], street.reshape(-1, 3)[cell], 0)
+    local, profile = _profile(image, cell, laid_out & ~unknown, settings.robust)
+    local = np.where(laid_out[..., None], local.reshape(-1, 3)[cell], 0)
     profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
     rest = (image - profile).astype(np.float32)
-    # A marking that the profile does not explain is a dash or a crossing's bar: continued, it would be a smear.
-    odd = np.abs(rest - street).max(-1) / settings.marking
-    weight = np.where(unknown, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
-    guess = np.clip(_sideways(rest, weight) + profile, 0, 1)
-    return Continued(np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend)
+    # What differs from the ground around it is a line, a dash or a crossing's bar: continued, it would be a smear.
+    odd = np.abs(image - local).max(-1) / settings.marking
+    weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
+    guess = _sideways(rest, weight) + profile
+    standing = (~unknown & ~flat & ~clear).astype(np.float32)
+    walls = (_sideways(image, standing) + push_pull(image, standing)) / 2
+    guess = np.where(upright[..., None], walls, guess)
+    guess = np.where(sky[..., None], _sideways(image, (~unknown & clear).astype(np.float32)), guess)
+    guess = np.clip(guess, 0, 1)
+    return Continued(np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend, foot)
 
 
-def foot_rows(road: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
-    """Row (W,) at which each column's ground ends; where that is hidden, interpolated between both sides."""
-    height, width = road.shape
-    ground = (road > 0.5) & (np.arange(height)[:, None] > horizon + 1)
-    ground = cv2.morphologyEx(ground.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-    top = ground.argmax(0)
-    covered = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    columns = np.arange(width)
-    sure = ground.any(0) & ~covered[top, columns] & ~covered[np.maximum(top - 3, 0), columns]
-    if np.count_nonzero(sure) < 10:
-        return np.full(width, horizon + 0.08 * (height - horizon))
-    return np.interp(columns, columns[sure], median_filter(top[sure].astype(float), 15, mode="nearest"))
+def _column_ahead(plane: Plane, heading: float) -> float:
+    """Column of the road's vanishing point: where the farthest row of the ground lies straight ahead."""
+    rows = np.flatnonzero((plane.along < 399).all(1))
+    if rows.size == 0:
+        return plane.along.shape[1] / 2
+    return float(np.abs(plane.across[rows[0]] - heading * plane.along[rows[0]]).argmin())
+
+
+def foot_rows(
+    ground: NDArray[np.float32], unknown: Mask, plane: Plane, horizon: float, ahead: float
+) -> NDArray[np.float64]:
+    """Row (W,) at which each column's ground ends, by how much (H, W) known pixels look like ground.
+
+    Where that is hidden, it goes on straight from what is seen beside, at most towards the road's vanishing point
+    in the horizon's column `ahead`; where nothing is seen beside, walls are taken to stand `_BESIDE_M` further out
+    than the last that is surely ground. It stays within what is hidden.
+    """
+    height = ground.shape[0]
+    start = int(np.clip(np.ceil(horizon + 1), 0, height - 2))
+    top, bottom = (start + part for part in _splits(ground[start:], unknown[start:]))
+    columns = np.arange(len(top))
+    sure = bottom - top <= _SURE_PX
+    foot = (top + bottom) / 2
+    foot[sure] = median_filter(foot[sure], 15, mode="nearest") if sure.any() else foot[sure]
+    last = np.minimum(bottom, height - 1).astype(np.int64)
+    aside = np.abs(plane.across[last, columns] - (plane.across[last, np.full_like(columns, int(ahead))]))
+    beside, farthest = (horizon + (last - horizon) * aside / (aside + gap) for gap in (_BESIDE_M, _FARTHEST_M))
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], sure, [True]]).astype(np.int8)))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        here = columns[first:end]
+        left = _onward(columns, foot, sure & (columns < first), (horizon, ahead), here)
+        right = _onward(columns, foot, sure & (columns >= end), (horizon, ahead), here)
+        if left is None or right is None:
+            one = right if left is None else left
+            foot[here] = beside[here] if one is None else np.maximum(one, farthest[here])
+        elif (first - 1 - ahead) * (end - ahead) > 0:
+            foot[here] = np.interp(here, [first - 1, end], [foot[first - 1], foot[end]])
+        else:
+            foot[here] = np.maximum(left, right)
+    return np.clip(foot, np.where(sure, foot, top), np.where(sure, foot, bottom))
+
+
+def _onward(
+    columns: NDArray[np.int64],
+    foot: NDArray[np.float64],
+    known: Mask,
+    vanishing: tuple[float, float],
+    to: NDArray[np.int64],
+) -> NDArray[np.float64] | None:
+    """Rows at columns `to` of the line through the known columns next to them; None where these tell nothing."""
+    horizon, ahead = vanishing
+    near = columns[known & (np.abs(columns - to.mean()) < to.size / 2 + _FIT_PX)]
+    if near.size < _LEAST_COLUMNS:
+        return None
+    end = near[np.abs(near - to.mean()).argmin()]
+    apart = float(end - ahead)
+    one_side = bool(((to - ahead) * apart > 0).any())
+    if not one_side or abs(apart) < _FAR_PX:
+        return None
+    drop = float(foot[end] - horizon)
+    slope = float(np.polyfit(near, foot[near], 1)[0])
+    share = float(np.clip(slope * apart / max(drop, 1.0), 0, 1))
+    return foot[end] + share * drop / apart * (to - end)
+
+
+def top_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
+    """Row (W,) below which each column shows no sky any more; where that is hidden, interpolated between both
+    sides."""
+    end = int(np.clip(np.ceil(horizon + 1), 2, sky.shape[0]))
+    top, bottom = _splits(1 - sky[:end], unknown[:end])
+    sure = bottom - top <= _SURE_PX
+    if not sure.any():
+        return top
+    columns = np.arange(len(top))
+    rows = median_filter(((top + bottom) / 2)[sure], 15, mode="nearest")
+    return np.clip(np.interp(columns, columns[sure], rows), top, bottom)
+
+
+def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rows (W,) between which each column begins to belong to a class below, by its share (H, W) in known
+    pixels."""
+    height, width = share.shape
+    gain = np.where(unknown, 0.0, share - 0.5)
+    # Of all splits the one with most of the class below it and least above it.
+    total = np.concatenate([np.cumsum(gain[::-1], 0)[::-1], np.zeros((1, width))])
+    total = 2 * total - gain.sum(0)
+    good = total >= total.max(0) - _DOUBT
+    return good.argmax(0).astype(float), (height - good[::-1].argmax(0)).astype(float)
 
 
 def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
@@ -175,14 +291,14 @@ def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
 
 
 def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) -> tuple[Image, Image]:
-    """The street's colour, smooth, and how much what runs along the road differs from it, both (rows, columns, 3)
-    of the straightened ground."""
+    """The ground's colour around each cell, and how much what runs along the road differs from the street's, both
+    (rows, columns, 3) of the straightened ground."""
     shape = (_ROWS, _COLUMNS)
     where, size = cell[known], _ROWS * _COLUMNS
     count = np.bincount(where, minlength=size).reshape(shape)
     colour = np.stack([np.bincount(where, image[..., c][known], size) for c in range(3)], -1).reshape(*shape, 3)
     colour = (colour / np.maximum(count, 1)[..., None]).astype(np.float32)
-    filled = (count > 0).astype(np.float32)
+    filled = known_cells = (count > 0).astype(np.float32)
 
     def mean(values: Image, weight: NDArray[np.float32], sigma: tuple[float, float]) -> tuple[Image, Image]:
         total = cv2.GaussianBlur(weight, (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
@@ -200,7 +316,8 @@ def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) 
         # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
         weight = filled / (1 + (np.abs(difference - line).max(-1) / robust) ** 2)
         line, total = mean(difference, weight, (10.0, 0.5))
-    return street, line * np.clip(total * 10, 0, 1)[..., None]
+    local, _ = mean(colour, known_cells, (1.5, _AROUND))
+    return local, line * np.clip(total * 10, 0, 1)[..., None]
 
 
 def _sideways(image: Image, weight: NDArray[np.float32]) -> Image:

@@ -28,15 +28,17 @@ start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
-vec13 = wp.types.vector(length=13, dtype=wp.float32)
+vec17 = wp.types.vector(length=17, dtype=wp.float32)
 
 NEAR = wp.constant(wp.float32(0.05))
 FAR_AWAY = wp.constant(wp.float32(1e5))
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 DEPTH_LOW, DEPTH_HIGH = (wp.constant(wp.float32(v)) for v in texture.DEPTH_TOLERANCE_M)
-TURN_LOW, TURN_HIGH = (wp.constant(wp.float32(v)) for v in texture.TURN_TOLERANCE)
+STRETCH_LOW, STRETCH_HIGH = (wp.constant(wp.float32(v)) for v in texture.STRETCH)
+GRAZING, GRAZING_PAINT = (wp.constant(wp.float32(v)) for v in texture.GRAZING)
 OPEN_TURN_LOW, OPEN_TURN_HIGH = (wp.constant(wp.float32(v)) for v in texture.OPEN_TURN)
 OPEN_ALPHA_LOW, OPEN_ALPHA_HIGH = (wp.constant(wp.float32(v)) for v in texture.OPEN_ALPHA)
 RIM_LOW, RIM_HIGH = (wp.constant(wp.float32(v)) for v in texture.RIM)
@@ -44,6 +46,7 @@ OUTLINE_LOW, OUTLINE_HIGH = (wp.constant(wp.float32(v * v)) for v in texture.OUT
 BORDER_LOW, BORDER_HIGH = (wp.constant(wp.float32(v)) for v in texture.BORDER_PX)
 EXTENDED_LOW, EXTENDED_HIGH = (wp.constant(wp.float32(v)) for v in texture.EXTENDED_PX)
 OPAQUE, EVEN = wp.constant(wp.float32(1.0 - 1e-6)), wp.constant(wp.float32(1e-6))
+AROUND, ABOVE = (wp.constant(wp.float32(v)) for v in texture.AMBIENT)
 GROUND_RGB = wp.constant(wp.vec3f(*texture.GROUND_RGB))
 HORIZON_RGB = wp.constant(wp.vec3f(*texture.HORIZON_RGB))
 ZENITH_RGB = wp.constant(wp.vec3f(*texture.ZENITH_RGB))
@@ -276,21 +279,23 @@ def corner_values(
     i: int,
     clip: wp.array(dtype=wp.vec3f),
     facing: wp.array(dtype=wp.float32),
+    brighter: wp.array(dtype=wp.float32),
     base_clip: wp.array(dtype=wp.vec3f),
     base: wp.array(dtype=wp.vec3f),
 ):
-    """Clip then minus now (3), w then, cosine now minus then, and then, paint, height."""
+    """Clip then minus now (3), w then, cosine now minus then, and then, paint, height, how much brighter."""
     then = base_clip[i]
     delta = then - clip[i]
     fixed = base[i]
-    return vec8(delta[0], delta[1], delta[2], then[2], facing[i] - fixed[0], fixed[0], fixed[1], fixed[2])
+    turned = facing[i] - fixed[0]
+    return vec9(delta[0], delta[1], delta[2], then[2], turned, fixed[0], fixed[1], fixed[2], brighter[i])
 
 
 @wp.func
-def exact_dot(a: vec8, b: vec8):
+def exact_dot(a: vec9, b: vec9):
     """In double precision: differences between corners matter, which are small beside the values."""
     total = wp.float64(a[0]) * wp.float64(b[0])
-    for k in range(1, 8):
+    for k in range(1, 9):
         total += wp.float64(a[k]) * wp.float64(b[k])
     return total
 
@@ -302,20 +307,21 @@ def look_kernel(
     face: wp.array(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
     facing: wp.array(dtype=wp.float32),
+    brighter: wp.array(dtype=wp.float32),
     base_clip: wp.array(dtype=wp.vec3f),
     base: wp.array(dtype=wp.vec3f),
     faces: wp.array(dtype=wp.vec3i),
-    out: wp.array(dtype=vec8),
+    out: wp.array(dtype=vec9),
 ):
     i = start + wp.tid()
-    value = vec8()
+    value = vec9()
     if face[i] >= 0:
         at = table[i]
         hit = find_hit(face[i], at[1], at[2], clip, faces)
-        a = corner_values(hit.i0, clip, facing, base_clip, base) * wp.float32(hit.b[0])
-        a += corner_values(hit.i1, clip, facing, base_clip, base) * wp.float32(hit.b[1])
-        a += corner_values(hit.i2, clip, facing, base_clip, base) * wp.float32(hit.b[2])
-        value = vec8(FAR_AWAY, FAR_AWAY, a[3], a[3] - a[2], a[4], a[5], a[6], a[7])
+        a = corner_values(hit.i0, clip, facing, brighter, base_clip, base) * wp.float32(hit.b[0])
+        a += corner_values(hit.i1, clip, facing, brighter, base_clip, base) * wp.float32(hit.b[1])
+        a += corner_values(hit.i2, clip, facing, brighter, base_clip, base) * wp.float32(hit.b[2])
+        value = vec9(FAR_AWAY, FAR_AWAY, a[3], a[3] - a[2], a[4], a[5], a[6], a[7], a[8])
         if a[3] > NEAR:
             value[0] = (a[0] - wp.float32(at[1]) * a[2]) / a[3]
             value[1] = (a[1] - wp.float32(at[2]) * a[2]) / a[3]
@@ -329,13 +335,15 @@ def look_backward_kernel(
     face: wp.array(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
     facing: wp.array(dtype=wp.float32),
+    brighter: wp.array(dtype=wp.float32),
     base_clip: wp.array(dtype=wp.vec3f),
     base: wp.array(dtype=wp.vec3f),
     faces: wp.array(dtype=wp.vec3i),
-    value: wp.array(dtype=vec8),
-    grad_out: wp.array(dtype=vec8),
+    value: wp.array(dtype=vec9),
+    grad_out: wp.array(dtype=vec9),
     grad_clip: wp.array(dtype=wp.vec3d),
     grad_facing: wp.array(dtype=wp.float32),
+    grad_brighter: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
     if face[i] >= 0:
@@ -346,15 +354,15 @@ def look_backward_kernel(
         v = value[i]
         go = grad_out[i]
         # Back through the division, to the interpolated values.
-        g = vec8(0.0, 0.0, -go[3], go[2] + go[3], go[4], go[5], go[6], go[7])
+        g = vec9(0.0, 0.0, -go[3], go[2] + go[3], go[4], go[5], go[6], go[7], go[8])
         if v[2] > NEAR:
             g[0] = go[0] / v[2]
             g[1] = go[1] / v[2]
             g[2] -= g[0] * x + g[1] * y
             g[3] -= g[0] * v[0] + g[1] * v[1]
-        s0 = exact_dot(g, corner_values(hit.i0, clip, facing, base_clip, base))
-        s1 = exact_dot(g, corner_values(hit.i1, clip, facing, base_clip, base))
-        s2 = exact_dot(g, corner_values(hit.i2, clip, facing, base_clip, base))
+        s0 = exact_dot(g, corner_values(hit.i0, clip, facing, brighter, base_clip, base))
+        s1 = exact_dot(g, corner_values(hit.i1, clip, facing, brighter, base_clip, base))
+        s2 = exact_dot(g, corner_values(hit.i2, clip, facing, brighter, base_clip, base))
         mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
         add_to_corners(hit, at[1], at[2], s0 - mean, s1 - mean, s2 - mean, grad_clip)
         d = wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[2]))
@@ -364,12 +372,16 @@ def look_backward_kernel(
         wp.atomic_add(grad_facing, hit.i0, g[4] * wp.float32(hit.b[0]))
         wp.atomic_add(grad_facing, hit.i1, g[4] * wp.float32(hit.b[1]))
         wp.atomic_add(grad_facing, hit.i2, g[4] * wp.float32(hit.b[2]))
+        if g[8] != 0.0:
+            wp.atomic_add(grad_brighter, hit.i0, g[8] * wp.float32(hit.b[0]))
+            wp.atomic_add(grad_brighter, hit.i1, g[8] * wp.float32(hit.b[1]))
+            wp.atomic_add(grad_brighter, hit.i2, g[8] * wp.float32(hit.b[2]))
 
 
 def _look_inputs(fixed) -> list:
-    table, face, clip, facing, base_clip, base, faces = fixed
+    table, face, clip, facing, brighter, base_clip, base, faces = fixed
     return [
-        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _array(facing)),
+        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _array(facing), _array(brighter)),
         *(_vec3(base_clip), _vec3(base), _array(faces, wp.vec3i)),
     ]
 
@@ -440,8 +452,8 @@ def fill_kernel(
     rects: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     coverage: wp.array(dtype=wp.float32),
-    values: wp.array(dtype=vec8),
-    out: wp.array(dtype=vec8),
+    values: wp.array(dtype=vec9),
+    out: wp.array(dtype=vec9),
 ):
     i = start + wp.tid()
     if leans(i, face, coverage):
@@ -458,14 +470,14 @@ def keep_kernel(
     start: int,
     face: wp.array(dtype=wp.int32),
     coverage: wp.array(dtype=wp.float32),
-    grad: wp.array(dtype=vec8),
-    kept: wp.array(dtype=vec8),
+    grad: wp.array(dtype=vec9),
+    kept: wp.array(dtype=vec9),
 ):
     """Moves gradients of leaning pixels from `grad` to `kept`, so that `fill_backward_kernel` can spread them."""
     i = start + wp.tid()
     if leans(i, face, coverage):
         kept[i] = grad[i]
-        grad[i] = vec8()
+        grad[i] = vec9()
 
 
 @wp.func
@@ -494,9 +506,9 @@ def fill_backward_kernel(
     rects: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     coverage: wp.array(dtype=wp.float32),
-    values: wp.array(dtype=vec8),
-    kept: wp.array(dtype=vec8),
-    grad: wp.array(dtype=vec8),
+    values: wp.array(dtype=vec9),
+    kept: wp.array(dtype=vec9),
+    grad: wp.array(dtype=vec9),
     grad_coverage: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
@@ -638,20 +650,21 @@ def inside_weight(u: float, v: float, wh: wp.vec2f, low: float, high: float):
 
 
 @wp.func
-def facing_weight(turned: float, cos_then: float):
+def facing_weight(turned: float, cos_then: float, paint: float):
     """`texture.facing_weight`."""
     positive = 0.5 * (cos_then + wp.sqrt(cos_then * cos_then + 1e-4))
-    return 1.0 - step(turned - positive, TURN_LOW, TURN_HIGH)
+    slack = GRAZING + (GRAZING_PAINT - GRAZING) * paint
+    return 1.0 - step(turned / (positive + slack), STRETCH_LOW, STRETCH_HIGH)
 
 
 @wp.func
-def seen_weight(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+def seen_weight(look: vec9, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
     """How much of what is shown the photograph knows; and how much of it it sees there at all."""
     u = xy[0] + look[0]
     v = xy[1] + look[1]
     clear = 1.0 - step(texel[4], 0.0, 1.0)
     inside = inside_weight(u, v, wh, BORDER_LOW, BORDER_HIGH)
-    facing = facing_weight(look[4], look[5])
+    facing = facing_weight(look[4], look[5], look[6])
     weight = facing * inside * clear
     if inside < 1.0:
         near = inside_weight(u, v, wh, EXTENDED_LOW, EXTENDED_HIGH) * step(texel[3], 0.5, 0.95)
@@ -661,7 +674,19 @@ def seen_weight(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
 
 
 @wp.func
-def mesh_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+def relit(c: float, brighter: float):
+    """`texture.relit`, one channel of it."""
+    return c * (1.0 + brighter * (1.0 - c * c))
+
+
+@wp.func
+def relit_slope(c: float, brighter: float):
+    """Its derivative to the colour."""
+    return 1.0 + brighter * (1.0 - 3.0 * c * c)
+
+
+@wp.func
+def mesh_pixel(look: vec9, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
     """Premultiplied RGB, opacity, and how much is left to be completed."""
     seen = seen_weight(look, texel, xy, wh)
     weight = seen[0]
@@ -672,17 +697,17 @@ def mesh_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
     closed = weight * opened * (1.0 - empty) * step(alpha, OPEN_ALPHA_LOW, OPEN_ALPHA_HIGH)
     shown = weight + closed / wp.max(alpha, OPEN_ALPHA_LOW)
     out = vec5()
-    out[0] = shown * texel[0]
-    out[1] = shown * texel[1]
-    out[2] = shown * texel[2]
+    out[0] = shown * relit(texel[0], look[8])
+    out[1] = shown * relit(texel[1], look[8])
+    out[2] = shown * relit(texel[2], look[8])
     out[3] = shown * alpha
     out[4] = (1.0 - weight) * (1.0 - empty)
     return out
 
 
 @wp.func
-def plainly_seen(look: vec8, texel: vec8, u: float, v: float, wh: wp.vec2f):
-    """Whether every weight of `mesh_pixel` is flat at full: then it is the texel, and so is its gradient."""
+def plainly_seen(look: vec9, texel: vec8, u: float, v: float, wh: wp.vec2f):
+    """Whether every weight of `mesh_pixel` is flat at full: then it is the texel, relit, and so is its gradient."""
     seen = texel[4] <= 0.0 and texel[7] >= 0.9 and look[2] - texel[6] <= DEPTH_LOW
     if seen:
         seen = (
@@ -694,27 +719,32 @@ def plainly_seen(look: vec8, texel: vec8, u: float, v: float, wh: wp.vec2f):
     if seen:  # nothing opens up: it did not turn, lies inside, or is opaque
         seen = look[4] <= OPEN_TURN_LOW or look[5] >= RIM_HIGH or texel[3] >= OPAQUE
     if seen:
-        seen = look[4] <= TURN_LOW + wp.max(look[5], 0.0)
+        seen = look[4] <= STRETCH_LOW * (GRAZING_PAINT + wp.max(look[5], 0.0))
     return seen
 
 
 @wp.func
-def mesh_loss(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_fill: float):
+def mesh_loss(look: vec9, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_fill: float):
     p = mesh_pixel(look, texel, xy, wh)
     return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[4] * to_fill
 
 
 @wp.func
-def halo_pixel(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
+def halo_pixel(look: vec9, texel: vec8, xy: wp.vec2f, wh: wp.vec2f):
     """Premultiplied RGB and opacity."""
     seen = seen_weight(look, texel, xy, wh)
     on_outline = 1.0 - step(look[4] * look[4], OUTLINE_LOW, OUTLINE_HIGH)
     shown = seen[0] * step(texel[5], 0.0, 1.0) * on_outline
-    return wp.vec4f(shown * texel[0], shown * texel[1], shown * texel[2], shown * texel[3])
+    return wp.vec4f(
+        shown * relit(texel[0], look[8]),
+        shown * relit(texel[1], look[8]),
+        shown * relit(texel[2], look[8]),
+        shown * texel[3],
+    )
 
 
 @wp.func
-def halo_loss(look: vec8, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
+def halo_loss(look: vec9, texel: vec8, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
     return wp.dot(halo_pixel(look, texel, xy, wh), g)
 
 
@@ -739,7 +769,7 @@ def shade_kernel(
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     frame_wh: wp.array(dtype=wp.vec2f),
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     mesh: wp.array(dtype=wp.vec4f),
     halo: wp.array(dtype=wp.vec4f),
     fill: wp.array(dtype=wp.float32),
@@ -757,7 +787,7 @@ def shade_kernel(
         a = look[i]
         uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
         texel = texel_at(texels, rect, first, uv)
-        to_mesh = wp.vec4f(texel[0], texel[1], texel[2], texel[3])
+        to_mesh = wp.vec4f(relit(texel[0], a[8]), relit(texel[1], a[8]), relit(texel[2], a[8]), texel[3])
         if not plainly_seen(a, texel, uv[0], uv[1], wh):
             p = mesh_pixel(a, texel, xy, wh)
             to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
@@ -781,11 +811,11 @@ def shade_backward_kernel(
     rects: wp.array2d(dtype=wp.int64),
     offsets: wp.array(dtype=wp.int64),
     frame_wh: wp.array(dtype=wp.vec2f),
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     grad_mesh: wp.array(dtype=wp.vec4f),
     grad_halo: wp.array(dtype=wp.vec4f),
     grad_fill: wp.array(dtype=wp.float32),
-    grad_look: wp.array(dtype=vec8),
+    grad_look: wp.array(dtype=vec9),
 ):
     i = start + wp.tid()
     at = table[i]
@@ -798,8 +828,12 @@ def shade_backward_kernel(
         uv = wp.vec2f(xy[0] + a[0], xy[1] + a[1])
         g = grad_mesh[i]
         texel = texel_around(texels, rect, first, uv)
-        to_look = vec8()
-        to_texel = vec8(g[0], g[1], g[2], g[3], 0.0, 0.0, 0.0, 0.0)
+        c = texel.value
+        to_look = vec9()
+        to_texel = vec8(0.0, 0.0, 0.0, g[3], 0.0, 0.0, 0.0, 0.0)
+        for k in range(3):
+            to_texel[k] = g[k] * relit_slope(c[k], a[8])
+            to_look[8] += g[k] * c[k] * (1.0 - c[k] * c[k])
         # Where opacity changes along a surface that turned, so does how much of it opens up.
         even = a[4] <= OPEN_TURN_LOW or wp.max(wp.abs(texel.to_u[3]), wp.abs(texel.to_v[3])) <= EVEN
         if not (even and plainly_seen(a, texel.value, uv[0], uv[1], wh)):
@@ -834,13 +868,13 @@ class Meshes:
     coverage: wp.array(dtype=wp.float32)
     clip: wp.array(dtype=wp.vec3f)
     faces: wp.array(dtype=wp.vec3i)
-    attributes: wp.array(dtype=vec13)
+    attributes: wp.array(dtype=vec17)
 
 
 @wp.func
 def own_at(m: Meshes, i: int):
     """The mesh's own attributes at a pixel that it hits, else 0."""
-    value = vec13()
+    value = vec17()
     if m.face[i] >= 0:
         at = m.table[i]
         hit = find_hit(m.face[i], at[1], at[2], m.clip, m.faces)
@@ -864,22 +898,22 @@ def own_filled(m: Meshes, i: int):
 
 
 @wp.func
-def exact_dot13(a: vec13, b: vec13):
+def exact_dot17(a: vec17, b: vec17):
     """See `exact_dot`."""
     total = wp.float64(a[0]) * wp.float64(b[0])
-    for k in range(1, 13):
+    for k in range(1, 17):
         total += wp.float64(a[k]) * wp.float64(b[k])
     return total
 
 
 @wp.func
-def own_to_clip(m: Meshes, i: int, g: vec13, share: float, grad_clip: wp.array(dtype=wp.vec3d)):
+def own_to_clip(m: Meshes, i: int, g: vec17, share: float, grad_clip: wp.array(dtype=wp.vec3d)):
     """Add what `share` of a gradient to `own_at` means for the corners; returns g . own_at."""
     at = m.table[i]
     hit = find_hit(m.face[i], at[1], at[2], m.clip, m.faces)
-    s0 = exact_dot13(g, m.attributes[hit.i0])
-    s1 = exact_dot13(g, m.attributes[hit.i1])
-    s2 = exact_dot13(g, m.attributes[hit.i2])
+    s0 = exact_dot17(g, m.attributes[hit.i0])
+    s1 = exact_dot17(g, m.attributes[hit.i1])
+    s2 = exact_dot17(g, m.attributes[hit.i2])
     mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
     if share != 0.0:
         part = wp.float64(share)
@@ -889,7 +923,7 @@ def own_to_clip(m: Meshes, i: int, g: vec13, share: float, grad_clip: wp.array(d
 
 @wp.func
 def own_backward(
-    m: Meshes, i: int, g: vec13, grad_clip: wp.array(dtype=wp.vec3d), grad_coverage: wp.array(dtype=wp.float32)
+    m: Meshes, i: int, g: vec17, grad_clip: wp.array(dtype=wp.vec3d), grad_coverage: wp.array(dtype=wp.float32)
 ):
     """Add what a gradient to `own_filled` means for corners and coverages."""
     if leans(i, m.face, m.coverage):
@@ -921,14 +955,21 @@ def clamped(v: wp.vec3f):
 
 @wp.func
 def shade(
-    normal: wp.vec3f, to_eye: wp.vec3f, albedo: wp.vec3f, paint: float, glass: float, height: float, sun: wp.vec3f
+    normal: wp.vec3f,
+    to_eye: wp.vec3f,
+    albedo: wp.vec3f,
+    paint: float,
+    glass: float,
+    height: float,
+    sunlit: wp.vec4f,
 ):
-    """`texture.shade`, one row of it."""
+    """`texture.shade`, one row of it. sunlit: direction and strength of the sun."""
+    sun = wp.vec3f(sunlit[0], sunlit[1], sunlit[2])
     dome = 0.5 - 0.5 * normal[1]
     soft = wp.dot(normal, sun)
     direct = 0.5 * (soft + wp.sqrt(soft * soft + 0.01))
     occluded = 0.45 + 0.55 * step(height, -0.05, 0.4)
-    diffuse = ((0.30 + 0.38 * dome) + 0.62 * direct) * occluded
+    diffuse = ((AROUND + ABOVE * dome) + sunlit[3] * direct) * occluded
     cosine = wp.clamp(wp.dot(normal, to_eye), 0.0, 1.0)
     mirror = normal * (2.0 * cosine) - to_eye
     above = HORIZON_RGB + (ZENITH_RGB - HORIZON_RGB) * step(-mirror[1], 0.0, 0.9)
@@ -943,11 +984,11 @@ def shade(
     g32 = (g8 * g8) * (g8 * g8)
     glint = (g32 * g8) * (0.35 * paint + 0.5 * glass)
     lit = albedo * diffuse
-    return clamped(lit + (surround - lit) * strength + (wp.vec3f(1.0, 1.0, 1.0) - lit) * glint)
+    return lit + (surround - lit) * strength + (wp.vec3f(1.0, 1.0, 1.0) - lit) * glint
 
 
 @wp.func
-def mirror_place(own: vec13):
+def mirror_place(own: vec17):
     """Where the photograph shows the other side of the car, px."""
     safe = wp.max(own[11], 0.1)
     return wp.vec2f(own[9] / safe, own[10] / safe)
@@ -955,47 +996,45 @@ def mirror_place(own: vec13):
 
 @wp.func
 def completed(
-    own: vec13,
+    own: vec17,
     facing: float,
     texel: vec8,
     turn: wp.vec2f,
     to_eye: wp.vec3f,
-    sun: wp.vec3f,
-    tint: wp.vec3f,
+    sun: wp.vec4f,
     wh: wp.vec2f,
 ):
     """`Compositor._completion`, one row of it. own: colours (3), local normal (3), paint, glass, height, mirror clip
-    (3), mirror cosine; facing: cosine towards the camera now."""
+    (3), mirror cosine, gain (3), lift; facing: cosine towards the camera now."""
     normal = unit(wp.vec3f(turn[0] * own[3] + turn[1] * own[5], own[4], turn[0] * own[5] - turn[1] * own[3]))
-    white = wp.vec3f(1.0, 1.0, 1.0)
-    albedo = wp.cw_mul(wp.vec3f(own[0], own[1], own[2]), white + (tint - white) * own[6])
-    colour = shade(normal, to_eye, albedo, own[6], own[7], own[8], sun)
+    light = shade(normal, to_eye, wp.vec3f(own[0], own[1], own[2]), own[6], own[7], own[8], sun)
+    left = wp.vec3f(wp.exp(-light[0] * own[13]), wp.exp(-light[1] * own[14]), wp.exp(-light[2] * own[15]))
+    colour = wp.vec3f(1.0, 1.0, 1.0) - left * (1.0 - own[16])  # `texture.finished`
     uv = mirror_place(own)
     weight = inside_weight(uv[0], uv[1], wh, BORDER_LOW, BORDER_HIGH)
     weight = weight * (1.0 - step(texel[4], 0.0, 1.0)) * step(texel[3], 0.5, 0.95)
     weight = weight * (1.0 - step(own[11] - texel[6], DEPTH_LOW, DEPTH_HIGH))
-    weight = weight * facing_weight(facing - own[12], own[12]) * step(own[12], 0.05, 0.2)
+    weight = weight * facing_weight(facing - own[12], own[12], own[6]) * step(own[12], 0.05, 0.2)
     straight = clamped(wp.vec3f(texel[0], texel[1], texel[2]) / wp.max(texel[3], 0.4))
     return colour + (straight - colour) * weight
 
 
 @wp.func
 def completed_loss(
-    own: vec13,
+    own: vec17,
     facing: float,
     texel: vec8,
     turn: wp.vec2f,
     to_eye: wp.vec3f,
-    sun: wp.vec3f,
-    tint: wp.vec3f,
+    sun: wp.vec4f,
     wh: wp.vec2f,
     g: wp.vec3f,
 ):
-    return wp.dot(completed(own, facing, texel, turn, to_eye, sun, tint, wh), g)
+    return wp.dot(completed(own, facing, texel, turn, to_eye, sun, wh), g)
 
 
 @wp.func
-def mirror_loss(own: vec13, g: wp.vec2f):
+def mirror_loss(own: vec17, g: wp.vec2f):
     return wp.dot(mirror_place(own), g)
 
 
@@ -1004,8 +1043,7 @@ class View:
     """What completion knows of an object: see `Complete`."""
 
     turn: wp.array(dtype=wp.vec2f)
-    sun: wp.array(dtype=wp.vec3f)
-    tint: wp.array(dtype=wp.vec3f)
+    sun: wp.array(dtype=wp.vec4f)
     frame_wh: wp.array(dtype=wp.vec2f)
     unproject: wp.array(dtype=wp.mat33f)
 
@@ -1026,7 +1064,7 @@ def complete_kernel(
     offsets: wp.array(dtype=wp.int64),
     view: View,
     meshes: Meshes,
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     fill: wp.array(dtype=wp.float32),
     mesh: wp.array(dtype=wp.vec4f),
 ):
@@ -1036,9 +1074,7 @@ def complete_kernel(
     v = own_filled(meshes, i)
     texel = texel_at(texels, rect_of(rects, o), wp.int32(offsets[o]), mirror_place(v))
     a = look[i]
-    c = completed(
-        v, a[4] + a[5], texel, view.turn[o], eye_of(view, at), view.sun[o], view.tint[o], view.frame_wh[o]
-    )
+    c = completed(v, a[4] + a[5], texel, view.turn[o], eye_of(view, at), view.sun[o], view.frame_wh[o])
     f = fill[i]
     mesh[i] = mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
 
@@ -1052,10 +1088,10 @@ def complete_backward_kernel(
     offsets: wp.array(dtype=wp.int64),
     view: View,
     meshes: Meshes,
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     fill: wp.array(dtype=wp.float32),
     grad_mesh: wp.array(dtype=wp.vec4f),
-    grad_look: wp.array(dtype=vec8),
+    grad_look: wp.array(dtype=vec9),
     grad_fill: wp.array(dtype=wp.float32),
     grad_turn: wp.array(dtype=wp.vec2d),
     grad_clip: wp.array(dtype=wp.vec3d),
@@ -1070,18 +1106,18 @@ def complete_backward_kernel(
     first = wp.int32(offsets[o])
     texel = texel_around(texels, rect, first, mirror_place(v))
     eye = eye_of(view, at)
-    c = completed(v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o])
+    c = completed(v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.frame_wh[o])
     g = grad_mesh[i]
     f = fill[i]
     to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
-    grad_fill[i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
-    to_own, to_facing, to_texel, to_turn, to_eye, to_sun, to_tint, to_wh, to_g = wp.grad(completed_loss)(
-        v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.tint[o], view.frame_wh[o], to_colour
+    grad_fill[i] = grad_fill[i] + g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
+    to_own, to_facing, to_texel, to_turn, to_eye, to_sun, to_wh, to_g = wp.grad(completed_loss)(
+        v, a[4] + a[5], texel.value, view.turn[o], eye, view.sun[o], view.frame_wh[o], to_colour
     )
     move = wp.vec2f(wp.dot(to_texel, texel.to_u), wp.dot(to_texel, texel.to_v))
     more, to_move = wp.grad(mirror_loss)(v, move)
     own_backward(meshes, i, to_own + more, grad_clip, grad_coverage)
-    to_look = vec8()
+    to_look = vec9()
     to_look[4] = to_facing
     to_look[5] = to_facing
     wp.atomic_add(grad_look, i, to_look)
@@ -1099,7 +1135,7 @@ def combine_kernel(
     coverage: wp.array(dtype=wp.float32),
     mesh: wp.array(dtype=wp.vec4f),
     halo: wp.array(dtype=wp.vec4f),
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     colour: wp.array(dtype=wp.vec4f),
     opacity: wp.array(dtype=wp.float32),
     depth: wp.array(dtype=wp.float32),
@@ -1140,13 +1176,13 @@ def combine_backward_kernel(
     coverage: wp.array(dtype=wp.float32),
     mesh: wp.array(dtype=wp.vec4f),
     halo: wp.array(dtype=wp.vec4f),
-    look: wp.array(dtype=vec8),
+    look: wp.array(dtype=vec9),
     grad_colour: wp.array(dtype=wp.vec4f),
     grad_opacity: wp.array(dtype=wp.float32),
     grad_mesh: wp.array(dtype=wp.vec4f),
     grad_halo: wp.array(dtype=wp.vec4f),
     grad_coverage: wp.array(dtype=wp.float32),
-    grad_look: wp.array(dtype=vec8),
+    grad_look: wp.array(dtype=vec9),
 ):
     i = start + wp.tid()
     g = grad_colour[i]
@@ -1161,7 +1197,7 @@ def combine_backward_kernel(
         to_share = g[0] * m[0] + g[1] * m[1] + g[2] * m[2] + to_a * m[3]
         to_mesh = wp.vec4f(g[0], g[1], g[2], to_a) * coverage[i]
         if g[3] != 0.0 and z > NEAR:
-            to_z = vec8()
+            to_z = vec9()
             to_z[3] = -g[3] * m[3] * coverage[i] / (safe * safe)
             wp.atomic_add(grad_look, i, to_z)
     if in_halo(i, nearest, coverage):
@@ -1173,7 +1209,7 @@ def combine_backward_kernel(
         to_share -= g[0] * h[0] + g[1] * h[1] + g[2] * h[2] + to_a * h[3]
         to_halo = wp.vec4f(g[0], g[1], g[2], to_a) * (1.0 - coverage[i])
         if g[3] != 0.0 and z > NEAR:
-            to_z = vec8()
+            to_z = vec9()
             to_z[3] = -g[3] * h[3] * (1.0 - coverage[i]) / (safe * safe)
             wp.atomic_add(grad_look, j, to_z)
     grad_mesh[i] = to_mesh
@@ -1324,9 +1360,9 @@ def _shadow_inputs(s: Setting, table: Tensor, then: Tensor) -> list:
 class Setting:
     """What `Photographed` reads and does not change. See `fused.Fixed` and `compositor.Drawn` for what is not said here.
 
-    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `Ground`. tint (N, 3): RGB of the objects' paint. painter:
-    None, or what repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 8)
-    and the codes, differentiable. reach_px: how far each halo reaches.
+    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `Ground`. painter:
+    None, or what repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 9),
+    how much of them was filled (T,) and the codes, differentiable. reach_px: how far each halo reaches.
     """
 
     fragments: Fragments
@@ -1342,12 +1378,11 @@ class Setting:
     frame_wh: Tensor
     sun: Tensor
     unproject: Tensor
-    tint: Tensor
     painter: Painter | None
 
 
-Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""From mesh, halo, look, codes, table and nearest to mesh and halo."""
+Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From mesh, halo, look, fill, codes, table and nearest to mesh and halo."""
 
 
 class _Parts:
@@ -1368,26 +1403,27 @@ class _Parts:
 class Photographed(torch.autograd.Function):
     """All pixels of photographed objects, and of their shadows.
 
-    clip (V, 3), facing (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `Ground`), code (N, 5) or (0,):
+    clip (V, 3), facing (V,), brighter (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `Ground`), code (N, 5) or (0,):
     differentiable, the code through the painter. -> premultiplied RGB and opacity / depth (T, 4),
     opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
     """
 
     @staticmethod
-    def forward(ctx: Any, clip, facing, coverage, yaw, then, code, s: Setting):
+    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, s: Setting):
         size, device = coverage.shape[0], clip.device
-        clip, facing, then = clip.detach(), facing.detach(), then.detach().contiguous()
+        clip, facing, brighter = clip.detach(), facing.detach(), brighter.detach().contiguous()
+        then = then.detach().contiguous()
         coverage, face = coverage.detach().contiguous(), s.fragments.face
         parts = _Parts(s, code if s.painter is not None else None)
         table, ground_table = _table_like(s.fragments.layout, device), _table_like(s.ground, device)
         nearest = torch.empty(size, dtype=torch.int64, device=device)
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1).detach()
-        found, look = clip.new_empty(size, 8), clip.new_empty(size, 8)
+        found, look = clip.new_empty(size, 9), clip.new_empty(size, 9)
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
-        seen = _look_inputs((table, face, clip, facing, s.base_clip, s.base, s.faces))
-        filled = [*_outline(s, table, coverage), _array(found, vec8), _array(look, vec8)]
+        seen = _look_inputs((table, face, clip, facing, brighter, s.base_clip, s.base, s.faces))
+        filled = [*_outline(s, table, coverage), _array(found, vec9), _array(look, vec9)]
         shades = _shade_inputs(s, table, nearest, coverage, look)
         shaded = [*shades, _array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
         combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
@@ -1406,7 +1442,7 @@ class Photographed(torch.autograd.Function):
             if last == first:
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
-            launch(look_kernel, [first, last], [*seen, _array(found, vec8)], (), device)
+            launch(look_kernel, [first, last], [*seen, _array(found, vec9)], (), device)
             launch(fill_kernel, [first, last], filled, (), device)
             launch(shade_kernel, [first, last], shaded, (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
@@ -1421,14 +1457,27 @@ class Photographed(torch.autograd.Function):
         ctx.painted = None
         if s.painter is not None:
             with torch.enable_grad():
-                leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, code))
+                leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
                 ctx.painted = leaves, s.painter(*leaves, table, nearest)
             mesh, halo = (t.detach().contiguous() for t in ctx.painted[1])
             combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
             launch(combine_kernel, halves(size), [*combined, _array(opacity), _array(depth)], (), device)
         ctx.setting, ctx.parts, ctx.needs = s, parts, needs
         ctx.save_for_backward(
-            clip, facing, coverage, turn, found, look, mesh, halo, fill, table, ground_table, nearest, then
+            clip,
+            facing,
+            brighter,
+            coverage,
+            turn,
+            found,
+            look,
+            mesh,
+            halo,
+            fill,
+            table,
+            ground_table,
+            nearest,
+            then,
         )
         ctx.mark_non_differentiable(depth)
         return colour, opacity, depth, shadow
@@ -1436,7 +1485,7 @@ class Photographed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor, grad_shadow: Tensor):
-        clip, facing, coverage, turn, found, look, mesh, halo, fill, *others = ctx.saved_tensors
+        clip, facing, brighter, coverage, turn, found, look, mesh, halo, fill, *others = ctx.saved_tensors
         table, ground_table, nearest, then = others
         s: Setting = ctx.setting
         parts: _Parts = ctx.parts
@@ -1446,10 +1495,11 @@ class Photographed(torch.autograd.Function):
         grad_mesh, grad_halo = torch.empty_like(mesh), torch.empty_like(halo)
         grad_coverage, grad_look = torch.empty_like(coverage), torch.empty_like(look)
         kept, grad_fill, grad_facing = torch.empty_like(look), torch.empty_like(fill), torch.zeros_like(facing)
+        grad_brighter = torch.zeros_like(brighter)
         grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=device)
         grad_then = torch.zeros_like(then)
         grad_turn = torch.zeros_like(turn, dtype=torch.float64)
-        to_clip, to_look = _array(grad_clip, wp.vec3d), _array(grad_look, vec8)
+        to_clip, to_look = _array(grad_clip, wp.vec3d), _array(grad_look, vec9)
         through = [
             *(*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(grad_colour, wp.vec4f)),
             *(_array(grad_opacity), _array(grad_mesh, wp.vec4f), _array(grad_halo, wp.vec4f)),
@@ -1458,13 +1508,13 @@ class Photographed(torch.autograd.Function):
         shades = _shade_inputs(s, table, nearest, coverage, look)
         spread = [
             *_outline(s, table, coverage),
-            _array(found, vec8),
-            _array(kept, vec8),
+            _array(found, vec9),
+            _array(kept, vec9),
             to_look,
             _array(grad_coverage),
         ]
-        looked = _look_inputs((table, s.fragments.face, clip, facing, s.base_clip, s.base, s.faces))
-        looked += [_array(found, vec8), to_look, to_clip, _array(grad_facing)]
+        looked = _look_inputs((table, s.fragments.face, clip, facing, brighter, s.base_clip, s.base, s.faces))
+        looked += [_array(found, vec9), to_look, to_clip, _array(grad_facing), _array(grad_brighter)]
         shadowed = [*_shadow_inputs(s, ground_table, then), _vec3(grad_shadow)]
         shadowed.append(_array(grad_then, wp.mat33d))
 
@@ -1480,7 +1530,8 @@ class Photographed(torch.autograd.Function):
                 return
             if ctx.painted is None:
                 combine(start, end)
-            grad_fill[first:last].zero_()
+            if ctx.painted is None:
+                grad_fill[first:last].zero_()
             need = ctx.needs[start]
             if need.numel():
                 inputs = [
@@ -1497,7 +1548,7 @@ class Photographed(torch.autograd.Function):
                 to_look,
             ]
             launch(shade_backward_kernel, [first, last], inputs, (), device)
-            inputs = [_array(s.fragments.face), _array(coverage), to_look, _array(kept, vec8)]
+            inputs = [_array(s.fragments.face), _array(coverage), to_look, _array(kept, vec9)]
             launch(keep_kernel, [first, last], inputs, (), device)
             launch(fill_backward_kernel, [first, last], spread, (), device)
             launch(look_backward_kernel, [first, last], looked, (), device)
@@ -1506,12 +1557,16 @@ class Photographed(torch.autograd.Function):
         if ctx.painted is not None:
             combine(0, len(parts.pixels) - 1)
             leaves, painted = ctx.painted
-            grad_mesh, grad_halo, more, grad_code = torch.autograd.grad(painted, leaves, (grad_mesh, grad_halo))
+            grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
+                painted, leaves, (grad_mesh, grad_halo), allow_unused=True
+            )
+            grad_fill.copy_(torch.zeros_like(fill) if to_fill is None else to_fill)
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
             grad_look += more
         share(work, parts.edges)
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
-        return grad_clip.to(clip.dtype), grad_facing, grad_coverage, grad_yaw, grad_then, grad_code, None
+        to_place = grad_clip.to(clip.dtype), grad_facing, grad_brighter
+        return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, None
 
 
 def _table_like(layout: Layout, device: torch.device) -> Tensor:
@@ -1527,7 +1582,7 @@ def _shade_inputs(s: Setting, table: Tensor, nearest: Tensor, coverage: Tensor, 
     texels, rects, offsets = s.texels
     return [
         *(_array(table, wp.vec4i), _array(s.fragments.face), _array(coverage), _array(nearest)),
-        *(_array(texels, vec8), _array(rects), _array(offsets), _array(s.frame_wh, wp.vec2f), _array(look, vec8)),
+        *(_array(texels, vec8), _array(rects), _array(offsets), _array(s.frame_wh, wp.vec2f), _array(look, vec9)),
     ]
 
 
@@ -1542,16 +1597,16 @@ def _complete_inputs(
     fill: Tensor,
 ) -> list:
     view, meshes = View(), Meshes()
-    view.turn, view.sun, view.tint = _field(turn, wp.vec2f), _field(s.sun, wp.vec3f), _field(s.tint, wp.vec3f)
+    view.turn, view.sun = _field(turn, wp.vec2f), _field(s.sun, wp.vec4f)
     view.frame_wh, view.unproject = _field(s.frame_wh, wp.vec2f), _field(s.unproject, wp.mat33f)
     meshes.table, meshes.rects = _field(table, wp.vec4i), _field(s.fragments.layout.rects)
     meshes.face, meshes.coverage = _field(s.fragments.face), _field(coverage)
     meshes.clip, meshes.faces = _field(clip, wp.vec3f), _field(s.faces, wp.vec3i)
-    meshes.attributes = _field(s.own, vec13)
+    meshes.attributes = _field(s.own, vec17)
     texels, rects, offsets = s.texels
     return [
         *(_array(need), _array(texels, vec8), _array(rects), _array(offsets), view, meshes),
-        *(_array(look, vec8), _array(fill)),
+        *(_array(look, vec9), _array(fill)),
     ]
 
 
@@ -1560,7 +1615,7 @@ def _combine_inputs(
 ) -> list:
     return [
         *(_array(s.fragments.face), _array(nearest), _array(coverage), _array(mesh, wp.vec4f)),
-        *(_array(halo, wp.vec4f), _array(look, vec8)),
+        *(_array(halo, wp.vec4f), _array(look, vec9)),
     ]
 
 
@@ -1572,8 +1627,9 @@ def adjoints_kernel(out: wp.array(dtype=wp.float32)):
     xy = wp.vec2f(0.0, 0.0)
     c = wp.vec3f(0.0, 0.0, 0.0)
     g = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    out[0] = mesh_loss(a, a, xy, xy, g, 0.0) + halo_loss(a, a, xy, xy, g) + border_loss(xy, xy)
-    out[1] = completed_loss(vec13(), 0.0, a, xy, c, c, c, xy, c) + mirror_loss(vec13(), xy)
+    b = vec9()
+    out[0] = mesh_loss(b, a, xy, xy, g, 0.0) + halo_loss(b, a, xy, xy, g) + border_loss(xy, xy)
+    out[1] = completed_loss(vec17(), 0.0, a, xy, c, g, xy, c) + mirror_loss(vec17(), xy)
 
 
 def _field(values: Tensor, dtype: Any = None) -> wp.array:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from drivesem.cli import main, parse
 from drivesem.config import DATASETS, DEMO, Derender, Edit, Render
@@ -20,8 +21,11 @@ from drivesem.data.registry import open_dataset
 from drivesem.edits import read_frame_edit
 from drivesem.scene_sheet import GAIN, PANEL_PX, scene_sheet
 from scene_ir import files
+from scene_ir.derender.silhouette import extent, placed, silhouettes
 from scene_ir.errors import RangeError
 from scene_ir.io import load_scene, save_scene
+from scene_ir.meshes.templates import template
+from scene_ir.types import Camera, Mesh
 
 KITTI = Path(__file__).parents[2].parent / "shared" / "data" / "kitti"
 
@@ -95,6 +99,8 @@ def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFix
         (["--root", "somewhere"], "--root"),
         (["--velodyne"], "--velodyne: expected --dataset kitti"),
         (["--device", "cuda"], "--device: expected cpu"),
+        (["--meshes", "."], "--meshes: expected a PHOTO or a --dataset"),
+        (["photo.png", "--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
         (["--dataset", "kitti", "--root", "nowhere"], "nowhere: expected a KITTI folder"),
         (["--dataset", "coco", "--root", "nowhere"], "nowhere"),
         (["--limit", "0"], "--limit"),
@@ -240,6 +246,42 @@ def test_frames_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert found["frames"]["000001"]["objects"] == 0
     assert main(["render", str(tmp_path / "B" / "000001")]) == 0
     assert np.array_equal(files.read_image(tmp_path / "B" / "000001" / "render.png"), image)
+
+
+def street_with(mesh: Mesh, root: Path) -> None:
+    """A KITTI folder with one picture of a flat red vehicle of this shape, labelled as a van."""
+    camera = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+    place, yaw, size = torch.tensor([0.5, 1.65, 12.0]), torch.tensor(0.3), torch.tensor([5.0, 1.7, 1.9])
+    mask = silhouettes([placed(mesh, place, yaw, size)], camera)[0]
+    rng = np.random.default_rng(3)
+    image = np.clip(120 + rng.normal(0, 12, (200, 480, 3)), 0, 255)
+    image[mask] = np.clip(np.array([190, 40, 40]) + rng.normal(0, 12, (int(mask.sum()), 3)), 0, 255)
+    files.write_png(root / "training" / "image_2" / "000000.png", image.astype(np.uint8))
+    x0, y0, x1, y1 = extent(mask)
+    label = f"Van 0 0 0.26 {x0} {y0} {x1 - 1} {y1 - 1} 1.7 1.9 5.0 0.5 1.65 12.0 0.3\n"
+    files.write_text(root / "training" / "label_2" / "000000.txt", label)
+    calibration = "P2: 380 0 239.5 0 0 380 88 0 0 0 1 0\n"
+    files.write_text(root / "training" / "calib" / "000000.txt", calibration)
+
+
+@pytest.mark.slow
+def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shape = template("pickup")
+    street_with(shape, tmp_path / "D")
+    (tmp_path / "meshes").mkdir()
+    metres = shape.vertices.numpy() * np.array([5.0, 1.7, 1.9])
+    turned = metres * np.array([1.0, -1.0, -1.0])
+    trimesh.Trimesh(turned, shape.faces.numpy(), process=False).export(tmp_path / "meshes" / "my-pickup.obj")
+    (tmp_path / "meshes" / "vehicles.yaml").write_text("my-pickup.obj: {front: +x, kind: van}\n")
+    words = ["derender", "--dataset", "kitti", "--root", str(tmp_path / "D"), "--workers", "1", "--fast"]
+    chosen = {}
+    for name, more in (("A", []), ("B", ["--meshes", str(tmp_path / "meshes")])):
+        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
+        chosen[name] = load_scene(tmp_path / name / "000000").provenance["objects[0].mesh"]
+    assert chosen["A"] != chosen["B"] == "my-pickup"
+    assert '"my-pickup"' in (tmp_path / "B" / "000000" / "scene.json").read_text()
+    said = fail([*words, "--out", str(tmp_path / "B")], capsys)
+    assert "other values of meshes" in said
 
 
 def test_points_are_kittis(tmp_path: Path) -> None:

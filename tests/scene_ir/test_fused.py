@@ -12,7 +12,7 @@ from torch import Tensor
 
 from scene_ir.compositor import Compositor, RenderSettings, render_batch, scene_to
 from scene_ir.ffd import from_symmetric
-from scene_ir.types import SceneIR
+from scene_ir.types import Crop, SceneIR
 
 PARAMETERS = ("translation", "yaw", "ffd", "texture_code", "weather", "foliage")
 VALUE, GRADIENT = 2e-4, 1e-4
@@ -114,6 +114,26 @@ def test_a_vehicle_that_the_photograph_never_showed(photographed: SceneIR) -> No
     check(hidden, values, ("translation", "yaw"))
 
 
+def with_regions(scene: SceneIR) -> SceneIR:
+    """The scene with a soft region of paint for all objects but the last."""
+    sources = list(scene.objects.source)
+    for i, source in enumerate(sources[:-1]):
+        h, w = source.foreground.values.shape[1:]
+        wave = 0.5 + 0.5 * torch.sin(torch.arange(w) / 3.0) * torch.cos(torch.arange(h) / 4.0)[:, None]
+        region = Crop(wave[None].to(scene.photograph), source.foreground.x0, source.foreground.y0)
+        sources[i] = replace(source, region=region)
+    return scene.with_objects(source=tuple(sources))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_codes_recolour_regions_of_paint(photographed: SceneIR, spread: float) -> None:
+    scene = with_regions(scene_to(photographed, torch.float32))
+    active = ("translation", "yaw", "texture_code")
+    values = draws(scene, 6, spread, active)
+    values["texture_code"] = draws(scene, 6, 1.0, active)["texture_code"]
+    check(scene, values, active)
+
+
 def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> None:
     scene = scene_to(photographed, torch.float32)
     fewer = scene.with_objects(**{
@@ -121,7 +141,7 @@ def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> N
         for n in ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d",
                   "truncation", "occlusion")
     }, source=scene.objects.source[:2])  # fmt: skip
-    first, second = Compositor(scene), Compositor(fewer)
+    first, second = Compositor(scene), Compositor(with_regions(fewer))
     kinds: list[tuple[Compositor, SceneIR, tuple[str, ...]]] = [
         (first, scene, ("translation", "yaw", "ffd")),
         (second, fewer, ("yaw", "texture_code", "weather")),

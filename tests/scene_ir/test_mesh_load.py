@@ -187,19 +187,37 @@ def test_parts_named_front_decide_over_the_outline(tmp_path: Path) -> None:
     assert float(mesh.vertices[mesh.vertices[:, 1] < -0.99][:, 0].mean()) > 0.1
 
 
-@pytest.mark.parametrize("end", [1.0, -1.0])
-def test_windows_at_one_end_only_are_a_cabs(tmp_path: Path, end: float) -> None:
+def lorry(folder: Path, end: float, windows: str) -> Mesh:
+    """A lorry, read from a file, whose lower cab is at this end: as cars are, by its outline it would look the
+    other way. windows: the name of the cab's panes."""
     scene = trimesh.Scene()
     for name, extents, centre in (
-        ("cargo", (2.4, 2.5, 6.0), (0.0, 2.0, -1.0 * end)),
-        ("cab", (2.3, 1.6, 1.5), (0.0, 1.5, 3.0 * end)),
-        ("glass", (2.0, 0.8, 0.1), (0.0, 2.4, 3.7 * end)),
+        ("cargo", (2.4, 1.6, 6.0), (0.0, 1.6, -1.0 * end)),
+        ("cab", (2.3, 2.9, 1.5), (0.0, 1.75, 3.0 * end)),
+        (windows, (2.0, 0.8, 0.1), (0.0, 2.4, 3.7 * end)),
     ):
         box = trimesh.creation.box(extents=extents, transform=trimesh.transformations.translation_matrix(centre))
         scene.add_geometry(box, geom_name=name, node_name=name)
-    scene.export(tmp_path / "lorry.glb")
-    mesh = load_mesh(tmp_path / "lorry.glb")
+    scene.export(folder / "lorry.glb")
+    return load_mesh(folder / "lorry.glb")
+
+
+def cab_side(mesh: Mesh) -> float:
+    """Where along the vehicle what is highest lies: the cab."""
+    return float(mesh.vertices[mesh.vertices[:, 1] < -0.9][:, 0].mean())
+
+
+@pytest.mark.parametrize("end", [1.0, -1.0])
+def test_windows_at_one_end_only_are_a_cabs(tmp_path: Path, end: float) -> None:
+    mesh = lorry(tmp_path, end, "glass")
+    assert cab_side(mesh) > 0.3
     assert mesh.vertices[mesh.faces[mesh.part == Part.GLASS]][..., 0].mean() > 0.3
+
+
+@pytest.mark.parametrize("end", [1.0, -1.0])
+def test_without_windows_a_lorry_is_taken_for_a_car_and_looks_backwards(tmp_path: Path, end: float) -> None:
+    # what makes the test above one: nothing but the windows tells where this lorry's cab is
+    assert cab_side(lorry(tmp_path, end, "panel")) < -0.3
 
 
 @pytest.mark.parametrize("name", ["sedan", "garbage-truck", "ambulance"])

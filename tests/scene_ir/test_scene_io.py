@@ -35,8 +35,21 @@ def rich_scene(seed: int = 0, count: int = 2, **changes: Any) -> SceneIR:
         Mesh(rand(3, 3), torch.tensor([[0, 1, 2]]), torch.tensor([4])),
     )
     source = tuple(
-        Source(rand(3), rand(1)[0], rand(3), rand(64, 3), Crop(rand(4, 3, 5), 2, 1), shadow, 0.07 + i, rand(3))
-        for i, shadow in zip(range(count), (Crop(rand(3, 4, 2), 0, 6), None), strict=False)
+        Source(
+            rand(3),
+            rand(1)[0],
+            rand(3),
+            rand(64, 3),
+            Crop(rand(4, 3, 5), 2, 1),
+            shadow,
+            0.07 + i,
+            rand(3),
+            0.3 + i,
+            region,
+        )
+        for i, shadow, region in zip(
+            range(count), (Crop(rand(3, 4, 2), 0, 6), None), (None, Crop(rand(1, 3, 5), 2, 1)), strict=False
+        )
     )
     objects = Objects(
         mesh_index=torch.arange(count) % 2,
@@ -235,7 +248,7 @@ BAD = [
     ("damaged", damaged, r"arrays\.npz: expected an NPZ"),
     ("list", lambda f: (f / "scene.json").write_text("[]"), r"scene\.json: expected an object, found list"),
     ("schema", edit("schema", value="other"), r"scene\.json: schema: expected 'drivesem\.scene', found 'other'"),
-    ("version", edit("version", value=99), r"scene\.json: version: expected 1, found 99"),
+    ("version", edit("version", value=99), r"scene\.json: version: expected 2, found 99"),
     (
         "missing",
         edit("camera", "intrinsics"),

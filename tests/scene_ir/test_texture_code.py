@@ -108,11 +108,11 @@ def test_any_code_gives_finite_colours_and_gradients(code: list[float]) -> None:
 def test_seen_weights_are_exactly_one_where_nothing_turned() -> None:
     cos = torch.linspace(-1, 1, 41, dtype=torch.float64, requires_grad=True)
     turned = torch.zeros(41, dtype=torch.float64, requires_grad=True)
-    weight = texture.facing_weight(turned, cos)
+    weight = texture.facing_weight(turned, cos, torch.ones_like(cos))
     assert torch.equal(weight, torch.ones_like(weight))
     slopes = torch.autograd.grad(weight.sum(), [turned, cos])
     assert all(torch.equal(s, torch.zeros_like(s)) for s in slopes)
-    hidden_side = texture.facing_weight(torch.tensor([0.6]), torch.tensor([-0.4]))
+    hidden_side = texture.facing_weight(torch.tensor([0.6]), torch.tensor([-0.4]), torch.tensor([0.0]))
     assert float(hidden_side) == 0.0
 
 
@@ -149,6 +149,34 @@ def test_shade_is_brighter_towards_the_sun_and_in_range() -> None:
     assert 0.0 <= float(lit.min()) <= float(lit.max()) <= 1.0
     towards = (normal * sun).sum(-1)
     assert float(lit[towards > 0.5].mean()) > 1.3 * float(lit[towards < -0.3].mean())
+
+
+def test_relit_is_the_same_bits_where_nothing_turned() -> None:
+    rgb = torch.rand(50, 3, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(texture.relit(rgb, torch.zeros(50)), rgb)
+    bright = texture.relit(rgb, torch.full((50,), 0.2))
+    assert bool((bright >= rgb).all())
+    assert float((bright - rgb).max()) < 0.1
+    ratio = torch.linspace(-0.9, 4.0, 60, dtype=torch.float64, requires_grad=True)
+    paint = torch.linspace(0, 1, 60, dtype=torch.float64)
+    share = texture.brightened(ratio, paint)
+    assert float(share.detach().abs().max()) <= texture.RELIT_MOST
+    assert torch.autograd.gradcheck(lambda r: texture.brightened(r, paint), (ratio,))
+
+
+def test_paint_share_is_the_region_where_it_was_seen() -> None:
+    mesh, region = torch.tensor([1.0, 0.0, 0.6, 0.2]), torch.tensor([0.3, 0.9, 0.0, 0.0])
+    unseen, known = torch.tensor([0.0, 0.5, 0.0, 1.0]), torch.tensor([True, True, False, True])
+    share = texture.paint_share(mesh, region, unseen, known)
+    assert share.tolist() == pytest.approx([0.3, 0.45, 0.6, 0.2])
+
+
+def test_finished_stays_in_gamut_and_keeps_black_lifted() -> None:
+    light = torch.linspace(0, 3, 20)[:, None].expand(20, 3)
+    shown = texture.finished(light, torch.full((20, 3), 1.5), torch.full((20, 1), 0.1))
+    assert float(shown[0].max()) == pytest.approx(0.1)
+    assert bool((shown.diff(dim=0) > 0).all())
+    assert float(shown.max()) < 1.0
 
 
 def test_smoothstep_is_flat_outside_and_has_its_gradient() -> None:

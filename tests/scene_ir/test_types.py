@@ -50,6 +50,7 @@ def source(**changes: Any) -> Source:
         "shadow": Crop(torch.ones(3, 2, 3), 0, 0),
         "inflation": 0.1,
         "paint": torch.zeros(3),
+        "sunlight": 0.5,
     }
     return Source(**{**values, **changes})
 

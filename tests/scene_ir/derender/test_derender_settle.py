@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from scene_ir.derender import settle as settle_module
 from scene_ir.derender import silhouette
 from scene_ir.derender.settle import SettleSettings, settle
 from scene_ir.derender.silhouette import Boxes, Placement
@@ -40,12 +41,37 @@ def test_a_label_that_is_off_comes_to_fill_its_box():
     assert np.abs(np.array(box_of(seen(found))) - box_of(target)).max() <= 1.5
 
 
-def test_a_car_that_the_image_cuts_fills_what_is_left_of_its_box():
-    truth, start = car(-3.2, 5.2, 0.3), car(-3.05, 5.3, 0.36, (4.15, 1.43, 1.75))
+CUT = {"left": (-3.2, 5.2, 0.3), "right": (3.4, 5.2, 0.3), "below": (0.4, 3.6, 0.9), "nearest": (-2.1, 2.6, 0.2)}
+
+
+@pytest.mark.parametrize("where", CUT)
+def test_a_car_that_the_image_cuts_fills_what_is_left_of_its_box(where: str):
+    x, z, yaw = CUT[where]
+    truth, start = car(x, z, yaw), car(x + 0.15, z + 0.1, yaw + 0.06, (4.15, 1.43, 1.75))
     target = seen(truth)
-    assert target[:, 0].any()
-    found = settled(start, box_of(target), (0.0, 1.0, 1.0, 1.0))
-    assert silhouette.iou(seen(found), target) > silhouette.iou(seen(start), target) + 0.02
+    borders = np.array([target[:, 0].any(), target[0].any(), target[:, -1].any(), target[-1].any()])
+    assert borders.any()
+    trust = tuple(np.where(borders, 0.0, 1.0).tolist())
+    found = settled(start, box_of(target), trust)
+    assert silhouette.iou(seen(found), target) > silhouette.iou(seen(start), target) + 0.01
+    apart = np.abs(np.array(box_of(seen(found))) - box_of(target))
+    assert apart[~borders].max(initial=0) <= 2.5
+
+
+@pytest.mark.parametrize("where", CUT)
+def test_what_lies_beyond_the_border_is_cut_off_and_not_squeezed(where: str):
+    # the box of what shows, found by cutting edges, is that of the drawn pixels
+    placement = car(*CUT[where])
+    corners = placement.vertices().double().numpy()
+    clip = CAMERA.matrix.double().numpy() @ np.concatenate([corners.T, np.ones((1, len(corners)))])
+    faces = placement.mesh.faces.numpy()
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    found = settle_module._extent(clip, edges, CAMERA, np.zeros(4))
+    shown = np.array(box_of(seen(placement)))
+    assert np.abs(found - np.clip(shown, 0, [479, 199, 479, 199])).max() <= 1.5
+    assert ((found >= -1e-6) & (found <= np.array([479, 199, 479, 199]) + 1e-6)).all()
+    whole = clip[:2] / np.maximum(clip[2], 0.5)
+    assert (whole.min(1) < -5).any() or (whole.max(1) > np.array([484, 204])).any()
 
 
 @pytest.mark.parametrize("trust", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0, 1.0)])

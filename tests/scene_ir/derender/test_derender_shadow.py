@@ -54,10 +54,18 @@ def test_ground_view_knows_the_footprints_corners_and_middle():
     assert np.isinf(ground.distance[:88]).all()
 
 
+def found_in(
+    light: shadow.Light, sun: torch.Tensor, allowed: np.ndarray = ROAD > 0.5, pixels: np.ndarray | None = None
+) -> np.ndarray:
+    """The car's shadow when the sun is known."""
+    cast = shadow.cast(CAR, view(), sun)
+    return shadow.find(light, vehicle() if pixels is None else pixels, [view()], [allowed], [cast])[0][0]
+
+
 def test_a_shadow_is_found_and_the_lit_road_is_not():
     image, factor = shaded(toward(0.6, 0.0))
     light = shadow.light(image, ROAD, vehicle(), [view()])
-    found = shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0]
+    found = found_in(light, toward(0.6, 0.0))
     visible = ~vehicle() & (view().distance < 2.4)
     assert found[visible & (factor < 0.5)].mean() > 0.95
     assert found[visible & (factor > 0.95)].mean() < 0.02
@@ -69,7 +77,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
     image[:, :260] *= 0.4
     image[92:110] *= 2.5
     light = shadow.light(np.clip(image, 0, 1), ROAD, vehicle(), [view()])
-    found = shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0]
+    found = found_in(light, toward(0.0, 0.0))
     shade = (view().distance > 1.2) & (view().distance < 2.0) & ~vehicle()
     shade[:, 250:] = False
     assert found[shade].mean() < 0.15
@@ -98,6 +106,42 @@ def test_reach_of_the_renderers_patch():
     assert not reach[ground.distance > 3.5].any()
 
 
+def test_a_low_suns_shadow_is_found_to_its_end():
+    sun = toward(-1.7, 0.3)
+    image, factor = shaded(sun)
+    light = shadow.light(image, ROAD, vehicle(), [view()])
+    estimate = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
+    azimuths = [float(torch.atan2(s[2], s[0])) for s in (estimate, sun)]
+    assert abs(np.remainder(azimuths[0] - azimuths[1] + np.pi, 2 * np.pi) - np.pi) < 0.2
+    found = found_in(light, sun)
+    far = (factor < 0.75) & ~vehicle() & (view().distance > 1.3)
+    assert np.count_nonzero(far) > 200
+    assert found[far].mean() > 0.9
+
+
+def test_dark_ground_beyond_reach_counts_and_vanishes_with_longer_shadows():
+    sun = toward(-1.8, 0.0)
+    image, _ = shaded(sun)
+    light = shadow.light(image, ROAD, vehicle(), [view()])
+    beyond = []
+    for factor in (0.15, 1.0):
+        lower = shadow.stretched(sun, factor)
+        assert float(lower[0] / lower[1]) == pytest.approx(factor * float(sun[0] / sun[1]), rel=1e-5)
+        allowed = shadow.reachable(CAR, view(), lower)
+        casts = [shadow.cast(CAR, view(), lower)]
+        beyond.append(shadow.find(light, vehicle(), [view()], [allowed], casts)[1])
+    assert beyond[0] > 50
+    assert beyond[1] == 0
+
+
+def test_the_cast_is_the_renderers_and_ends_where_its_patch_does():
+    sun = toward(0.6, 0.2)
+    cast, (_, factor) = shadow.cast(CAR, view(), sun), shaded(sun)
+    inside = shadow.reachable(CAR, view(), sun)
+    assert not cast[~inside].any()
+    assert cast[inside] == pytest.approx((1 - factor[inside]) / 0.8, abs=1e-4)
+
+
 def test_factors_darken_only_in_their_region():
     image = np.full((4, 5, 3), 0.2, np.float32)
     background = np.full((4, 5, 3), 0.5, np.float32)
@@ -120,5 +164,5 @@ def test_what_is_known_to_be_behind_a_car_tells_a_dark_strip_from_its_shadow():
     )
     dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (view().distance < 2.4)
     assert np.count_nonzero(dark) > 50
-    wrong, right = (shadow.find(light, vehicle(), [view()], [ROAD > 0.5])[0] for light in (plain, told))
+    wrong, right = (found_in(light, toward(0.6, 0.0)) for light in (plain, told))
     assert right[dark].mean() < 0.1 < wrong[dark].mean()

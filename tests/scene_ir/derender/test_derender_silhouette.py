@@ -73,6 +73,29 @@ def test_templates_by_type_and_proportion(kind, size, first):
     assert silhouette.candidates(kind, size)[0] == first
 
 
+@pytest.mark.parametrize(
+    ("kind", "size", "withheld"),
+    [("Car", (4.5, 1.45, 1.8), "sedan"), ("Van", (5.5, 2.6, 2.0), "van"), ("Truck", (8.0, 3.2, 2.5), "truck")],
+)
+def test_a_kind_that_is_withheld_is_no_candidate(kind, size, withheld):
+    assert withheld in silhouette.candidates(kind, size)
+    left = silhouette.candidates(kind, size, withheld)
+    assert left
+    assert withheld not in left
+
+
+def test_a_users_meshes_are_tried_by_body_and_size():
+    mesh = silhouette.placed("van", torch.zeros(3), torch.tensor(0.0), torch.ones(3)).mesh
+    lengths = (4.0, 4.4, 3.6, 4.8, 5.2, 3.2, 4.2, 4.1)
+    own = [silhouette.OwnMesh(replace(mesh, name=f"own {x}"), "sedan", (x, 1.5, 1.7)) for x in lengths]
+    lorry = silhouette.OwnMesh(replace(mesh, name="lorry"), "truck", (4.0, 1.5, 1.7))
+    chosen = silhouette.own_candidates("Car", (4.05, 1.5, 1.7), [lorry, *own])
+    assert [m.name for m in chosen[:3]] == ["own 4.1", "own 4.0", "own 4.2"]
+    assert len(chosen) == 6
+    assert [m.name for m in silhouette.own_candidates("Truck", (8.0, 3.0, 2.5), [lorry, *own])] == ["lorry"]
+    assert silhouette.own_candidates("Van", (4.05, 1.5, 1.7), [lorry, *own]) == ()
+
+
 def test_fit_finds_a_pose_that_is_off():
     truth, start = car(), car(x=0.65, yaw=0.57)
     target = outline(truth)

@@ -1,0 +1,220 @@
+"""What stands behind the cars: columns of the same photograph, moved sideways.
+
+Walls, hedges and fences go on beside a car. Each hidden column copies another one, whole from the hole's upper
+edge down to its foot, so what stands stays upright and sharp; columns next to each other copy neighbours unless a
+seam is cheap. Of all choices dynamic programming takes the best (shift-maps, Pritch et al., ICCV 2009, with one
+seam per column). Copies grow and shrink with their foot's distance from the horizon, as walls along a road do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from scene_ir.derender.background import mean_inside
+from scene_ir.derender.street import Continued
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.float64]
+_AREA = cv2.INTER_AREA
+
+
+@dataclass(frozen=True, slots=True)
+class UprightSettings:
+    """scale: of the photograph at which columns are compared. In px of that size: reach_px, step_px: shifts that
+    are tried; ring_px: what is known so near to the hole must agree with what is known beside the copy; guess_px:
+    blur at which a copy is held against the guide. Weights of squared differences of colour, one pixel's at most
+    `most` (`most_ring` in the ring): ring_weight, guess_weight, seam_weight. far: cost of a shift by 100 px, per
+    pixel, in units of `most`. jump: cost of a seam; again, again_px: how often it counts between shifts that are
+    nearly the same, and how nearly: such seams show the same thing twice. settle, settle_px: how much of the
+    copy's mean colour is brought to the guide's, over which distance in px of the photograph.
+    """
+
+    scale: float = 0.5
+    reach_px: int = 220
+    step_px: int = 2
+    ring_px: int = 7
+    guess_px: float = 5.0
+    most: float = 0.06
+    most_ring: float = 0.25
+    ring_weight: float = 3.0
+    guess_weight: float = 3.0
+    seam_weight: float = 1.0
+    far: float = 0.4
+    jump: float = 5.0
+    again: float = 6.0
+    again_px: float = 40.0
+    settle: float = 0.5
+    settle_px: float = 10.0
+
+
+_LEAST_SHIFT_PX = 4
+"""Smaller shifts only smear."""
+_SAMPLES = 16
+"""Heights at which two copies of a column are compared."""
+_LEAST_HEIGHT_PX = 5.0
+"""Of a foot below the horizon: what is farther keeps its size."""
+_LEAST_RATIO, _MOST_RATIO = 0.7, 1.45
+"""Of a source's size to its copy's: more would blur, or show another street."""
+_FOOT_PX = 12.0
+"""Feet are smoothed so far along the street: their noise must not shake what stands on them."""
+_BAD = 4.0
+"""Cost, in units of `most`, of a pixel that must not be copied."""
+
+
+@dataclass(frozen=True, slots=True)
+class Copied:
+    """image (H, W, 3) with what was copied; done (H, W): those pixels."""
+
+    image: Image
+    done: Mask
+
+
+def copied(
+    image: Image,
+    hole: Mask,
+    forbidden: Mask,
+    guide: Continued,
+    horizon: float,
+    settings: UprightSettings | None = None,
+) -> Copied:
+    """The image with the upright part of the hole copied from columns beside it.
+
+    image (H, W, 3) in [0, 1]; hole, forbidden (H, W): what to fill, and what must not be copied: ground, other
+    vehicles, the hole; guide: roughly what is to be seen, and where ground is; horizon: its row, px. Pixels that
+    the best columns do not show are left to others.
+    """
+    settings = settings or UprightSettings()
+    hole = hole & ~guide.ground
+    height, width = hole.shape
+    size = (max(round(width * settings.scale), 1), max(round(height * settings.scale), 1))
+    small = cv2.resize(hole.astype(np.float32), size, interpolation=_AREA) > 0.3
+    if not small.any():
+        return Copied(image.copy(), np.zeros_like(hole))
+    heights = _heights(guide.foot, horizon)
+    shifts = _Search(image, small, forbidden, guide.image, (heights, horizon), settings).best()
+    place = np.minimum((np.arange(width) * settings.scale).astype(np.int64), shifts.size - 1)
+    moved = np.isfinite(shifts[place])
+    where = np.arange(width) + np.where(moved, np.rint(shifts[place] / settings.scale), 0)
+    ratio = _ratio(heights, np.arange(width), where)
+    u = np.ascontiguousarray(np.broadcast_to(where.astype(np.float32), (height, width)))
+    v = (horizon + (np.arange(height)[:, None] - horizon) * ratio).astype(np.float32)
+    copy = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    blocked = forbidden.astype(np.float32)
+    bad = cv2.remap(blocked, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1.0,))
+    done = hole & (bad < 0.01) & moved
+    copy = copy + settings.settle * mean_inside(guide.image - copy, done, settings.settle_px)
+    return Copied(np.where(done[..., None], np.clip(copy, 0, 1), image).astype(np.float32), done)
+
+
+def _heights(foot: Rows, horizon: float) -> Rows:
+    """Heights (W,) px from the horizon down to the foot, smooth."""
+    return np.maximum(gaussian_filter1d(foot, _FOOT_PX, mode="nearest") - horizon, _LEAST_HEIGHT_PX)
+
+
+def _ratio(heights: Rows, columns: NDArray[np.int64], where: Rows) -> Rows:
+    """Size of the source against its copy's."""
+    source = np.interp(where, np.arange(heights.size), heights)
+    return np.clip(source / heights[columns], 1 / _MOST_RATIO, 1 / _LEAST_RATIO)
+
+
+class _Search:
+    """The shift of each column at the size at which columns are compared."""
+
+    def __init__(
+        self,
+        image: Image,
+        hole: Mask,
+        forbidden: Mask,
+        guide: Image,
+        street: tuple[Rows, float],
+        settings: UprightSettings,
+    ) -> None:
+        """hole (h, w): at the smaller size; all else of the photograph's; street: heights of the feet, horizon."""
+        self.settings, self.hole = settings, hole
+        height, width = hole.shape
+
+        def small(values: Image) -> Image:
+            return np.asarray(cv2.resize(values, (width, height), interpolation=_AREA), np.float32)
+
+        self.image, self.guide = small(image), small(guide)
+        self.forbidden = small(forbidden.astype(np.float32)) > 0
+        heights, horizon = street
+        self.horizon = horizon * settings.scale
+        columns = (np.arange(width) + 0.5) / settings.scale
+        self.heights = np.interp(columns, np.arange(heights.size), heights) * settings.scale
+        reach = np.ones((2 * settings.ring_px + 1, 2 * settings.ring_px + 1), np.uint8)
+        above_foot = np.arange(height)[:, None] < self.horizon + self.heights
+        self.ring = (cv2.dilate(hole.astype(np.uint8), reach) > 0) & ~self.forbidden & above_foot
+        self.smooth = mean_inside(self.image, ~self.forbidden, settings.guess_px)
+        shifts = np.arange(-settings.reach_px, settings.reach_px + 1, settings.step_px)
+        self.shifts = shifts[np.abs(shifts) >= _LEAST_SHIFT_PX]
+
+    def best(self) -> Rows:
+        """Shifts (w,) px of this size; nan in columns without a hole."""
+        chosen = np.full(self.hole.shape[1], np.nan)
+        columns = np.flatnonzero(self.hole.any(0))
+        costs, looks = self._costs(columns)
+        pixels = self.hole.sum(0).astype(np.float32)[columns]
+        for run in np.split(np.arange(columns.size), np.flatnonzero(np.diff(columns) > 1) + 1):
+            chosen[columns[run]] = self.shifts[self._path(costs[run], looks[run], pixels[run])]
+        return chosen
+
+    def _costs(self, columns: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Cost (columns, shifts) of each copy, and its colours (columns, shifts, samples * 3)."""
+        settings = self.settings
+        used = np.flatnonzero((self.hole | self.ring)[:, columns].any(1))
+        rows = np.arange(used[0], used[-1] + 1)
+        part = np.ix_(rows, columns)
+        hole, ring, image, guide = self.hole[part], self.ring[part], self.image[part], self.guide[part]
+        height, width = self.hole.shape
+        top, last = hole.argmax(0), len(rows) - 1 - hole[::-1].argmax(0)
+        sample = np.rint(top + (last - top) * np.linspace(0, 1, _SAMPLES)[:, None]).astype(np.int64)
+        costs = np.empty((columns.size, self.shifts.size), np.float32)
+        looks = np.empty((columns.size, self.shifts.size, _SAMPLES * 3), np.float32)
+        for k, shift in enumerate(self.shifts.tolist()):
+            where = columns + shift
+            ratio = _ratio(self.heights, columns, where.astype(np.float64))
+            v = np.rint(self.horizon + (rows[:, None] - self.horizon) * ratio).astype(np.int64)
+            u = np.broadcast_to(where, v.shape)
+            outside = (v < 0) | (v >= height) | (u < 0) | (u >= width)
+            v, u = v.clip(0, height - 1), u.clip(0, width - 1)
+            found, bad = self.image[v, u], self.forbidden[v, u] | outside
+            apart = np.minimum(((found - image) ** 2).sum(-1), settings.most_ring)
+            cost = settings.ring_weight * np.where(bad, settings.most, apart) * ring
+            guess = np.minimum(((self.smooth[v, u] - guide) ** 2).sum(-1), settings.most)
+            far = settings.far * abs(shift) / 100 * settings.most
+            cost = cost + (settings.guess_weight * guess + _BAD * settings.most * bad + far) * hole
+            costs[:, k] = cost.sum(0)
+            looks[:, k] = found[sample, np.arange(columns.size)].transpose(1, 0, 2).reshape(columns.size, -1)
+        return costs, looks
+
+    def _path(
+        self, costs: NDArray[np.float32], looks: NDArray[np.float32], pixels: NDArray[np.float32]
+    ) -> NDArray[np.int64]:
+        """Index of each column's shift: least sum of costs and seams. pixels: of the hole in each column."""
+        settings = self.settings
+        apart = np.abs(self.shifts[:, None] - self.shifts[None])
+        jump = settings.jump * (1 + settings.again * np.exp(-apart / settings.again_px))
+        total = costs[0]
+        back = np.zeros(costs.shape, np.int64)
+        stay = np.arange(total.size)
+        for column in range(1, len(costs)):
+            look = looks[column]
+            square = (look * look).sum(1)
+            apart = (square[:, None] + square[None] - 2 * look @ look.T).clip(0) / _SAMPLES
+            seam = settings.seam_weight * np.minimum(apart, settings.most) * pixels[column] + jump
+            seam[stay, stay] = 0
+            reached = total[:, None] + seam
+            back[column] = reached.argmin(0)
+            total = reached[back[column], stay] + costs[column]
+        path = np.empty(len(costs), np.int64)
+        path[-1] = total.argmin()
+        for column in range(len(costs) - 1, 0, -1):
+            path[column - 1] = back[column, path[column]]
+        return path

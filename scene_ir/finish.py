@@ -1,0 +1,199 @@
+"""The finish of a vehicle beside its template's: what the photograph shows of the surface, carried on to the rest.
+
+Where a template has to stand for what was never seen, its colours in daylight are multiplied by a *gain* a vertex:
+photograph over template, as seen nearby on the same part, fading into the part's own mean. So the template goes on
+where the photograph ends, in the vehicle's own paint, glass and rubber, and in the photograph's own light.
+
+Shapes: K samples, pixels that show the surface; V vertices of one object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+import scipy.spatial
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_ir import texture
+from scene_ir.surfaces import Surface
+from scene_ir.types import Part
+
+Array = NDArray[np.float64]
+
+_LEAST_GAIN = 0.03
+"""Of any part, by night."""
+_MOST_GAIN = (3.0, 1.4)
+"""Of paint, whose colour is the vehicle's own, and of all else, whose colour the template knows but for the
+light."""
+_DARK_SHARE = 0.05
+"""Share of a vehicle that is as dark as its darkest parts: tyres, grilles and gaps are on all sides."""
+_MOST_LIFT = 0.25
+_STRENGTHS = np.linspace(0.0, 2.4, 13)
+"""Of the sun; with the largest, a side that faces it gets six times the light of one that does not."""
+_SIDES, _UNEVEN, _UNSURE = 10.0, 0.25, 0.3
+"""Independent samples that a car's paint is worth, their scatter about one colour (logarithm), and that of the
+expected strength."""
+_DARKEST, _BRIGHTEST = 0.02, 0.97
+"""Display values beyond which a template's or a photograph's colour says nothing of their ratio."""
+_PRIOR = 0.02
+"""Pull of a part's mean, beside a bond of 1 between neighbours: it is felt from about seven vertices on."""
+_MOST_SAMPLES = 4.0
+"""Samples of a vertex beyond which more add no weight: large panels would not bend at all."""
+_TWIN = 0.3
+"""Bond of a vertex to its twin on the other side: cars are symmetric, their light is not."""
+_FEWEST = 4.0
+"""Samples below which a part's mean is taken from all that is no paint, and the paint's from all of the car."""
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """What the photograph shows of one object. vertex (K, 3) int64, the corners of the triangle at each pixel, and
+    share (K, 3), how near it is to them; template, photograph (K, 3) RGB; sky, direct (K,): light on it by
+    `texture.daylight` without a sun, and what a sun of strength 1 adds; weight (K,) in [0, 1]."""
+
+    vertex: NDArray[np.int64]
+    share: Array
+    template: Array
+    photograph: Array
+    sky: Array
+    direct: Array
+    weight: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Web:
+    """A surface's vertices as nodes, one for each place and part. node (V,); part (M,); bonds: their Laplacian."""
+
+    node: NDArray[np.int64]
+    part: NDArray[np.int64]
+    bonds: scipy.sparse.csc_array
+
+
+def base_paint(surface: Surface, samples: Samples) -> Tensor | None:
+    """The paint (3,) RGB as the photograph shows it most: the median in CIE L*a*b*; None where it shows none."""
+    part = surface.part.cpu().numpy()
+    clear = (part[samples.vertex] == Part.PAINT).all(axis=1) & (samples.weight > 0.5)
+    if np.count_nonzero(clear) < _FEWEST:
+        return None
+    lab = texture.lab(torch.from_numpy(samples.photograph[clear]))
+    return texture.rgb_exact(lab.median(dim=0).values[None])[0].clamp(0.0, 1.0)
+
+
+def sunlight(surface: Surface, samples: Samples, expected: float) -> float:
+    """How strongly the sun lights the paint, as `texture.shade` counts it: the strength for which sides that face
+    it and others are of one colour, not far from the expected one."""
+    part = surface.part.cpu().numpy()
+    clear = (part[samples.vertex] == Part.PAINT).all(axis=1)
+    weight = samples.weight * clear
+    expected = float(np.clip(expected, 0.0, _STRENGTHS[-1]))
+    if weight.sum() < _FEWEST:
+        return expected
+    level = np.log(_light(samples.photograph.mean(axis=1)))
+    rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
+    mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
+    apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
+    cost = _SIDES * apart / _UNEVEN**2 + np.square((_STRENGTHS - expected) / _UNSURE)
+    return float(_STRENGTHS[int(cost.argmin())])
+
+
+def fitted(surface: Surface, samples: Samples) -> Array:
+    """For each vertex (V, 4) the gains (3) and the lift of `texture.finished`.
+
+    The lift is how bright the vehicle's darkest parts are, by haze and by what they mirror; paint has none.
+    """
+    web = _web(surface.weld, surface.faces, surface.part, surface.unit)
+    count = len(web.part)
+    lift = np.where(web.part == Part.PAINT, 0.0, _lift(surface, samples))
+    less = 1.0 - lift[web.node[samples.vertex[:, :1]]]
+    ratio = np.log(_light(1.0 - (1.0 - samples.photograph) / less) / np.maximum(samples.template, _DARKEST))
+    node = web.node[samples.vertex].reshape(-1)
+    share = (samples.weight[:, None] * samples.share).reshape(-1)
+    total = _summed(node, share, count)
+    mean = np.stack([_summed(node, share * ratio[:, c].repeat(3), count) for c in range(3)], axis=1)
+    mean /= np.maximum(total, 1e-9)[:, None]
+    most = np.log(np.where(web.part == Part.PAINT, *_MOST_GAIN))[:, None]
+    mean = np.clip(mean, np.log(_LEAST_GAIN), most)
+    data = np.minimum(total, _MOST_SAMPLES)
+    matrix = web.bonds + scipy.sparse.diags_array(data + _PRIOR)
+    known = data[:, None] * mean + _PRIOR * _priors(web.part, total, mean)
+    found = np.exp(scipy.sparse.linalg.splu(matrix.tocsc()).solve(known))[web.node]
+    return np.concatenate([found, lift[web.node, None]], axis=1)
+
+
+def _summed(node: NDArray[np.int64], values: Array, count: int) -> Array:
+    """The sum of values (L,) at each of `count` nodes (L,)."""
+    return np.bincount(node, values, count).astype(np.float64)
+
+
+def _light(display: Array) -> Array:
+    """The light that `texture.finished` shows as these display values."""
+    return -np.log(1.0 - np.clip(display, _DARKEST / 2, _BRIGHTEST))
+
+
+def _lift(surface: Surface, samples: Samples) -> float:
+    """How much brighter the darkest of the vehicle, paint apart, is than its template's darkest."""
+    part = surface.part.cpu().numpy()[samples.vertex[:, 0]]
+    clear = (samples.weight > 0.5) & (part != Part.PAINT)
+    if np.count_nonzero(clear) < _FEWEST:
+        return 0.0
+    dark, own = (np.quantile(v[clear].mean(axis=1), _DARK_SHARE) for v in (samples.photograph, samples.template))
+    return float(np.clip((dark - own) / (1.0 - own), 0.0, _MOST_LIFT))
+
+
+def _priors(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
+    """The logarithm (M, 3) of the gain that nodes of a part have by the median; of other parts' where it is
+    unseen."""
+    out = np.zeros((len(part), 3))
+    rest = _median(mean, total * (part != Part.PAINT))
+    for kind in np.unique(part):
+        mine = part == kind
+        own = total * mine
+        if own.sum() >= _FEWEST:
+            out[mine] = _median(mean, own)
+        elif kind == Part.PAINT:
+            out[mine] = _median(mean, total)
+        else:
+            # No colour of its own: as dark or bright as the rest.
+            out[mine] = rest.mean()
+    return out
+
+
+def _median(values: Array, weight: Array) -> Array:
+    """The weighted median (3,) of values (M, 3); 0 where there is no weight."""
+    if weight.sum() < _FEWEST:
+        return np.zeros(3)
+    order = np.argsort(values, axis=0, kind="stable")
+    running = np.cumsum(weight[order], axis=0)
+    place = (running < 0.5 * weight.sum()).sum(axis=0)
+    return np.take_along_axis(values, order, axis=0)[np.minimum(place, len(values) - 1), np.arange(3)]
+
+
+@lru_cache(maxsize=128)
+def _web(weld: Tensor, faces: Tensor, part: Tensor, unit: Tensor) -> _Web:
+    welded, kinds = weld.cpu().numpy(), part.cpu().numpy()
+    key, first, node = np.unique(welded * len(Part) + kinds, return_index=True, return_inverse=True)
+    count = len(key)
+    corners = node[faces.cpu().numpy()]
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges = np.unique(np.sort(edges[kinds[first][edges[:, 0]] == kinds[first][edges[:, 1]]], axis=1), axis=0)
+    # Twins: the vertex of the same part that is nearest to the mirrored place.
+    points = unit.double().cpu().numpy()[first]
+    twins = []
+    for kind in np.unique(kinds):
+        mine = np.flatnonzero(kinds[first] == kind)
+        tree = scipy.spatial.KDTree(points[mine])
+        twins.append(np.stack([mine, mine[tree.query(points[mine] * [1.0, 1.0, -1.0])[1]]], axis=1))
+    pairs = np.concatenate([edges, *twins])
+    bond = np.concatenate([np.ones(len(edges)), np.full(len(pairs) - len(edges), 0.5 * _TWIN)])
+    proper = pairs[:, 0] != pairs[:, 1]
+    pairs, bond = pairs[proper], bond[proper]
+    rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    joined = scipy.sparse.coo_array((np.tile(bond, 2), (rows, columns)), shape=(count, count)).tocsc()
+    return _Web(node, kinds[first], (scipy.sparse.diags_array(joined.sum(axis=1)) - joined).tocsc())

@@ -1,0 +1,155 @@
+"""Edges of meshes against edges of pictures."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import borders, silhouette
+from scene_ir.derender.silhouette import Boxes, Evidence, FitSettings, Placement
+from scene_ir.geometry import to_clip
+from scene_ir.raster import verbs
+from scene_ir.types import Camera, Part
+
+CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+NOTHING = np.zeros((200, 480), bool)
+NO_BOXES = Boxes(torch.zeros(1, 4), torch.zeros(1, 4))
+COLOURS = {
+    Part.PAINT: (190, 40, 40),
+    Part.GLASS: (30, 35, 40),
+    Part.TYRE: (20, 20, 20),
+    Part.LIGHT: (240, 235, 200),
+}
+
+
+def car(yaw: float = 0.6, kind: str = "hatchback", x: float = 0.5) -> Placement:
+    return silhouette.placed(kind, torch.tensor([x, 1.65, 9.0]), torch.tensor(yaw), torch.tensor([4.0, 1.5, 1.7]))
+
+
+def drawn(placement: Placement) -> tuple[verbs.Fragments, torch.Tensor]:
+    clip = to_clip(placement.vertices(), CAMERA.matrix)
+    layout = verbs.Layout.of(torch.tensor([[0, 0, 480, 200]]))
+    faces = placement.mesh.faces
+    return verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout), clip
+
+
+def painted(placement: Placement) -> np.ndarray:
+    """A picture (200, 480, 3) of the car whose parts have plain colours, on grey with grain."""
+    face = drawn(placement)[0].face.reshape(200, 480).long()
+    part = np.where(face.numpy() >= 0, placement.mesh.part[face.clamp(min=0)].numpy(), -1)
+    image = np.full((200, 480, 3), 120.0)
+    for kind, colour in COLOURS.items():
+        image[part == int(kind)] = colour
+    image[part == int(Part.OTHER)] = (70, 70, 70)
+    image = cv2.GaussianBlur(image, (0, 0), 0.7) + np.random.default_rng(0).normal(0, 3, image.shape)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def followed(placement: Placement, known: np.ndarray) -> tuple[borders.Followed, torch.Tensor]:
+    hits, clip = drawn(placement)
+    face, depth = (values.reshape(200, 480) for values in (hits.face.long(), hits.depth))
+    return borders.follow(face, depth, clip, placement.mesh.faces, placement.mesh.part, known), clip
+
+
+def test_edges_of_a_square_pull_by_direction():
+    picture = np.full((60, 80, 3), 40, np.uint8)
+    picture[20:40, 30:50] = 200
+    field = borders.edge_field(picture, np.zeros((60, 80), bool))
+    assert field.shape == (4, 60, 80)
+    assert float(field.min()) == 0
+    assert float(field.max()) == 1
+    upright, level = field[0, 30], field[2, :, 40]
+    assert int(upright.argmin()) in (29, 30, 49, 50)
+    assert int(level.argmin()) in (19, 20, 39, 40)
+    assert float(field[0, 20, 40]) == 1
+    assert float(upright[33]) == pytest.approx(3.5 / borders.REACH_PX, abs=1.1 / borders.REACH_PX)
+
+
+def test_edges_of_what_is_unknown_do_not_pull():
+    picture = np.full((60, 80, 3), 40, np.uint8)
+    picture[20:40, 30:50] = 200
+    assert float(borders.edge_field(picture, np.ones((60, 80), bool)).min()) == 1
+
+
+def test_followed_points_lie_where_parts_meet():
+    placement = car()
+    found, clip = followed(placement, ~NOTHING)
+    assert len(found.channel) > 200
+    assert torch.allclose(found.weight.sum(1), torch.ones(()), atol=1e-4)
+    point = (clip[found.vertex] * found.weight[..., None]).sum(1)
+    pixel = (point[:, :2] / point[:, 2:] + found.offset).numpy()
+    face = drawn(placement)[0].face.reshape(200, 480).long()
+    part = np.where(face.numpy() >= 0, placement.mesh.part[face.clamp(min=0)].numpy(), -1)
+    x, y = pixel.T
+    # a border lies half-way between two pixels of different parts
+    first = part[np.floor(y + 0.01).astype(int), np.floor(x + 0.01).astype(int)]
+    second = part[np.ceil(y - 0.01).astype(int), np.ceil(x - 0.01).astype(int)]
+    assert np.mean(first != second) > 0.99
+
+
+def test_what_is_hidden_is_not_followed():
+    known = ~NOTHING
+    known[:, 240:] = False
+    found, clip = followed(car(), known)
+    point = (clip[found.vertex] * found.weight[..., None]).sum(1)
+    assert len(found.channel) > 20
+    assert float((point[:, 0] / point[:, 2]).max()) < 240.5
+    nothing, clip = followed(car(), NOTHING)
+    assert len(nothing.channel) == 0
+    assert float(borders.apart(torch.ones(4, 200, 480), nothing, clip)) == 0
+
+
+def test_the_right_pose_is_nearest_and_the_slope_leads_to_it():
+    field = borders.edge_field(painted(car()), NOTHING)
+    distance = {}
+    for turn in (-0.1, -0.05, 0.0, 0.05, 0.1):
+        found, clip = followed(car(0.6 + turn), ~NOTHING)
+        distance[turn] = float(borders.apart(field, found, clip))
+    assert min(distance, key=lambda turn: distance[turn]) == 0.0
+    assert distance[0.0] < 0.25
+    placement = car()
+    shift = torch.tensor(0.03, requires_grad=True)
+    found, _ = followed(car(x=0.53), ~NOTHING)
+    moved = placement.vertices() + shift * torch.tensor([1.0, 0.0, 0.0])
+    borders.apart(field, found, to_clip(moved, CAMERA.matrix)).backward()
+    assert shift.grad is not None
+    assert float(shift.grad) > 0
+
+
+def test_edges_find_the_yaw_that_the_outline_leaves_open():
+    truth, start = car(0.6), car(0.67)
+    picture = painted(truth)
+    mask = silhouette.silhouettes([truth], CAMERA)[0]
+    # a mask whose border says nothing within 2 px of the outline, as those of photographs
+    ragged = silhouette.grow(mask, 2) & ~(
+        silhouette.grow(mask, 2) & (np.indices(mask.shape).sum(0) % 7 < 3) & ~mask
+    )
+    turn = {}
+    for name, beside in (("outline", None), ("edges", Evidence(picture))):
+        fitted = silhouette.fit([start], [ragged], [NOTHING], NO_BOXES, CAMERA, FitSettings(), beside=beside)[0]
+        turn[name] = abs(math.degrees(float(fitted.yaw) - 0.6))
+    assert turn["edges"] < 1.5
+    assert turn["edges"] < turn["outline"]
+
+
+def test_a_picture_tells_one_template_from_another():
+    for kind in ("sedan", "hatchback", "suv"):
+        options = [car(kind=k) for k in ("sedan", "hatchback", "suv")]
+        distances = silhouette.edge_distances(options, NOTHING, painted(car(kind=kind)), CAMERA)
+        assert options[int(np.argmin(distances))].mesh.name == f"{kind}-0"
+
+
+def test_a_car_out_of_sight_is_nowhere_near():
+    assert silhouette.edge_distances([car(x=80.0)], NOTHING, painted(car()), CAMERA) == [1.0]
+
+
+def test_what_a_laser_measured_hardly_moves():
+    truth, start = car(0.6), car(0.67)
+    mask = silhouette.silhouettes([truth], CAMERA)[0]
+    beside = Evidence(painted(truth), [True])
+    fitted = silhouette.fit([start], [mask], [NOTHING], NO_BOXES, CAMERA, FitSettings(), beside=beside)[0]
+    assert abs(float(fitted.yaw - start.yaw)) <= 0.25 * FitSettings().max_turn_rad + 1e-5

@@ -1,0 +1,120 @@
+"""Meshes and headings told from one another before there is a mask."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import silhouette, stand
+from scene_ir.derender.silhouette import Boxes, Placement
+from scene_ir.geometry import to_clip
+from scene_ir.raster import verbs
+from scene_ir.types import Camera, Part
+
+CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+NOTHING = np.zeros((200, 480), bool)
+YAW = 0.6
+COLOURS = {
+    Part.PAINT: (190, 40, 40),
+    Part.GLASS: (30, 35, 40),
+    Part.TYRE: (20, 20, 20),
+    Part.LIGHT: (240, 235, 200),
+}
+
+
+def car(kind: str = "sedan", yaw: float = YAW, size: tuple[float, float, float] = (4.3, 1.5, 1.75)) -> Placement:
+    return silhouette.placed(kind, torch.tensor([0.5, 1.65, 9.0]), torch.tensor(yaw), torch.tensor(size))
+
+
+def photograph(placement: Placement) -> np.ndarray:
+    """(200, 480, 3): the car's parts in plain colours, on grey with grain."""
+    clip = to_clip(placement.vertices(), CAMERA.matrix)
+    layout = verbs.Layout.of(torch.tensor([[0, 0, 480, 200]]))
+    faces = placement.mesh.faces
+    face = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout).face.reshape(200, 480).long()
+    part = np.where(face.numpy() >= 0, placement.mesh.part[face.clamp(min=0)].numpy(), -1)
+    image = np.full((200, 480, 3), 120.0)
+    for kind, colour in COLOURS.items():
+        image[part == int(kind)] = colour
+    image[part == int(Part.OTHER)] = (70, 70, 70)
+    image = cv2.GaussianBlur(image, (0, 0), 0.7) + np.random.default_rng(0).normal(0, 3, image.shape)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def view_of(placement: Placement) -> stand.View:
+    return stand.View(photograph(placement), NOTHING, CAMERA)
+
+
+def box_of(placement: Placement) -> Boxes:
+    x0, y0, x1, y1 = silhouette.extent(silhouette.silhouettes([placement], CAMERA)[0])
+    return Boxes(torch.tensor([[x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5]]), torch.ones(1, 4))
+
+
+def off_deg(placement: Placement) -> float:
+    return abs(math.degrees(float(placement.yaw) - YAW))
+
+
+@pytest.mark.parametrize("turn", [-0.1, -0.06, 0.06, 0.1])
+@pytest.mark.parametrize("boxed", [True, False])
+def test_a_heading_that_is_off_is_found(turn: float, boxed: bool):
+    truth = car()
+    start = car(yaw=YAW + turn)
+    found, apart = stand.likely([start], box_of(truth) if boxed else None, view_of(truth))
+    assert off_deg(found[0]) < 0.6 * math.degrees(abs(turn))
+    assert 0 <= apart[0] < 1
+
+
+def test_a_heading_that_is_right_stays():
+    truth = car()
+    found, _ = stand.likely([truth], box_of(truth), view_of(truth))
+    assert off_deg(found[0]) < 1
+
+
+@pytest.mark.parametrize("kind", ["sedan", "hatchback", "suv"])
+def test_the_template_is_told_from_labels_that_are_off(kind: str):
+    truth = car(kind)
+    options = [car(k, YAW + 0.08, (4.5, 1.45, 1.8)) for k in ("sedan", "hatchback", "suv")]
+    found, apart = stand.likely(options, box_of(truth), view_of(truth))
+    assert found[int(np.argmin(apart))].mesh.name == f"{kind}-0"
+    assert [p.mesh.name for p in found] == ["sedan-0", "hatchback-0", "suv-0"]
+
+
+def test_what_a_laser_measured_is_not_turned():
+    truth = car()
+    start = replace(truth, yaw=truth.yaw + 0.1)
+    found, _ = stand.likely([start], None, view_of(truth), measured=True)
+    assert torch.equal(found[0].yaw, start.yaw)
+
+
+def test_nothing_to_see_leaves_the_label():
+    away = replace(car(), translation=torch.tensor([60.0, 1.65, 9.0]))
+    found, apart = stand.likely([away], None, view_of(car()))
+    assert torch.equal(found[0].yaw, away.yaw)
+    assert apart[0] == 1
+
+
+def test_what_hardly_shows_keeps_its_heading():
+    truth = car()
+    start = replace(truth, yaw=truth.yaw + 0.1)
+    hidden = NOTHING.copy()
+    hidden[:, 225:] = True
+    view = replace(view_of(truth), hidden=hidden)
+    assert 0 < stand.shown(truth, view) < stand.LEAST_SHOWN
+    assert stand.shown(truth, view_of(truth)) == 1
+    found, _ = stand.likely([start], None, view)
+    assert torch.equal(found[0].yaw, start.yaw)
+
+
+def test_a_pickup_is_the_last_to_be_believed():
+    # seen from behind, cars hardly differ
+    truth = car("sedan", -math.pi / 2)
+    options = [car("sedan", -math.pi / 2), car("pickup", -math.pi / 2)]
+    _, apart = stand.likely(options, None, view_of(truth), measured=True)
+    bare = silhouette.edge_distances(options, NOTHING, photograph(truth), CAMERA)
+    assert apart[0] == pytest.approx(bare[0])
+    assert apart[1] > bare[1] + 0.03

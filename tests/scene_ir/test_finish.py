@@ -1,0 +1,102 @@
+"""Templates in the vehicles' own finish, and the light on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from scene_ir import finish, texture
+from scene_ir.compositor import Compositor, RenderSettings
+from scene_ir.surfaces import Surface
+from scene_ir.types import Part, SceneIR
+
+
+@pytest.fixture(scope="module")
+def compositor(photographed: SceneIR) -> Compositor:
+    return Compositor(photographed, RenderSettings("reference"))
+
+
+def test_the_template_is_the_photograph_where_that_shows_it(compositor: Compositor) -> None:
+    for surface, samples in zip(compositor.fleet.surfaces, compositor.samples(), strict=True):
+        own = finish.fitted(surface, samples)
+        gain, lift = (
+            (samples.share[..., None] * own[samples.vertex][..., k]).sum(axis=1) for k in (slice(3), [3])
+        )
+        again = texture.finished(*(torch.from_numpy(v) for v in (samples.template, gain, lift))).numpy()
+        sure = samples.weight > 0.9
+        before = np.abs(samples.template[sure] - samples.photograph[sure]).mean()
+        assert np.abs(again[sure] - samples.photograph[sure]).mean() < min(0.05, 0.3 * before)
+
+
+def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> None:
+    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    own = finish.fitted(surface, samples)[:, :3]
+    paint = surface.part.numpy() == Part.PAINT
+    seen = np.zeros(len(paint), bool)
+    seen[np.unique(samples.vertex[samples.weight > 0.5])] = True
+    assert (paint & ~seen).any()
+    ratio = own[paint & ~seen] / np.median(own[paint & seen], axis=0)
+    assert np.median(np.abs(np.log(ratio))) < 0.3
+
+
+def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
+    none = finish.Samples(np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3)
+    surface = compositor.fleet.surfaces[0]
+    own = finish.fitted(surface, none)
+    assert np.allclose(own, [1.0, 1.0, 1.0, 0.0])
+    assert finish.base_paint(surface, none) is None
+    assert finish.sunlight(surface, none, 0.4) == pytest.approx(0.4)
+
+
+def test_base_paint_is_the_photographs(compositor: Compositor, photographed: SceneIR) -> None:
+    """The first car is painted red, the second blue."""
+    red, blue = (s.paint for s in photographed.objects.source[:2])
+    assert torch.equal(torch.stack([s.paint for s in photographed.objects.source]), compositor.base_paint())
+    assert float(red[0]) > 1.5 * float(red[1])
+    assert float(blue[2]) > 1.3 * float(blue[0])
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.6, 1.4])
+def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
+    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    level = 0.3 * (samples.sky + strength * samples.direct)
+    lit = replace(samples, photograph=np.repeat(1.0 - np.exp(-level)[:, None], 3, axis=1))
+    assert finish.sunlight(surface, lit, strength) == pytest.approx(strength, abs=0.01)
+    assert abs(finish.sunlight(surface, lit, strength + 0.4) - strength) < 0.4
+
+
+def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor) -> None:
+    """Without samples on one side, its gains are pulled towards the other's."""
+    surface: Surface = compositor.fleet.surfaces[1]
+    samples = compositor.samples()[1]
+    brighter = replace(samples, photograph=np.minimum(1.5 * samples.photograph, 0.9))
+    plain, bright = (finish.fitted(surface, s)[:, 0] for s in (samples, brighter))
+    assert (bright >= plain - 1e-9).all()
+    assert (bright > 1.1 * plain)[surface.part.numpy() == Part.PAINT].mean() > 0.9
+
+
+def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
+    compositor = Compositor(photographed, RenderSettings("reference"))
+    objects = compositor.scene.objects
+    assert bool((compositor.brighter(objects) == 0).all())
+    live = objects.yaw.clone().requires_grad_()
+    still = compositor.brighter(replace(objects, yaw=live))
+    assert bool((still == 0).all())
+    turned = compositor.brighter(replace(objects, yaw=objects.yaw + 0.3))
+    assert 0.02 < float(turned.abs().max()) <= texture.RELIT_MOST
+    # A side that turned to the sun is brighter.
+    sun = photographed.environment.sun
+    normal = compositor._smooth
+    yaw = compositor.fleet.spread(objects.yaw)
+    gained = (_turned(normal, yaw + 0.3) - _turned(normal, yaw)) @ sun
+    lit = (_turned(normal, yaw) @ sun > 0.1) & (gained.abs() > 0.02)
+    assert bool((turned[lit].sign() == gained[lit].sign()).all())
+
+
+def _turned(vectors: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+    cos, sin = yaw.cos(), yaw.sin()
+    x, y, z = vectors.unbind(-1)
+    return torch.stack([cos * x + sin * z, y, cos * z - sin * x], dim=-1)
