@@ -13,9 +13,8 @@ import argparse
 import csv
 import json
 import math
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import cv2
@@ -24,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detectors.registry import read_weights, write_weights
+from detectors.averaged import AveragedRun
 from drivesem.synth.assets import Assets, assets_from, of_split
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
@@ -520,98 +519,41 @@ class Settings:
         return 0.0
 
 
-class Run:
-    """Weights, their average and the optimiser's state."""
+class Run(AveragedRun[CutoutNet]):
+    """The network in training."""
+
+    settings: Settings
 
     def __init__(self, settings: Settings) -> None:
-        self.settings = settings
         torch.manual_seed(settings.seed)
-        self.network = CutoutNet().to(memory_format=torch.channels_last).train()
-        self.average = {k: v.detach().clone() for k, v in self._tensors().items()}
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=settings.rate(0), weight_decay=settings.weight_decay
-        )
-        self.seconds = 0.0
-        self.step_number = 0
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {k: v for k, v in self.network.state_dict().items() if v.is_floating_point()}
+        super().__init__(CutoutNet().to(memory_format=torch.channels_last).train(), settings)
 
     def step(self, store: Store) -> dict[str, float]:
         """One step of the optimiser; the terms of the loss."""
-        start, step, settings = time.process_time(), self.step_number, self.settings
-        samples, rng = batch_of(store, step, settings)
-        crops, said = first_inputs(samples)
-        truth = torch.from_numpy(np.stack([s.truth for s in samples])).permute(0, 3, 1, 2).float() / 255
-        flip = torch.from_numpy(rng.random(len(samples)) < 0.5)
-        weight = torch.from_numpy(np.stack([weight_of(s) for s in samples])[:, None])
-        crops, said, truth, weight = mirrored(crops, said, truth, weight, flip)
-        for group in self.optimiser.param_groups:
-            group["lr"] = settings.rate(step)
-        with torch.autocast("cpu", torch.bfloat16):
-            logits = self.network(crops, said)
-        terms = {"first": first_loss(logits, truth, weight)}
-        seen = logits.detach().float().softmax(1)[:, :3]
-        seen = torch.where(flip[:, None, None, None], seen.flip(3), seen).numpy()
-        tiles = [
-            tile for sample, share in zip(samples, seen, strict=True) for tile in tiles_of(sample, share, rng)
-        ]
-        both, wanted = (torch.from_numpy(np.stack(part)) for part in zip(*tiles, strict=True))
-        both = both.contiguous(memory_format=torch.channels_last)
-        with torch.autocast("cpu", torch.bfloat16):
-            change = self.network.look_again(both[:, :3], both[:, 3:])
-        terms["second"] = second_loss(change.float(), wanted)
-        terms["total"] = terms["first"] + terms["second"]
-        self.optimiser.zero_grad(set_to_none=True)
-        terms["total"].backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        if not bool(torch.isfinite(norm)):
-            raise FloatingPointError(f"step {step}: expected a finite gradient, found a norm of {float(norm)}")
-        self.optimiser.step()
-        decay = min(settings.average, (1 + step) / (10 + step))
-        for name, tensor in self._tensors().items():
-            self.average[name].lerp_(tensor.detach(), 1 - decay)
-        self.step_number += 1
-        self.seconds += time.process_time() - start
+        step, settings = self.step_number, self.settings
+        with self.timed():
+            samples, rng = batch_of(store, step, settings)
+            crops, said = first_inputs(samples)
+            truth = torch.from_numpy(np.stack([s.truth for s in samples])).permute(0, 3, 1, 2).float() / 255
+            flip = torch.from_numpy(rng.random(len(samples)) < 0.5)
+            weight = torch.from_numpy(np.stack([weight_of(s) for s in samples])[:, None])
+            crops, said, truth, weight = mirrored(crops, said, truth, weight, flip)
+            with torch.autocast("cpu", torch.bfloat16):
+                logits = self.network(crops, said)
+            terms = {"first": first_loss(logits, truth, weight)}
+            seen = logits.detach().float().softmax(1)[:, :3]
+            seen = torch.where(flip[:, None, None, None], seen.flip(3), seen).numpy()
+            tiles = [
+                tile for sample, share in zip(samples, seen, strict=True) for tile in tiles_of(sample, share, rng)
+            ]
+            both, wanted = (torch.from_numpy(np.stack(part)) for part in zip(*tiles, strict=True))
+            both = both.contiguous(memory_format=torch.channels_last)
+            with torch.autocast("cpu", torch.bfloat16):
+                change = self.network.look_again(both[:, :3], both[:, 3:])
+            terms["second"] = second_loss(change.float(), wanted)
+            terms["total"] = terms["first"] + terms["second"]
+            self.descend(terms["total"], settings.rate(step))
         return {k: float(v.detach()) for k, v in terms.items()}
-
-    def averaged(self) -> CutoutNet:
-        """A network with the averaged weights, rounded as they are shipped, in eval mode."""
-        network = CutoutNet()
-        network.load_state_dict({k: v.half().float() for k, v in self.average.items()}, strict=False)
-        network.requires_grad_(False)
-        return network.eval()
-
-    def save(self, path: Path) -> None:
-        """Write the checkpoint, atomically."""
-        tensors = {f"weights.{k}": v.detach().contiguous() for k, v in self._tensors().items()}
-        tensors |= {f"average.{k}": v.contiguous() for k, v in self.average.items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{k}": v.contiguous() for k, v in state.items()}
-        settings = json.dumps(asdict(self.settings), sort_keys=True)
-        facts = {"step": str(self.step_number), "seconds": repr(self.seconds), "settings": settings}
-        write_weights(path, facts, tensors)
-
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint. ValueError where it belongs to other settings."""
-        facts, tensors = read_weights(path)
-        wanted = json.dumps(asdict(self.settings), sort_keys=True)
-        if facts["settings"] != wanted:
-            raise ValueError(f"{path}: expected settings {wanted}, found {facts['settings']}")
-        state: dict[int, dict[str, Tensor]] = {}
-        weights: dict[str, Tensor] = {}
-        for key, tensor in tensors.items():
-            section, name = key.split(".", 1)
-            if section == "weights":
-                weights[name] = tensor
-            elif section == "average":
-                self.average[name].copy_(tensor)
-            else:
-                index, part = name.split(".", 1)
-                state.setdefault(int(index), {})[part] = tensor
-        self.network.load_state_dict(weights, strict=False)
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
-        self.step_number, self.seconds = int(facts["step"]), float(facts["seconds"])
 
 
 @torch.no_grad()
@@ -747,7 +689,7 @@ def main() -> None:
     figures = {amount: judge(held, network, amount) for amount in AMOUNTS}
     print(table_of(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
-    write_weights(arguments.out, facts, {k: v.half().contiguous() for k, v in run.average.items()})
+    run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
         second=sum(p.numel() for p in network.second.parameters()),

@@ -13,9 +13,8 @@ import argparse
 import csv
 import json
 import math
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from detectors.averaged import AveragedRun
 from detectors.boxes import iou_matrix
-from detectors.registry import load_detector, read_weights, write_weights
+from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.data.classes import VEHICLES
 from drivesem.data.kitti import KittiDataset
@@ -248,82 +248,25 @@ class Settings:
     seed: int = 0
 
 
-class Run:
-    """Weights, their average and the optimiser's state."""
+class Run(AveragedRun[PoseNet]):
+    """The network in training."""
+
+    settings: Settings
 
     def __init__(self, settings: Settings) -> None:
-        self.settings = settings
         torch.manual_seed(settings.seed)
-        self.network = PoseNet().train()
-        self.average = {k: v.detach().clone() for k, v in self._tensors().items()}
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay
-        )
-        self.seconds = 0.0
-        self.step_number = 0
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {k: v for k, v in self.network.state_dict().items() if v.is_floating_point()}
+        super().__init__(PoseNet().train(), settings)
 
     def step(self, store: CropStore) -> dict[str, float]:
         """One step of the optimiser; the terms of the loss."""
-        start, step, settings = time.process_time(), self.step_number, self.settings
-        crops, numbers, targets = batch_of(store, step, settings)
-        warm = min(1.0, (step + 1) / 100)
-        rate = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        terms = loss_terms(self.network(crops, numbers), targets)
-        self.optimiser.zero_grad(set_to_none=True)
-        terms["total"].backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        if not bool(torch.isfinite(norm)):
-            raise FloatingPointError(f"step {step}: expected a finite gradient, found a norm of {float(norm)}")
-        self.optimiser.step()
-        decay = min(settings.average, (1 + step) / (10 + step))
-        for name, tensor in self._tensors().items():
-            self.average[name].lerp_(tensor.detach(), 1 - decay)
-        self.step_number += 1
-        self.seconds += time.process_time() - start
+        step, settings = self.step_number, self.settings
+        with self.timed():
+            crops, numbers, targets = batch_of(store, step, settings)
+            warm = min(1.0, (step + 1) / 100)
+            terms = loss_terms(self.network(crops, numbers), targets)
+            rate = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+            self.descend(terms["total"], rate)
         return {k: float(v.detach()) for k, v in terms.items()}
-
-    def averaged(self) -> PoseNet:
-        """A network with the averaged weights, rounded as they are shipped, in eval mode."""
-        network = PoseNet()
-        network.load_state_dict({k: v.half().float() for k, v in self.average.items()}, strict=False)
-        network.requires_grad_(False)
-        return network.eval()
-
-    def save(self, path: Path) -> None:
-        """Write the checkpoint, atomically."""
-        tensors = {f"weights.{k}": v.detach().contiguous() for k, v in self._tensors().items()}
-        tensors |= {f"average.{k}": v.contiguous() for k, v in self.average.items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{k}": v.contiguous() for k, v in state.items()}
-        settings = json.dumps(asdict(self.settings), sort_keys=True)
-        facts = {"step": str(self.step_number), "seconds": repr(self.seconds), "settings": settings}
-        write_weights(path, facts, tensors)
-
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint. ValueError where it belongs to other settings."""
-        facts, tensors = read_weights(path)
-        wanted = json.dumps(asdict(self.settings), sort_keys=True)
-        if facts["settings"] != wanted:
-            raise ValueError(f"{path}: expected settings {wanted}, found {facts['settings']}")
-        state: dict[int, dict[str, Tensor]] = {}
-        weights: dict[str, Tensor] = {}
-        for key, tensor in tensors.items():
-            section, name = key.split(".", 1)
-            if section == "weights":
-                weights[name] = tensor
-            elif section == "average":
-                self.average[name].copy_(tensor)
-            else:
-                index, part = name.split(".", 1)
-                state.setdefault(int(index), {})[part] = tensor
-        self.network.load_state_dict(weights, strict=False)
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
-        self.step_number, self.seconds = int(facts["step"]), float(facts["seconds"])
 
 
 @dataclass(frozen=True)
@@ -568,7 +511,7 @@ def main() -> None:
     figures = all_figures(network, arguments.held_out, arguments.also)
     print(table_of(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
-    write_weights(arguments.out, facts, {k: v.half().contiguous() for k, v in run.average.items()})
+    run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
         file=arguments.out.name,

@@ -12,9 +12,8 @@ import argparse
 import csv
 import json
 import math
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from detectors.registry import read_weights, write_weights
+from detectors.averaged import AveragedRun
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
     VARIANTS,
@@ -299,84 +298,27 @@ def loss_of(logits: Tensor, classes: Tensor) -> Tensor:
     return -(shares * logits.log_softmax(1) * weights).sum(1).mean()
 
 
-class Run:
-    """Weights, their average and the optimiser's state."""
+class Run(AveragedRun[SegmentNet]):
+    """The network in training."""
+
+    settings: Settings
 
     def __init__(self, settings: Settings) -> None:
-        self.settings = settings
         torch.manual_seed(settings.seed)
-        self.network = SegmentNet().train()
-        self.average = {k: v.detach().clone() for k, v in self._tensors().items()}
+        super().__init__(SegmentNet().train(), settings)
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay
-        )
-        self.seconds = 0.0
-        self.step_number = 0
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {k: v for k, v in self.network.state_dict().items() if v.is_floating_point()}
 
     def step(self, store: Store) -> float:
         """One step of the optimiser; the loss."""
-        start, step, settings = time.process_time(), self.step_number, self.settings
-        images, heights, classes = batch_of(store, step, settings)
-        warm = min(1.0, (step + 1) / 50)
-        for group in self.optimiser.param_groups:
-            group["lr"] = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
-        with torch.autocast("cpu", torch.bfloat16):
-            logits = self.network(images, heights)
-        loss = loss_of(logits.float(), classes)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        if not bool(torch.isfinite(norm)):
-            raise FloatingPointError(f"step {step}: expected a finite gradient, found a norm of {float(norm)}")
-        self.optimiser.step()
-        decay = min(settings.average, (1 + step) / (10 + step))
-        for name, tensor in self._tensors().items():
-            self.average[name].lerp_(tensor.detach(), 1 - decay)
-        self.step_number += 1
-        self.seconds += time.process_time() - start
+        step, settings = self.step_number, self.settings
+        with self.timed():
+            images, heights, classes = batch_of(store, step, settings)
+            warm = min(1.0, (step + 1) / 50)
+            with torch.autocast("cpu", torch.bfloat16):
+                logits = self.network(images, heights)
+            loss = loss_of(logits.float(), classes)
+            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
-
-    def averaged(self) -> SegmentNet:
-        """A network with the averaged weights, rounded as they are shipped, in eval mode."""
-        network = SegmentNet()
-        network.load_state_dict({k: v.half().float() for k, v in self.average.items()}, strict=False)
-        network.requires_grad_(False)
-        return network.eval()
-
-    def save(self, path: Path) -> None:
-        """Write the checkpoint, atomically."""
-        tensors = {f"weights.{k}": v.detach().contiguous() for k, v in self._tensors().items()}
-        tensors |= {f"average.{k}": v.contiguous() for k, v in self.average.items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{k}": v.contiguous() for k, v in state.items()}
-        settings = json.dumps(asdict(self.settings), sort_keys=True)
-        facts = {"step": str(self.step_number), "seconds": repr(self.seconds), "settings": settings}
-        write_weights(path, facts, tensors)
-
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint. ValueError where it belongs to other settings."""
-        facts, tensors = read_weights(path)
-        wanted = json.dumps(asdict(self.settings), sort_keys=True)
-        if facts["settings"] != wanted:
-            raise ValueError(f"{path}: expected settings {wanted}, found {facts['settings']}")
-        state: dict[int, dict[str, Tensor]] = {}
-        weights: dict[str, Tensor] = {}
-        for key, tensor in tensors.items():
-            section, name = key.split(".", 1)
-            if section == "weights":
-                weights[name] = tensor
-            elif section == "average":
-                self.average[name].copy_(tensor)
-            else:
-                index, part = name.split(".", 1)
-                state.setdefault(int(index), {})[part] = tensor
-        self.network.load_state_dict(weights, strict=False)
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
-        self.step_number, self.seconds = int(facts["step"]), float(facts["seconds"])
 
 
 JUDGED = ("sky", "foliage", "road", "vehicle")
@@ -496,7 +438,7 @@ def main() -> None:
     figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
     print(table_of(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
-    write_weights(arguments.out, facts, {k: v.half().contiguous() for k, v in run.average.items()})
+    run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
         focal=segment.INPUT_FOCAL_PX,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
 import io
 import sys
 import tarfile
@@ -19,6 +18,7 @@ import yaml
 from drivesem.synth.assets import assets_from
 from scene_ir.errors import FormatError
 from scene_ir.types import Part
+from tests.tools.loading import tool
 
 TOOLS = Path(__file__).parents[2] / "tools"
 CATALOGUE = """# made up
@@ -38,15 +38,9 @@ height#2=90
 """
 
 
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fetch_assets", TOOLS / "fetch_assets.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fetch_assets"] = module
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture(scope="module", name="tool")
+def script() -> ModuleType:
+    return tool("fetch_assets")
 
 
 def box_obj(

@@ -1,8 +1,6 @@
 """Figures fitted to a made-up archive are those that were planted in it."""
 
-import importlib.util
 import json
-import sys
 import tarfile
 from pathlib import Path
 from types import ModuleType
@@ -10,18 +8,16 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from tests.tools.loading import tool
+
 TOOLS = Path(__file__).parents[2] / "tools"
 P2 = "7.2e+02 0 6.0e+02 4.5e+01 0 7.2e+02 1.7e+02 2.0e-01 0 0 1 2.7e-03"
 OTHER = "7.0e+02 0 6.1e+02 0 0 7.0e+02 1.8e+02 0 0 0 1 0"
 
 
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fit_kitti_statistics", TOOLS / "fit_kitti_statistics.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture(scope="module", name="tool")
+def script() -> ModuleType:
+    return tool("fit_kitti_statistics")
 
 
 def _line(kind: str, box: str, x: float, z: float, yaw: float, truncated: float = 0.0, occluded: int = 0) -> str:

@@ -3,8 +3,6 @@ with."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +13,9 @@ import torch
 import torch.nn.functional as F
 
 from scene_ir.derender.segment import Class
+from tests.tools.loading import tool
 
-ROOT = Path(__file__).resolve().parents[2]
-specification = importlib.util.spec_from_file_location("train_segmenter", ROOT / "tools" / "train_segmenter.py")
-assert specification is not None
-assert specification.loader is not None
-training: Any = importlib.util.module_from_spec(specification)
-sys.modules["train_segmenter"] = training
-specification.loader.exec_module(training)
+training: Any = tool("train_segmenter")
 SETTINGS = training.Settings(steps=4, batch=2, frames=2)
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import pickle
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,19 +14,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.types import Detections, Targets
 from drivesem.data.kitti import KittiWriter
 from scene_ir.types import Labels
-
-TOOLS = Path(__file__).parents[2] / "tools"
-
-
-def tool(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, TOOLS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
+from tests.tools.loading import tool
 
 backbone, training = tool("fetch_backbone"), tool("train_squeezedet")
 
