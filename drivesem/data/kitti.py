@@ -62,7 +62,7 @@ _MERGED = {"tree": "vegetation", "van": "car", "cyclist": "rider", "tram": "trai
 """What Cityscapes has no id for, and what it is there."""
 
 
-def _number(where: str, text: str) -> float:
+def finite_number(where: str, text: str) -> float:
     """A finite number."""
     try:
         value = float(text)
@@ -106,7 +106,7 @@ def _parse_line(where: str, text: str, with_score: bool) -> _Line:
         raise FormatError(where, expected, len(parts))
     kind = parts[0]
     _require(kind in TYPES, where, "type", f"one of {', '.join(TYPES)}", repr(kind))
-    values = [_number(f"{where}: {FIELDS[i + 1]}", part) for i, part in enumerate(parts[1:])]
+    values = [finite_number(f"{where}: {FIELDS[i + 1]}", part) for i, part in enumerate(parts[1:])]
     truncated, occluded, _, left, top, right, bottom, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
     _require(left < right, where, "right", f"more than left ({left:g})", f"{right:g}")
     _require(top < bottom, where, "bottom", f"more than top ({top:g})", f"{bottom:g}")
@@ -256,7 +256,7 @@ def read_calib(path: Path) -> Calibration:
         where = f"{path}:{number}: {key}"
         if key in found:
             raise FormatError(where, "the key once", "it twice")
-        values = [_number(where, part) for part in rest.split()]
+        values = [finite_number(where, part) for part in rest.split()]
         if len(values) != _CALIBRATION_COUNTS[key]:
             raise FormatError(where, f"{_CALIBRATION_COUNTS[key]} numbers", len(values))
         found[key] = torch.tensor(values, dtype=torch.float32).reshape(3, -1)

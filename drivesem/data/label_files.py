@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.data.kitti import FIELDS, IMAGE_SUFFIXES, UNKNOWN_ANGLE, UNKNOWN_POSITION
+from drivesem.data.kitti import FIELDS, IMAGE_SUFFIXES, UNKNOWN_ANGLE, UNKNOWN_POSITION, finite_number
 from drivesem.data.label_table import REGION, LabelTable
 from drivesem.data.truth import TrackedObject
 from drivesem.data.vkitti1 import SIZE_HW, Vkitti1Dataset
@@ -459,20 +459,10 @@ def _yolo_results(path: Path, truth: LabelTable | None) -> LabelTable:
                 raise FormatError(f"{file}:{n}", "6 fields: class cx cy w h score", len(parts))
             kind, box = parse_line(f"{file}:{n}", parts[:5], names, (width, height))
             rows.append((i, truth.kinds.index(kind), box))
-            scores.append(_number(f"{file}:{n}: score", parts[5]))
+            scores.append(finite_number(f"{file}:{n}: score", parts[5]))
     if not rows:
         raise FormatError(str(path), "at least one detection", f"{len(paths)} empty files")
     return _table_of(frames, truth.kinds, rows, score=np.array(scores, float))
-
-
-def _number(where: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise FormatError(where, "a number", repr(text)) from None
-    if not math.isfinite(value):
-        raise FormatError(where, "a finite number", text)
-    return value
 
 
 def _table_of(
