@@ -23,7 +23,7 @@ from drivesem.scene_sheet import GAIN, PANEL_PX, scene_sheet
 from scene_ir import files
 from scene_ir.derender.silhouette import extent, placed, silhouettes
 from scene_ir.errors import RangeError
-from scene_ir.io import load_scene, save_scene
+from scene_ir.io import VERSION, load_scene, save_scene
 from scene_ir.meshes.templates import template
 from scene_ir.types import Camera, Mesh
 
@@ -192,9 +192,9 @@ def test_a_scene_of_another_version_is_refused(
     out = tmp_path / "S"
     shutil.copytree(taken, out)
     record = out / "demo-001" / "scene.json"
-    record.write_text(record.read_text().replace('"version": 1', '"version": 99'))
+    record.write_text(record.read_text().replace(f'"version": {VERSION}', '"version": 99'))
     said = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
-    assert "scene.json: version: expected 1, found 99" in said
+    assert f"scene.json: version: expected {VERSION}, found 99" in said
 
 
 def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -238,6 +238,7 @@ def test_identifiers_with_slashes_become_nested_folders(
 def test_frames_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "D"
     image = empty_streets(root, (1,), count=2)
+    (root / "training" / "velodyne").mkdir()
     words = ["derender", "--dataset", "kitti", "--root", str(root), "--workers", "1", "--velodyne"]
     assert main([*words, "--out", str(tmp_path / "A")]) == 2
     assert "000000.txt: expected a readable file" in capsys.readouterr().err.splitlines()[-1]
