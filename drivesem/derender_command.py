@@ -95,6 +95,11 @@ def run(config: Derender) -> int:
     if isinstance(worker.source, PlainPhotograph):
         focal = worker.source.focal
         console.print(f"camera: focal length {focal.length_px:.0f} px ({focal.source})", soft_wrap=True)
+    if config.meshes is not None:
+        from drivesem.synth.assets import unreadable_in
+
+        for name, fault in unreadable_in(config.meshes):
+            console.print(f"--meshes: {name} is left out: {fault}", soft_wrap=True, highlight=False, markup=False)
     with Progress(*columns, console=console, disable=not todo) as progress:
         task = progress.add_task("taking frames apart", total=len(todo))
         for name, outcome in outcomes(worker.take_apart, partial(_in_process, config, out), todo, config):

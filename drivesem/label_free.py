@@ -56,9 +56,10 @@ _INSIDE = 0.35
 """Share of the smaller footprint from which on two vehicles cannot both be where they are."""
 DETECTOR_LOOKS = 2
 """A detector's boxes are not tight: the network looks again at those of what it found."""
-FITTING = FitSettings(max_shift_m=0.8, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
-"""How far the fit to the outlines may leave the estimate: farther than it may leave a data set's labels. The boxes
-say nothing of their own, they are the estimate's."""
+FITTING = FitSettings(max_shift_m=0.4, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
+"""How far the fit to the outlines may leave the estimate: farther than it may leave a data set's labels, in
+heading above all. Outlines hardly tell distances: more shift made those no better. The boxes say nothing of their
+own, they are the estimate's."""
 
 
 def settings_for(settings: DerenderSettings) -> DerenderSettings:

@@ -294,8 +294,8 @@ class KittiDataset:
     """The frames of a KITTI object folder.
 
     root: the folder that holds `split`, or `split` itself. with_points: read the laser's points where a frame has
-    them. Raises FormatError naming the folder where there is no image_2 or it is empty; a frame's own faults are
-    raised by `labels` and `frame`, so that the other frames can be used.
+    them. Raises FormatError naming the folder where there is no image_2 or it is empty, or no velodyne for points;
+    a frame's own faults are raised by `labels` and `frame`, so that the other frames can be used.
     """
 
     def __init__(self, root: Path, split: str = "training", with_points: bool = False) -> None:
@@ -305,6 +305,8 @@ class KittiDataset:
             raise FormatError(str(root), "a KITTI folder", "no such folder")
         if not (self.folder / "image_2").is_dir():
             raise FormatError(str(self.folder / "image_2"), "a folder of images", "no such folder")
+        if with_points and not (self.folder / "velodyne").is_dir():
+            raise FormatError(str(self.folder / "velodyne"), "a folder of a laser's points", "no such folder")
         self.with_points = with_points
         self._images = {
             path.stem: path

@@ -184,7 +184,9 @@ def test_no_detections_and_wrong_labels() -> None:
 def test_the_fit_may_go_farther_than_from_labels() -> None:
     settings = settings_for(DerenderSettings(fit=False, seed=3))
     assert (settings.fit, settings.seed, settings.fitting) == (False, 3, FITTING)
-    assert FITTING.max_shift_m > DerenderSettings().fitting.max_shift_m
+    usual = DerenderSettings().fitting
+    assert FITTING.max_shift_m > usual.max_shift_m
+    assert FITTING.max_turn_rad > usual.max_turn_rad
 
 
 @pytest.fixture(scope="module")
