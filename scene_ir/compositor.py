@@ -28,7 +28,7 @@ from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.surfaces import Fleet, Surface
 from scene_ir.texture import Regions, Texels, smoothstep
-from scene_ir.types import Crop, Objects, Render, SceneIR, Source
+from scene_ir.types import Crop, Objects, Render, SceneIR
 
 T = TypeVar("T")
 
@@ -37,6 +37,9 @@ HALO_MAX_PX = 64.0
 sixth."""
 
 
+_MOST_SAMPLES, _GOLDEN = 5000, 0.6180339887
+"""Pixels of one object that its finish is read off, some for each vertex; steps by the golden section spread
+them."""
 _PATCH_MARGIN_PX = 4
 """Ground kept around a photographed shadow: the reach of the lookups' kernel, and two pixels."""
 
@@ -311,6 +314,7 @@ class Compositor:
         self._height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self._like.new_zeros(0)
         self._texels, self._shadows, self.regions = None, None, None
         self._finish: Tensor | None = None
+        self._drawn: Drawn | None = None  # until the finish is found
         self._fixed: fused.Fixed | None = None
         self.paint_lightness = self._base_lightness(objects)
         if objects.source:
@@ -356,6 +360,7 @@ class Compositor:
 
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
         drawn = self.draw(base)
+        self._drawn = drawn
         mirrored = self.fleet.place(
             self.fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
         )
@@ -401,14 +406,8 @@ class Compositor:
             parts = zip(self.fleet.surfaces, self.samples(), strict=True)
             found = [torch.from_numpy(finish.fitted(surface, samples)) for surface, samples in parts]
             self._finish = torch.cat(found).to(self._like)
+            self._drawn = None
         return self._finish
-
-    def refinish(self, sources: Sequence[Source]) -> None:
-        """Take over the paint and the sunlight of one source an object."""
-        self.scene = replace(self.scene, objects=replace(self.scene.objects, source=tuple(sources)))
-        self._sunlight = self._like.new_tensor([s.sunlight for s in sources])
-        self.paint_lightness = self._base_lightness(self.scene.objects)
-        self._finish, self._fixed, self._lit = None, None, None
 
     def _fuse(self) -> fused.Fixed:
         """What the fast kernels read, gathered."""
@@ -453,11 +452,12 @@ class Compositor:
         count = total.new_zeros(len(total)).index_add(0, fleet.owner, fleet.paint)
         return total / count.clamp(min=1e-3)[:, None]
 
-    def base_paint(self) -> Tensor:
-        """The paint (N, 3) of the objects as the photograph shows it; the templates' where it shows none."""
+    def base_paint(self, samples: Sequence[finish.Samples]) -> Tensor:
+        """The paint (N, 3) of the objects as the photograph shows it, by their `samples`; the templates' where it
+        shows none."""
         paint = self._template_paint()
-        for i, (surface, samples) in enumerate(zip(self.fleet.surfaces, self.samples(), strict=True)):
-            found = finish.base_paint(surface, samples)
+        for i, (surface, own) in enumerate(zip(self.fleet.surfaces, samples, strict=True)):
+            found = finish.base_paint(surface, own)
             if found is not None:
                 paint[i] = found.to(paint)
         return paint
@@ -531,7 +531,7 @@ class Compositor:
             shaded = self._photographed_rows(objects, drawn, rows)
         else:
             own = self._mesh_attributes(drawn, rows, self._own_attributes(objects, drawn.geometry))
-            colour = self._own_colour(rows, own, None).clamp(0.0, 1.0)
+            colour = self._own_colour(rows.xy, rows.owner, own).clamp(0.0, 1.0)
             shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
         colour, depth = shaded.colour, shaded.depth
         if _active(objects.texture_code):
@@ -644,9 +644,9 @@ class Compositor:
         parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self._height)
         return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
 
-    def _own_colour(self, rows: _Rows, own: Tensor, need: Tensor | None) -> Tensor:
-        """The templates' colours (K, 3) in daylight, not clamped, for the rows `need` or all."""
-        xy, owner = (rows.xy, rows.owner) if need is None else (rows.xy[need], rows.owner[need])
+    def _own_colour(self, xy: Tensor, owner: Tensor, own: Tensor) -> Tensor:
+        """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
+        `_own_attributes` (K, 10)."""
         sunlight = self._sunlight.index_select(0, owner)
         albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self._unproject.T
@@ -665,7 +665,7 @@ class Compositor:
         mirror = torch.cat([self._mirror_clip, self._mirror_cos[:, None]], dim=1)
         both = self._mesh_attributes(drawn, rows, torch.cat([own, mirror, self.finish], dim=1))[need]
         gain, lift = both[:, 14:17], both[:, 17:]
-        colour = texture.finished(self._own_colour(rows, both[:, :10], need), gain, lift)
+        colour = texture.finished(self._own_colour(rows.xy[need], rows.owner[need], both[:, :10]), gain, lift)
         clip, cos_then = both[:, 10:13], both[:, 13]
         z = clip[:, 2]
         safe = z.clamp(min=0.1)
@@ -681,6 +681,7 @@ class Compositor:
             * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
             * texture.facing_weight(cos_now[need] - cos_then, cos_then, both[:, 6])
             * smoothstep(cos_then, 0.05, 0.2)
+            * (1.0 - smoothstep(seen[:, 5], *texture.MIRRORED_RIM))
         )
         straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
         return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
@@ -711,29 +712,39 @@ class Compositor:
 
     @torch.no_grad()
     def samples(self) -> list[finish.Samples]:
-        """What the photograph shows of each object, beside its template in daylight: a row a pixel."""
-        objects = _photographed(self.scene.objects)
-        drawn = self.draw(objects)
-        geometry, rows = drawn.geometry, self._rows(drawn, False)
-        own = torch.cat([self._own_attributes(objects, geometry), geometry.cos[:, None]], dim=1)
-        own = self._mesh_attributes(drawn, rows, own)
+        """What the photograph shows of each object, beside its template in daylight: a row a pixel, of large
+        objects about `_MOST_SAMPLES` pixels, spread evenly."""
+        objects, drawn = _photographed(self.scene.objects), self._drawn
+        if drawn is None:
+            drawn = self.draw(objects)
+        layout, count = drawn.mesh.layout, len(objects)
+        pixel = (drawn.mesh.face >= 0).nonzero()[:, 0]
+        owner, xy = layout.draw()[pixel], layout.pixels()[pixel].to(self._like)
         assert self._texels is not None
-        counts = torch.cat([rows.counts, torch.zeros_like(rows.counts)])
-        seen = self._texels.sample(rows.xy, counts, self.settings.backend, "clamp")
-        template = self._own_colour(rows, own[:, :10], None)
-        weight = smoothstep(own[:, 10], *texture.SQUARE) * smoothstep(seen[:, 3], 0.9, 0.99)
-        weight = weight * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0)) * (1.0 - smoothstep(seen[:, 5], 0.0, 1.0))
-        face = drawn.mesh.face.index_select(0, rows.pixel).long()
-        kept = (weight > 0.0) & (face >= 0)
-        owner, corner = rows.owner[kept], self.fleet.faces[face[kept]]
-        share = surfaces.weights_at(geometry.clip[corner], rows.xy[kept])
-        normal = torch.nn.functional.normalize(own[kept, 3:6], dim=-1, eps=1e-6)
+        counts = torch.bincount(owner, minlength=2 * count)
+        seen = self._texels.sample(xy, counts, self.settings.backend, "clamp")
+        weight = smoothstep(seen[:, 3], 0.9, 0.99) * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
+        weight = weight * (1.0 - smoothstep(seen[:, 5], 0.0, 1.0))
+        plain = (weight > 0.0).nonzero()[:, 0]
+        # By their places within the object, so that others beside it change nothing.
+        size = torch.bincount(owner[plain], minlength=count)
+        place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
+        chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MOST_SAMPLES / size.clamp(min=1))[owner[plain]]]
+        pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
+        corner = self.fleet.faces[drawn.mesh.face[pixel].long()]
+        share = surfaces.weights_at(drawn.geometry.clip[corner], xy).to(self._like)
+        own = torch.cat([self._own_attributes(objects, drawn.geometry), drawn.geometry.cos[:, None]], dim=1)
+        own = (own[corner] * share[..., None]).sum(dim=1)
+        weight = weight * smoothstep(own[:, 10], *texture.SQUARE)
+        template = self._own_colour(xy, owner, own[:, :10])
+        normal = torch.nn.functional.normalize(own[:, 3:6], dim=-1, eps=1e-6)
         sun = self.scene.environment.sun.to(self._like)
         sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
-        columns = (corner, share, template[kept], seen[kept, :3], sky, lit - sky, weight[kept])
+        columns = (corner, share, template, seen[:, :3], sky, lit - sky, weight)
         out = []
         for i, (start, _) in enumerate(self.fleet.vertex_ranges.tolist()):
-            vertex, *values = (c[owner == i].cpu().numpy() for c in columns)
+            mine = (owner == i) & (weight > 0.0)
+            vertex, *values = (c[mine].cpu().numpy() for c in columns)
             out.append(finish.Samples(vertex - start, *(v.astype(np.float64) for v in values)))
         return out
 
@@ -762,7 +773,7 @@ class Compositor:
         hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)
         counts = torch.bincount(owner[reached], minlength=len(objects))
         dark = self._shadows.sample(uv, counts, self.settings.backend, "zero")
-        dark = dark * texture.inside_weight(wanted, height, width, texture.EXTENDED_PX)[:, None]
+        dark = dark * texture.inside_weight(wanted, height, width, texture.SHADOW_EXTENDED_PX)[:, None]
         return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 
     def ground_density(self, drawn: Drawn) -> Tensor:

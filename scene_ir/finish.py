@@ -9,6 +9,7 @@ Shapes: K samples, pixels that show the surface; V vertices of one object.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -39,6 +40,10 @@ _STRENGTHS = np.linspace(0.0, 2.4, 13)
 _SIDES, _UNEVEN, _UNSURE = 10.0, 0.25, 0.3
 """Independent samples that a car's paint is worth, their scatter about one colour (logarithm), and that of the
 expected strength."""
+_SHADED, _NO_SHADOW = 0.3, 0.02
+"""Sunlight to expect where nothing tells, between an overcast sky's and a clear one's; weight of that."""
+_SURE_PX, _DISAGREES = 200.0, 20.0
+"""Samples of paint at which a vehicle counts half; how much one vehicle's disagreement may cost."""
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 """Display values beyond which a template's or a photograph's colour says nothing of their ratio."""
 _PRIOR = 0.02
@@ -85,20 +90,28 @@ def base_paint(surface: Surface, samples: Samples) -> Tensor | None:
     return texture.rgb_exact(lab.median(dim=0).values[None])[0].clamp(0.0, 1.0)
 
 
-def sunlight(surface: Surface, samples: Samples, expected: float) -> float:
-    """How strongly the sun lights the paint, as `texture.shade` counts it: the strength for which sides that face
-    it and others are of one colour, not far from the expected one."""
-    part = surface.part.cpu().numpy()
-    clear = (part[samples.vertex] == Part.PAINT).all(axis=1)
-    weight = samples.weight * clear
-    expected = float(np.clip(expected, 0.0, _STRENGTHS[-1]))
-    if weight.sum() < _FEWEST:
-        return expected
-    level = np.log(_light(samples.photograph.mean(axis=1)))
-    rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
-    mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
-    apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
-    cost = _SIDES * apart / _UNEVEN**2 + np.square((_STRENGTHS - expected) / _UNSURE)
+def sunlight(seen: Sequence[tuple[Surface, Samples]], expected: Sequence[float | None]) -> float:
+    """How strongly the sun lights a frame's vehicles, as `texture.shade` counts it: the strength for which sides
+    of a vehicle that face it and others are of one colour, for most vehicles, not far from what is expected.
+
+    seen: the vehicles; expected: of each, by its shadow, None where it has none. A vehicle counts by how much of
+    its paint is seen, and one that disagrees with the rest, in the shade of a tree, by no more than `_DISAGREES`.
+    """
+    cost = _NO_SHADOW * np.square((_STRENGTHS - _SHADED) / _UNSURE)
+    for (surface, samples), strength in zip(seen, expected, strict=True):
+        clear = (surface.part.cpu().numpy()[samples.vertex] == Part.PAINT).all(axis=1)
+        weight = samples.weight * clear
+        own = np.zeros_like(cost)
+        if weight.sum() >= _FEWEST:
+            level = np.log(_light(samples.photograph.mean(axis=1)))
+            rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
+            mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
+            apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
+            own += _SIDES * apart / _UNEVEN**2
+        if strength is not None:
+            own += np.square((_STRENGTHS - np.clip(strength, 0.0, _STRENGTHS[-1])) / _UNSURE)
+        evidence = (weight.sum() + _FEWEST) / (weight.sum() + _SURE_PX)
+        cost = cost + evidence * np.minimum(own - own.min(), _DISAGREES)
     return float(_STRENGTHS[int(cost.argmin())])
 
 
@@ -122,7 +135,11 @@ def fitted(surface: Surface, samples: Samples) -> Array:
     data = np.minimum(total, _MOST_SAMPLES)
     matrix = web.bonds + scipy.sparse.diags_array(data + _PRIOR)
     known = data[:, None] * mean + _PRIOR * _priors(web.part, total, mean)
-    found = np.exp(scipy.sparse.linalg.splu(matrix.tocsc()).solve(known))[web.node]
+    # Symmetric and dominated by its diagonal: no pivots, and an order that fills in little.
+    solver = scipy.sparse.linalg.splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    found = np.exp(solver.solve(known))[web.node]
     return np.concatenate([found, lift[web.node, None]], axis=1)
 
 

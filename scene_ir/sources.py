@@ -33,8 +33,6 @@ _SOLID = 0.95
 _COLOUR_SLACK = 0.1
 """How far a foreground colour may leave the range between photograph and vehicle: thin trims do; what a wrong
 matte or background asks for goes farther, and would travel with the vehicle as dark or bright specks."""
-_SHADED = 0.3
-"""Sunlight to expect of a vehicle without shadow: between an overcast sky's and a clear one's."""
 _OPEN = 0.9
 """Share of the light of the sky, in display values, that reaches the ground beside a vehicle."""
 _LEVELS = 255.0
@@ -125,10 +123,15 @@ def _solve(
         surfaces.camera_centre(scene.camera.matrix),
         blend.standing_footprints(scene.front, scene.camera.matrix),
     )
+    behind_nearer = {
+        i: texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
+        for place, i in enumerate(order)
+    }
+    lit = [factors[i] if shadows[i] is not None else None for i in range(count)]
+    blank = _lit_sources(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
     solved: dict[int, Source] = {}
     front = list(scene.front)
     for place, i in enumerate(order):
-        hidden = texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
         nearer = torch.zeros(frame_hw, dtype=torch.bool)
         for j in order[place + 1 :]:
             _window(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
@@ -143,12 +146,9 @@ def _solve(
         x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
         coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
         foreground = _foreground(mattes[i], image, canvas, nearer, coverage)
-        shadow = factors[i] if shadows[i] is not None else None
-        source = replace(blank[i], foreground=foreground, shadow=shadow)
+        source = replace(blank[i], foreground=foreground, shadow=lit[i])
         one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), front=())
-        alone = Compositor(one, RenderSettings(settings.backend), hidden=[hidden])
-        source = replace(source, paint=alone.base_paint()[0], sunlight=_sunlight(alone, shadow))
-        alone.refinish([source])
+        alone = Compositor(one, RenderSettings(settings.backend), hidden=[behind_nearer[i]])
         canvas = _with_layer(alone)
         solved[i] = source
     sources = tuple(solved[i] for i in range(count))
@@ -168,6 +168,30 @@ def _source(
         translation, objects.yaw[index], objects.size_lhw[index], objects.ffd[index],
         replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation), texture.SUNLIGHT,
     )  # fmt: skip
+
+
+def _lit_sources(
+    scene: SceneIR,
+    blank: list[Source],
+    mattes: list[Crop],
+    shadows: list[Crop | None],
+    hidden: list[Tensor],
+    settings: SolveSettings,
+) -> list[Source]:
+    """Sources with the paint that the photograph shows, and the strength of the sun: one for the whole frame."""
+    if not blank:
+        return blank
+    plain = []
+    for source, matte in zip(blank, mattes, strict=False):  # those of what stands in front come after
+        colour = _window(scene.photograph, matte) * matte.values
+        plain.append(replace(source, foreground=replace(matte, values=torch.cat([colour, matte.values]))))
+    whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), front=())
+    compositor = Compositor(whole, RenderSettings(settings.backend), hidden=hidden)
+    samples = compositor.samples()
+    seen = list(zip(compositor.fleet.surfaces, samples, strict=True))
+    strength = finish.sunlight(seen, [_by_shadow(s, scene.environment.sun) for s in shadows])
+    paint = compositor.base_paint(samples)
+    return [replace(s, paint=paint[i], sunlight=strength) for i, s in enumerate(blank)]
 
 
 def _only(objects: Objects, index: int) -> Objects:
@@ -334,17 +358,16 @@ def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
     return low, (torch.maximum(goal, inside) + _COLOUR_SLACK).clamp(max=1.0)
 
 
-def _sunlight(alone: Compositor, shadow: Crop | None) -> float:
-    """How strongly the sun lights the object: what its shadow takes away, and its paint shows on several sides."""
-    expected = _SHADED
-    dark = shadow.values.mean(dim=0) if shadow is not None and shadow.values.numel() else None
-    if dark is not None and bool((dark < 1.0).any()):
-        core = 1.0 - dark
-        left = 1.0 - float(core[core > 0.5 * core.max()].median())
-        level = sum(texture.AMBIENT)
-        rise = max(-float(alone.scene.environment.sun[1]), 0.3)
-        expected = (_OPEN * level / max(left, 0.05) - level) / rise
-    return finish.sunlight(alone.fleet.surfaces[0], alone.samples()[0], expected)
+def _by_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
+    """How strong the sun (3,) is that casts this shadow, by what it takes away; None without one."""
+    if shadow is None or not shadow.values.numel():
+        return None
+    core = 1.0 - shadow.values.mean(dim=0)
+    if not bool((core > 0.0).any()):
+        return None
+    left = 1.0 - float(core[core > 0.5 * core.max()].median())
+    level = sum(texture.AMBIENT)
+    return (_OPEN * level / max(left, 0.05) - level) / max(-float(sun[1]), 0.3)
 
 
 def _with_layer(alone: Compositor) -> Tensor:

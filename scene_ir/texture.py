@@ -26,7 +26,7 @@ seat."""
 STRETCH = (1.0, 2.2)
 """Growth of the cosine towards the camera, in units of what the photograph saw, at which its texels begin to
 smear, and at which what stands for unseen parts looks better: drawn out to twice and three times their width."""
-GRAZING = (0.14, 0.04)
+GRAZING = (0.06, 0.04)
 """Cosine added to what the photograph saw, of all but paint and of paint: at its very outline a surface would
 else have none. Tyres, arches and trims are small and curved; drawn out a little they look better than their
 templates, whose dark edges lie where the mesh has them."""
@@ -44,13 +44,18 @@ OUTLINE_TURN = (0.1, 0.25)
 OUTLINE_PX = (1.0, 2.2)
 """Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the
 inside."""
+MIRRORED_RIM = (0.0, 1.0)
+"""How much of a texel is outline, from which on, and where no longer, it stands for the other side: at the outline
+a matte may have taken in what lies behind, and a pixel there is drawn out over many."""
 HIDDEN_PX = (1.0, 3.0)
 """Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
 BORDER_PX = (0.5, 1.5)
 """Distance beyond the photograph's border over which what it shows ends."""
-EXTENDED_PX = (4.0, 60.0)
-"""Distance beyond it over which a vehicle's looks at the border still stand for what goes on there: panels and
-windows run on, and a soft change to the template's colours shows less than a seam."""
+EXTENDED_PX = (2.0, 14.0)
+"""Distance beyond it over which a vehicle's looks at the border give way to its other side's or the template's: a
+soft change shows less than a seam, and drawn out farther the border's pixels become bars."""
+SHADOW_EXTENDED_PX = (4.0, 60.0)
+"""The same of its shadow, which has no other side to go by, and is smooth."""
 SUPPORT_PX = 2
 """Beyond the matte by more than this, the photograph shows that there is no vehicle."""
 SATURATED = 1e-6
@@ -220,11 +225,16 @@ def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
         h, w = matte.values.shape[1:]
         region = support[matte.y0 : matte.y0 + h, matte.x0 : matte.x0 + w]
         region[matte.values[0].detach().cpu().numpy() > 0.0] = 1
-    if not support.any():
-        return like.new_zeros(frame_hw)
-    padded = np.pad(support, 1, mode="edge")
+    out = like.new_zeros(frame_hw)
+    x, y, w, h = cv2.boundingRect(support)
+    if not w:
+        return out
+    # A pixel around what is there, within the frame: the distance to it is measured, the frame's border is none.
+    window = (slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1))
+    padded = np.pad(support[window], 1, mode="edge")
     distance = np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
-    return smoothstep(torch.from_numpy(distance).to(like), *HIDDEN_PX)
+    out[window] = smoothstep(torch.from_numpy(distance).to(like), *HIDDEN_PX)
+    return out
 
 
 def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:

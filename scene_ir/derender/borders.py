@@ -96,7 +96,9 @@ def follow(
     vertex = faces[face[torch.from_numpy(y), torch.from_numpy(x)]]
     corners = clip.detach()[vertex].double().transpose(1, 2)
     pixel = torch.from_numpy(np.stack([x, y, np.ones(len(x))], 1)).double()
-    share = torch.linalg.lstsq(corners, pixel[..., None]).solution[..., 0] if len(x) else pixel
+    # Cramer's rule: what all three have in common, the determinant, drops out of their ratio.
+    a, b, c = corners.unbind(2)
+    share = torch.stack([(pixel * torch.linalg.cross(*two)).sum(1) for two in ((b, c), (c, a), (a, b))], 1)
     share = share / share.sum(1, keepdim=True)
     usable = torch.isfinite(share).all(1) & (share.abs() < 2).all(1)
     return Followed(

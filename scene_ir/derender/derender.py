@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scene_ir.derender import background as fills
 from scene_ir.derender import cutout as cutouts
 from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand, street, upright
+from scene_ir.derender import widen as wide
 from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.matte import opacity_of
 from scene_ir.derender.silhouette import Placement
@@ -56,7 +57,14 @@ among the templates of one car the former varies about three times as much."""
 _STOOD_M = 0.3
 """How far around a vehicle's footprint there is ground."""
 _SURELY = 0.8
-"""How much a pixel must look like an unlabelled vehicle or person not to be copied."""
+"""How much a pixel must look like an unlabelled person not to be copied."""
+_CERTAINLY, _LEAST_CORE_PX, _AROUND_CORE_PX = 0.97, 150, 150
+"""How much the core of an unlabelled vehicle must look like one, its least area, and how far its less certain rest
+reaches."""
+_LEAST_REST = 0.05
+"""Less than that for all but vehicles says nothing of the rest."""
+_BORDER_PX = 5
+"""So near to vehicles and their shadows colours are mixed, and masks may err: not copied."""
 _LARGE_HOLE_PX = 60_000
 """Holes beyond are not searched at full size: a third of the time less, hardly to be seen."""
 _UNDERBODY = 0.3
@@ -110,21 +118,30 @@ class _Looks:
     ground: torch.Tensor
     settings: DerenderSettings
 
-    def at(self, row: int, placement: Placement, hidden: Mask) -> tuple[Mask, Mask]:
-        """Pixels (H, W) of a label's vehicle, and of what else stands in front of it. hidden (H, W): what is known
-        to be in front."""
+    def at(self, row: int, placement: Placement, hidden: Mask) -> tuple[Mask, Mask, Cutout | None]:
+        """Pixels (H, W) of a label's vehicle, and of what else stands in front of it; and the first look, where
+        one was needed. hidden (H, W): what is known to be in front."""
         if self.frame.masks is not None:
-            return (self.frame.masks[row] > 0.5).numpy() & ~hidden, hidden
-        seen = self._seen(row, placement, hidden, False)
-        return _pixels(seen, hidden), seen.whole("front", hidden.shape) >= 0.5
+            return (self.frame.masks[row] > 0.5).numpy() & ~hidden, hidden, None
+        found = self._look([placement], hidden)[0]
+        outline = silhouette.silhouettes([placement], self.frame.camera, self.settings.backend)[0]
+        seen = self._believed(row, found, outline, hidden)
+        return _pixels(seen, hidden), seen.whole("front", hidden.shape) >= 0.5, found
 
-    def cut(self, row: int, placement: Placement, outline: Mask, hidden: Mask, told: bool) -> _Cut:
-        """A vehicle cut out about its placement. outline (H, W): of it; told: whether it fills its label's box."""
+    def cut(
+        self, row: int, placement: Placement, outline: Mask, hidden: Mask, told: bool, first: Cutout | None = None
+    ) -> _Cut:
+        """A vehicle cut out about its placement. outline (H, W): of it; told: whether it fills its label's box;
+        first: the first look with the template at this place, where there was one."""
         if self.frame.masks is not None:
             mask = (self.frame.masks[row] > 0.5).numpy() & ~hidden
             seen = cutouts.of_mask(self.image, mask, hidden)
         else:
-            seen = self._seen(row, placement, hidden, True)
+            if first is None:
+                # Without a fit the template is at its label already.
+                widen = self.settings.fit and not told
+                first = self._first(row, placement, outline, hidden, widen)
+            seen = self._believed(row, cutouts.refined(self.image, [first])[0], outline, hidden)
             if told:
                 seen = _close_to(outline & ~hidden, seen)
             mask = _pixels(seen, hidden)
@@ -136,14 +153,33 @@ class _Looks:
                 seen = cutouts.of_mask(self.image, mask, hidden)
         return _Cut(row, placement, mask, hidden, outline, silhouette.iou(mask, outline, hidden), seen)
 
-    def _seen(self, row: int, placement: Placement, hidden: Mask, again: bool) -> Cutout:
-        camera, labels, backend = self.frame.camera, self.frame.labels, self.settings.backend
+    def _look(self, places: list[Placement], hidden: Mask) -> list[Cutout]:
+        """First looks with the template at each of the places."""
+        camera, backend = self.frame.camera, self.settings.backend
+        hides = [hidden] * len(places)
+        return cutouts.cut_out(self.image, places, hides, self.ground, camera, backend=backend, again=False)
+
+    def _first(self, row: int, placement: Placement, outline: Mask, hidden: Mask, widen: bool) -> Cutout:
+        """The first look; of a large vehicle another with the template at its label, and what those two and the
+        colours tell together."""
+        if not (widen and outline.any() and _height(outline) >= wide.LEAST_PX):
+            return self._look([placement], hidden)[0]
+        labels, camera = self.frame.labels, self.frame.camera
         assert labels is not None
-        found = cutouts.cut_out(
-            self.image, [placement], [hidden], self.ground, camera, backend=backend, again=again
-        )
-        outline = silhouette.silhouettes([placement], camera, backend)[0]
-        seen = cutouts.believed(cutouts.tidy(found[0]), outline, hidden)
+        pose = labels.translation[row], labels.yaw[row], labels.size_lhw[row]
+        labelled = silhouette.placed(placement.mesh, *pose)
+        seen, other = self._look([placement, labelled], hidden)
+        if not (seen.visible.size and other.visible.size):
+            return seen
+        outlines = np.stack([outline, *silhouette.silhouettes([labelled], camera, self.settings.backend)])
+        allowed = _label_box(labels, row, hidden.shape) & ~hidden
+        return wide.widened(self.image, seen, other, outlines.mean(0, dtype=np.float32), allowed)
+
+    def _believed(self, row: int, found: Cutout, outline: Mask, hidden: Mask) -> Cutout:
+        """What is likely of a cut-out. outline (H, W): of its placement."""
+        labels = self.frame.labels
+        assert labels is not None
+        seen = cutouts.believed(cutouts.tidy(found), outline, hidden)
         return replace(seen, visible=seen.visible * _label_box(labels, row, hidden.shape)[seen.window])
 
 
@@ -345,6 +381,7 @@ def _cut_out(
     hidden: list[Mask] = []
     kept: list[int] = []
     held: list[bool] = []
+    firsts: list[Cutout | None] = []
     for row in order:
         options, by_laser = _options(frame, labels, row, settings)
         mine = unknown[row] | _union(masks, image.shape[:2])
@@ -355,7 +392,7 @@ def _cut_out(
         likeliest = int(np.argmin(edges))
         if not outlines[likeliest].any():
             continue
-        mask, in_front = looks.at(row, options[likeliest], mine)
+        mask, in_front, first = looks.at(row, options[likeliest], mine)
         mine = mine | in_front
         scores = [silhouette.iou(outline, mask, mine) for outline in outlines]
         best = int(np.argmax(np.subtract(scores, _EDGES * edges)))
@@ -366,6 +403,8 @@ def _cut_out(
         kept.append(row)
         held.append(by_laser or stand.shown(options[best], view) < stand.LEAST_SHOWN)
         chosen.append(options[best])
+        # Without a fit the template stays where the first look had it.
+        firsts.append(None if settings.fit or best != likeliest else first)
         masks.append(mask)
         hidden.append(mine)
     if settings.fit:
@@ -379,7 +418,7 @@ def _cut_out(
         whole = outlines[index] if frame.masks is None else (frame.masks[row] > 0.5).numpy()
         if not (whole & ~mine).any():
             continue
-        cut = looks.cut(row, chosen[index], outlines[index], mine, told[row])
+        cut = looks.cut(row, chosen[index], outlines[index], mine, told[row], firsts[index])
         if cut.mask.any():
             cuts.append(cut)
     return sorted(cuts, key=lambda cut: cut.row)
@@ -524,11 +563,10 @@ def _shaded(
 
 def _filled(image: Array, hole: Mask, near: Array, surroundings: _Surroundings, seed: int) -> Array:
     """The image (H, W, 3) without what is in the hole. near (H, W) m: distance from the cars' footprints."""
+    guide = _continued(image, silhouette.grow(hole, 2), near, surroundings)
+    forbidden = silhouette.grow(hole, _BORDER_PX) | _not_copied(surroundings, hole)
     seen = surroundings.seen
-    forbidden = silhouette.grow(hole, 2)
-    guide = _continued(image, forbidden, near, surroundings)
-    forbidden = forbidden | _not_copied(surroundings)
-    like = np.where(forbidden, 0, seen.ground).astype(np.float32)
+    like = np.where(forbidden, 0, np.where(guide.ground, _ground_share(seen), seen.ground)).astype(np.float32)
     standing = upright.copied(image, hole, forbidden | (like > 0.5), guide, surroundings.horizon)
     rest, forbidden = hole & ~standing.done, forbidden & ~standing.done
     ground = fills.Ground((near < _STOOD_M) | guide.ground, like)
@@ -540,16 +578,31 @@ def _filled(image: Array, hole: Mask, near: Array, surroundings: _Surroundings, 
 def _continued(image: Array, unknown: Mask, near: Array, surroundings: _Surroundings) -> street.Continued:
     """The street behind unknown pixels. near (H, W) m: distance from the cars' footprints."""
     seen = surroundings.seen
-    unknown = unknown | _not_copied(surroundings)
+    unknown = unknown | _not_copied(surroundings, unknown)
     plane = street.plane_view(surroundings.ground, surroundings.camera)
-    shares = street.Shares(seen.ground, seen.sky, unknown & (near < _STOOD_M))
+    shares = street.Shares(seen.ground, seen.sky, unknown & (near < _STOOD_M), _ground_share(seen))
     return street.continued(image, unknown, shares, plane, surroundings.horizon)
 
 
-def _not_copied(surroundings: _Surroundings) -> Mask:
-    """Pixels (H, W) that show no street: people and vehicles, also those that nobody labelled."""
+def _ground_share(seen: segment.Segmentation) -> Array:
+    """How much each pixel (H, W) looks like ground, given that it shows no vehicle: where these are is known."""
+    return np.clip(seen.ground / np.maximum(1 - seen.vehicle, _LEAST_REST), 0, 1).astype(np.float32)
+
+
+def _not_copied(surroundings: _Surroundings, unknown: Mask) -> Mask:
+    """Pixels (H, W) outside the unknown ones that show no street: people and vehicles, also those that nobody
+    labelled."""
     seen = surroundings.seen
-    return surroundings.others | (np.maximum(seen.vehicle, seen.person) > _SURELY)
+    # Light walls and cobbles look somewhat like cars: only what has a large, certain core is one.
+    certain = ((seen.vehicle > _CERTAINLY) & ~unknown).astype(np.uint8)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(certain)
+    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= _LEAST_CORE_PX]
+    core = np.isin(parts, large)
+    vehicle = core
+    if large:
+        rest = (seen.vehicle > 0.5) & (_ground_share(seen) < 0.5)
+        vehicle = core | (silhouette.grow(core, _AROUND_CORE_PX) & rest)
+    return surroundings.others | silhouette.grow(vehicle, _BORDER_PX) | (seen.person > _SURELY)
 
 
 def _environment(

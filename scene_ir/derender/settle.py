@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scene_ir.derender.silhouette import Boxes, Placement
+from scene_ir.meshes.lod import detail
 from scene_ir.types import Camera, Mesh
 
 _STEPS = 6
 _DELTA = 1e-3
 """Of the differences that stand for derivatives, in standard deviations."""
+_DETAIL_PX = 90.0
+"""Height for which a mesh's triangles count where a border cuts it: finer ones move no side by half a pixel."""
 _NEAR_M = 0.5
 """What is nearer projects anywhere; such boxes are cut by the image's border anyway."""
 
@@ -117,8 +120,8 @@ def _moved(placement: Placement, change: NDArray[np.float64]) -> Placement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shape:
-    """Of a mesh: vertices (V, 3); edges (E, 2); the vertices of its hull (K, 3), a tenth of them, which tell how
-    far a car reaches that lies inside the image."""
+    """Of a mesh: vertices (V, 3) and edges (E, 2) of its triangles, some left out; the vertices of its hull
+    (K, 3), a tenth of them, which tell how far a car reaches that lies inside the image."""
 
     vertices: NDArray[np.float64]
     edges: NDArray[np.int64]
@@ -126,9 +129,10 @@ class _Shape:
 
     @classmethod
     def of(cls, mesh: Mesh) -> _Shape:
-        faces, vertices = mesh.faces.numpy(), mesh.vertices.double().numpy()
+        vertices, light = mesh.vertices.double().numpy(), detail(mesh, _DETAIL_PX)
+        faces = light.faces.numpy()
         edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-        return cls(vertices, edges, vertices[ConvexHull(vertices).vertices])
+        return cls(light.vertices.double().numpy(), edges, vertices[ConvexHull(vertices).vertices])
 
 
 def _solve(

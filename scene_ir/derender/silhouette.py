@@ -19,6 +19,7 @@ from torch import Tensor
 from scene_ir import ffd as lattice
 from scene_ir.derender import borders
 from scene_ir.geometry import place, to_clip
+from scene_ir.meshes.lod import detail
 from scene_ir.meshes.templates import template
 from scene_ir.raster import verbs
 from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
@@ -28,6 +29,8 @@ Mask = NDArray[np.bool_]
 _WORK_PX = 160
 """Larger side of the windows in which outlines are fitted: more changes nothing that shows, less loses the
 wheels."""
+_DETAIL_PX = 90.0
+"""Height for which meshes are drawn in those windows: their edges do not show finer triangles."""
 _BAND = 0.12
 """Width of the band in which mask and outline pull at each other, as a fraction of the window."""
 
@@ -67,8 +70,9 @@ class Placement:
 
     def vertices(self) -> Tensor:
         """Vertices (V, 3) m in camera space."""
-        unit = self.mesh.vertices
-        deformed = lattice.deform(unit, lattice.lattice_weights(unit), self.ffd)
+        deformed = unit = self.mesh.vertices
+        if self.ffd.requires_grad or bool(self.ffd.any()):
+            deformed = lattice.deform(unit, lattice.lattice_weights(unit), self.ffd)
         return place(deformed, self.size_lhw, self.yaw, self.translation)
 
 
@@ -78,7 +82,7 @@ class FitSettings:
     weights of staying there (prior), of filling the label's 2D box (box), and of the picture's edges (edges).
     """
 
-    steps: int = 40
+    steps: int = 30
     rate: float = 0.25
     max_shift_m: float = 0.3
     max_turn_rad: float = 0.087
@@ -182,11 +186,20 @@ def extent(mask: Mask) -> tuple[int, int, int, int]:
 
 def grow(mask: Mask, radius: float) -> Mask:
     """The mask with everything within `radius` px (negative: without what is that near to its border)."""
+    if not mask.any():
+        return mask.copy()
+    # Only where something can change: a frame has many more pixels than a car.
+    margin = int(max(radius, 0)) + 2
+    x0, y0, x1, y1 = extent(mask)
+    window = (slice(max(y0 - margin, 0), y1 + margin), slice(max(x0 - margin, 0), x1 + margin))
+    part, grown = mask[window], mask.copy()
     if radius >= 0:
-        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
-        return mask | (outside <= radius) if mask.any() else mask.copy()
-    padded = np.pad(mask, 1, mode="edge").astype(np.uint8)
-    return cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1] > -radius
+        outside = cv2.distanceTransform((~part).astype(np.uint8), cv2.DIST_L2, 5)
+        grown[window] |= outside <= radius
+    else:
+        padded = np.pad(part, 1, mode="edge").astype(np.uint8)
+        grown[window] = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1] > -radius
+    return grown
 
 
 def instance_mask(
@@ -283,6 +296,7 @@ def fit(
                zip(masks, unknown, silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
     layout = verbs.Layout.of(rects)
+    whole, placements = placements, _lighter(placements)
     pull = torch.from_numpy(np.concatenate([w.pull.reshape(-1) / w.length for w in windows]))
     faces, _, face_ranges = _pack(placements, camera.matrix)[1:]
     matrices = [w.zoom @ camera.matrix for w in windows]
@@ -333,7 +347,12 @@ def fit(
             scale = (square / (1 - _ADAM[1] ** (step + 1))).sqrt() + 1e-8
             code -= settings.rate * mean / (1 - _ADAM[0] ** (step + 1)) / scale
             code.clamp_(-bound / spread, bound / spread)
-    return [_apply(p, c, modes) for p, c in zip(placements, best_code * spread, strict=True)]
+    return [_apply(p, c, modes) for p, c in zip(whole, best_code * spread, strict=True)]
+
+
+def _lighter(placements: Sequence[Placement]) -> list[Placement]:
+    """With no more triangles than windows show."""
+    return [replace(p, mesh=detail(p.mesh, _DETAIL_PX)) for p in placements]
 
 
 def edge_distances(
@@ -350,6 +369,7 @@ def edge_distances(
     if not seen.any():
         return [1.0] * len(placements)
     windows = [_window(seen, unknown, seen, picture)] * len(placements)
+    placements = _lighter(placements)
     height, width = windows[0].known.shape
     layout = verbs.Layout.of(torch.tensor([[0, 0, width, height]] * len(placements)))
     clip, faces, vertex_ranges, face_ranges = _pack(placements, windows[0].zoom @ camera.matrix)

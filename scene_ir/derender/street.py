@@ -53,6 +53,10 @@ _FIT_PX, _LEAST_COLUMNS = 100, 20
 """Columns beside a hidden stretch that tell where the foot goes on, and how many at least."""
 _FAR_PX = 60
 """So near to the vanishing point a foot is the road's far end and tells nothing of walls beside it."""
+_DROP = 2.0
+"""Rows that a skyline falls in each column behind the edge of what stands out from it, as trees do."""
+_PAINT_PX = 6.0
+"""So near to what is unknown colours of walls are not trusted."""
 _SURE_PX = 8
 """Range of good splits up to which a column counts as known."""
 
@@ -73,11 +77,13 @@ class StreetSettings:
 @dataclass(frozen=True, slots=True)
 class Shares:
     """ground, sky (H, W) in [0, 1]: how much each known pixel looks like it; stood (H, W): where vehicles stood,
-    which is ground though it is hidden."""
+    which is ground though it is hidden; flat (H, W): ground again, given that known pixels show no vehicle, to
+    tell what lies on the ground below its end; left out, it is the same."""
 
     ground: NDArray[np.float32]
     sky: NDArray[np.float32]
     stood: Mask
+    flat: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +148,7 @@ def continued(
     sky = (rows < top_rows(share.sky, unknown, horizon)[None]) & ~below
     upright = ~ground & ~sky
     # What is known is what it looks like: trees before the sky, signs on the verge.
-    flat = np.where(unknown, ground, ground & (share.ground > 0.5))
+    flat = np.where(unknown, ground, ground & ((share.ground if share.flat is None else share.flat) > 0.5))
     clear = np.where(unknown, sky, share.sky > 0.5)
     along = np.where(flat, plane.along, 1.0)
     straight = plane.across - heading * along - bend * along**2 / 2
@@ -158,7 +164,9 @@ def continued(
     odd = np.abs(image - local).max(-1) / settings.marking
     weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
     guess = _sideways(rest, weight) + profile
-    standing = (~unknown & ~flat & ~clear).astype(np.float32)
+    # Paint at the borders of removed cars must not tint what stands behind them.
+    apart = cv2.distanceTransform((~unknown).astype(np.uint8), cv2.DIST_L2, 5) > _PAINT_PX
+    standing = (apart & ~flat & ~clear).astype(np.float32)
     walls = (_sideways(image, standing) + push_pull(image, standing)) / 2
     guess = np.where(upright[..., None], walls, guess)
     guess = np.where(sky[..., None], _sideways(image, (~unknown & clear).astype(np.float32)), guess)
@@ -232,8 +240,11 @@ def _onward(
 
 
 def top_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
-    """Row (W,) below which each column shows no sky any more; where that is hidden, interpolated between both
-    sides."""
+    """Row (W,) below which each column shows no sky any more.
+
+    Where that is hidden, it is the lower of both sides: what is higher than the rest of the skyline, a tree or a
+    house, ends soon behind its own edge.
+    """
     end = int(np.clip(np.ceil(horizon + 1), 2, sky.shape[0]))
     top, bottom = _splits(1 - sky[:end], unknown[:end])
     sure = bottom - top <= _SURE_PX
@@ -241,7 +252,14 @@ def top_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray
         return top
     columns = np.arange(len(top))
     rows = median_filter(((top + bottom) / 2)[sure], 15, mode="nearest")
-    return np.clip(np.interp(columns, columns[sure], rows), top, bottom)
+    known = columns[sure]
+    after = np.searchsorted(known, columns).clip(max=known.size - 1)
+    before = (after - 1).clip(min=0)
+    left = np.where(known[after] == columns, rows[after], rows[before])
+    right = rows[after]
+    drop = np.minimum(left + _DROP * abs(columns - known[before]), right + _DROP * abs(known[after] - columns))
+    hidden = np.minimum(np.maximum(left, right), drop)
+    return np.clip(np.where(sure, np.interp(columns, known, rows), hidden), top, bottom)
 
 
 def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -3,7 +3,8 @@
 Walls, hedges and fences go on beside a car. Each hidden column copies another one, whole from the hole's upper
 edge down to its foot, so what stands stays upright and sharp; columns next to each other copy neighbours unless a
 seam is cheap. Of all choices dynamic programming takes the best (shift-maps, Pritch et al., ICCV 2009, with one
-seam per column). Copies grow and shrink with their foot's distance from the horizon, as walls along a road do.
+seam per column) among long runs: short ones, repeated, are what the eye finds first. What no long run fits is left
+to others. Copies grow and shrink with their foot's distance from the horizon, as walls along a road do.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ class UprightSettings:
     are tried; ring_px: what is known so near to the hole must agree with what is known beside the copy; guess_px:
     blur at which a copy is held against the guide. Weights of squared differences of colour, one pixel's at most
     `most` (`most_ring` in the ring): ring_weight, guess_weight, seam_weight. far: cost of a shift by 100 px, per
-    pixel, in units of `most`. jump: cost of a seam; again, again_px: how often it counts between shifts that are
-    nearly the same, and how nearly: such seams show the same thing twice. settle, settle_px: how much of the
-    copy's mean colour is brought to the guide's, over which distance in px of the photograph.
+    pixel, in units of `most`. jump: cost of a seam, per pixel, in the same units; again: how often it counts where
+    something is shown twice. leave: cost of a column, per pixel, from which on it is left to others. least_px:
+    columns that share a shift at least; in a narrower hole half of that. settle, settle_px: how much of the copy's
+    mean colour is brought to the guide's, over which distance in px of the photograph.
     """
 
     scale: float = 0.5
@@ -44,12 +46,13 @@ class UprightSettings:
     most_ring: float = 0.25
     ring_weight: float = 3.0
     guess_weight: float = 3.0
-    seam_weight: float = 1.0
+    seam_weight: float = 15.0
     far: float = 0.4
-    jump: float = 5.0
-    again: float = 6.0
-    again_px: float = 40.0
-    settle: float = 0.5
+    jump: float = 3.0
+    again: float = 8.0
+    leave: float = 0.3
+    least_px: int = 36
+    settle: float = 0.75
     settle_px: float = 10.0
 
 
@@ -161,8 +164,13 @@ class _Search:
         columns = np.flatnonzero(self.hole.any(0))
         costs, looks = self._costs(columns)
         pixels = self.hole.sum(0).astype(np.float32)[columns]
+        judged = pixels + self.ring.sum(0)[columns]
         for run in np.split(np.arange(columns.size), np.flatnonzero(np.diff(columns) > 1) + 1):
-            chosen[columns[run]] = self.shifts[self._path(costs[run], looks[run], pixels[run])]
+            limit = self.settings.leave * judged[run]
+            least = min(self.settings.least_px, (run.size + 1) // 2)
+            path = self._path(np.minimum(costs[run], limit[:, None]), looks[run], pixels[run], least)
+            kept = _long_runs(costs[run, path] < limit, path, least)
+            chosen[columns[run[kept]]] = self.shifts[path[kept]]
         return chosen
 
     def _costs(self, columns: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -195,26 +203,53 @@ class _Search:
         return costs, looks
 
     def _path(
-        self, costs: NDArray[np.float32], looks: NDArray[np.float32], pixels: NDArray[np.float32]
+        self, costs: NDArray[np.float32], looks: NDArray[np.float32], pixels: NDArray[np.float32], least: int
     ) -> NDArray[np.int64]:
-        """Index of each column's shift: least sum of costs and seams. pixels: of the hole in each column."""
+        """Index of each column's shift: least sum of costs and seams over runs of at least so many columns.
+
+        costs (columns, shifts); looks (columns, shifts, samples * 3); pixels (columns,): of the hole.
+        """
         settings = self.settings
-        apart = np.abs(self.shifts[:, None] - self.shifts[None])
-        jump = settings.jump * (1 + settings.again * np.exp(-apart / settings.again_px))
-        total = costs[0]
-        back = np.zeros(costs.shape, np.int64)
-        stay = np.arange(total.size)
-        for column in range(1, len(costs)):
-            look = looks[column]
+        count, size = costs.shape
+        jump = np.where(self.shifts[:, None] > self.shifts[None], settings.again, 1.0) * settings.jump
+        jump = (jump * settings.most).astype(np.float32)
+        summed = np.concatenate([np.zeros((1, size)), np.cumsum(costs, 0, dtype=np.float64)])
+        # Of the columns so far, the last `least` of them with the same shift; and where that shift began.
+        total = np.full((count + 1, size), np.inf)
+        began = np.zeros((count + 1, size), np.int64)
+        before = np.full((count + 1, size), -1, np.int64)
+        stay = np.arange(size)
+        for end in range(least, count + 1):
+            start = end - least
+            if start == 0:
+                total[end] = summed[end]
+                continue
+            total[end], began[end] = total[end - 1] + costs[end - 1], began[end - 1]
+            before[end] = before[end - 1]
+            if start < least:
+                continue
+            look = looks[start]
             square = (look * look).sum(1)
             apart = (square[:, None] + square[None] - 2 * look @ look.T).clip(0) / _SAMPLES
-            seam = settings.seam_weight * np.minimum(apart, settings.most) * pixels[column] + jump
-            seam[stay, stay] = 0
-            reached = total[:, None] + seam
-            back[column] = reached.argmin(0)
-            total = reached[back[column], stay] + costs[column]
-        path = np.empty(len(costs), np.int64)
-        path[-1] = total.argmin()
-        for column in range(len(costs) - 1, 0, -1):
-            path[column - 1] = back[column, path[column]]
+            seam = (settings.seam_weight * np.minimum(apart, settings.most) + jump) * pixels[start]
+            reached = total[start][:, None] + seam
+            last = reached.argmin(0)
+            new = reached[last, stay] + summed[end] - summed[start]
+            better = new < total[end]
+            total[end] = np.where(better, new, total[end])
+            began[end] = np.where(better, start, began[end])
+            before[end] = np.where(better, last, before[end])
+        path = np.empty(count, np.int64)
+        end, shift = count, int(total[count].argmin())
+        while end > 0:
+            start, last = int(began[end, shift]), int(before[end, shift])
+            path[start:end] = shift
+            end, shift = start, last
         return path
+
+
+def _long_runs(good: NDArray[np.bool_], path: NDArray[np.int64], least: int) -> NDArray[np.bool_]:
+    """The good columns of runs with one shift that are at least so long."""
+    ends = np.flatnonzero(np.diff(np.where(good, path, -1))) + 1
+    parts = np.split(good, ends)
+    return np.concatenate([part & (part.size >= least) for part in parts])

@@ -44,7 +44,9 @@ OPEN_ALPHA_LOW, OPEN_ALPHA_HIGH = (wp.constant(wp.float32(v)) for v in texture.O
 RIM_LOW, RIM_HIGH = (wp.constant(wp.float32(v)) for v in texture.RIM)
 OUTLINE_LOW, OUTLINE_HIGH = (wp.constant(wp.float32(v * v)) for v in texture.OUTLINE_TURN)
 BORDER_LOW, BORDER_HIGH = (wp.constant(wp.float32(v)) for v in texture.BORDER_PX)
+MIRRORED_LOW, MIRRORED_HIGH = (wp.constant(wp.float32(v)) for v in texture.MIRRORED_RIM)
 EXTENDED_LOW, EXTENDED_HIGH = (wp.constant(wp.float32(v)) for v in texture.EXTENDED_PX)
+SHADOW_LOW, SHADOW_HIGH = (wp.constant(wp.float32(v)) for v in texture.SHADOW_EXTENDED_PX)
 OPAQUE, EVEN = wp.constant(wp.float32(1.0 - 1e-6)), wp.constant(wp.float32(1e-6))
 AROUND, ABOVE = (wp.constant(wp.float32(v)) for v in texture.AMBIENT)
 GROUND_RGB = wp.constant(wp.vec3f(*texture.GROUND_RGB))
@@ -1015,6 +1017,7 @@ def completed(
     weight = weight * (1.0 - step(texel[4], 0.0, 1.0)) * step(texel[3], 0.5, 0.95)
     weight = weight * (1.0 - step(own[11] - texel[6], DEPTH_LOW, DEPTH_HIGH))
     weight = weight * facing_weight(facing - own[12], own[12], own[6]) * step(own[12], 0.05, 0.2)
+    weight = weight * (1.0 - step(texel[5], MIRRORED_LOW, MIRRORED_HIGH))
     straight = clamped(wp.vec3f(texel[0], texel[1], texel[2]) / wp.max(texel[3], 0.4))
     return colour + (straight - colour) * weight
 
@@ -1283,13 +1286,13 @@ def shadow_kernel(start: int, table: wp.array(dtype=wp.vec4i), ground: Ground, o
             dark += dark_row(ground.dark, t.rows[1], t, t.wx) * t.wy[1]
             dark += dark_row(ground.dark, t.rows[2], t, t.wx) * t.wy[2]
             dark += dark_row(ground.dark, t.rows[3], t, t.wx) * t.wy[3]
-            factor = factor - dark * inside_weight(place[0], place[1], wh, EXTENDED_LOW, EXTENDED_HIGH)
+            factor = factor - dark * inside_weight(place[0], place[1], wh, SHADOW_LOW, SHADOW_HIGH)
     out[i] = factor
 
 
 @wp.func
 def border_loss(place: wp.vec2f, wh: wp.vec2f):
-    return inside_weight(place[0], place[1], wh, EXTENDED_LOW, EXTENDED_HIGH)
+    return inside_weight(place[0], place[1], wh, SHADOW_LOW, SHADOW_HIGH)
 
 
 @wp.kernel(enable_backward=False)

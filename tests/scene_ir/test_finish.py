@@ -48,24 +48,55 @@ def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
     own = finish.fitted(surface, none)
     assert np.allclose(own, [1.0, 1.0, 1.0, 0.0])
     assert finish.base_paint(surface, none) is None
-    assert finish.sunlight(surface, none, 0.4) == pytest.approx(0.4)
+    assert finish.sunlight([(surface, none)], [None]) == pytest.approx(0.4, abs=0.11)
+    assert finish.sunlight([(surface, none)] * 3, [1.2] * 3) == pytest.approx(1.2, abs=0.21)
 
 
 def test_base_paint_is_the_photographs(compositor: Compositor, photographed: SceneIR) -> None:
     """The first car is painted red, the second blue."""
-    red, blue = (s.paint for s in photographed.objects.source[:2])
-    assert torch.equal(torch.stack([s.paint for s in photographed.objects.source]), compositor.base_paint())
+    kept = torch.stack([s.paint for s in photographed.objects.source])
+    assert torch.allclose(kept, compositor.base_paint(compositor.samples()), atol=0.02)
+    red, blue = kept[:2]
     assert float(red[0]) > 1.5 * float(red[1])
     assert float(blue[2]) > 1.3 * float(blue[0])
+
+
+def _lit(samples: finish.Samples, strength: float) -> finish.Samples:
+    level = 0.3 * (samples.sky + strength * samples.direct)
+    return replace(samples, photograph=np.repeat(1.0 - np.exp(-level)[:, None], 3, axis=1))
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.6, 1.4])
 def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
     surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
-    level = 0.3 * (samples.sky + strength * samples.direct)
-    lit = replace(samples, photograph=np.repeat(1.0 - np.exp(-level)[:, None], 3, axis=1))
-    assert finish.sunlight(surface, lit, strength) == pytest.approx(strength, abs=0.01)
-    assert abs(finish.sunlight(surface, lit, strength + 0.4) - strength) < 0.4
+    seen = [(surface, _lit(samples, strength))]
+    assert finish.sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
+    assert abs(finish.sunlight(seen, [strength + 0.4]) - strength) < 0.4
+
+
+def test_one_vehicle_in_the_shade_does_not_change_the_frames_sunlight(compositor: Compositor) -> None:
+    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    seen = [(surface, _lit(samples, s)) for s in (1.4, 1.4, 0.0)]
+    assert finish.sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
+
+
+def test_a_frames_vehicles_share_their_sunlight(photographed: SceneIR) -> None:
+    assert len({s.sunlight for s in photographed.objects.source}) == 1
+
+
+def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a hidden car's completion would change once the others are there, and the picture with it."""
+    monkeypatch.setattr("scene_ir.compositor._MOST_SAMPLES", 150)
+    names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
+    names = (*names, "box2d", "truncation", "occlusion")
+    objects, clear = photographed.objects, torch.zeros_like(photographed.depth)
+    together = Compositor(photographed, hidden=[clear] * len(objects)).samples()[1]
+    single = {n: getattr(objects, n)[1:2] for n in names}
+    one = replace(photographed, objects=replace(objects, source=objects.source[1:2], **single))
+    alone = Compositor(one, hidden=[clear]).samples()[0]
+    assert 50 < len(alone.weight) <= 151
+    assert np.array_equal(together.vertex, alone.vertex)
+    assert np.array_equal(together.photograph, alone.photograph)
 
 
 def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor) -> None:

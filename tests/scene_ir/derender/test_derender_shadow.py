@@ -54,6 +54,23 @@ def test_ground_view_knows_the_footprints_corners_and_middle():
     assert np.isinf(ground.distance[:88]).all()
 
 
+@pytest.mark.parametrize("place", [(0.5, 1.65, 9.0), (-2.5, 1.65, 2.0), (4.0, 1.65, 40.0)])
+def test_ground_view_holds_all_ground_within_metres_of_the_footprint(place: tuple[float, float, float]):
+    car = silhouette.placed("hatchback", torch.tensor(place), torch.tensor(0.4), CAR.size_lhw)
+    ground = shadow.ground_view(car, LEVEL, CAMERA)
+    v, u = np.mgrid[0:200, 0:480]
+    intrinsics = CAMERA.matrix.numpy()
+    with np.errstate(divide="ignore"):
+        z = 1.65 * intrinsics[1, 1] / np.maximum(v - intrinsics[1, 2], 0)
+    x = (u - intrinsics[0, 2]) * np.minimum(z, 1e3) / intrinsics[0, 0]
+    near = (np.hypot(x - place[0], z - place[2]) < 5.0) & (z > 0)
+    assert near.any()
+    assert np.isfinite(ground.distance[near]).all()
+    beyond = np.ones_like(near)
+    beyond[ground.window] = False
+    assert np.isinf(ground.distance[beyond]).all()
+
+
 def found_in(
     light: shadow.Light, sun: torch.Tensor, allowed: np.ndarray = ROAD > 0.5, pixels: np.ndarray | None = None
 ) -> np.ndarray:

@@ -195,3 +195,17 @@ def test_a_box_holds_a_car_that_the_image_cuts_by_what_is_inside():
     boxes = Boxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 1.0, 1.0]]))
     fitted = silhouette.fit([truth], [target], [NOTHING], boxes, CAMERA, FitSettings())[0]
     assert silhouette.iou(outline(fitted), target) > 0.97
+
+
+@pytest.mark.parametrize("radius", [0.0, 1.5, 4.0, -1.0, -2.5])
+def test_growing_looks_at_no_more_than_it_needs_and_misses_nothing(radius: float):
+    mask = np.zeros((60, 90), bool)
+    mask[20:33, 40:70] = mask[50:, :12] = True
+    mask[25, 55] = False
+    if radius < 0:
+        away = cv2.distanceTransform(np.pad(mask, 1, mode="edge").astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        wanted = away > -radius
+    else:
+        wanted = mask | (cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) <= radius)
+    assert np.array_equal(silhouette.grow(mask, radius), wanted)
+    assert not silhouette.grow(np.zeros_like(mask), radius).any()

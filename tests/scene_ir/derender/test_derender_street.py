@@ -166,3 +166,26 @@ def test_the_fill_has_the_guides_colours_and_the_photographs_grain():
     assert result[part].std() > 1.3 * guide.image[part].std()
     dark = fill(image, mask, mask, HORIZON, Ground(guide.ground, like), guide=guide.image * np.float32(0.6))
     assert dark[part].mean() < result[part].mean() - 0.1
+
+
+def test_behind_a_hole_a_tree_at_its_edge_ends_and_the_low_skyline_goes_on():
+    sky = np.zeros((100, 300), np.float32)
+    sky[:60] = 1
+    sky[20:60, 200:260] = 0
+    unknown = np.zeros(sky.shape, bool)
+    unknown[10:95, 120:200] = True
+    found = top_rows(sky, unknown, 70.0)
+    assert np.abs(found[120:178] - 60).max() < 3
+    assert found[199] < 30
+
+
+def test_what_the_maps_took_for_a_vehicle_lies_on_the_ground_where_none_is():
+    image = photograph(0.0, 0.0)
+    known = shares()
+    taken = known.ground.copy()
+    taken[100:, :] = 0.1
+    plain = continued(image, hole(), Shares(known.ground, known.sky, known.stood), view(), HORIZON)
+    found = continued(image, hole(), Shares(known.ground, known.sky, known.stood, taken), view(), HORIZON)
+    low = hole() & plain.ground
+    assert low.any()
+    assert np.abs(found.image - plain.image)[low].max() > 0.01

@@ -89,3 +89,19 @@ def test_without_an_upright_hole_nothing_changes(rows):
     found = copied(image, mask, mask, guide(image), HORIZON)
     assert np.array_equal(found.image, image)
     assert not found.done.any()
+
+
+def test_a_narrow_source_is_not_shown_again_and_again():
+    image = np.full((*SHAPE, 3), 0.9, np.float32)
+    # 20 columns have the guide's colour: repeated, they would fill the 60 of the hole.
+    image[:, 202:222] = 0.52
+    image[:, 210:214] = 0.35
+    found = copied(spoilt(image), hole(), hole(), guide(image), HORIZON, UprightSettings(settle=0, ring_weight=0))
+    assert found.done[60, 140:200].any()
+    assert np.count_nonzero(found.image[60, 140:200, 0] < 0.7) <= 30
+
+
+def test_what_nothing_beside_fits_is_left_to_others():
+    image = fence()
+    image[:, :140], image[:, 200:] = (1, 0, 0), (0, 0, 1)
+    assert not copied(spoilt(image), hole(), hole(), guide(image), HORIZON).done.any()
