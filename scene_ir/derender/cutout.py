@@ -26,7 +26,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from scene_ir.derender.pose import crops_of
+from scene_ir.derender.pose import Block, crops_of
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.meshes.lod import detail
@@ -95,20 +95,6 @@ class Cutout:
         return out
 
 
-class _Block(nn.Module):
-    """Convolution, normalisation, ReLU; added to its input where that has the same shape."""
-
-    def __init__(self, channels: int, out: int, stride: int = 1) -> None:
-        super().__init__()
-        self.convolution = nn.Conv2d(channels, out, 3, stride=stride, padding=1, bias=False)
-        self.normalisation = nn.BatchNorm2d(out)
-        self.residual = stride == 1 and channels == out
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(self.normalisation(self.convolution(x)))
-        return x + y if self.residual else y
-
-
 class _First(nn.Module):
     """The first look: an encoder to a sixteenth and back, (N, 10, 96, 160) to logits (N, 4, 96, 160)."""
 
@@ -117,14 +103,14 @@ class _First(nn.Module):
         widths = (32, 64, 96, 128)
         down, across, up, channels = [], [], [], 3 + GUIDES
         for out in widths:
-            down.append(nn.Sequential(_Block(channels, out, 2), _Block(out, out)))
+            down.append(nn.Sequential(Block(channels, out, 2), Block(out, out)))
             channels = out
         for out in widths[-2::-1]:
             across.append(nn.Conv2d(channels, out, 1))
-            up.append(_Block(out, out))
+            up.append(Block(out, out))
             channels = out
         self.down, self.across, self.up = nn.ModuleList(down), nn.ModuleList(across), nn.ModuleList(up)
-        self.bottom = _Block(widths[-1], widths[-1])
+        self.bottom = Block(widths[-1], widths[-1])
         self.out = nn.Conv2d(channels, 4 * len(CLASSES), 1)
 
     def forward(self, x: Tensor) -> Tensor:

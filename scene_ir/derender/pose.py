@@ -67,10 +67,10 @@ _HUBER = 1.5
 """Standard deviations from which on a vehicle pulls at the plane, or the plane at a vehicle, no stronger."""
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     """Convolution, normalisation, ReLU; added to its input where that has the same shape."""
 
-    def __init__(self, channels: int, out: int, stride: int) -> None:
+    def __init__(self, channels: int, out: int, stride: int = 1) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(channels, out, 3, stride=stride, padding=1, bias=False)
         self.normalisation = nn.BatchNorm2d(out)
@@ -107,7 +107,7 @@ class PoseNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         layers = ((3, 16, 2), (16, 32, 2), (32, 32, 1), (32, 64, 2), (64, 64, 1), (64, 128, 2), (128, 128, 1))
-        self.blocks = nn.Sequential(*(_Block(*layer) for layer in layers))
+        self.blocks = nn.Sequential(*(Block(*layer) for layer in layers))
         self.squeeze = nn.Conv2d(128, 40, 1)
         cells = 40 * (CROP_HW[0] // 16) * (CROP_HW[1] // 16)
         self.hidden = nn.Linear(cells + NUMBERS, 160)
