@@ -20,7 +20,6 @@ from scene_ir.derender import segment
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera
 
-pytest.importorskip("onnxruntime")
 NAMES = ("sky", "vegetation", "road", "building")
 FLOAT, INT64 = 1, 7
 Value = int | str | bytes

@@ -49,7 +49,6 @@ def graph(constant_graph: Callable[..., bytes], tmp_path: Path) -> Make:
     """A file with constant outputs, for an input (1, 3, SIDE, SIDE) or another one."""
 
     def make(given: Mapping[str, np.ndarray], shape: tuple[int | str, ...] = (1, 3, SIDE, SIDE)) -> Path:
-        pytest.importorskip("onnxruntime")
         path = tmp_path / "tiny.onnx"
         path.write_bytes(constant_graph(shape, given))
         return path
@@ -114,7 +113,6 @@ def test_nothing_is_found_in_an_empty_picture(graph: Make) -> None:
     ],
 )
 def test_files_that_are_none(content: bytes | None, message: str, tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
     path = tmp_path / "own.onnx"
     if content is not None:
         path.write_bytes(content)
@@ -165,7 +163,6 @@ def test_the_shipped_detector_is_a_predictor_too() -> None:
 
 @pytest.mark.skipif(not NANODET.is_file(), reason="needs ../shared/data/detectors/nanodet_m.onnx")
 def test_nanodet_is_recognised_and_threads_follow_torch() -> None:
-    pytest.importorskip("onnxruntime")
     predictor = OnnxPredictor(NANODET)
     assert predictor.format is nanodet.FORMAT
     assert predictor.input_hw == (416, 416)

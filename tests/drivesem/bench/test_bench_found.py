@@ -237,7 +237,6 @@ def test_the_command_reads_scenes_and_draws_failures(
 def test_bad_input_is_one_line_and_exit_code_2(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("onnxruntime")
     (tmp_path / "EMPTY").mkdir()
     given = [str(tmp_path / "EMPTY") if word == "EMPTY" else word for word in words]
     assert main(["bench", "found", *given]) == 2

@@ -5,49 +5,23 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from scene_ir.derender import silhouette, stand
 from scene_ir.derender.silhouette import Boxes, Placement
-from scene_ir.geometry import to_clip
-from scene_ir.raster import verbs
-from scene_ir.types import Camera, Part
+from tests.scene_ir.derender.painting import CAMERA, NOTHING, painted
 
-CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
-NOTHING = np.zeros((200, 480), bool)
 YAW = 0.6
-COLOURS = {
-    Part.PAINT: (190, 40, 40),
-    Part.GLASS: (30, 35, 40),
-    Part.TYRE: (20, 20, 20),
-    Part.LIGHT: (240, 235, 200),
-}
 
 
 def car(kind: str = "sedan", yaw: float = YAW, size: tuple[float, float, float] = (4.3, 1.5, 1.75)) -> Placement:
     return silhouette.placed(kind, torch.tensor([0.5, 1.65, 9.0]), torch.tensor(yaw), torch.tensor(size))
 
 
-def photograph(placement: Placement) -> np.ndarray:
-    """(200, 480, 3): the car's parts in plain colours, on grey with grain."""
-    clip = to_clip(placement.vertices(), CAMERA.matrix)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 480, 200]]))
-    faces = placement.mesh.faces
-    face = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout).face.reshape(200, 480).long()
-    part = np.where(face.numpy() >= 0, placement.mesh.part[face.clamp(min=0)].numpy(), -1)
-    image = np.full((200, 480, 3), 120.0)
-    for kind, colour in COLOURS.items():
-        image[part == int(kind)] = colour
-    image[part == int(Part.OTHER)] = (70, 70, 70)
-    image = cv2.GaussianBlur(image, (0, 0), 0.7) + np.random.default_rng(0).normal(0, 3, image.shape)
-    return np.clip(image, 0, 255).astype(np.uint8)
-
-
 def view_of(placement: Placement) -> stand.View:
-    return stand.View(photograph(placement), NOTHING, CAMERA)
+    return stand.View(painted(placement), NOTHING, CAMERA)
 
 
 def box_of(placement: Placement) -> Boxes:
@@ -115,6 +89,6 @@ def test_a_pickup_is_the_last_to_be_believed():
     truth = car("sedan", -math.pi / 2)
     options = [car("sedan", -math.pi / 2), car("pickup", -math.pi / 2)]
     _, apart = stand.likely(options, None, view_of(truth), measured=True)
-    bare = silhouette.edge_distances(options, NOTHING, photograph(truth), CAMERA)
+    bare = silhouette.edge_distances(options, NOTHING, painted(truth), CAMERA)
     assert apart[0] == pytest.approx(bare[0])
     assert apart[1] > bare[1] + 0.03
