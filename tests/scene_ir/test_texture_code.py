@@ -193,3 +193,10 @@ def test_looks_at_the_border_fade_beyond_it() -> None:
     assert weight[[0, 1, 3, 4]].tolist() == [1.0, 1.0, 0.0, 0.0]
     assert 0.4 < float(weight[2]) < 0.6
     assert texture.inside_weight(uv, 20, 30).tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_relit_spares_what_is_white() -> None:
+    colours = torch.tensor([[0.5, 1.0, 0.2], [0.5, 1.0, 0.2]])
+    found = texture.relit(colours, torch.tensor([0.2, -0.4]))
+    expected = torch.tensor([[0.575, 1.0, 0.2384], [0.35, 1.0, 0.1232]])
+    assert torch.allclose(found, expected, atol=1e-6)
