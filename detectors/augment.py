@@ -1,6 +1,7 @@
-"""Views of a training frame: windows at (nearly) native scale, mirrored, with other colours, blur, noise, JPEG.
+"""Views of a training frame: windows at half to native scale, mirrored, with other colours, blur, noise, JPEG.
 
-Everything is drawn from the generator that comes in, so a view is a function of (frame, generator) alone.
+kornia changes the pixels. Everything is drawn from the generator that comes in, so a view is a function of (frame,
+generator) alone, and a run that was stopped goes on to the same bytes.
 """
 
 from __future__ import annotations
@@ -9,41 +10,29 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+from kornia import enhance, filters
+from kornia.geometry import transform
 from torch import Tensor
 
 from detectors import boxes
-from detectors.squeezedet import BGR_MEAN
 from detectors.types import Targets
 
 CUT_VISIBLE = 0.3
 """A box of which the window shows less than this fraction becomes an ignored one."""
 
-_LUMA = (0.299, 0.587, 0.114)
-"""ITU-R BT.601."""
-
-_JPEG_LUMA = (
-    (16, 11, 10, 16, 24, 40, 51, 61),
-    (12, 12, 14, 19, 26, 58, 60, 55),
-    (14, 13, 16, 24, 40, 57, 69, 56),
-    (14, 17, 22, 29, 51, 87, 80, 62),
-    (18, 22, 37, 56, 68, 109, 103, 77),
-    (24, 35, 55, 64, 81, 104, 113, 92),
-    (49, 64, 78, 87, 103, 121, 120, 101),
-    (72, 92, 95, 98, 112, 100, 103, 99),
-)
-"""Quantisation of luminance, ITU-T T.81, table K.1; used for all three channels."""
+FILL_RGB = (124, 117, 104)
+"""Outside the frame: the mean colour of ImageNet, which backbones take for nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class AugmentSettings:
     """How far views may depart from their frame."""
 
-    window_hw: tuple[int, int] = (288, 640)
+    window_hw: tuple[int, int] = (224, 640)
     """Size of the view in pixels; frames smaller than it are padded by their border."""
-    scale: tuple[float, float] = (0.75, 1.35)
+    scale: tuple[float, float] = (0.5, 1.35)
     """Range of the zoom, drawn uniformly in its logarithm."""
-    scale_probability: float = 0.7
+    scale_probability: float = 0.8
     object_probability: float = 0.9
     """How often the window is placed around an object instead of anywhere."""
     flip_probability: float = 0.5
@@ -54,6 +43,8 @@ class AugmentSettings:
     channel_gain: float = 0.12
     saturation: float = 0.6
     hue_rad: float = 0.35
+    hue_probability: float = 0.25
+    """Of a change of hue, by far the slowest of all."""
     blur_probability: float = 0.15
     noise_probability: float = 0.2
     jpeg_probability: float = 0.15
@@ -72,11 +63,11 @@ def view(
     x0, y0 = _place(image.shape[:2], (height, width), targets, settings, generator)
     pixels = torch.from_numpy(_cut(image, x0, y0, height, width)).permute(2, 0, 1).float() / 255
     if (height, width) != settings.window_hw:
-        pixels = F.interpolate(pixels[None], settings.window_hw, mode="bilinear", antialias=scale < 1)[0]
+        pixels = transform.resize(pixels, settings.window_hw, "bilinear", align_corners=False, antialias=scale < 1)
     zoom_xy = (settings.window_hw[1] / width, settings.window_hw[0] / height)
     moved = cut_targets(targets, (x0, y0), zoom_xy, settings)
     if generator.random() < settings.flip_probability:
-        pixels, moved = pixels.flip(2), mirror(moved, settings.window_hw[1])
+        pixels, moved = transform.hflip(pixels), mirror(moved, settings.window_hw[1])
     return degrade(recolour(pixels, settings, generator), settings, generator), moved
 
 
@@ -108,27 +99,32 @@ def mirror(targets: Targets, width: int) -> Targets:
 
 def recolour(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
     """The image (3, H, W) in [0, 1] in other light: brightness, contrast, saturation, hue, channel gain, gamma."""
-    gain = np.exp(generator.uniform(-settings.channel_gain, settings.channel_gain, 3))
-    contrast = np.exp(generator.uniform(-settings.contrast, settings.contrast))
-    saturation = 1 + settings.saturation * generator.uniform(-1, 1)
-    hue = generator.uniform(-settings.hue_rad, settings.hue_rad)
-    matrix = contrast * gain[:, None] * _colour_matrix(hue, saturation)
-    shift = 0.5 * (1 - contrast) + generator.uniform(-settings.brightness, settings.brightness)
+    gain = np.exp(generator.uniform(-settings.channel_gain, settings.channel_gain, 3)).astype(np.float32)
+    contrast = float(np.exp(generator.uniform(-settings.contrast, settings.contrast)))
+    brightness = float(generator.uniform(-settings.brightness, settings.brightness))
+    saturation = 1 + settings.saturation * float(generator.uniform(-1, 1))
     exponent = float(np.exp(generator.uniform(-settings.gamma, settings.gamma)))
-    offset = torch.full((3, 1), float(shift))
-    flat = torch.addmm(offset, torch.from_numpy(matrix.astype(np.float32)), image.reshape(3, -1))
-    return flat.clamp_(0, 1).pow_(exponent).reshape(image.shape)
+    hue = float(generator.uniform(-settings.hue_rad, settings.hue_rad))
+    image = (image * torch.from_numpy(gain)[:, None, None]).clamp_(0, 1)
+    image = enhance.adjust_contrast_with_mean_subtraction(image, contrast)
+    image = enhance.adjust_brightness(image, brightness)
+    image = enhance.adjust_saturation_with_gray_subtraction(image, saturation)
+    if generator.random() < settings.hue_probability:
+        image = enhance.adjust_hue(image, hue)
+    return enhance.adjust_gamma(image, exponent)
 
 
 def degrade(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
     """The image (3, H, W) in [0, 1], now and then blurred, noisy, or through JPEG."""
     if generator.random() < settings.blur_probability:
-        image = _blur(image, float(generator.uniform(0.4, 1.3)))
+        sigma = float(generator.uniform(0.4, 1.3))
+        image = filters.gaussian_blur2d(image[None], (7, 7), (sigma, sigma), "replicate")[0]
     if generator.random() < settings.noise_probability:
         grain = generator.standard_normal(tuple(image.shape), dtype=np.float32)
         image = (image + torch.from_numpy(grain) * float(generator.uniform(0.005, 0.04))).clamp_(0, 1)
     if generator.random() < settings.jpeg_probability:
-        image = _jpeg(image, float(generator.uniform(0.3, 2.0)))
+        quality = torch.tensor([generator.uniform(30, 90)], dtype=image.dtype)
+        image = enhance.jpeg_codec_differentiable(image[None], quality)[0]
     return image
 
 
@@ -155,44 +151,13 @@ def _place(
 
 
 def _cut(image: np.ndarray, x0: int, y0: int, height: int, width: int) -> np.ndarray:
-    """Pixels (height, width, 3) from (x0, y0) on; the network's mean colour outside the frame."""
+    """Pixels (height, width, 3) from (x0, y0) on; FILL_RGB outside the frame."""
     inside_y = slice(max(y0, 0), min(y0 + height, image.shape[0]))
     inside_x = slice(max(x0, 0), min(x0 + width, image.shape[1]))
     part = image[inside_y, inside_x]
     if part.shape[:2] == (height, width):
         return np.array(part)
     window = np.empty((height, width, 3), np.uint8)
-    window[:] = np.round(BGR_MEAN[::-1])
+    window[:] = FILL_RGB
     window[inside_y.start - y0 : inside_y.stop - y0, inside_x.start - x0 : inside_x.stop - x0] = part
     return window
-
-
-def _colour_matrix(hue_rad: float, saturation: float) -> np.ndarray:
-    """(3, 3) that turns chroma around the grey axis by an angle and scales it; grey stays grey."""
-    axis = np.full(3, 3**-0.5)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turn = np.eye(3) + np.sin(hue_rad) * cross + (1 - np.cos(hue_rad)) * cross @ cross  # Rodrigues
-    grey = np.tile(_LUMA, (3, 1))
-    return (grey + saturation * (np.eye(3) - grey)) @ turn
-
-
-def _blur(image: Tensor, sigma_px: float) -> Tensor:
-    reach = torch.arange(-3, 4, dtype=image.dtype)
-    kernel = torch.exp(-0.5 * (reach / sigma_px) ** 2)
-    kernel = kernel / kernel.sum()
-    padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
-    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, 7)), kernel.view(1, 1, 7, 1))[:, 0]
-
-
-def _jpeg(image: Tensor, strength: float) -> Tensor:
-    """Quantise 8x8 cosine blocks (3, H, W) as JPEG does, at that multiple of its standard table (quality 50)."""
-    rows = torch.arange(8, dtype=image.dtype)
-    cosine = torch.cos((2 * rows[None] + 1) * rows[:, None] * torch.pi / 16) / 2
-    cosine[0] /= 2**0.5
-    table = torch.tensor(_JPEG_LUMA, dtype=image.dtype) * (strength / 255)
-    height, width = image.shape[1:]
-    padded = F.pad(image, (0, -width % 8, 0, -height % 8), mode="replicate")
-    blocks = padded.unfold(1, 8, 8).unfold(2, 8, 8)  # (3, H/8, W/8, 8, 8)
-    coded = torch.round(cosine @ blocks @ cosine.T / table) * table
-    decoded = (cosine.T @ coded @ cosine).permute(0, 1, 3, 2, 4).reshape(padded.shape)
-    return decoded[:, :height, :width].clamp(0, 1)

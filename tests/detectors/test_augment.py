@@ -104,7 +104,7 @@ def test_no_change_of_colour_is_none() -> None:
 
 def test_hue_and_saturation_keep_grey() -> None:
     grey = torch.full((3, 4, 4), 0.3)
-    settings = replace(QUIET, hue_rad=0.5, saturation=0.8)
+    settings = replace(QUIET, hue_rad=0.5, hue_probability=1.0, saturation=0.8)
     torch.testing.assert_close(recolour(grey, settings, np.random.default_rng(1)), grey)
 
 
