@@ -49,6 +49,21 @@ def paired_iou(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
     return _quotient(shared, area(first_xyxy) + area(second_xyxy) - shared)
 
 
+def paired_giou(first_xyxy: Tensor, second_xyxy: Tensor) -> Tensor:
+    """Generalised IoU (N,) in [-1, 1] of the n-th box with the n-th box (Rezatofighi et al., 2019): IoU less the
+    share of the smallest box around both that neither covers. Differentiable, also where the two do not meet.
+    """
+    overlap = (
+        torch.minimum(first_xyxy[:, 2:], second_xyxy[:, 2:]) - torch.maximum(first_xyxy[:, :2], second_xyxy[:, :2])
+    ).clamp_min(0)
+    around = torch.maximum(first_xyxy[:, 2:], second_xyxy[:, 2:]) - torch.minimum(
+        first_xyxy[:, :2], second_xyxy[:, :2]
+    )
+    shared, hull = overlap[:, 0] * overlap[:, 1], around[:, 0] * around[:, 1]
+    union = area(first_xyxy) + area(second_xyxy) - shared
+    return _quotient(shared, union) - _quotient(hull - union, hull)
+
+
 def clip(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
     """Boxes (..., 4) moved into the image: x in [0, width - 1], y in [0, height - 1], KITTI's 0-based limits."""
     limit = boxes_xyxy.new_tensor([width - 1, height - 1, width - 1, height - 1])

@@ -7,10 +7,10 @@ be any. At 1248x384 the two differ by less than a cell.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -59,21 +59,59 @@ SCORE_MINIMUM = 0.005
 IGNORE_OVERLAP = 0.5
 """An anchor that overlaps an ignored box more than this is no negative."""
 
-_FIRE = (
-    # name, input channels, squeeze, expand (1x1 and 3x3 each); None is a 3x3/2 max pooling
-    ("fire2", 64, 16, 64),
-    ("fire3", 128, 16, 64),
-    None,
-    ("fire4", 128, 32, 128),
-    ("fire5", 256, 32, 128),
-    None,
-    ("fire6", 256, 48, 192),
-    ("fire7", 384, 48, 192),
-    ("fire8", 384, 64, 256),
-    ("fire9", 512, 64, 256),
-    ("fire10", 512, 96, 384),
-    ("fire11", 768, 96, 384),
+Sizes = tuple[tuple[float, float], ...]
+"""Width and height of each anchor, px."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Layers up to ConvDet. kernel, channels: of conv1, stride 2; fires: channels of squeeze and of each of the two
+    expansions, by name; pooled: fires that a 3x3/2 max pooling follows, as it follows conv1.
+    """
+
+    kernel: int
+    channels: int
+    fires: dict[str, tuple[int, int]]
+    pooled: tuple[str, str]
+
+
+_LAYOUT = Layout(
+    kernel=3,
+    channels=64,
+    fires={
+        "fire2": (16, 64),
+        "fire3": (16, 64),
+        "fire4": (32, 128),
+        "fire5": (32, 128),
+        "fire6": (48, 192),
+        "fire7": (48, 192),
+        "fire8": (64, 256),
+        "fire9": (64, 256),
+        "fire10": (96, 384),
+        "fire11": (96, 384),
+    },
+    pooled=("fire3", "fire5"),
 )
+"""nets/squeezeDet.py of the published code."""
+
+_LAYOUT_PLUS = Layout(
+    kernel=7,
+    channels=96,
+    fires={
+        "fire2": (96, 64),
+        "fire3": (96, 64),
+        "fire4": (192, 128),
+        "fire5": (192, 128),
+        "fire6": (288, 192),
+        "fire7": (288, 192),
+        "fire8": (384, 256),
+        "fire9": (384, 256),
+        "fire10": (384, 256),
+        "fire11": (384, 256),
+    },
+    pooled=("fire4", "fire8"),
+)
+"""nets/squeezeDetPlus.py of the published code."""
 
 
 class Fire(nn.Module):
@@ -131,19 +169,36 @@ class SqueezeDet(Detector):
 
     In eval mode with all weights frozen it runs as `detectors.frozen` has it. gradient_precision: what passes
     compute in that a gradient to the images may follow; the others, which judge, always use the weights' own.
+    overlap_weight: of 1 - generalised IoU, averaged over objects, in the box term; 0 is the published loss.
     """
 
     name = "squeezedet"
     fresh_layers = ("convdet.", "fires.fire10.", "fires.fire11.")
+    layout = _LAYOUT
 
-    def __init__(self, classes: tuple[str, ...] = CLASSES, t_star: float = 0.5, dropout: float = 0.5) -> None:
+    def __init__(
+        self,
+        classes: tuple[str, ...] = CLASSES,
+        t_star: float = 0.5,
+        dropout: float = 0.5,
+        anchors: Sequence[Sequence[float]] = ANCHOR_SIZES_WH,
+    ) -> None:
+        """anchors: width and height of each, px, as many as wanted (see `detectors.anchors`). Raises ValueError
+        where they are no such pairs.
+        """
         super().__init__()
         self.classes = tuple(classes)
         self.t_star = t_star
-        self.conv1 = nn.Conv2d(3, 64, 3, stride=2)
-        self.fires = nn.ModuleDict({fire[0]: Fire(*fire[1:]) for fire in _FIRE if fire is not None})
+        self.anchors = _checked_sizes(anchors)
+        self.conv1 = nn.Conv2d(3, self.layout.channels, self.layout.kernel, stride=2)
+        inputs, fires = self.layout.channels, {}
+        for name, (squeeze, expand) in self.layout.fires.items():
+            fires[name] = Fire(inputs, squeeze, expand)
+            inputs = 2 * expand
+        self.fires = nn.ModuleDict(fires)
         self.dropout = SeededDropout(dropout)
-        self.convdet = nn.Conv2d(768, len(ANCHOR_SIZES_WH) * (len(self.classes) + 1 + 4), 3, padding=1)
+        self.convdet = nn.Conv2d(inputs, len(self.anchors) * (len(self.classes) + 1 + 4), 3, padding=1)
+        self.overlap_weight = 0.0
         self.gradient_precision: torch.dtype | None = None
         self._nets: dict[torch.dtype, tuple[object, frozen.FrozenNet]] = {}
 
@@ -156,7 +211,7 @@ class SqueezeDet(Detector):
                 module.weight.normal_(0.0, 1e-3 if module is self.convdet else std, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
-        count = len(ANCHOR_SIZES_WH)
+        count = len(self.anchors)
         first = count * len(self.classes)
         if self.convdet.bias is not None:
             self.convdet.bias[first : first + count] = -2.0  # sigmoid 0.12: most anchors see no object
@@ -176,7 +231,9 @@ class SqueezeDet(Detector):
             own.copy_(tensors[key])
 
     def forward(self, images: Tensor) -> RawPredictions:
-        """images (B, 3, H, W), RGB in [0, 1]; A = 9 * ceil(H / 16) * ceil(W / 16), cells row by row, 9 each."""
+        """images (B, 3, H, W), RGB in [0, 1]; A = K * ceil(H / 16) * ceil(W / 16) for K anchors, cells row by row, K
+        each.
+        """
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
         height, width = int(images.shape[2]), int(images.shape[3])
@@ -184,13 +241,16 @@ class SqueezeDet(Detector):
             return self._interpret(self._frozen(images)(images), (height, width))
         mean = images.new_tensor(BGR_MEAN).view(1, 3, 1, 1)
         x = images.flip(1) * 255.0 - mean
-        # To a multiple of 16, and one more row and column for conv1: TensorFlow's SAME puts its single row of
-        # padding for stride 2 below and to the right. Zeros here are the mean colour.
-        x = F.pad(x, (0, -width % STRIDE + 1, 0, -height % STRIDE + 1))
+        # To a multiple of 16, and for conv1 as TensorFlow's SAME: of an odd number of rows for stride 2, it puts the
+        # one more below and to the right. Zeros here are the mean colour.
+        before = frozen.rows_before(self.layout.kernel)
+        x = F.pad(x, (before, -width % STRIDE + before + 1, before, -height % STRIDE + before + 1))
         x = x.contiguous(memory_format=torch.channels_last)
         x = F.relu(_pool(self.conv1(x)), inplace=True)  # the order does not matter, a quarter of the pixels does
-        for fire in _FIRE:
-            x = _pool(x) if fire is None else self.fires[fire[0]](x)
+        for name, fire in self.fires.items():
+            x = fire(x)
+            if name in self.layout.pooled:
+                x = _pool(x)
         return self._interpret(self.convdet(self.dropout(x)), (height, width))
 
     def _frozen(self, images: Tensor) -> frozen.FrozenNet:
@@ -207,7 +267,6 @@ class SqueezeDet(Detector):
     @torch.no_grad()
     def _freeze(self, dtype: torch.dtype) -> frozen.FrozenNet:
         fires = [fire for fire in self.fires.values() if isinstance(fire, Fire)]
-        pooled = {layer[0] for layer, after in pairwise(_FIRE) if layer is not None and after is None}
         following = [*(fire.squeeze for fire in fires[1:]), self.convdet]
         stages = [
             frozen.Stage(
@@ -215,7 +274,7 @@ class SqueezeDet(Detector):
                     frozen.convolution(fire.expand1x1, [fire.squeeze.out_channels], dtype),
                     frozen.convolution(fire.expand3x3, [fire.squeeze.out_channels], dtype),
                 ),
-                pools=name in pooled,
+                pools=name in self.layout.pooled,
                 following=frozen.convolution(
                     after, [fire.expand1x1.out_channels, fire.expand3x3.out_channels], dtype
                 ),
@@ -240,8 +299,8 @@ class SqueezeDet(Detector):
         height, width = raw.image_hw
         like = raw.deltas
         grid = -(-height // STRIDE), -(-width // STRIDE)
-        anchors_cxcywh = _anchors(*grid, like.dtype, like.device)
-        anchors_xyxy = _anchor_corners(*grid, like.dtype, like.device)
+        anchors_cxcywh = _anchors(self.anchors, *grid, like.dtype, like.device)
+        anchors_xyxy = _anchor_corners(self.anchors, *grid, like.dtype, like.device)
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
         image, anchor, true_boxes, labels, meeting = [], [], [], [], []
         for b, target in enumerate(targets):
@@ -303,6 +362,11 @@ class SqueezeDet(Detector):
             "box": WEIGHT_BOX * box,
             "class": WEIGHT_CLASS * classes,
         }
+        if self.overlap_weight:
+            # Four offsets, each judged by itself, leave boxes loose. In units of their anchor, boxes overlap as in
+            # pixels.
+            apart = 1 - boxes.paired_giou(_boxes_of(raw.deltas[image, anchor]), _boxes_of(assignment.deltas))
+            terms["box"] = terms["box"] + self.overlap_weight * apart.sum() / objects
         return terms | {
             "total": terms["confidence"] + terms["box"] + terms["class"],
             "objectness": (WEIGHT_CONFIDENCE_POSITIVE * unseen + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
@@ -325,14 +389,14 @@ class SqueezeDet(Detector):
         return found
 
     def _interpret(self, output: Tensor, image_hw: tuple[int, int]) -> RawPredictions:
-        """Split ConvDet's channels (B, 9 * (C + 1 + 4), gh, gw): class scores, confidences, deltas."""
+        """Split ConvDet's channels (B, K * (C + 1 + 4), gh, gw): class scores, confidences, deltas."""
         batch, _, rows, columns = output.shape
-        count, classes = len(ANCHOR_SIZES_WH), len(self.classes)
+        count, classes = len(self.anchors), len(self.classes)
         cells = output.permute(0, 2, 3, 1)
         if cells.dtype in (torch.bfloat16, torch.float16):  # boxes need more than their 8 or 11 bits
             cells = cells.float()
         class_logits, confidence, deltas = cells.split((count * classes, count, count * 4), -1)
-        anchors = _anchors(rows, columns, cells.dtype, cells.device)
+        anchors = _anchors(self.anchors, rows, columns, cells.dtype, cells.device)
         deltas = deltas.reshape(batch, -1, 4)
         centre = anchors[:, :2] + deltas[..., :2] * anchors[:, 2:]
         size = anchors[:, 2:] * _safe_exp(deltas[..., 2:])
@@ -345,25 +409,44 @@ class SqueezeDet(Detector):
         )
 
 
+class SqueezeDetPlus(SqueezeDet):
+    """SqueezeDet+ of the same paper: a wider stem and wider squeezes, over three times the weights. Its conv1 is
+    padded as SqueezeDet's is, where the published one leaves the border out.
+    """
+
+    name = "squeezedet-plus"
+    fresh_layers = ("",)
+    layout = _LAYOUT_PLUS
+
+
+def _checked_sizes(anchors: Sequence[Sequence[float]]) -> Sizes:
+    sizes = tuple(tuple(float(number) for number in size) for size in anchors)
+    if not sizes or any(len(size) != 2 or not all(0 < number < math.inf for number in size) for size in sizes):
+        raise ValueError(f"anchors: expected pairs of positive px, at least one, found {sizes}")
+    return tuple((width, height) for width, height in sizes)
+
+
 def _pool(x: Tensor) -> Tensor:
     # TensorFlow's SAME on an even size: the last window reaches one pixel beyond the edge.
     return F.max_pool2d(x, 3, stride=2, ceil_mode=True)
 
 
 @lru_cache(maxsize=16)
-def _anchors(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Anchors (9 * rows * columns, 4) as centre x, centre y, width, height in px; cells row by row, 9 each."""
+def _anchors(sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Anchors (K * rows * columns, 4) as centre x, centre y, width, height in px; cells row by row, K each."""
     y = torch.arange(rows, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
     x = torch.arange(columns, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
     centres = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (rows, columns, 2)
-    sizes = torch.tensor(ANCHOR_SIZES_WH, dtype=dtype, device=device)
-    shape = (rows, columns, len(ANCHOR_SIZES_WH), 2)
+    sizes = torch.tensor(sizes_wh, dtype=dtype, device=device)
+    shape = (rows, columns, len(sizes_wh), 2)
     return torch.cat((centres[:, :, None].expand(shape), sizes.expand(shape)), -1).reshape(-1, 4)
 
 
 @lru_cache(maxsize=16)
-def _anchor_corners(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    return _corners(_anchors(rows, columns, dtype, device))
+def _anchor_corners(
+    sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    return _corners(_anchors(sizes_wh, rows, columns, dtype, device))
 
 
 def _corners(boxes_cxcywh: Tensor) -> Tensor:
@@ -398,6 +481,11 @@ def _covered(candidates_xyxy: Tensor, ignored_xyxy: Tensor) -> Tensor:
     """Candidates (N,) of which an ignored box covers more than IGNORE_OVERLAP. No IoU exceeds that share."""
     shared = boxes.intersection_matrix(ignored_xyxy, candidates_xyxy)
     return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
+
+
+def _boxes_of(deltas: Tensor) -> Tensor:
+    """Boxes (N, 4) as left, top, right, bottom, in units of their anchor's size, around its centre."""
+    return _corners(torch.cat((deltas[:, :2], _safe_exp(deltas[:, 2:])), 1))
 
 
 def _safe_exp(x: Tensor) -> Tensor:

@@ -290,7 +290,8 @@ class Eval(Command):
     out: str | None = None
     """Folder for metrics.json, CSV, Markdown and PNG."""
     detector: str | None = None
-    """Instead of --gt and --pred: run this detector, a shipped one, a .safetensors file or onnx:FILE."""
+    """Instead of --gt and --pred: run this detector, a shipped one, a file, or another project's (see
+    docs/detectors.md)."""
     dataset: str = "kitti"
     """Of --detector: kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
@@ -305,6 +306,10 @@ class Eval(Command):
     """Of --detector: lower objects are neither missed nor a hit, px."""
     max_occlusion: int = 1
     """Of --detector: objects occluded more (KITTI's 0 to 3) are neither missed nor a hit."""
+    max_truncation: float = 1.0
+    """Of --detector: objects of which a larger share lies outside the image are neither missed nor a hit."""
+    pictures: int = 0
+    """Of --detector: draw hits, misses and false alarms of the N frames with most mistakes into --out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,6 +437,10 @@ def _validate_eval(config: Eval) -> None:
         raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
     if config.detector is not None and config.dataset not in DATASETS[1:]:
         raise UsageError("--dataset", f"one of {', '.join(DATASETS[1:])}", repr(config.dataset))
+    if config.pictures < 0:
+        raise UsageError("--pictures", "at least 0", config.pictures)
+    if config.pictures and (config.detector is None or config.out is None):
+        raise UsageError("--pictures", "--detector and --out", "one of them missing")
     if config.bootstrap is not None and config.bootstrap < 0:
         raise UsageError("--bootstrap", "at least 0", config.bootstrap)
     if config.limit is not None and config.limit < 1:

@@ -22,6 +22,7 @@ from drivesem.evaluation.curves import Rule, Tally, average_precision, sampled_c
 from drivesem.evaluation.instances import EVERY_CLASS, Found, Truths
 from drivesem.evaluation.matching import Candidates, Match, mean_of
 from drivesem.evaluation.resampling import (
+    DRAWS,
     Averaged,
     Difference,
     Figure,
@@ -33,8 +34,8 @@ from drivesem.evaluation.resampling import (
 
 VOC_OVERLAP = 0.5
 """At least so much must overlap (VOC)."""
-DRAWS, MANY_FRAMES = 200, 5000
-"""Bootstrap draws by default, and frames from which on there are none."""
+MANY_FRAMES = 5000
+"""From so many frames on there are no bootstrap draws by default."""
 _FILE_WIDTH = 120
 """Characters a line of the tables where they go to a file and not to a terminal."""
 

@@ -21,8 +21,11 @@ from drivesem.config import Eval, UsageError
 from drivesem.data.classes import KITTI, ClassMap
 from drivesem.data.coco import COCO_ROAD_USERS
 from drivesem.data.registry import Dataset, open_dataset
+from drivesem.eval_outcome import Outcome, marked
 from drivesem.eval_report import percent
 from drivesem.evaluation import coco
+from drivesem.evaluation.resampling import DRAWS, Interval
+from drivesem.pipeline import to_uint8
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.types import Labels
@@ -43,7 +46,11 @@ def run(config: Eval) -> int:
     names = dataset.identifiers[: config.limit]
     found, targets = _look(config, dataset, detector, names)
     t_star = float(getattr(detector, "t_star", DEFAULT_T_STAR))
-    scores = coco.evaluate(targets, found, _judged(detector), t_star, HEADLINE)
+    judged = _judged(detector)
+    scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
+    outcome = Outcome.of(targets, found, judged.index(HEADLINE))
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    spread = outcome.intervals(draws, config.seed) if draws else []
     data: dict[str, Any] = {
         "detector": config.detector,
         "dataset": config.dataset,
@@ -52,15 +59,29 @@ def run(config: Eval) -> int:
         "t_star": t_star,
         "min_height": config.min_height,
         "max_occlusion": config.max_occlusion,
+        "max_truncation": config.max_truncation,
         "tiles": config.tiles,
         **scores.to_json(),
+        "bootstrap": draws,
+        "intervals": [asdict(one) for one in spread],
     }
     if config.out is not None:
-        _write(Path(config.out), data, names, found, _judged(detector))
+        _write(Path(config.out), data, names, found, judged)
+        _draw(config, dataset, names, outcome, t_star)
     if config.json:
         sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    _print(scores.per_class, data, Console(stderr=True))
+    _print(scores.per_class, data, spread, Console(stderr=True))
     return 0
+
+
+def _draw(config: Eval, dataset: Dataset, names: Sequence[str], outcome: Outcome, t_star: float) -> None:
+    """The frames with most mistakes, worst first."""
+    marks = [outcome.marks(frame, t_star) for frame in range(len(names))]
+    worst = sorted(range(len(names)), key=lambda i: (-marks[i].mistakes, i))
+    for rank, frame in enumerate(worst[: config.pictures], start=1):
+        picture = marked(to_uint8(dataset.frame(names[frame]).photograph), marks[frame])
+        name = names[frame].replace("/", "_")
+        files.write_png(Path(config.out or "") / "pictures" / f"{rank:03d}-{name}.png", picture)
 
 
 def _detector(config: Eval) -> Predictor:
@@ -108,6 +129,8 @@ def _targets(labels: Labels, config: Eval, judged: Sequence[str]) -> Targets:
     boxes, ignore = named.boxes_xyxy, named.ignore.clone()
     height = boxes[:objects, 3] - boxes[:objects, 1]
     ignore[:objects] |= (height < config.min_height) | (labels.occlusion > config.max_occlusion)
+    # an unknown truncation (NaN) is no reason to leave an object out
+    ignore[:objects] |= labels.truncation > config.max_truncation
     places = torch.tensor([judged.index(name) if name in judged else -1 for name in CLASSES])
     own = places[named.labels]
     # an object of its own class that is not judged, a neighbour of a class, or a region: said for every class
@@ -143,7 +166,12 @@ def _write(
         write_labels(path, labels, one.scores[kept])
 
 
-def _print(per_class: Mapping[str, coco.ClassScores], data: Mapping[str, Any], console: Console) -> None:
+def _print(
+    per_class: Mapping[str, coco.ClassScores],
+    data: Mapping[str, Any],
+    spread: Sequence[Interval],
+    console: Console,
+) -> None:
     table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
     table.add_column("class")
     for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*", "objects"):
@@ -153,8 +181,12 @@ def _print(per_class: Mapping[str, coco.ClassScores], data: Mapping[str, Any], c
         cells = [percent(row[key]) for key in ("ap50", "ap70", "ap", "recall", "recall_at_t_star")]
         table.add_row(name, *cells, str(scores.objects))
     console.print(table)
+    for one in spread:
+        if one.low is not None and one.high is not None:
+            bounds = f"{percent(one.low)} to {percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
+            console.print(f"{HEADLINE} {one.name} {percent(one.value)}, {bounds}", soft_wrap=True)
     console.print(
         f"{data['frames']} frames; judged: at least {data['min_height']:g} px high, occlusion at most "
-        f"{data['max_occlusion']}; t* {data['t_star']:.3f}",
+        f"{data['max_occlusion']}, truncation at most {data['max_truncation']:g}; t* {data['t_star']:.3f}",
         soft_wrap=True,
     )

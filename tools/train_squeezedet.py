@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -295,6 +295,7 @@ def main() -> None:
     parser.add_argument("--thin", type=int, default=2, help="judge by every n-th held-out frame until the end")
     parser.add_argument("--no-bfloat16", action="store_true")
     parser.add_argument("--note", default="", help="a remark on this run for the model card")
+    parser.add_argument("--overlap-weight", type=float, default=2.0, help="of generalised IoU in the box term")
     parser.add_argument("--dropout", type=float, default=0.5)
     arguments = parser.parse_args()
     settings = TrainingSettings(
@@ -303,12 +304,13 @@ def main() -> None:
         batch=arguments.batch,
         rate=arguments.rate,
         seed=arguments.seed,
-        bfloat16=not arguments.no_bfloat16,
+        precision="float32" if arguments.no_bfloat16 else "bfloat16",
         warmup_steps=60,
         checkpoint_every=50,
         evaluate_every=arguments.evaluate_every if arguments.held_out else 0,
     )
     detector = SqueezeDet(dropout=arguments.dropout)
+    detector.overlap_weight = arguments.overlap_weight
     detector.initialise(torch.Generator().manual_seed(arguments.seed))
     detector.load_backbone(read_weights(arguments.backbone)[1])
     detector = detector.to(memory_format=torch.channels_last)
@@ -323,8 +325,8 @@ def main() -> None:
     with Progress(*columns, transient=True, console=Console(stderr=True)) as bar:
         task = bar.add_task("training", total=settings.steps)
 
-        def progress(done: int, steps: int, loss: float) -> None:
-            bar.update(task, completed=done, total=steps, description=f"loss {loss:.3f}")
+        def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
+            bar.update(task, completed=done, total=steps, description=f"loss {row['total']:.3f}")
 
         train(detector, frames, settings, arguments.run, keeper, progress=progress)
 

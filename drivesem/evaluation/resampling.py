@@ -18,6 +18,8 @@ from drivesem.evaluation.kitti import Curve
 
 LEVEL = 0.95
 """Share of draws inside an interval."""
+DRAWS = 200
+"""Bootstrap draws by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,26 @@ class Sampled:
         return Sampled(joined)
 
 
-Part = Averaged | Sampled
+@dataclass(frozen=True, slots=True)
+class Recalled:
+    """Recall of one tally with all its detections, at weights of frames."""
+
+    tally: Tally
+
+    def value(self, weights: Floats | None) -> float | None:
+        """None where no object is drawn."""
+        objects = self.tally.count(weights)
+        if objects <= 0:
+            return None
+        hits, _ = self.tally.curve(weights)
+        return float(hits[-1]) / objects if len(hits) else 0.0
+
+    def beside(self, other: Recalled) -> Recalled:
+        """Both at once: the other's frames are counted on from this one's."""
+        return Recalled(_beside(self.tally, other.tally))
+
+
+Part = Averaged | Sampled | Recalled
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,3 +83,17 @@ def test_nms_equals_brute_force(seed: int, count: int, threshold: float) -> None
     assert boxes.nms(all_boxes, scores, threshold, labels).tolist() == expected
     unlabelled = plain_nms(all_boxes.tolist(), scores.tolist(), threshold, [0] * count)
     assert boxes.nms(all_boxes, scores, threshold).tolist() == unlabelled
+
+
+def test_generalised_iou_by_hand() -> None:
+    first = torch.tensor([[0.0, 0.0, 10.0, 10.0], [0.0, 0.0, 10.0, 10.0], [0.0, 0.0, 2.0, 2.0]])
+    second = torch.tensor([[0.0, 0.0, 10.0, 10.0], [5.0, 0.0, 15.0, 10.0], [6.0, 0.0, 8.0, 2.0]])
+    # the same; half and half: 50 of 150, nothing left open; apart: 8 of a hull of 16
+    assert boxes.paired_giou(first, second).tolist() == pytest.approx([1.0, 1 / 3, -0.5])
+
+
+def test_generalised_iou_draws_boxes_together_that_do_not_meet() -> None:
+    box = torch.tensor([[0.0, 0.0, 2.0, 2.0]], requires_grad=True)
+    boxes.paired_giou(box, torch.tensor([[6.0, 0.0, 8.0, 2.0]])).sum().backward()
+    assert box.grad is not None
+    assert float(box.grad[0, 2]) > 0

@@ -222,6 +222,30 @@ def test_box_and_class_terms_by_hand() -> None:
     assert terms["total"].item() == pytest.approx(sum(terms[k].item() for k in ("confidence", "box", "class")))
 
 
+def test_overlap_joins_the_box_term_where_it_has_a_weight() -> None:
+    # The anchor of 36 x 37 px against an object as large, half an anchor to its right: the shift is 0.5, the overlap
+    # 1/3, and nothing is left open.
+    parts, detector = silent(1, 64, 64), fresh()
+    raw = raw_of(parts, 64, 64)
+    anchor = anchor_at(1, 1, 0, 4)
+    assignment = Assignment(
+        image=torch.tensor([0]),
+        anchor=torch.tensor([anchor]),
+        confidence=torch.tensor([1.0]),
+        deltas=torch.tensor([[0.5, 0.0, 0.0, 0.0]]),
+        labels=torch.tensor([0]),
+        negative=torch.zeros(1, raw.deltas.shape[1], dtype=torch.bool),
+        found_by=torch.tensor([anchor]),
+        found=torch.tensor([True]),
+    )
+    published = detector.loss_terms(raw, assignment)
+    assert float(published["box"]) == pytest.approx(5 * 0.5**2)
+    detector.overlap_weight = 3.0
+    tighter = detector.loss_terms(raw, assignment)
+    assert float(tighter["box"]) == pytest.approx(5 * 0.5**2 + 3 * (1 - 1 / 3))
+    assert float(tighter["total"] - published["total"]) == pytest.approx(2.0)
+
+
 def test_terms_are_means_over_all_objects_of_the_batch() -> None:
     parts = silent(2, 64, 160)
     first, second = anchor_at(2, 5, 8, 10), anchor_at(2, 2, 8, 10)

@@ -12,6 +12,8 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from drivesem.cli import main
+from drivesem.report.pictures import LOST_COLOUR
+from scene_ir import files
 
 Run = Callable[..., tuple[int, dict, str]]
 BOXES = [(100.0, 100.0, 200.0, 160.0), (300.0, 100.0, 380.0, 170.0), (500.0, 120.0, 590.0, 180.0)]
@@ -306,6 +308,11 @@ def test_one_line_and_exit_code_2(run: Run, tmp_path: Path, name: str, message: 
     [
         ((), "--gt and --pred, or --detector: expected one or the other, found neither"),
         (("--gt", "a", "--pred", "b", "--detector", "squeezedet"), "one or the other, found both"),
+        (
+            ("--detector", "squeezedet", "--root", ".", "--pictures", "2"),
+            "--pictures: expected --detector and --out",
+        ),
+        (("--detector", "squeezedet", "--root", ".", "--pictures", "-1"), "--pictures: expected at least 0"),
         (("--detector", "squeezedet"), "--root: expected the folder of data set 'kitti', found nothing"),
         (("--gt", "a", "--pred", "b", "--bootstrap", "-1"), "--bootstrap: expected at least 0, found -1"),
         (("--detector", "retinanot", "--root", "."), "image_2"),
@@ -378,6 +385,35 @@ def test_a_run_of_the_attack(run: Run, tmp_path: Path):
     assert both["comparison"][0]["difference"] == pytest.approx(-0.5)
 
 
+@pytest.fixture
+def kitti_with_images(tmp_path: Path) -> Path:
+    """KITTI's layout: a grey frame without objects, and one with three cars, cut off by 0, 40 and 70 %."""
+    cars = [_line("Car", box, truncated=share) for box, share in zip(BOXES, (0, 0.4, 0.7), strict=True)]
+    _write(tmp_path / "kitti/training/label_2", [[], cars])
+    calibration = "P2: 721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    for name in ("000000", "000001"):
+        files.write_png(tmp_path / f"kitti/training/image_2/{name}.png", np.full((375, 1242, 3), 120, np.uint8))
+        files.write_text(tmp_path / f"kitti/training/calib/{name}.txt", calibration)
+    return tmp_path / "kitti"
+
+
+def test_a_detectors_mistakes_are_drawn_worst_first(run: Run, tmp_path: Path, kitti_with_images: Path):
+    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
+    code, data, _ = run(*words, "--out", tmp_path / "out", "--pictures", 1)
+    assert code == 0
+    assert data["intervals"] == []
+    # frame 000001 has objects that no detector finds in plain grey, 000000 none
+    assert [p.name for p in (tmp_path / "out/pictures").iterdir()] == ["001-000001.png"]
+    picture = files.read_image(tmp_path / "out/pictures/001-000001.png")
+    assert picture.shape[:2] == (375 + 22, 1242)
+    assert picture[150, 100].tolist() == list(LOST_COLOUR)  # the left edge of what was missed
+
+
+def test_truncation_decides_what_is_judged(run: Run, kitti_with_images: Path):
+    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
+    assert [run(*words, "--max-truncation", share)[1]["objects"] for share in (0.3, 0.5, 1.0)] == [1, 2, 3]
+
+
 def test_a_detector_on_a_data_set(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     root = tmp_path / "kitti"
     assert main(["synth", "--frames", "2", "--out", str(root), "--workers", "1"]) == 0
@@ -389,6 +425,11 @@ def test_a_detector_on_a_data_set(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert sorted(p.name for p in (tmp_path / "out/detections").iterdir()) == ["000000.txt", "000001.txt"]
     more = run("--detector", "squeezedet", "--root", root, "--min-height", 0, "--max-occlusion", 3)[1]
     assert more["objects"] >= data["objects"]
+    names = [one["name"] for one in data["intervals"]]
+    assert names == ["AP50", "recall"]
+    for one, value in zip(data["intervals"], (data["ap50"], data["recall"]), strict=True):
+        assert one["value"] == pytest.approx(value)
+        assert 0 <= one["low"] <= value <= one["high"] <= 1
     code, again, _ = run(
         "--gt", root, "--pred", tmp_path / "out/detections", "--protocol", "kitti", "--bootstrap", 0
     )

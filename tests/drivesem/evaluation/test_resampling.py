@@ -5,7 +5,7 @@ import pytest
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.kitti import evaluate
-from drivesem.evaluation.resampling import Averaged, Figure, Sampled, differences, intervals
+from drivesem.evaluation.resampling import Averaged, Figure, Recalled, Sampled, differences, intervals
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
@@ -79,6 +79,16 @@ def test_kitti_curves_side_by_side_weigh_as_each_alone(make_truths, make_found, 
         both = Figure("R40", (Sampled(a),)).beside(Figure("R40", (Sampled(b),)))
         assert both.value(np.concatenate([ones, none])) == a.r40()
         assert both.value(np.concatenate([none, ones])) == b.r40()
+
+
+def test_recall_weighs_frames_and_counts_on():
+    first, second = Recalled(_tally(np.array([5, 0, 2]), 3)), Recalled(_tally(np.array([1, 1, 1]), 3))
+    assert first.value(None) == pytest.approx(7 / 15)
+    assert first.value(np.array([2.0, 0.0, 1.0])) == pytest.approx(12 / 15)
+    assert first.value(np.zeros(3)) is None
+    both = first.beside(second)
+    assert both.value(np.array([0, 0, 0, 1.0, 1.0, 1.0])) == pytest.approx(3 / 15)
+    assert Recalled(_tally(np.zeros(2, int), 2)).value(None) == 0
 
 
 def test_figures_without_objects():
