@@ -1,11 +1,15 @@
-"""The contract of detectors: images to raw predictions, to detections; with gradients, also to a loss."""
+"""The contract of detectors: images to raw predictions, to detections; with gradients, also to a loss.
+
+`detectors.check.check_detector` tests an implementation; docs/detectors.md says what it must do and shows one.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +19,32 @@ from detectors.types import Detections, Targets
 
 class DetectorError(ValueError):
     """A detector that cannot be had: no such name or file, or weights that belong to another one."""
+
+
+@runtime_checkable
+class Raw(Protocol):
+    """What any detector with gradients says about a batch of images: its own affair, but for these two."""
+
+    def __len__(self) -> int:
+        """Images of the batch."""
+        ...
+
+    def one(self, index: int) -> Raw:
+        """What is said about one image of the batch, as a batch of one."""
+        ...
+
+
+@runtime_checkable
+class Plantable(Protocol):
+    """Raw predictions into which a test can put one of its own."""
+
+    def planted(self, box_xyxy: Tensor, label: int) -> Any:
+        """The same, but silent about all images except for one certain prediction in each: a box (4,) px."""
+        ...
+
+
+CERTAIN = 20.0
+"""A logit that is as good as certain: its sigmoid differs from 1 by 2e-9."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +83,15 @@ class RawPredictions:
             self.image_hw,
         )
 
+    def planted(self, box_xyxy: Tensor, label: int) -> RawPredictions:
+        """The same, but for a certain prediction by each image's first anchor, and silence of all others."""
+        boxes, classes = self.boxes_xyxy.clone(), torch.full_like(self.class_logits, -CERTAIN)
+        confidence = torch.full_like(self.confidence_logits, -CERTAIN)
+        boxes[:, 0] = box_xyxy.to(boxes)
+        classes[:, 0, label] = CERTAIN
+        confidence[:, 0] = CERTAIN
+        return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
+
 
 class Predictor(Protocol):
     """A detector that need have no gradient: what `Detector` is, less loss and t*; detectors of other projects.
@@ -80,7 +119,12 @@ def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
 
 
 class Detector(nn.Module, ABC):
-    """A detector: `name`, `classes` (labels are indices into it), `t_star` (score of best F1 on benign frames)."""
+    """A detector: `name`, `classes` (labels are indices into it), `t_star` (score of best F1 on benign frames).
+
+    It takes images as they are: what normalises, pads or resizes them is part of `forward`, and boxes are px of
+    the image that was given. With all weights frozen (`requires_grad_(False)`) it is in eval mode, and `train()`
+    does not take it out: neither dropout nor the statistics of a normalisation change while it is attacked.
+    """
 
     name: str
     classes: tuple[str, ...]
@@ -89,16 +133,36 @@ class Detector(nn.Module, ABC):
     """Beginnings of the names of those parameters that no pretrained backbone provides."""
 
     @abstractmethod
-    def forward(self, images: Tensor) -> RawPredictions:
-        """images (B, 3, H, W), RGB in [0, 1], any size; differentiable to the images."""
+    def forward(self, images: Tensor) -> Any:
+        """images (B, 3, H, W), RGB in [0, 1], any size, to what `Raw` is; differentiable to the images."""
 
     @abstractmethod
-    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """Scalars "confidence", "box", "class", their sum "total", and "objectness"; one Targets for each image.
+    def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """Scalars by name, of what `forward` gave and one Targets for each image. Two of them all detectors have:
 
-        "objectness" falls as the objects' confidences rise to 1 and those elsewhere fall to 0: attacks raise it.
+        "total", what training lowers, the sum of the detector's own terms (SqueezeDet: "confidence", "box",
+        "class"); and "objectness", which falls as the objects' confidences rise to 1 and those elsewhere fall to
+        0: attacks raise it. Ignored targets are neither objects nor elsewhere.
+
+        Raises ValueError where targets and images differ in number, or a label is no class of this detector.
         """
 
     @abstractmethod
-    def decode(self, raw: RawPredictions) -> list[Detections]:
+    def decode(self, raw: Any) -> list[Detections]:
         """One Detections for each image, best first, boxes inside the image; carries no gradient."""
+
+    @contextmanager
+    def holding(self, raw: Any) -> Iterator[None]:
+        """Inside, `forward` makes those choices that its gradient takes as constant as it made them for `raw`.
+        So differences can be held against the gradient. Most detectors make none.
+        """
+        yield
+
+    def train(self, mode: bool = True) -> Self:
+        """Training mode, where there is something to train: with all weights frozen it stays in eval mode."""
+        return super().train(mode and any(parameter.requires_grad for parameter in self.parameters()))
+
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """Of all weights. Without gradients there is nothing to train, and the detector goes into eval mode."""
+        super().requires_grad_(requires_grad)
+        return self if requires_grad else self.eval()

@@ -60,8 +60,9 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Stem:
-    """Everything up to the first squeeze. mean (3, 1, 1): of RGB in [0, 1]; weight (64, 3, 3, 3), for what is left
-    of the pixels; back (12, 64, 2, 2): its gradient, as the four pixels of RGB that a convolved one begins with.
+    """Everything up to the first squeeze. mean (3, 1, 1): of RGB in [0, 1]; weight (C, 3, k, k), for what is left
+    of the pixels; back (12, C, (k + 1) / 2, (k + 1) / 2): its gradient, as the four pixels of RGB that a convolved
+    one begins with.
     """
 
     mean: Tensor
@@ -119,12 +120,19 @@ def convolution(layer: nn.Conv2d, parts: Sequence[int], dtype: torch.dtype) -> C
     )
 
 
+def rows_before(kernel: int) -> int:
+    """Rows above and columns to the left of the image that a convolution of that size and stride 2 begins with, as
+    TensorFlow's SAME has them: of k - 2 in all, the smaller half.
+    """
+    return (kernel - 2) // 2
+
+
 def stem(layer: nn.Conv2d, bgr_mean: Sequence[float], following: Convolution, dtype: torch.dtype) -> Stem:
-    """The stem of a convolution 3x3/2 that wants BGR in 0..255 less its mean."""
+    """The stem of a convolution of odd size and stride 2 that wants BGR in 0..255 less its mean."""
     assert layer.bias is not None
     weight = layer.weight.detach().flip(1) * 255
     # Image row 2i + a gets its gradient through the kernel's row a + 2m from the convolved row i - m.
-    taps = F.pad(weight, (0, 1, 0, 1)).unflatten(2, (2, 2)).unflatten(4, (2, 2))  # (64, c, m, a, n, b)
+    taps = F.pad(weight, (0, 1, 0, 1)).unflatten(2, (-1, 2)).unflatten(4, (-1, 2))  # (C, c, m, a, n, b)
     back = taps.permute(3, 5, 1, 0, 2, 4).flatten(0, 2).flip(2, 3)
     mean = weight.new_tensor(list(reversed(bgr_mean))) / 255
     return Stem(
@@ -193,11 +201,15 @@ def _through_stem(net: FrozenNet, images: Tensor, keep: bool) -> tuple[Tensor, l
     layers, dtype = net.stem, net.stem.weight.dtype
     batch, _, height, width = images.shape
     padded_h, padded_w = height + -height % net.stride, width + -width % net.stride
-    # One more row and column than a multiple of the stride: see SqueezeDet.forward. Zero is the mean colour.
-    x = _empty((batch, 3, padded_h + 1, padded_w + 1), dtype, images.device)
-    x[:, :, height:] = 0
-    x[:, :, :height, width:] = 0
-    torch.sub(images, layers.mean, out=x[:, :, :height, :width])
+    # More rows and columns than a multiple of the stride: see SqueezeDet.forward. Zero is the mean colour.
+    kernel = layers.weight.shape[-1]
+    before, beyond = rows_before(kernel), kernel - 2
+    x = _empty((batch, 3, padded_h + beyond, padded_w + beyond), dtype, images.device)
+    x[:, :, :before] = 0
+    x[:, :, before + height :] = 0
+    x[:, :, before : before + height, :before] = 0
+    x[:, :, before : before + height, before + width :] = 0
+    torch.sub(images, layers.mean, out=x[:, :, before : before + height, before : before + width])
     convolved_rows = padded_h // 2
     squeezed = _empty(
         (batch, len(layers.following.bias), padded_h // 4, padded_w // 4), dtype=dtype, device=images.device
@@ -205,7 +217,7 @@ def _through_stem(net: FrozenNet, images: Tensor, keep: bool) -> tuple[Tensor, l
     bands: list[_Band] = []
     for several, top, bottom in _bands(batch, squeezed.shape[2], images.device):
         rows = min(2 * bottom + 1, convolved_rows) - 2 * top
-        convolved = F.conv2d(x[several, :, 4 * top : 4 * top + 2 * rows + 1], layers.weight, layers.bias, 2)
+        convolved = F.conv2d(x[several, :, 4 * top : 4 * top + 2 * rows + beyond], layers.weight, layers.bias, 2)
         pooled, indices = _pool(convolved)
         squeezed[several, :, top:bottom] = layers.following([pooled[:, :, : bottom - top].relu_()])
         if keep:
@@ -219,17 +231,18 @@ def _back_through_stem(
     """The gradient to the images (B, 3, H, W), stored channels-last, of one to the first squeeze's output."""
     layers = net.stem
     batch, _, rows, columns = gradient.shape
-    image = gradient.new_zeros((batch, 4 * rows + 2, 4 * columns + 2, 3), dtype=dtype)
+    before, reach = rows_before(layers.weight.shape[-1]), layers.back.shape[-1] - 1
+    image = gradient.new_zeros((batch, 4 * rows + 2 * reach, 4 * columns + 2 * reach, 3), dtype=dtype)
     for band in bands:
         bottom = band.top + band.pooled.shape[2]
         (pooled,) = layers.following.backward(gradient[band.images, :, band.top : bottom])
         _mask(pooled, band.pooled)
         convolved = _unpool(pooled, band.indices, band.convolved_shape[2:])
-        quads = F.conv2d(convolved, layers.back, padding=1).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
+        quads = F.conv2d(convolved, layers.back, padding=reach).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
         into = image[band.images, 4 * band.top : 4 * band.top + 2 * quads.shape[1]]
         into = into.unflatten(1, (-1, 2)).unflatten(3, (-1, 2))  # (b, h, 2, w, 2, 3)
         into += quads.unflatten(3, (2, 2, 3)).transpose(2, 3)
-    return image[:, : shape[2], : shape[3]].permute(0, 3, 1, 2)
+    return image[:, before : before + shape[2], before : before + shape[3]].permute(0, 3, 1, 2)
 
 
 def _bands(batch: int, rows: int, device: torch.device) -> Iterator[tuple[slice, int, int]]:

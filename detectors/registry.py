@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from detectors.adapters import choose
 from detectors.base import Detector, DetectorError, Predictor
-from detectors.squeezedet import SqueezeDet
+from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
+from detectors.yolov3 import cfg
+from detectors.yolov3.yolov3 import YoloV3, YoloV3Slim, YoloV3Tiny
 
-ARCHITECTURES: dict[str, type[SqueezeDet]] = {"squeezedet": SqueezeDet}
+_KINDS = (SqueezeDet, SqueezeDetPlus, YoloV3, YoloV3Tiny, YoloV3Slim)
+ARCHITECTURES: dict[str, type[SqueezeDet] | type[YoloV3]] = {kind.name: kind for kind in _KINDS}
 """Name of an architecture, as weights files carry it in their metadata, and its class."""
 
 SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safetensors"}
@@ -24,21 +29,22 @@ SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safeten
 ONNX = "onnx:"
 """Before the path of an ONNX graph: onnx:FILE."""
 
+DARKNET = "darknet:"
+"""Before Darknet's files: darknet:FILE.cfg,FILE.weights, or the former alone where the latter has its name."""
+
 
 def load_predictor(
     name_or_path: str | Path, device: str | torch.device = "cpu", tiling: str = "auto"
 ) -> Predictor:
-    """A detector that is only asked what it finds: `onnx:FILE`, or what `load_detector` takes.
+    """A detector that is only asked what it finds: `onnx:FILE[,SPEC.yaml]`, or what `load_detector` takes.
 
     device: of the latter; graphs run on the CPU. tiling: of a graph, "auto" or "off" (see
     `detectors.adapters.onnx`). Raises DetectorError as `load_detector` does, and for a file that is no graph, a
     graph of no known kind, or where ONNX Runtime is missing.
     """
-    if not str(name_or_path).startswith(ONNX):
-        return load_detector(name_or_path, device)
-    from detectors.adapters.onnx import OnnxPredictor
-
-    return OnnxPredictor(Path(str(name_or_path).removeprefix(ONNX)), tiling)
+    if str(name_or_path).startswith(ONNX):
+        return choose.open_predictor(str(name_or_path), tiling)
+    return load_detector(name_or_path, device)
 
 
 def load_detector(
@@ -46,7 +52,8 @@ def load_detector(
     device: str | torch.device = "cpu",
     gradient_precision: torch.dtype | None = None,
 ) -> Detector:
-    """The shipped detector of that name, or the one in a `.safetensors` file; frozen, eval mode, channels-last.
+    """The shipped detector of that name, or the one in a `.safetensors` file, or `darknet:FILE.cfg,FILE.weights`;
+    frozen, eval mode, channels-last. Or one from elsewhere (see `detectors.adapters.choose`), always in float32.
 
     gradient_precision: torch.bfloat16 or, on GPUs, torch.float16, for passes that a gradient follows; without it,
     all compute in float32. Detections and losses that are judged always do.
@@ -54,13 +61,22 @@ def load_detector(
     Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
     to another architecture; the message names the file, what was expected and what was found.
     """
-    if str(name_or_path).startswith(ONNX):
-        raise DetectorError(f"detector: expected one with gradients, found {str(name_or_path)!r}, which has none")
+    if choose.kind_of(str(name_or_path)) is not None:
+        if gradient_precision is not None:
+            raise DetectorError(f"{name_or_path}: expected float32 for its gradients, found {gradient_precision}")
+        return choose.open_detector(str(name_or_path)).to(device)
+    if str(name_or_path).startswith(DARKNET):
+        from detectors.yolov3 import darknet
+
+        files = [Path(part) for part in str(name_or_path).removeprefix(DARKNET).split(",", 1)]
+        return _ready(darknet.load(*files), device, gradient_precision)
     path = SHIPPED.get(str(name_or_path), Path(name_or_path))
     if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
         known = ", ".join(sorted(SHIPPED))
+        kinds = ", ".join(f"{kind}:" for kind in choose.KINDS)
         raise DetectorError(
-            f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r}"
+            f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r} (those from "
+            f"elsewhere begin with {DARKNET}, {kinds})"
         )
     if not path.is_file():
         raise DetectorError(f"{path}: expected a weights file, found none")
@@ -70,26 +86,48 @@ def load_detector(
         known = ", ".join(sorted(ARCHITECTURES))
         raise DetectorError(f"{path}: expected architecture {known}, found {architecture!r}")
     try:
-        classes = tuple(json.loads(metadata.get("classes", json.dumps(CLASSES))))
-        t_star = float(metadata.get("t_star", "0.5"))
+        settings: dict[str, Any] = {
+            "classes": tuple(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
+            "t_star": float(metadata.get("t_star", "0.5")),
+        }
+        if "anchors" in metadata:
+            settings["anchors"] = json.loads(metadata["anchors"])
+        if "cfg" in metadata:
+            settings["cfg"] = cfg.parse(metadata["cfg"])
+        detector = ARCHITECTURES[architecture](**settings)
     except (ValueError, TypeError) as error:
-        raise DetectorError(f"{path}: expected metadata classes (list) and t_star (number): {error}") from None
-    detector = ARCHITECTURES[architecture](classes=classes, t_star=t_star)
+        raise DetectorError(
+            f"{path}: expected metadata classes (list), t_star (number) and anchors (pairs, px): {error}"
+        ) from None
     _load_into(detector, tensors, path)
+    return _ready(detector, device, gradient_precision)
+
+
+def _ready(
+    detector: SqueezeDet | YoloV3, device: str | torch.device, gradient_precision: torch.dtype | None
+) -> Detector:
+    """Frozen, in eval mode, channels-last."""
     detector.requires_grad_(False)
     detector.gradient_precision = gradient_precision
     return detector.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
 def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None = None) -> None:
-    """Write weights as float16 with name, classes, t_star and further facts as metadata; atomic."""
+    """Write weights as float16 with name, classes, t_star, anchors and further facts as metadata; atomic."""
     metadata = {
         "architecture": detector.name,
         "classes": json.dumps(list(detector.classes)),
         "t_star": f"{detector.t_star:.6g}",
+        **({"anchors": json.dumps(detector.anchors)} if isinstance(detector, SqueezeDet) else {}),
+        **({"cfg": cfg.write(detector.cfg)} if isinstance(detector, YoloV3) else {}),
         **(facts or {}),
     }
-    tensors = {k: v.detach().cpu().contiguous().to(torch.float16) for k, v in detector.state_dict().items()}
+    learned = {name for name, _ in detector.named_parameters()}
+    # What was counted or measured in training need not lie in float16's range.
+    tensors = {
+        k: v.detach().cpu().contiguous().to(torch.float16 if k in learned else v.dtype)
+        for k, v in detector.state_dict().items()
+    }
     write_weights(path, metadata, tensors)
 
 

@@ -65,8 +65,8 @@ Sizes = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Layers up to ConvDet. kernel, channels: of conv1, stride 2; fires: channels of squeeze and of each of the two
-    expansions, by name; pooled: fires that a 3x3/2 max pooling follows, as it follows conv1.
+    """Layers up to ConvDet. kernel, channels: of conv1, stride 2; fires: channels of squeeze and of each of the
+    two expansions, by name; pooled: fires that a 3x3/2 max pooling follows, as it follows conv1.
     """
 
     kernel: int
@@ -231,8 +231,8 @@ class SqueezeDet(Detector):
             own.copy_(tensors[key])
 
     def forward(self, images: Tensor) -> RawPredictions:
-        """images (B, 3, H, W), RGB in [0, 1]; A = K * ceil(H / 16) * ceil(W / 16) for K anchors, cells row by row, K
-        each.
+        """images (B, 3, H, W), RGB in [0, 1]; A = K * ceil(H / 16) * ceil(W / 16) for K anchors, cells row by row,
+        K each.
         """
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
@@ -241,8 +241,8 @@ class SqueezeDet(Detector):
             return self._interpret(self._frozen(images)(images), (height, width))
         mean = images.new_tensor(BGR_MEAN).view(1, 3, 1, 1)
         x = images.flip(1) * 255.0 - mean
-        # To a multiple of 16, and for conv1 as TensorFlow's SAME: of an odd number of rows for stride 2, it puts the
-        # one more below and to the right. Zeros here are the mean colour.
+        # To a multiple of 16, and for conv1 as TensorFlow's SAME: stride 2 needs an odd number of rows more,
+        # the larger half of them below and to the right. Zeros here are the mean colour.
         before = frozen.rows_before(self.layout.kernel)
         x = F.pad(x, (before, -width % STRIDE + before + 1, before, -height % STRIDE + before + 1))
         x = x.contiguous(memory_format=torch.channels_last)
@@ -443,9 +443,7 @@ def _anchors(sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, devic
 
 
 @lru_cache(maxsize=16)
-def _anchor_corners(
-    sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device
-) -> Tensor:
+def _anchor_corners(sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     return _corners(_anchors(sizes_wh, rows, columns, dtype, device))
 
 

@@ -1,7 +1,8 @@
 """Training of a detector on frames that come in as a sequence; resumable to the bit.
 
 What step k sees depends on the seed and k alone, so a checkpoint holds weights, their running average and the
-optimiser's state, and nothing about random generators.
+optimiser's state, and nothing about random generators. For the same reason frames can be made ready ahead by
+threads, and a batch can be shared by the processes of torch.distributed, where a launcher has set it up.
 """
 
 from __future__ import annotations
@@ -10,25 +11,36 @@ import csv
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from detectors.augment import AugmentSettings, view
-from detectors.base import Detector
+from detectors.base import Detector, DetectorError, RawPredictions
 from detectors.registry import read_weights, write_weights
 from detectors.squeezedet import SeededDropout
 from detectors.types import Targets
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.csv"
-_COLUMNS: tuple[str, ...] = ("step", "seconds", "rate", "confidence", "box", "class", "total", "norm")
+
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+OPTIMISERS = ("adamw", "sgd")
+
+NO_LOSS = "objectness"
+"""The term that only attacks use: no column of the log."""
+
+_FREE = ("minutes", "checkpoint_every", "evaluate_every")
+"""Settings that a run may change on the way: a schedule by the clock may be stretched, the others change no
+weight."""
 
 Sample = tuple[np.ndarray, Targets]
 """A frame (H, W, 3) uint8 RGB and what is in it."""
@@ -36,32 +48,49 @@ Sample = tuple[np.ndarray, Targets]
 Evaluate = Callable[[Detector, int], None]
 """Called with the averaged detector (eval mode) and the number of steps done."""
 
-Progress = Callable[[int, int, float], None]
-"""Called after each step with the steps done, the steps in all, and the loss."""
+Progress = Callable[[int, int, Mapping[str, float]], None]
+"""Called after each step with the steps done, the steps in all, and the row of the log."""
+
+
+@runtime_checkable
+class Drawn(Protocol):
+    """A data set whose frames need not look the same each time."""
+
+    def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
+        """What to show instead of frame `index` in step `step`; a function of these three alone."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingSettings:
-    """How to train. Published: SGD 0.01, momentum 0.9, halved every 10k steps, decay 1e-4, clip 1, batch 20."""
+    """How to train; the published schedules are presets in configs/."""
 
     steps: int = 10000
-    """Length of the cosine schedule."""
+    """Length of the schedule."""
     minutes: float = 0.0
     """Where above 0, the schedule also ends after this wall-clock time (then a rerun is not equal to the bit)."""
     batch: int = 8
+    """Views a step, over all processes."""
     optimiser: str = "adamw"
-    """adamw or sgd (momentum 0.9)."""
+    """adamw or sgd (with momentum)."""
+    momentum: float = 0.9
     rate: float = 1e-3
     """Peak learning rate."""
     backbone_rate: float = 0.3
     """Rate of the layers that start from ImageNet weights, relative to the others'."""
     weight_decay: float = 1e-4
     warmup_steps: int = 200
+    warmup_power: float = 1.0
+    """The rate rises with this power of the steps done."""
+    drops: tuple[int, ...] = ()
+    """Steps at which the rate is multiplied by drop_factor; without any it falls in a half cosine."""
+    drop_factor: float = 0.1
     clip_norm: float = 50.0
     average_decay: float = 0.998
     """Decay a step of the exponential moving average of the weights."""
-    bfloat16: bool = False
-    """Autocast; twice as fast on CPUs with AVX512-BF16."""
+    precision: str = "float32"
+    """What the network computes in; its loss is always float32. bfloat16 is twice as fast on CPUs with
+    AVX512-BF16."""
     seed: int = 0
     checkpoint_every: int = 200
     evaluate_every: int = 0
@@ -69,10 +98,12 @@ class TrainingSettings:
     augment: AugmentSettings = field(default_factory=AugmentSettings)
 
     def __post_init__(self) -> None:
-        if self.optimiser not in ("adamw", "sgd"):
-            raise ValueError(f"optimiser: expected adamw or sgd, found {self.optimiser!r}")
-        for name in ("steps", "batch", "rate", "checkpoint_every"):
-            if getattr(self, name) <= 0:
+        if self.optimiser not in OPTIMISERS:
+            raise ValueError(f"optimiser: expected {' or '.join(OPTIMISERS)}, found {self.optimiser!r}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision: expected one of {', '.join(PRECISIONS)}, found {self.precision!r}")
+        for name in ("steps", "batch", "rate", "checkpoint_every", "clip_norm"):
+            if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a number above 0, found {getattr(self, name)}")
 
 
@@ -84,66 +115,133 @@ def train(
     evaluate: Evaluate | None = None,
     stop_after: int | None = None,
     progress: Progress | None = None,
+    loaders: int = 0,
 ) -> Detector:
     """Train in place, from the checkpoint in `folder` where there is one; the detector returned holds the averaged
     weights, in eval mode.
 
-    `stop_after` leaves the schedule at that step, as a killed run does. Raises ValueError for an empty dataset and
-    FloatingPointError (with the step) where the loss is no finite number.
+    `stop_after` leaves the schedule at that step, as a killed run does. `loaders`: threads that make views ready
+    ahead, each with one of torch's threads; without any, views are made between the steps. In a process group of
+    torch.distributed each process computes its share of every batch, and the first one alone writes, evaluates and
+    tells progress.
+
+    Raises ValueError for an empty dataset, or a batch that the processes cannot share evenly; DetectorError for a
+    checkpoint of another detector or of other settings; FloatingPointError (with the step) where the loss is no
+    finite number.
     """
     if len(dataset) == 0:
         raise ValueError("dataset: expected at least one frame, found 0")
+    rank, ranks = _place()
+    if settings.batch % ranks:
+        raise ValueError(f"batch: expected a multiple of the {ranks} processes, found {settings.batch}")
     folder.mkdir(parents=True, exist_ok=True)
     run = _Run(detector, settings)
     step = run.load(folder / CHECKPOINT) if (folder / CHECKPOINT).is_file() else 0
+    _wait_for_all()
     started, before = time.monotonic(), run.seconds
-    with _Log(folder / LOG, step) as log:
+    slots = range(rank, settings.batch, ranks)
+    with _Log(folder / LOG, step, rank == 0) as log, _Batches(dataset, settings, slots, loaders) as batches:
         while step < settings.steps and (stop_after is None or step < stop_after):
             run.seconds = before + time.monotonic() - started
             done = _done(step, run.seconds, settings)
             if done >= 1:
                 break
-            terms = run.step(step, dataset, schedule(done, step, settings))
+            row = run.step(step, *batches.of(step), schedule(done, step, settings))
             step += 1
-            log.add(step, run.seconds, terms)
-            if progress is not None:
-                progress(step, settings.steps, terms["total"])
-            if step % settings.checkpoint_every == 0:
+            log.add(step, run.seconds, row)
+            if progress is not None and rank == 0:
+                progress(step, settings.steps, row)
+            if step % settings.checkpoint_every == 0 and rank == 0:
                 run.save(folder / CHECKPOINT, step)
                 log.flush()
             if evaluate is not None and settings.evaluate_every and step % settings.evaluate_every == 0:
-                with run.averaged() as averaged:
-                    evaluate(averaged, step)
-        if stop_after is None:
+                log.flush()
+                if rank == 0:
+                    with run.averaged() as averaged:
+                        evaluate(averaged, step)
+                _wait_for_all()
+        if stop_after is None and rank == 0:
             run.save(folder / CHECKPOINT, step)
     run.use_average()
-    if evaluate is not None and stop_after is None:
+    if evaluate is not None and stop_after is None and rank == 0:
         evaluate(detector, step)
+    _wait_for_all()
     return detector
 
 
 def schedule(done: float, step: int, settings: TrainingSettings) -> float:
-    """Learning rate after the fraction `done` in [0, 1]: linear warm-up over steps, then a half cosine to 1%."""
-    warm = min((step + 1) / max(settings.warmup_steps, 1), 1.0)
+    """Learning rate after the fraction `done` in [0, 1]: warm-up over steps, then drops or a half cosine to 1%."""
+    warm = min((step + 1) / max(settings.warmup_steps, 1), 1.0) ** settings.warmup_power
+    if settings.drops:
+        return settings.rate * warm * settings.drop_factor ** sum(step >= drop for drop in settings.drops)
     return settings.rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
 
 
-def batch_of(dataset: Sequence[Sample], step: int, settings: TrainingSettings) -> tuple[Tensor, list[Targets]]:
-    """What step `step` sees: images (batch, 3, h, w) float32 in [0, 1], and targets.
+def batch_of(
+    dataset: Sequence[Sample], step: int, settings: TrainingSettings, slots: Sequence[int] | None = None
+) -> tuple[Tensor, list[Targets]]:
+    """What step `step` sees: images (batch, 3, h, w) float32 in [0, 1], and targets; or those `slots` of it.
 
     Frames come epoch by epoch, each in an order of its own.
     """
-    views = []
-    for slot in range(settings.batch):
-        epoch, place = divmod(step * settings.batch + slot, len(dataset))
-        order = np.random.default_rng([settings.seed, 1, epoch]).permutation(len(dataset))
-        image, targets = dataset[int(order[place])]
-        views.append(view(image, targets, settings.augment, np.random.default_rng([settings.seed, 2, step, slot])))
+    chosen = range(settings.batch) if slots is None else slots
+    return _stacked([_sample(dataset, step, slot, settings) for slot in chosen])
+
+
+def _sample(dataset: Sequence[Sample], step: int, slot: int, settings: TrainingSettings) -> tuple[Tensor, Targets]:
+    epoch, place = divmod(step * settings.batch + slot, len(dataset))
+    order = np.random.default_rng([settings.seed, 1, epoch]).permutation(len(dataset))
+    index = int(order[place])
+    if isinstance(dataset, Drawn):
+        image, targets = dataset.draw(index, step, np.random.default_rng([settings.seed, 3, step, slot]))
+    else:
+        image, targets = dataset[index]
+    return view(image, targets, settings.augment, np.random.default_rng([settings.seed, 2, step, slot]))
+
+
+def _stacked(views: Sequence[tuple[Tensor, Targets]]) -> tuple[Tensor, list[Targets]]:
     return torch.stack([image for image, _ in views]), [targets for _, targets in views]
 
 
+class _Batches:
+    """Batches in the order of their steps; threads, where there are any, make the coming ones ready."""
+
+    AHEAD = 2
+    """Steps: one that is waited for, and one that the threads work on meanwhile."""
+
+    def __init__(
+        self, dataset: Sequence[Sample], settings: TrainingSettings, slots: Sequence[int], threads: int
+    ) -> None:
+        self._dataset, self._settings, self._slots = dataset, settings, slots
+        self._pool: ThreadPoolExecutor | None = None
+        if threads > 0:
+            # a new thread would start with torch's default number, and sums depend on it
+            self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+        self._ready: deque[tuple[int, list[Future[tuple[Tensor, Targets]]]]] = deque()
+
+    def __enter__(self) -> _Batches:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def of(self, step: int) -> tuple[Tensor, list[Targets]]:
+        """This process's share of the batch of `step`; steps are asked for one after the other."""
+        if self._pool is None:
+            return batch_of(self._dataset, step, self._settings, self._slots)
+        for coming in range(step + len(self._ready), min(step + self.AHEAD, self._settings.steps)):
+            futures = [
+                self._pool.submit(_sample, self._dataset, coming, slot, self._settings) for slot in self._slots
+            ]
+            self._ready.append((coming, futures))
+        ready, futures = self._ready.popleft()
+        assert ready == step
+        return _stacked([future.result() for future in futures])
+
+
 class _Run:
-    """Weights, their average and the optimiser's state."""
+    """Weights and buffers, their average and the optimiser's state."""
 
     def __init__(self, detector: Detector, settings: TrainingSettings) -> None:
         self.detector, self.settings = detector.train(), settings
@@ -152,7 +250,8 @@ class _Run:
         for module in detector.modules():
             if isinstance(module, SeededDropout):
                 module.generator = self.generator
-        self.average = {name: p.detach().clone() for name, p in detector.named_parameters()}
+        self.device = next(detector.parameters()).device
+        self.average = {name: value.detach().clone() for name, value in detector.state_dict().items()}
         fresh, started = [], []
         for name, parameter in detector.named_parameters():
             (fresh if name.startswith(detector.fresh_layers) else started).append(parameter)
@@ -166,36 +265,48 @@ class _Run:
             )
         else:
             self.optimiser = torch.optim.SGD(
-                groups, lr=settings.rate, momentum=0.9, weight_decay=settings.weight_decay
+                groups, lr=settings.rate, momentum=settings.momentum, weight_decay=settings.weight_decay
             )
+        # float16 loses small gradients: the loss is scaled up, and steps that overflow are left out
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=settings.precision == "float16")
+        self.forward: Callable[[Tensor], RawPredictions] = detector
+        if _place()[1] > 1:
+            self.forward = torch.nn.parallel.DistributedDataParallel(detector)
 
-    def step(self, step: int, dataset: Sequence[Sample], rate: float) -> dict[str, float]:
-        """One step of the optimiser; the loss terms, the norm of the gradient and the rate."""
-        images, targets = batch_of(dataset, step, self.settings)
-        self.generator.manual_seed(self.settings.seed * 1_000_003 + step)
+    def step(self, step: int, images: Tensor, targets: Sequence[Targets], rate: float) -> dict[str, float]:
+        """One step of the optimiser; the rate, the loss terms and the norm of the gradient."""
+        dtype = PRECISIONS[self.settings.precision]
+        # other masks in each process, as in the parts of one batch
+        self.generator.manual_seed(self.settings.seed * 1_000_003 + step + (_place()[0] << 40))
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16):
-            raw = self.detector(images)
+        with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
+            raw = self.forward(images.to(self.device, non_blocking=True))
         terms = self.detector.loss(raw, targets)
         self.optimiser.zero_grad(set_to_none=True)
-        terms["total"].backward()
+        self.scaler.scale(terms["total"]).backward()
+        self.scaler.unscale_(self.optimiser)
         norm = torch.nn.utils.clip_grad_norm_(self.detector.parameters(), self.settings.clip_norm)
-        values = {name: float(terms[name].detach()) for name in ("confidence", "box", "class", "total")}
-        if not (math.isfinite(values["total"]) and bool(torch.isfinite(norm))):
+        values = {name: float(value.detach()) for name, value in terms.items() if name != NO_LOSS}
+        overflown = self.scaler.is_enabled() and math.isfinite(values["total"])
+        if not (math.isfinite(values["total"]) and (overflown or bool(torch.isfinite(norm)))):
             raise FloatingPointError(f"step {step}: expected a finite loss and gradient, found {values}, {norm}")
-        self.optimiser.step()
+        self.scaler.step(self.optimiser)
+        self.scaler.update()
         # The average of the first steps must not be the random start: its memory grows with the steps.
         decay = min(self.settings.average_decay, (1 + step) / (10 + step))
         with torch.no_grad():
-            for name, parameter in self.detector.named_parameters():
-                self.average[name].lerp_(parameter, 1 - decay)
-        return values | {"norm": float(norm), "rate": rate}
+            for name, value in self.detector.state_dict().items():
+                if value.is_floating_point():
+                    self.average[name].lerp_(value, 1 - decay)
+                else:
+                    self.average[name].copy_(value)
+        return {"rate": rate, **values, "norm": float(norm)}
 
     @contextmanager
     def averaged(self) -> Iterator[Detector]:
         """The detector with its averaged weights in eval mode; inside this block only."""
-        current = {name: p.detach().clone() for name, p in self.detector.named_parameters()}
+        current = {name: value.detach().clone() for name, value in self.detector.state_dict().items()}
         self.use_average()
         try:
             yield self.detector
@@ -208,28 +319,36 @@ class _Run:
         self.detector.eval()
 
     def save(self, path: Path, step: int) -> None:
-        tensors = {f"weights.{n}": p.detach().contiguous() for n, p in self.detector.named_parameters()}
-        tensors |= {f"average.{n}": p.contiguous() for n, p in self.average.items()}
+        tensors = {f"weights.{n}": v.detach().contiguous() for n, v in self.detector.state_dict().items()}
+        tensors |= {f"average.{n}": v.contiguous() for n, v in self.average.items()}
         for index, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{key}": value.contiguous() for key, value in state.items()}
-        facts = {"step": str(step), "seconds": repr(self.seconds), "settings": _fingerprint(self.settings)}
+        facts = {
+            "step": str(step),
+            "seconds": repr(self.seconds),
+            "settings": json.dumps(asdict(self.settings), sort_keys=True),
+        }
+        if self.scaler.is_enabled():
+            facts["scaler"] = json.dumps(self.scaler.state_dict())
         write_weights(path, facts, tensors)
 
     def load(self, path: Path) -> int:
-        """The step that a checkpoint was written after. ValueError where it belongs to other settings."""
+        """The step that a checkpoint was written after. DetectorError where it belongs to other settings."""
         facts, tensors = read_weights(path)
-        found, wanted = json.loads(facts.get("settings", "{}")), json.loads(_fingerprint(self.settings))
-        # A schedule by the clock may be stretched on the way; all else must be as it was.
-        differing = sorted(
-            k for k in found.keys() | wanted.keys() if k != "minutes" and found.get(k) != wanted.get(k)
-        )
+        found = _settings_of(facts)
+        wanted = json.loads(json.dumps(asdict(self.settings)))
+        differing = sorted(k for k in wanted if k not in _FREE and found.get(k) != wanted[k])
         if differing:
             name = differing[0]
-            raise ValueError(f"{path}: {name}: expected {wanted.get(name)} as set, found {found.get(name)}")
+            raise DetectorError(f"{path}: {name}: expected {wanted[name]} as set, found {found.get(name)}")
         sections: dict[str, dict[str, Tensor]] = {"weights": {}, "average": {}, "optimiser": {}}
         for key, tensor in tensors.items():
             section, name = key.split(".", 1)
             sections[section][name] = tensor
+        for section in ("weights", "average"):
+            shapes = {name: value.shape for name, value in sections[section].items()}
+            if shapes != {name: value.shape for name, value in self.average.items()}:
+                raise DetectorError(f"{path}: expected the tensors of {self.detector.name}, found others")
         _copy_into(self.detector, sections["weights"])
         # Copied, so that the averages keep the layout of the weights.
         for name, value in self.average.items():
@@ -239,47 +358,84 @@ class _Run:
             index, key = name.split(".", 1)
             state.setdefault(int(index), {})[key] = tensor
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        if self.scaler.is_enabled():
+            self.scaler.load_state_dict(json.loads(facts["scaler"]))
         self.seconds = float(facts["seconds"])
         return int(facts["step"])
 
 
 class _Log:
-    """CSV of the run, a line a step; a run that goes on drops the lines after its checkpoint."""
+    """CSV of the run, a line a step; a run that goes on drops the lines after its checkpoint.
 
-    def __init__(self, path: Path, step: int) -> None:
-        kept = []
-        if step and path.is_file():
+    Columns: step, seconds, rate, the detector's own loss terms, norm of the gradient.
+    """
+
+    def __init__(self, path: Path, step: int, writes: bool) -> None:
+        self._kept: list[dict[str, str]] = []
+        if step and writes and path.is_file():
             with path.open(newline="") as file:
-                kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-        self._file = path.open("w", newline="")
-        self._writer = csv.DictWriter(self._file, _COLUMNS)
-        self._writer.writeheader()
-        self._writer.writerows(kept)
+                self._kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+        self._file = path.open("w", newline="") if writes else None
+        self._writer: csv.DictWriter[str] | None = None
+        if self._kept:
+            self._begin(list(self._kept[0]))
 
     def __enter__(self) -> _Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
-    def add(self, step: int, seconds: float, values: dict[str, float]) -> None:
+    def _begin(self, columns: list[str]) -> None:
+        if self._file is not None:
+            self._writer = csv.DictWriter(self._file, columns)
+            self._writer.writeheader()
+            self._writer.writerows(self._kept)
+
+    def add(self, step: int, seconds: float, values: Mapping[str, float]) -> None:
         numbers = {name: f"{value:.6g}" for name, value in values.items()}
-        self._writer.writerow({"step": step, "seconds": f"{seconds:.1f}", **numbers})
+        row = {"step": str(step), "seconds": f"{seconds:.1f}", **numbers}
+        if self._writer is None:
+            self._begin(list(row))
+        if self._writer is not None:
+            self._writer.writerow(row)
 
     def flush(self) -> None:
-        self._file.flush()
+        if self._file is not None:
+            self._file.flush()
+
+
+def _place() -> tuple[int, int]:
+    """Number of this process and how many there are."""
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    return 0, 1
+
+
+def _wait_for_all() -> None:
+    if _place()[1] > 1:
+        distributed.barrier()
 
 
 def _done(step: int, seconds: float, settings: TrainingSettings) -> float:
-    by_time = seconds / (60 * settings.minutes) if settings.minutes > 0 else 0.0
-    return max(step / settings.steps, by_time)
+    if settings.minutes <= 0:
+        return step / settings.steps
+    shared = [seconds]
+    if _place()[1] > 1:  # one clock, so that all have the same rate and stop at the same step
+        distributed.broadcast_object_list(shared)
+    return max(step / settings.steps, shared[0] / (60 * settings.minutes))
 
 
-def _fingerprint(settings: TrainingSettings) -> str:
-    return json.dumps(asdict(settings), sort_keys=True)
+def _settings_of(facts: Mapping[str, str]) -> dict[str, Any]:
+    """The settings that a checkpoint was made with; those that it does not know had their defaults."""
+    found = json.loads(json.dumps(asdict(TrainingSettings()))) | json.loads(facts.get("settings", "{}"))
+    if "bfloat16" in found:  # how checkpoints named it before there were other precisions
+        found["precision"] = "bfloat16" if found["bfloat16"] else "float32"
+    return found
 
 
 @torch.no_grad()
-def _copy_into(detector: Detector, values: dict[str, Tensor]) -> None:
-    for name, parameter in detector.named_parameters():
-        parameter.copy_(values[name])
+def _copy_into(detector: Detector, values: Mapping[str, Tensor]) -> None:
+    for name, own in detector.state_dict().items():
+        own.copy_(values[name])

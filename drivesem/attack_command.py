@@ -20,11 +20,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from detectors.base import Detector, DetectorError
-from detectors.registry import load_detector
+from detectors.base import Detector, DetectorError, Predictor
+from detectors.registry import ONNX, load_detector, load_predictor
+from detectors.types import CLASSES
+from drivesem.attacks.base import Attack as AttackMethod
+from drivesem.attacks.cma_es import CMAES
+from drivesem.attacks.fgsm import FGSM
+from drivesem.attacks.sampling import Sampling
 from drivesem.attacks.si_fgsm import SiFGSM
-from drivesem.config import DEFAULT_COMBO, Attack, UsageError
+from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError
 from drivesem.evaluation import coco
+from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
 from drivesem.pool import outcomes
 from drivesem.report.html import render_report
@@ -35,9 +41,6 @@ from drivesem.space import Parameter, combo, parse_params
 from scene_ir import files
 from scene_ir.compositor import RenderSettings
 from scene_ir.errors import SceneError
-
-HEADLINE = "Car"
-"""The class that the paper reports."""
 
 _PACKAGES = (
     "drivesem",
@@ -54,26 +57,47 @@ _PACKAGES = (
 def run(config: Attack) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
-    params = parse_params(config.params) if config.params is not None else combo(config.combo or DEFAULT_COMBO)
+    params = _params(config)
     _check_device(config.device)
     worker = _Worker(config, params)
     out = Path(config.out) if config.out else Path("runs") / _name(config, params)
     claim(out, config, _clear)
-    names, without_vehicles, failed = _select(worker.source, config)
-    todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
-    console = Console(stderr=True)
-    _attack_all(worker, todo, out, failed, console)
-    done = [name for name in names if name not in failed]
-    results = [load_frame(out / "frames" / name / RESULT) for name in done]
-    summary = _summary(config, params, worker.detector, results, without_vehicles, failed, out, start)
-    files.write_json(out / "metrics.json", summary.to_json())
-    files.write_json(out / "manifest.json", _manifest(config, out, done))
-    files.write_text(out / "report.html", render_report(summary, results, out, _command(config)))
+    summary = _attacked(worker, _select(worker.source, config), out, start)
     if config.json:
         sys.stdout.write(json.dumps(summary.to_json()) + "\n")
     else:
         _print(summary, Console())
     return 0
+
+
+def attack_frames(config: Attack, names: Sequence[str], out: Path) -> RunSummary:
+    """Attack these frames, of all that the configuration's source has, into the run folder `out`; those that are
+    there already stay. Raises as `run`.
+    """
+    start = time.perf_counter()
+    claim(out, config, _clear)
+    return _attacked(_Worker(config, _params(config)), (list(names), 0, {}), out, start)
+
+
+def _attacked(
+    worker: _Worker, selected: tuple[list[str], int, dict[str, str]], out: Path, start: float
+) -> RunSummary:
+    """Attack what `_select` chose, as far as it is not done, and write what is said of all frames."""
+    names, without_vehicles, failed = selected
+    config = worker.config
+    todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
+    _attack_all(worker, todo, out, failed, Console(stderr=True))
+    done = [name for name in names if name not in failed]
+    results = [load_frame(out / "frames" / name / RESULT) for name in done]
+    summary = _summary(config, worker.params, worker.detector, results, without_vehicles, failed, out, start)
+    files.write_json(out / "metrics.json", summary.to_json())
+    files.write_json(out / "manifest.json", _manifest(config, out, done))
+    files.write_text(out / "report.html", render_report(summary, results, out, _command(config)))
+    return summary
+
+
+def _params(config: Attack) -> tuple[Parameter, ...]:
+    return parse_params(config.params) if config.params is not None else combo(config.combo or DEFAULT_COMBO)
 
 
 @dataclass
@@ -85,25 +109,58 @@ class _Worker:
 
     def __post_init__(self) -> None:
         self.source: SceneSource = open_source(self.config)
-        try:
-            precision = None if self.config.precision == "float32" else getattr(torch, self.config.precision)
-            self.detector: Detector = load_detector(self.config.detector, self.config.device, precision)
-        except DetectorError as error:
-            raise UsageError("--detector", "a detector", error) from error
+        self.method = attack_method(self.config)
+        self.detector = _detector(self.config, self.method.needs_gradient)
 
     def attack(self, identifier: str, out: Path) -> FrameResult:
         """One frame, from the source to its folder."""
         config = self.config
         settings = FrameSettings(
-            attack=SiFGSM(steps=config.steps, early_stop=config.early_stop),
+            attack=self.method,
             params=self.params,
             label_mode=config.objective_labels,
             term=config.objective,
             render=RenderSettings(backend=config.backend),
             seed=config.seed,
+            t_star=config.t_star,
         )
         scene = self.source.scene(identifier)
         return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+
+
+def attack_method(config: Attack) -> AttackMethod:
+    """The algorithm that the settings ask for."""
+    if config.method == "si-fgsm":
+        return SiFGSM(steps=config.steps, early_stop=config.early_stop)
+    if config.method == "fgsm":
+        return FGSM(steps=config.steps)
+    queries = config.queries or DEFAULT_QUERIES
+    steps = config.steps if config.range == "steps" else None
+    if config.method == "cma-es":
+        return CMAES(queries, steps, config.early_stop)
+    return Sampling(config.method, queries, steps, config.early_stop)
+
+
+def _detector(config: Attack, needs_gradient: bool) -> Predictor:
+    """The detector under attack. Raises UsageError where it is none, knows no cars, or lacks a needed gradient."""
+    try:
+        if config.precision == "float32":
+            detector = load_predictor(config.detector, config.device, config.tiles)
+        else:
+            detector = load_detector(config.detector, config.device, getattr(torch, config.precision))
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    if isinstance(detector, Detector):
+        return detector
+    if needs_gradient:
+        expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
+        raise UsageError("--method", expected, config.method)
+    if config.objective != "objectness":
+        raise UsageError(
+            "--objective", f"objectness for {config.detector}, which has no gradient", config.objective
+        )
+    return detector
 
 
 def _in_process(config: Attack, params: tuple[Parameter, ...], out: Path) -> Callable[[str], FrameResult]:
@@ -149,7 +206,8 @@ def _select(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[s
 
 
 def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
-    return f"{config.dataset}-{'-'.join(params)}-seed{config.seed}"
+    method = "" if config.method == Attack().method else f"-{config.method}"
+    return f"{config.dataset}-{'-'.join(params)}{method}-seed{config.seed}"
 
 
 def _clear(out: Path) -> None:
@@ -172,20 +230,21 @@ def _check_device(device: str) -> None:
 def _summary(
     config: Attack,
     params: tuple[Parameter, ...],
-    detector: Detector,
+    detector: Predictor,
     results: Sequence[FrameResult],
     without_vehicles: int,
     failed: dict[str, str],
     out: Path,
     start: float,
 ) -> RunSummary:
-    names = detector.classes
-    benign = [as_targets(r.targets_benign, names) for r in results]
-    moved = [as_targets(r.targets_moved, names) for r in results]
+    judged, t_star = JudgedClasses.of(detector), t_star_of(detector, config.t_star)
+    names = judged.names
+    benign = [judged.targets(as_targets(r.targets_benign, CLASSES)) for r in results]
+    moved = [judged.targets(as_targets(r.targets_moved, CLASSES)) for r in results]
     attacked = [as_detections(r.detections_attacked, names) for r in results]
 
     def scores(targets: list[Any], detections: list[Any]) -> coco.Scores:
-        return coco.evaluate(targets, detections, names, detector.t_star, HEADLINE)
+        return coco.evaluate(targets, detections, names, t_star, HEADLINE)
 
     def count(kind: str) -> dict[str, int]:
         counted = dict.fromkeys(names, 0)
@@ -199,7 +258,7 @@ def _summary(
         params=tuple(str(p) for p in params),
         detector=config.detector,
         headline=HEADLINE,
-        t_star=detector.t_star,
+        t_star=t_star,
         frames=len(results),
         frames_without_vehicles=without_vehicles,
         frames_failed=dict(sorted(failed.items())),
@@ -222,8 +281,11 @@ def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]
     """Versions, seed and hashes: what a second run must reproduce to the byte."""
     hashed = [f"{name}.png" for name in ("benign", "rerender", "counterexample")]
     hashed += ["theta.json", "labels_paper.txt", "labels_moved.txt"]
+    packages = [*_PACKAGES]
+    packages += ["cma"] if config.method == "cma-es" else []
+    packages += ["onnxruntime"] if config.detector.startswith(ONNX) else []
     return {
-        "versions": {package: importlib.metadata.version(package) for package in _PACKAGES},
+        "versions": {package: importlib.metadata.version(package) for package in packages},
         "seed": config.seed,
         "frames": {name: {part: _sha256(out / "frames" / name / part) for part in hashed} for name in names},
     }

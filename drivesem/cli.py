@@ -12,6 +12,7 @@ import tyro
 
 from drivesem.config import (
     COMMANDS,
+    Anchors,
     Attack,
     Bench,
     Command,
@@ -21,7 +22,10 @@ from drivesem.config import (
     Eval,
     Gradcheck,
     Render,
+    Retrain,
     Synth,
+    Train,
+    Transfer,
     UsageError,
     validate,
     yaml_arguments,
@@ -113,6 +117,10 @@ def _run(config: Command) -> int:
         from drivesem import attack_command
 
         return attack_command.run(config)
+    if isinstance(config, Transfer):
+        from drivesem import transfer_command
+
+        return transfer_command.run(config)
     if isinstance(config, Derender):
         from drivesem import derender_command
 
@@ -145,6 +153,18 @@ def _run(config: Command) -> int:
         from drivesem import convert_command
 
         return convert_command.run(config)
+    if isinstance(config, Train):
+        from drivesem import train_command
+
+        return train_command.run(config)
+    if isinstance(config, Anchors):
+        from drivesem import anchors_command
+
+        return anchors_command.run(config)
+    if isinstance(config, Retrain):
+        from drivesem import retrain_command
+
+        return retrain_command.run(config)
     raise UsageError("command", ", ".join(COMMANDS), type(config).__name__)
 
 

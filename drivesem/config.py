@@ -8,6 +8,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import shlex
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,6 +25,11 @@ DEFAULT_COMBO = 2
 DEMO = "demo"
 DATASETS = (DEMO, "kitti", "vkitti1", "vkitti2", "coco", "yolo")
 """What --dataset takes: the embedded scenes, and the readers of `drivesem.data.registry`."""
+SYNTH = "synth"
+"""What --dataset takes for training: frames that the generator makes."""
+GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
+"""Attacks that ask a detector only what it finds."""
+DEFAULT_QUERIES = 64
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
 
@@ -80,11 +87,19 @@ class Attack(Common):
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
     detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one."""
+    """A shipped detector, a file, or another project's (docs/detectors.md); without a gradient, such as an ONNX
+    graph, for the methods that need none."""
+    method: Literal["si-fgsm", "fgsm", "random", "halton", "sobol", "cma-es"] = "si-fgsm"
+    """si-fgsm and fgsm follow the gradient; random (uniform), halton, sobol (scrambled sequences) and cma-es ask
+    only what the detector finds."""
     steps: int = 10
-    """si-FGSM steps; each is one query of the detector's gradient."""
+    """si-FGSM steps, each one query of the detector's gradient; FGSM goes as far in one."""
+    queries: int | None = None
+    """Of methods without gradient: renders that are judged; by default 64."""
+    range: Literal["bounds", "steps"] = "bounds"
+    """Of methods without gradient: search all of the parameters' bounds, or what --steps steps of si-FGSM reach."""
     early_stop: Flag = False
-    """Stop a frame at its first success instead of using all steps."""
+    """Stop a frame at its first success instead of using all steps or queries."""
     objective_labels: Literal["moved", "paper"] = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence"] = "objectness"
@@ -96,6 +111,10 @@ class Attack(Common):
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
+    t_star: float | None = None
+    """Score from which a detection counts; by default the detector's own, or 0.3 where it has none."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +142,22 @@ class Derender(Common):
     sheet: Flag = False
     """Also draw sheet.jpg into each scene's folder: photograph, mattes, normals, depth, maps, shadows, background,
     re-render and difference."""
+
+
+@dataclass(frozen=True)
+class Transfer(Common):
+    """Show the counterexamples of finished runs to other detectors: whose failures are shared?"""
+
+    run: str | None = None
+    """Folder of a run of drivesem attack; several with commas."""
+    detectors: str | None = None
+    """Detectors to ask, with commas: shipped ones, files, or other projects' (docs/detectors.md)."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of ONNX detectors: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+    t_star: float | None = None
+    """Score from which a detection counts, of detectors that have no threshold of their own; by default 0.3."""
+    bootstrap: int | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,6 +348,26 @@ class Eval(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Anchors(Command):
+    """Anchor shapes for a data set, by k-means of its boxes with 1 - IoU as the distance."""
+
+    dataset: str = "kitti"
+    """kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str
+    """Folder of the data set."""
+    count: int = 9
+    """How many anchors."""
+    classes: str | None = None
+    """Boxes of these classes only, with commas, as the data set calls them; by default of all."""
+    min_height: float = 12.0
+    """Lower boxes are left out, px: nothing is trained on them."""
+    limit: int | None = None
+    """The first N frames."""
+    seed: int = 0
+    """Seed of the starts; the best of several is kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Convert(Command):
     """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, and say what is lost."""
 
@@ -338,8 +393,133 @@ class Convert(Command):
     """Classes by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
 
 
+@dataclass(frozen=True)
+class Train(Common):
+    """Train a detector; killed or stopped, the same command goes on and ends with the same weights."""
+
+    detector: str = "squeezedet"
+    """Architecture: squeezedet, or another one of docs/training.md."""
+    dataset: str = "kitti"
+    """kitti, vkitti1, vkitti2, coco or yolo; or synth, frames that the generator makes in the run's folder first."""
+    root: str | None = None
+    """Folder of the data set."""
+    held_out: str | None = None
+    """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
+    also: str | None = None
+    """Folder of further frames whose figures go into the model card, KITTI layout."""
+    frames: int = 1000
+    """Synth: how many frames to train on."""
+    held_out_frames: int = 100
+    """Synth: how many frames to judge by, of shapes and surroundings of their own; 0 is none."""
+    weights: str | None = None
+    """File for the best weights; by default DETECTOR.safetensors in the run's folder. Their card is beside them."""
+    start: str = "auto"
+    """First weights: auto (the shipped ones of this architecture, or none), none, squeezenet (ImageNet backbone),
+    or a .safetensors file: weights, a run's checkpoint, or a backbone."""
+    anchors: Literal["published", "kmeans"] = "published"
+    """SqueezeDet: as published, or as many by k-means of the data's boxes."""
+    steps: int = 10000
+    """Length of the schedule in steps."""
+    minutes: float = 0.0
+    """Where above 0, the schedule also ends after so many minutes by the clock."""
+    batch: int = 16
+    """Views a step, over all processes."""
+    window: str = "640x224"
+    """WIDTHxHEIGHT of the views, px."""
+    scale: str = "0.5,1.35"
+    """Smallest and largest zoom of the views."""
+    optimiser: Literal["adamw", "sgd"] = "adamw"
+    """sgd is with --momentum."""
+    momentum: float = 0.9
+    """Of sgd."""
+    rate: float = 1e-3
+    """Peak learning rate."""
+    backbone_rate: float = 0.3
+    """Rate of the layers that a backbone provides, relative to the others'."""
+    weight_decay: float = 1e-4
+    """Decay of the weights a step, relative to the rate."""
+    warmup: int = 60
+    """Steps in which the rate rises."""
+    warmup_power: float = 1.0
+    """The rate rises with this power of the steps (Darknet's burn-in: 4)."""
+    drops: str | None = None
+    """Steps, with commas, at which the rate is multiplied by --drop-factor; without, it falls in a half cosine."""
+    drop_factor: float = 0.1
+    """Of --drops."""
+    clip: float = 50.0
+    """Largest norm of a step's gradient."""
+    average: float = 0.998
+    """Decay a step of the moving average of the weights, which is what is judged and kept."""
+    dropout: float = 0.5
+    """Of detectors that have dropout."""
+    overlap_weight: float = 0.0
+    """SqueezeDet: weight of 1 - generalised IoU in the box term; 0 is the published loss."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the network computes in: bfloat16 where the processor has it, float16 on GPUs."""
+    checkpoint_every: int = 50
+    """Steps between checkpoints."""
+    evaluate_every: int = 500
+    """Steps between evaluations on the held-out frames; 0 is at the end only."""
+    thin: int = 1
+    """Judge by every n-th held-out frame until the best weights are written."""
+    semantic: float = 0.0
+    """Share of the views that show a frame with its vehicles moved, turned, bent and painted at random, weather and
+    foliage changed, by the project's own renderer; data sets with 3D boxes."""
+    loaders: int = 0
+    """Threads that make views ready ahead (where a GPU trains); 0 makes them between the steps."""
+    note: str = ""
+    """A remark on this run for the model card."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retrain(Common):
+    """Train a detector on with the counterexamples of a run, and attack it again. Defaults: the paper's protocol."""
+
+    run: str
+    """A run's folder, as drivesem attack writes it."""
+    dataset: str | None = None
+    """Benign frames to train on: kitti, vkitti1, vkitti2, coco or yolo; by default the run's own photographs."""
+    root: str | None = None
+    """Folder of that data set."""
+    start: str | None = None
+    """First weights: a shipped detector or a .safetensors file; by default the detector that the run attacked."""
+    fraction: float = 0.25
+    """Share of the training set that are counterexamples."""
+    mix: Literal["replace", "add"] = "replace"
+    """Counterexamples in the place of benign frames, drawn at random, or beside all of them."""
+    label_mode: Literal["paper", "moved"] = "paper"
+    """Labels of counterexamples in training: the benign ones as in the paper, or moved with the cars."""
+    ramp: float = 0.0
+    """Share of the steps over which counterexamples come in little by little; 0: all from the first step."""
+    validation: float = 0.25
+    """Share of the run's frames that are never trained on: the table's figures are of these."""
+    fresh: int | None = None
+    """How many of those are attacked again, against the retrained detector; by default all, 0 is none."""
+    attack_steps: int | None = None
+    """Steps of that attack; by default as many as the run's."""
+    steps: int = 6000
+    """Steps of training."""
+    minutes: float = 0.0
+    """Where above 0, training also ends after so many minutes by the clock."""
+    batch: int = 16
+    """Views a step."""
+    window: str = "640x224"
+    """WIDTHxHEIGHT of the views, px."""
+    rate: float = 3e-4
+    """Peak learning rate of AdamW; it falls in a half cosine."""
+    warmup: int = 60
+    """Steps in which the rate rises."""
+    overlap_weight: float = 0.0
+    """SqueezeDet: weight of 1 - generalised IoU in the box term; 0 is the published loss."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the network computes in when it is trained."""
+    checkpoint_every: int = 50
+    """Steps between checkpoints."""
+
+
 COMMANDS: dict[str, type[Command]] = {
     "attack": Attack,
+    "transfer": Transfer,
     "derender": Derender,
     "render": Render,
     "edit": Edit,
@@ -348,6 +528,9 @@ COMMANDS: dict[str, type[Command]] = {
     "gradcheck": Gradcheck,
     "eval": Eval,
     "convert": Convert,
+    "anchors": Anchors,
+    "train": Train,
+    "retrain": Retrain,
 }
 
 
@@ -405,6 +588,29 @@ def validate(config: Command) -> None:
             raise UsageError("--combo", "1, 2, 3 or 4", config.combo)
         if config.combo is not None and config.params is not None:
             raise UsageError("--params", "no --combo beside it", f"--combo {config.combo}")
+        if config.queries is not None and config.queries < 1:
+            raise UsageError("--queries", "at least 1", config.queries)
+        if config.method not in GRADIENT_FREE:
+            without = f"a method without gradient ({', '.join(GRADIENT_FREE)}) beside it"
+            if config.queries is not None:
+                raise UsageError("--queries", without, config.method)
+            if config.range != "bounds":
+                raise UsageError("--range", without, config.method)
+        elif config.precision != "float32":
+            raise UsageError(
+                "--precision", f"float32 with {config.method}, which takes no gradient", config.precision
+            )
+        if config.method == "fgsm" and config.early_stop:
+            raise UsageError("--early-stop", "a method of several steps or queries", config.method)
+    if isinstance(config, Attack | Transfer) and config.t_star is not None and not 0 < config.t_star <= 1:
+        raise UsageError("--t-star", "a score in (0, 1]", config.t_star)
+    if isinstance(config, Transfer):
+        if not config.run:
+            raise UsageError("--run", "a folder of drivesem attack", "nothing")
+        if not config.detectors:
+            raise UsageError("--detectors", "detectors with commas", "nothing")
+        if config.bootstrap is not None and config.bootstrap < 0:
+            raise UsageError("--bootstrap", "at least 0", config.bootstrap)
     if isinstance(config, Synth):
         if config.frames < 1:
             raise UsageError("--frames", "at least 1", config.frames)
@@ -428,6 +634,17 @@ def validate(config: Command) -> None:
             raise UsageError("--scenes", "no --dataset beside it", f"--dataset {config.dataset}")
     if isinstance(config, Eval):
         _validate_eval(config)
+    if isinstance(config, Anchors):
+        if config.dataset not in DATASETS[1:]:
+            raise UsageError("--dataset", f"one of {', '.join(DATASETS[1:])}", repr(config.dataset))
+        if config.count < 1:
+            raise UsageError("--count", "at least 1", config.count)
+        if config.limit is not None and config.limit < 1:
+            raise UsageError("--limit", "at least 1", config.limit)
+    if isinstance(config, Train):
+        _validate_train(config)
+    if isinstance(config, Retrain):
+        _validate_retrain(config)
 
 
 def _validate_eval(config: Eval) -> None:
@@ -445,6 +662,82 @@ def _validate_eval(config: Eval) -> None:
         raise UsageError("--bootstrap", "at least 0", config.bootstrap)
     if config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)
+
+
+def _validate_train(config: Train) -> None:
+    known = (*DATASETS[1:], SYNTH)
+    if config.dataset not in known:
+        raise UsageError("--dataset", f"one of {', '.join(known)}", repr(config.dataset))
+    if config.dataset != SYNTH and config.root is None:
+        raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
+    if config.dataset == SYNTH and (config.root, config.held_out) != (None, None):
+        raise UsageError("--root, --held-out", "none with --dataset synth, which makes both", "one")
+    for name in ("steps", "batch", "rate", "clip", "checkpoint_every", "thin", "frames"):
+        if not getattr(config, name) > 0:
+            raise UsageError(f"--{name.replace('_', '-')}", "a number above 0", getattr(config, name))
+    for name in ("minutes", "evaluate_every", "loaders", "held_out_frames", "warmup", "overlap_weight"):
+        if not getattr(config, name) >= 0:
+            raise UsageError(f"--{name.replace('_', '-')}", "at least 0", getattr(config, name))
+    for name in ("dropout", "average", "momentum", "semantic"):
+        if not 0 <= getattr(config, name) < 1:
+            raise UsageError(f"--{name}", "a number in [0, 1)", getattr(config, name))
+    if config.drops is not None:
+        numbers("--drops", config.drops)
+
+
+def _validate_retrain(config: Retrain) -> None:
+    if (config.dataset is None) != (config.root is None):
+        raise UsageError("--dataset and --root", "both or none", "one of them")
+    if config.dataset is not None and config.dataset not in DATASETS[1:]:
+        raise UsageError("--dataset", f"one of {', '.join(DATASETS[1:])}", repr(config.dataset))
+    if not 0 < config.fraction < 1:
+        raise UsageError("--fraction", "a share between 0 and 1", config.fraction)
+    if not 0 < config.validation < 1:
+        raise UsageError("--validation", "a share between 0 and 1", config.validation)
+    if not 0 <= config.ramp <= 1:
+        raise UsageError("--ramp", "a share from 0 to 1", config.ramp)
+    for name in ("steps", "batch", "rate", "checkpoint_every"):
+        if not getattr(config, name) > 0:
+            raise UsageError(f"--{name.replace('_', '-')}", "a number above 0", getattr(config, name))
+    for name in ("minutes", "warmup", "overlap_weight", "fresh"):
+        if (getattr(config, name) or 0) < 0:
+            raise UsageError(f"--{name.replace('_', '-')}", "at least 0", getattr(config, name))
+    if config.attack_steps is not None and config.attack_steps < 1:
+        raise UsageError("--attack-steps", "at least 1", config.attack_steps)
+
+
+def size_hw(setting: str, text: str) -> tuple[int, int]:
+    """Height and width of "WIDTHxHEIGHT". Raises UsageError naming the setting."""
+    width, cross, height = text.partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise UsageError(setting, "WIDTHxHEIGHT, px", repr(text))
+    return int(height), int(width)
+
+
+def interval(setting: str, text: str) -> tuple[float, float]:
+    """The positive numbers of "LOW,HIGH". Raises UsageError naming the setting."""
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        low, high = math.nan, math.nan
+    if not (0 < low <= high < math.inf):
+        raise UsageError(setting, "LOW,HIGH, both above 0", repr(text))
+    return low, high
+
+
+def command_line(command: str, config: Command, presentation: Collection[str] = ()) -> str:
+    """The command line that gives this configuration, without the settings named in `presentation`."""
+    words = ["drivesem", command]
+    for setting in dataclasses.fields(config):
+        value = getattr(config, setting.name)
+        if value == setting.default or setting.name in presentation:
+            continue
+        flag = setting.name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", str(value)]
+    return shlex.join(words)
 
 
 def class_map(setting: str, text: str | None) -> dict[str, str | None]:

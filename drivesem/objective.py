@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from detectors.base import Detector, RawPredictions
-from detectors.types import Detections
+from detectors.base import Detector, Predictor, RawPredictions, predict
+from detectors.types import Detections, Targets
+from drivesem import detection_loss
 from drivesem.attacks.base import Problem, Score
 from drivesem.evaluation import failures
 from drivesem.feasible import FeasibleSet
+from drivesem.judged import JudgedClasses, t_star_of
 from drivesem.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.space import ParameterSpace
 from scene_ir.compositor import Compositor, render_batch
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Render, SceneIR
 
+_OF_DETECTIONS = ("objectness",)
+"""Terms that need no more than detections."""
 _REMEMBERED = 3
 """Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """One theta, rendered, detected and labelled; carries no gradient. loss: the objective, by its own labels."""
+    """One theta, rendered, detected and labelled; carries no gradient. detections: labels are indices into the
+    judged classes. loss: the objective, by its own labels.
+    """
 
     scene: SceneIR
     render: Render
@@ -40,28 +46,34 @@ class Objective:
     """A term of the detector's loss as a function of theta (D,), to be raised by an attack.
 
     label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
-    away from the label. They are constant in the gradient. term: a key of `Detector.loss`.
+    away from the label. They are constant in the gradient. term: a key of `Detector.loss`; a detector without a
+    gradient has "objectness" only, of its detections. t_star: score from which a detection counts; by default the
+    detector's own. Raises DetectorError where the detector knows no cars, RangeError where it has no such term.
     """
 
     def __init__(
         self,
         compositor: Compositor,
         space: ParameterSpace,
-        detector: Detector,
+        detector: Predictor,
         label_mode: LabelMode = "moved",
         term: str = "objectness",
         difficulty: Difficulty | None = None,
+        t_star: float | None = None,
     ) -> None:
         self.compositor = compositor
         self.space = space
         self.detector = detector
         self.label_mode: LabelMode = label_mode
         self.term = term
+        self.t_star = t_star_of(detector, t_star)
+        self.judged = JudgedClasses.of(detector)
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, difficulty)
         self._benign = self._judged(space.scene, base_render)
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
+        self._scores: dict[bytes, Score] = {}
 
     @property
     def benign(self) -> Rendered:
@@ -103,24 +115,30 @@ class Objective:
         """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""
         labels = rendered.moved if mode == "moved" else rendered.paper
         return failures.find(
-            self._benign.paper.targets,
+            self.judged.targets(self._benign.paper.targets),
             self._benign.detections,
-            labels.targets,
+            self.judged.targets(labels.targets),
             rendered.detections,
-            self.detector.t_star,
+            self.t_star,
         )
 
     def score(self, theta: Tensor) -> Score:
-        """What the detector makes of theta (D,): a fresh render, judged under both label modes."""
-        rendered = self.evaluate(theta)
-        moved = self.failures(rendered, "moved")
-        return Score(
-            loss=rendered.loss,
-            lost=len(moved.lost),
-            phantoms=len(moved.phantoms),
-            success=moved.success,
-            success_paper=self.failures(rendered, "paper").success,
-        )
+        """What the detector makes of theta (D,): a render of its own, judged under both label modes.
+
+        Scores are kept, which are small, so that a search without gradient pays for each theta once.
+        """
+        key = theta.detach().cpu().numpy().tobytes()
+        if key not in self._scores:
+            rendered = self.evaluate(theta)
+            moved = self.failures(rendered, "moved")
+            self._scores[key] = Score(
+                loss=rendered.loss,
+                lost=len(moved.lost),
+                phantoms=len(moved.phantoms),
+                success=moved.success,
+                success_paper=self.failures(rendered, "paper").success,
+            )
+        return self._scores[key]
 
     def problem(self, feasible: FeasibleSet) -> Problem:
         """This objective as attacks see it."""
@@ -129,30 +147,54 @@ class Objective:
             project=feasible.project,
             score=self.score,
             step=self.space.step,
+            lower=self.space.lower,
+            upper=self.space.upper,
         )
+
+    @property
+    def differentiable(self) -> Detector:
+        """The detector. Raises RangeError where it has no gradient."""
+        if not isinstance(self.detector, Detector):
+            raise RangeError("detector", "one with a gradient", self.detector.name)
+        return self.detector
+
+    @torch.no_grad()
+    def detect(self, image: Tensor) -> Detections:
+        """What the detector finds in an image (3, H, W), as far as it is judged."""
+        return self.judged.detections(predict(self.detector, image[None])[0])
 
     def loss_of(self, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
         """The loss () of one image's predictions, by the labels of its scene and render."""
         labels = self._labeller.labels(self.label_mode, scene, render)
-        return self._term(self.detector.loss(raw, [labels.targets]))
+        return self._loss(self.differentiable, raw, labels.targets)
 
     @torch.no_grad()
     def _judged(self, scene: SceneIR, render: Render) -> Rendered:
         # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
-        raw = self.detector(render.image[None])
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
-        aim = moved if self.label_mode == "moved" else paper
-        loss = self._term(self.detector.loss(raw, [aim.targets]))
-        return Rendered(scene, render, self.detector.decode(raw)[0], paper, moved, float(loss))
+        aim = (moved if self.label_mode == "moved" else paper).targets
+        if isinstance(self.detector, Detector):
+            raw = self.detector(render.image[None])
+            loss = float(self._loss(self.detector, raw, aim))
+            found = self.judged.detections(self.detector.decode(raw)[0])
+        else:
+            self._check_term(_OF_DETECTIONS)
+            found = self.detect(render.image)
+            loss = detection_loss.objectness(self.judged.targets(aim), found)
+        return Rendered(scene, render, found, paper, moved, loss)
 
-    def _term(self, terms: dict[str, Tensor]) -> Tensor:
-        if self.term not in terms:
-            raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
+    def _loss(self, detector: Detector, raw: RawPredictions, aim: Targets) -> Tensor:
+        terms = detector.loss(raw, [self.judged.own_targets(self.judged.targets(aim))])
+        self._check_term(terms)
         loss = terms[self.term]
         if not bool(torch.isfinite(loss)):
             raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
         return loss
+
+    def _check_term(self, terms: Collection[str]) -> None:
+        if self.term not in terms:
+            raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
 
 
 class BatchObjective:
@@ -199,7 +241,7 @@ def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[T
     losses: dict[int, Tensor] = {}
     for members in of_size.values():
         images = [renders[i].image for i in members]
-        raw = objectives[members[0]].detector(images[0][None] if len(images) == 1 else torch.stack(images))
+        raw = objectives[members[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
         for row, i in enumerate(members):
             # Each by itself: the loss of a batch is a mean over its images, and weighs them by their objects.
             losses[i] = objectives[i].loss_of(raw.one(row), scenes[i], renders[i])

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from detectors.base import Detector
-from detectors.types import Detections, Targets
+from detectors.base import Predictor
+from detectors.types import CLASSES, Detections, Targets
 from drivesem.attacks.base import Attack as AttackMethod
 from drivesem.attacks.base import AttackResult
 from drivesem.data import kitti
@@ -35,7 +35,7 @@ RESULT = "result.json"
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
-    to be raised; seed: of its randomness.
+    to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's.
     """
 
     attack: AttackMethod
@@ -44,23 +44,24 @@ class FrameSettings:
     term: str
     render: RenderSettings
     seed: int
+    t_star: float | None = None
 
 
 def attack_frame(
-    identifier: str, scene: SceneIR, detector: Detector, settings: FrameSettings, folder: Path
+    identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings, folder: Path
 ) -> FrameResult:
     """Attack one scene and write its folder, whole or not at all. Returns what `folder / RESULT` holds.
 
-    Raises SceneError where the scene cannot be used, or a loss or gradient is not finite.
+    Raises SceneError where the scene cannot be used, or a loss or gradient is not finite; DetectorError where the
+    detector knows no cars.
     """
     start = time.perf_counter()
     space = ParameterSpace(scene, settings.params)
     compositor = Compositor(scene, settings.render)
-    objective = Objective(compositor, space, detector, settings.label_mode, settings.term)
+    objective = Objective(compositor, space, detector, settings.label_mode, settings.term, t_star=settings.t_star)
     attacked = settings.attack(objective.problem(FeasibleSet(space)), space.theta0, settings.seed)
     rendered = objective.evaluate(attacked.theta)
-    with torch.no_grad():
-        benign = detector.decode(detector(scene.photograph[None]))[0]
+    benign = objective.detect(scene.photograph)
     with files.whole_folder(folder) as part:
         save_scene(rendered.scene, part / "scene")
         saved = load_scene(part / "scene")
@@ -80,12 +81,12 @@ def _result(
     benign: Detections,
     violations: tuple[str, ...],
 ) -> FrameResult:
-    names = objective.detector.classes
+    names = objective.judged.names
     scene = objective.space.scene
     found = objective.failures(rendered, "moved")
     moved = rendered.moved.targets
     failures = [
-        Failure("lost", names[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i) for i in found.lost
+        Failure("lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i) for i in found.lost
     ]
     for i in found.phantoms:
         detections = rendered.detections
@@ -108,8 +109,8 @@ def _result(
         ),
         active_constraints=attacked.active_constraints,
         violations=violations,
-        targets_benign=target_records(objective.benign.paper.targets, names, len(scene.objects)),
-        targets_moved=target_records(moved, names, len(scene.objects)),
+        targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
+        targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(benign, names),
         detections_rerendered=detection_records(objective.benign.detections, names),
         detections_attacked=detection_records(rendered.detections, names),
@@ -128,7 +129,7 @@ def _write(part: Path, scene: SceneIR, objective: Objective, rendered: Rendered,
     files.write_png(part / "rerender.png", to_uint8(objective.benign.render.image))
     files.write_png(part / "counterexample.png", after)
     marked = pictures.overlay(
-        after, result.targets_moved, result.detections_attacked, result.failures, objective.detector.t_star
+        after, result.targets_moved, result.detections_attacked, result.failures, objective.t_star
     )
     files.write_png(part / "overlay.png", marked)
     files.write_png(part / "difference.png", pictures.difference(before, after))

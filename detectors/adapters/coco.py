@@ -1,4 +1,6 @@
-"""The 80 classes of COCO, in the order in which detectors trained on it number them."""
+"""The 80 classes of COCO, in the orders in which detectors trained on it number them."""
+
+from collections.abc import Iterable
 
 NAMES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
@@ -12,6 +14,21 @@ NAMES = (
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
 _OURS = {"car": "Car"}
-CLASSES = tuple(_OURS.get(name, name) for name in NAMES)
+
+
+def ours(names: Iterable[str]) -> tuple[str, ...]:
+    """COCO's names, "car" as this project's class."""
+    return tuple(_OURS.get(name, name) for name in names)
+
+
+CLASSES = ours(NAMES)
 """Their names, "car" as this project's class. The others keep COCO's: its trucks, buses and trains divide vans,
 trucks and trams otherwise than KITTI does, and its people may ride. Who judges cars passes over them."""
+
+_NEVER_USED = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+_numbers = [number for number in range(1, 91) if number not in _NEVER_USED]
+CLASSES_91 = tuple(
+    CLASSES[_numbers.index(number)] if number in _numbers else "" for number in range(_numbers[-1] + 1)
+)
+"""By the numbers in COCO's own files, as torchvision's detectors have them: 0 is the background, and ten were
+never given ("")."""

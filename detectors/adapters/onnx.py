@@ -1,24 +1,26 @@
 """Detectors as ONNX files, run by ONNX Runtime: they predict, and have no gradient.
 
-What the graph takes and gives is recognised from its outputs' shapes (`FORMATS`).
+What the graph gives is recognised from its outputs' shapes (`detectors.adapters.formats`); what it takes follows,
+or is said by a YAML file (`detectors.adapters.spec`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import ast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from detectors import boxes
-from detectors.adapters import nanodet
-from detectors.adapters.formats import Format
+from detectors.adapters import coco
+from detectors.adapters.formats import Shape, reading
+from detectors.adapters.spec import Fitted, Spec, fit, prepare, settings_of
 from detectors.adapters.tiles import NMS_IOU, Window, cut, merge, windows
 from detectors.base import DetectorError
 from detectors.types import Detections
@@ -30,19 +32,13 @@ _QUIET = 3
 """ONNX Runtime's level of messages from which on it speaks: errors."""
 
 
-FORMATS: tuple[Format, ...] = (nanodet.FORMAT,)
-"""The families of graphs that are known; the first that recognises a graph's outputs reads them."""
-
-
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the graph gave for one window of one image. scale: px of the network's input a px of the image;
-    offset_xy: px of the input left of and above the window's picture in it."""
+    """What the graph gave for one window of one image. fitted: where the window's picture lies in the input."""
 
     window: Window
     outputs: tuple[np.ndarray, ...]
-    scale: float
-    offset_xy: tuple[int, int]
+    fitted: Fitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +53,12 @@ class OnnxPredictor:
     """A `detectors.base.Predictor` from an ONNX file: images (B, 3, H, W) RGB in [0, 1], any size.
 
     name: of the file. tiling: "auto" looks at the whole picture and at overlapping windows of it (see
-    `detectors.adapters.tiles`), "off" at the whole picture only. Threads are as many as torch has when it is made.
+    `detectors.adapters.tiles`), "off" at the whole picture only. spec: a YAML file of settings; by default the one
+    beside the graph, FILE.yaml for FILE.onnx, where there is one. Threads are as many as torch has when made.
     Raises DetectorError where the file, ONNX Runtime, or a format that fits is missing.
     """
 
-    def __init__(self, path: Path, tiling: str = "auto") -> None:
+    def __init__(self, path: Path, tiling: str = "auto", spec: Path | None = None) -> None:
         if tiling not in TILINGS:
             raise DetectorError(f"tiles: expected {' or '.join(TILINGS)}, found {tiling!r}")
         runtime = _runtime(path)
@@ -77,10 +74,22 @@ class OnnxPredictor:
             session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own classes differ from version to version
             raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
-        self.input_hw = _input_hw(path, session.get_inputs())
-        self.format = _format(path, session.get_outputs(), self.input_hw)
+        settings = settings_of(path, spec)
+        self.input_hw = _input_hw(path, session.get_inputs(), settings.get("size"))
+        shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
+        names = _names(session.get_modelmeta().custom_metadata_map)
+        self._reading = reading(shapes, self.input_hw, settings, names, str(path))
+        flat_image = len(session.get_inputs()[0].shape) == 3
+        self._spec: Spec = replace(
+            self._reading.spec, size=self.input_hw, **({"input": "image"} if flat_image else {})
+        )
+        self.format = self._reading.format
         self.name = path.stem
-        self.classes = self.format.classes
+        self.classes = self._reading.classes
+        if self._spec.t_star is not None:
+            self.t_star = self._spec.t_star
+        self._nms_iou = NMS_IOU if self._spec.nms_iou is None else self._spec.nms_iou
+        self._least_score = LEAST_SCORE if self._spec.least_score is None else self._spec.least_score
         self._tiling = tiling
         self._session = session
         self._input = session.get_inputs()[0].name
@@ -99,25 +108,21 @@ class OnnxPredictor:
 
     def _look(self, image: Tensor, window: Window) -> Seen:
         part = image[None, :, window.y0 : window.y1, window.x0 : window.x1].float().cpu()
-        high, wide = part.shape[2:]
-        scale = min(self.input_hw[0] / high, self.input_hw[1] / wide)
-        size = (min(round(scale * high), self.input_hw[0]), min(round(scale * wide), self.input_hw[1]))
-        if size != (high, wide):
-            part = F.interpolate(part, size, mode="bilinear", antialias=True, align_corners=False)
-        left, top = (self.input_hw[1] - size[1]) // 2, (self.input_hw[0] - size[0]) // 2
-        right, bottom = self.input_hw[1] - size[1] - left, self.input_hw[0] - size[0] - top
-        fed = self.format.prepare(F.pad(part, (left, right, top, bottom)))
-        outputs = self._session.run(None, {self._input: fed.contiguous().numpy()})
-        return Seen(window, tuple(outputs), scale, (left, top))
+        fed, fitted = fit(part, self._spec)
+        fed = prepare(fed, self._spec)
+        given = fed if self._spec.input == "batch" else fed[0]
+        outputs = self._session.run(None, {self._input: given.contiguous().numpy()})
+        return Seen(window, tuple(outputs), fitted)
 
     def _merged(self, seen: Sequence[Seen], image_hw: tuple[int, int]) -> Detections:
         found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         for one in seen:
-            edges, all_scores = self.format.read(one.outputs, self.input_hw)
-            cells, labels = (all_scores > LEAST_SCORE).nonzero(as_tuple=True)
+            outputs = [torch.from_numpy(output) for output in one.outputs]
+            (edges,), (all_scores,) = self._reading.read(outputs, self.input_hw)
+            cells, labels = (all_scores > self._least_score).nonzero(as_tuple=True)
             scores = all_scores[cells, labels]
             placed = _placed(edges[cells], one)
-            kept = boxes.nms(placed, scores, NMS_IOU, labels)
+            kept = boxes.nms(placed, scores, self._nms_iou, labels)
             placed = placed[kept]
             found.append((placed, scores[kept], labels[kept], cut(placed, one.window, image_hw)))
         placed, scores, labels, is_cut = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -127,12 +132,11 @@ class OnnxPredictor:
 
 def _placed(edges: Tensor, seen: Seen) -> Tensor:
     """Boxes (N, 4) of the network's input, edges of pixels, as boxes of the image, cut to the window."""
-    offset = edges.new_tensor(seen.offset_xy).repeat(2)
-    window = edges.new_tensor([seen.window.x0, seen.window.y0, seen.window.x1, seen.window.y1])
-    placed = (edges - offset) / seen.scale + window[:2].repeat(2)
-    placed = torch.minimum(torch.maximum(placed, window[:2].repeat(2)), window[2:].repeat(2))
+    origin = edges.new_tensor([seen.window.x0, seen.window.y0])
+    end = edges.new_tensor([seen.window.x1, seen.window.y1])
+    placed = seen.fitted.back(edges) + origin.repeat(2)
     # Pixel centres lie at integers: the first pixel's left edge is at -1/2.
-    return placed - 0.5
+    return torch.minimum(torch.maximum(placed, origin.repeat(2) - 0.5), end.repeat(2) - 0.5)
 
 
 def _runtime(path: Path) -> ModuleType:
@@ -143,25 +147,28 @@ def _runtime(path: Path) -> ModuleType:
     return onnxruntime
 
 
-def _input_hw(path: Path, inputs: Sequence[Any]) -> tuple[int, int]:
-    """Height and width px of the one image that a graph takes."""
-    shape = list(inputs[0].shape) if len(inputs) == 1 else None
-    if shape is None or len(shape) != 4 or shape[1] != 3 or not all(isinstance(side, int) for side in shape[2:]):
-        found = ", ".join(f"{i.name} {i.shape}" for i in inputs)
-        raise DetectorError(f"{path}: expected one input (1, 3, height, width) of fixed size, found {found}")
-    return shape[2], shape[3]
+def _input_hw(path: Path, inputs: Sequence[Any], size: tuple[int, int] | None) -> tuple[int, int]:
+    """Height and width px of the one image that a graph takes. size: a YAML file's, for sides left open."""
+    shape = list(inputs[0].shape) if len(inputs) == 1 else []
+    if len(shape) in (3, 4) and (shape[-3] == 3 or not isinstance(shape[-3], int)):
+        fixed = tuple(side if isinstance(side, int) else None for side in shape[-2:])
+        if size is not None and all(side in (None, given) for side, given in zip(fixed, size, strict=True)):
+            return size
+        if size is None and None not in fixed:
+            return fixed[0] or 0, fixed[1] or 0
+    found = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+    expected = f"of {size[0]} x {size[1]}" if size else "of fixed size (or `size` in a YAML file)"
+    raise DetectorError(f"{path}: expected one input (1, 3, height, width) {expected}, found {found}")
 
 
-def _format(path: Path, outputs: Sequence[Any], input_hw: tuple[int, int]) -> Format:
-    """The family of graphs that gives such outputs."""
-    shapes = [tuple(output.shape) for output in outputs]
-    for form in FORMATS:
-        if form.recognises(shapes, input_hw):
-            return form
-    found = ", ".join(f"{o.name} {o.shape}" for o in outputs)
-    raise DetectorError(
-        f"{path}: expected the outputs of {' or '.join(form.name for form in FORMATS)}, found {found}"
-    )
+def _names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Classes as Ultralytics' export writes them into a file: "{0: 'person', 1: ...}"."""
+    try:
+        names = ast.literal_eval(metadata.get("names", ""))
+        listed = [str(names[i]) for i in range(len(names))]
+    except (ValueError, SyntaxError, TypeError, KeyError):
+        return None
+    return coco.ours(listed)
 
 
 def _first_line(error: Exception) -> str:

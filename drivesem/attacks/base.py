@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, ClassVar, final
 
 import torch
 from torch import Tensor
@@ -36,20 +36,33 @@ class Score:
 class Problem:
     """What an attack sees of scene and detector: callables of theta (D,).
 
-    loss_and_grad: the objective to be raised, and its gradient (D,). project: onto the feasible set.
-    score: re-render and judge. step (D,): the step alpha of each coordinate.
+    loss_and_grad: the objective to be raised, and its gradient (D,); for detectors that have one. project: onto
+    the feasible set. score: re-render and judge, without a gradient; what was judged once is not rendered again.
+    step (D,): the step alpha of each coordinate; lower, upper (D,): its bounds.
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
     project: Callable[[Tensor], Projected]
     score: Callable[[Tensor], Score]
     step: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    def box(self, theta0: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+        """Where a search may look: lower and upper (D,), so many steps around theta0, within the bounds; the whole
+        bounds where `steps` is None.
+        """
+        if steps is None:
+            return self.lower, self.upper
+        reach = steps * self.step
+        return torch.maximum(self.lower, theta0 - reach), torch.minimum(self.upper, theta0 + reach)
 
 
 @dataclass(frozen=True, slots=True)
 class Proposals:
     """What `_propose` hands over. thetas: the iterates in order; losses: one each, None where it was not computed;
-    queries: gradients taken; active_constraints: what projections on the way held back.
+    queries: gradients taken, or thetas judged by a search without gradient; active_constraints: what projections
+    on the way held back.
     """
 
     thetas: tuple[Tensor, ...]
@@ -62,8 +75,9 @@ class Proposals:
 class AttackResult:
     """theta, theta0 (D,); loss_trace: the objective at each iterate, as far as the attack knew it, and at theta;
     score: of theta, from the final re-render; success_paper, success_moved: whether theta fails the detector under
-    either label mode; queries: one gradient step counts as one (re-scoring takes no gradient and is not counted);
-    active_constraints: what held the attack back at any of its iterates, each named once.
+    either label mode; queries: one gradient step counts as one, and so does one theta judged by a search without
+    gradient (re-scoring is not counted); active_constraints: what held the attack back at any of its iterates,
+    each named once.
     """
 
     theta: Tensor
@@ -78,7 +92,9 @@ class AttackResult:
 
 
 class Attack(ABC):
-    """A way of choosing theta."""
+    """A way of choosing theta. needs_gradient: whether it asks for `Problem.loss_and_grad`."""
+
+    needs_gradient: ClassVar[bool] = True
 
     @abstractmethod
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from detectors.base import RawPredictions
 from detectors.registry import load_detector
-from detectors.squeezedet import SqueezeDet
+from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 
 FIELDS = ("boxes_xyxy", "deltas", "class_logits", "confidence_logits")
 
@@ -55,6 +55,21 @@ def test_frozen_layers_are_the_plain_ones(batch: int, height: int, width: int) -
     raw, slope = gradient(shipped(), images)
     expected_raw, expected = gradient(shipped(frozen=False), images)
     assert raw.image_hw == expected_raw.image_hw
+    for field in FIELDS:
+        assert difference(getattr(raw, field), getattr(expected_raw, field)) < 1e-12
+    assert slope.shape == images.shape
+    assert float(expected.norm()) > 0
+    assert difference(slope, expected) < 1e-12
+
+
+@pytest.mark.parametrize(("batch", "height", "width"), [(2, 93, 131), (1, 16, 16), (1, 210, 100)])
+def test_frozen_layers_of_squeezedet_plus_are_the_plain_ones(batch: int, height: int, width: int) -> None:
+    detector = SqueezeDetPlus(classes=("Car", "Truck"), anchors=[(40.0, 30.0), (90.0, 60.0)]).double().eval()
+    detector.initialise(torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(detector.convdet.weight, std=0.02, generator=torch.Generator().manual_seed(1))
+    images = smooth(batch, height, width)
+    expected_raw, expected = gradient(detector.requires_grad_(True), images)
+    raw, slope = gradient(detector.requires_grad_(False), images)
     for field in FIELDS:
         assert difference(getattr(raw, field), getattr(expected_raw, field)) < 1e-12
     assert slope.shape == images.shape

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, save_detector
-from detectors.squeezedet import SqueezeDet
+from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet, SqueezeDetPlus
 
 
 @pytest.fixture
@@ -35,6 +35,25 @@ def test_round_trip(weights: Path) -> None:
     assert torch.equal(weight, expected.convdet.weight.half().float())
     assert weights.stat().st_size < 5e6
     assert [p.name for p in weights.parent.iterdir()] == ["own.safetensors"]
+
+
+@pytest.mark.parametrize("kind", [SqueezeDet, SqueezeDetPlus])
+def test_anchors_and_layout_travel_with_the_weights(kind: type[SqueezeDet], tmp_path: Path) -> None:
+    detector = kind(anchors=[(40.0, 30.0), (90.5, 61.25)]).eval()
+    detector.initialise(torch.Generator().manual_seed(0))
+    save_detector(detector, tmp_path / "own.safetensors")
+    loaded = load_detector(tmp_path / "own.safetensors")
+    assert type(loaded) is kind
+    assert loaded.anchors == ((40.0, 30.0), (90.5, 61.25))
+    with torch.no_grad():
+        assert loaded(torch.rand(1, 3, 32, 48)).boxes_xyxy.shape == (1, 2 * 2 * 3, 4)
+
+
+def test_anchors_in_metadata_that_are_none(weights: Path) -> None:
+    for bad in ("[[1, 2, 3]]", "[]", "[[5, -1]]", '"none"', "7", "{"):
+        rewrite(weights, state(), {"anchors": bad})
+        with pytest.raises(DetectorError, match=r"own\.safetensors: expected metadata .* anchors \(pairs, px\)"):
+            load_detector(weights)
 
 
 def test_unknown_name_lists_the_known_ones() -> None:
@@ -73,7 +92,7 @@ def test_other_architecture(weights: Path) -> None:
     assert "own.safetensors: expected the 64 tensors of squeezedet, found 64 missing (conv1.bias, ...)" in message
     assert "2 unexpected (backbone.0.weight, ...)" in message
     rewrite(weights, state(), {"architecture": "resnet"})
-    with pytest.raises(DetectorError, match="expected architecture squeezedet, found 'resnet'"):
+    with pytest.raises(DetectorError, match=r"expected architecture .*squeezedet.*, found 'resnet'"):
         load_detector(weights)
 
 
@@ -100,4 +119,6 @@ def test_shipped_detector_is_whole() -> None:
     assert detector.classes == ("Car", "Truck", "Pedestrian", "Cyclist")
     assert 0.05 < detector.t_star < 0.99
     card = SHIPPED["squeezedet"].with_suffix(".md")
+    assert isinstance(detector, SqueezeDet)
+    assert detector.anchors == ANCHOR_SIZES_WH
     assert f"{detector.t_star:.3f}" in card.read_text()

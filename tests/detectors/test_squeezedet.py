@@ -10,7 +10,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import RawPredictions
-from detectors.squeezedet import ANCHOR_SIZES_WH, Assignment, SqueezeDet
+from detectors.squeezedet import ANCHOR_SIZES_WH, Assignment, SqueezeDet, SqueezeDetPlus
 from detectors.types import Targets
 
 
@@ -72,6 +72,68 @@ def test_parameter_count_is_the_published_one() -> None:
     convdet = (768 * 9 + 1) * 9 * (3 + 1 + 4)
     assert conv1 + fires + convdet == 2_082_120  # 7.9 MiB of float32, as the paper says
     assert sum(p.numel() for p in fresh().parameters()) == 2_082_120
+
+
+def test_parameter_count_of_squeezedet_plus_is_the_published_one() -> None:
+    conv1 = (3 * 49 + 1) * 96
+    fires = 0
+    for inputs, squeeze, expand in [
+        (96, 96, 64),
+        (128, 96, 64),
+        (128, 192, 128),
+        (256, 192, 128),
+        (256, 288, 192),
+        (384, 288, 192),
+        (384, 384, 256),
+        (512, 384, 256),
+        (512, 384, 256),
+        (512, 384, 256),
+    ]:
+        fires += (inputs + 1) * squeeze + (squeeze + 1) * expand + (squeeze * 9 + 1) * expand
+    convdet = (512 * 9 + 1) * 9 * (3 + 1 + 4)
+    assert conv1 + fires + convdet == 7_021_640  # 26.8 MiB of float32, as the paper says
+    plus = SqueezeDetPlus(classes=("Car", "Pedestrian", "Cyclist"))
+    assert sum(p.numel() for p in plus.parameters()) == 7_021_640
+
+
+def test_anchors_are_the_published_ones() -> None:
+    # The comparison is with the numbers of config/kitti_squeezeDet_config.py, in their order.
+    published = "36 37 366 174 115 59 162 87 38 90 258 173 224 108 78 170 72 43"
+    assert " ".join(f"{number:g}" for size in fresh().anchors for number in size) == published
+    assert SqueezeDetPlus().anchors == fresh().anchors
+
+
+def test_squeezedet_plus_sees_images_of_any_size() -> None:
+    plus = SqueezeDetPlus(classes=("Car",))
+    plus.initialise(torch.Generator().manual_seed(0))
+    for height, width, cells in ((64, 65, 20), (16, 16, 1), (50, 70, 20)):
+        with torch.no_grad():
+            assert plus.eval()(torch.zeros(1, 3, height, width)).confidence_logits.shape == (1, 9 * cells)
+
+
+def test_any_number_of_anchors() -> None:
+    detector = SqueezeDet(classes=("Car", "Truck"), anchors=[(40, 30), (90.5, 61.0)])
+    detector.initialise(torch.Generator().manual_seed(0))
+    assert detector.convdet.out_channels == 2 * (2 + 1 + 4)
+    torch.nn.init.zeros_(detector.convdet.weight)
+    # The channels of the two confidences follow those of 2 x 2 class scores.
+    assert detector.convdet.bias.tolist() == [0, 0, 0, 0, -2, -2, 0, 0, 0, 0, 0, 0, 0, 0]
+    detector.eval()
+    raw = detector(torch.rand(1, 3, 33, 48))
+    # second cell of the third row, second anchor
+    centre, index = (16 + 7.5, 32 + 7.5), (2 * 3 + 1) * 2 + 1
+    assert raw.boxes_xyxy.shape == (1, 3 * 3 * 2, 4)
+    expected = [centre[0] - 45.25, centre[1] - 30.5, centre[0] + 45.25, centre[1] + 30.5]
+    assert raw.boxes_xyxy[0, index].tolist() == expected
+    assigned = detector.assign(raw, [targets([expected], [1])])
+    assert assigned.anchor.tolist() == [index]
+    assert assigned.deltas.tolist() == [[0.0, 0.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("anchors", [[], [(10.0,)], [(10.0, 0.0)], [(10.0, math.inf)], [(1.0, 2.0, 3.0)]])
+def test_anchors_that_are_no_sizes_are_refused(anchors: list) -> None:
+    with pytest.raises(ValueError, match="anchors: expected pairs of positive px"):
+        SqueezeDet(anchors=anchors)
 
 
 @pytest.mark.parametrize(
@@ -223,8 +285,8 @@ def test_box_and_class_terms_by_hand() -> None:
 
 
 def test_overlap_joins_the_box_term_where_it_has_a_weight() -> None:
-    # The anchor of 36 x 37 px against an object as large, half an anchor to its right: the shift is 0.5, the overlap
-    # 1/3, and nothing is left open.
+    # The anchor of 36 x 37 px against an object as large, half an anchor to its right: the shift is 0.5, the
+    # overlap 1/3, and nothing is left open.
     parts, detector = silent(1, 64, 64), fresh()
     raw = raw_of(parts, 64, 64)
     anchor = anchor_at(1, 1, 0, 4)

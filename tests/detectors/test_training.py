@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,8 +72,11 @@ def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
 
 def test_progress_is_told_after_each_step(tmp_path: Path) -> None:
     told: list[tuple[int, int, float]] = []
-    settings = replace(SMALL, steps=4)
-    train(fresh(), painted(2), settings, tmp_path, stop_after=3, progress=lambda *told_now: told.append(told_now))
+
+    def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
+        told.append((done, steps, row["total"]))
+
+    train(fresh(), painted(2), replace(SMALL, steps=4), tmp_path, stop_after=3, progress=progress)
     assert [told_now[:2] for told_now in told] == [(1, 4), (2, 4), (3, 4)]
     log = list(csv.DictReader((tmp_path / LOG).read_text().splitlines()))
     assert [loss for *_, loss in told] == pytest.approx([float(row["total"]) for row in log], rel=1e-5)

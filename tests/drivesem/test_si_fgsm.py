@@ -7,6 +7,7 @@ from drivesem.feasible import Projected
 from scene_ir.errors import RangeError
 
 STEP = torch.tensor([0.1, 0.2, 0.3])
+LIMIT = torch.full((3,), 0.5)
 GOAL = torch.tensor([0.38, -10.0, 0.0])
 
 
@@ -37,7 +38,7 @@ class Analytic:
 
     @property
     def problem(self):
-        return Problem(self.loss_and_grad, self.project, self.score, STEP)
+        return Problem(self.loss_and_grad, self.project, self.score, STEP, lower=-LIMIT, upper=LIMIT)
 
 
 def test_steps_follow_the_sign_and_stay_feasible():

@@ -1,0 +1,458 @@
+"""YOLOv3 (Redmon and Farhadi, 2018, arXiv:1804.02767) for images of any size.
+
+Departures from the published code: images are padded right and below to a multiple of 32 px, with its grey, and
+never resized; an object whose best anchor is taken in its cell gets the next best one; sums of the loss are divided
+by the objects of the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from detectors import boxes
+from detectors.base import Detector, RawPredictions
+from detectors.types import CLASSES, Detections, Targets
+from detectors.yolov3 import layouts
+from detectors.yolov3.cfg import Cfg
+from detectors.yolov3.network import Folded, Network
+
+GREY = 0.5
+"""What Darknet fills with where there is no image."""
+LARGEST_LOG = 6.0
+"""Boxes are at most e^6 = 400 times their anchor: an untrained one cannot overflow."""
+MEETING_IOU = 0.5
+"""Overlap from which a predicted box meets an object, as in the evaluation."""
+IGNORE_OVERLAP = 0.5
+"""An anchor that lies in an ignored region by more than this need not be silent."""
+SCORE_MINIMUM = 0.005
+NMS_IOU = 0.45
+"""Decoding for evaluation (published code: `validate_detector`)."""
+TOP_CANDIDATES = 256
+"""Boxes of a class each that suppression begins with; of more, the best."""
+PRIOR = 0.01
+"""Objectness before training: almost all anchors see nothing."""
+_HALF = (torch.bfloat16, torch.float16)
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the A anchors of an image are: heads in the file's order, cells row by row, a cell's anchors together.
+
+    cells_xy (A, 2): px of the cell's corner; strides (A,) px; anchors_wh (A, 2) px.
+    """
+
+    cells_xy: Tensor
+    strides: Tensor
+    anchors_wh: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Which anchors answer for which objects; holds no gradient. K pairs of both; M objects that are not ignored.
+
+    image, anchor (K,) int64; deltas (K, 4), what the box head should say: x and y as places in the cell in (0, 1),
+    logarithms of width and height in anchors; scales (K,), 2 less the object's share of the image; labels (K,)
+    int64; negative (B, A) bool: the anchors that must be silent. found_image, found_by (M,) int64: an object's image,
+    and the most confident of the anchors whose predicted boxes meet it (IoU of at least 0.5); found (M,) bool:
+    whether there is any; alarm (B, A) bool: negatives that meet no object.
+    """
+
+    image: Tensor
+    anchor: Tensor
+    deltas: Tensor
+    scales: Tensor
+    labels: Tensor
+    negative: Tensor
+    found_image: Tensor
+    found_by: Tensor
+    found: Tensor
+    alarm: Tensor
+
+
+class YoloV3(Detector):
+    """The network of a `.cfg` with its loss and decoding.
+
+    In eval mode with all weights frozen, normalisation is folded into the convolutions. gradient_precision: what
+    passes compute in that a gradient to the images may follow; the others, which judge, use the weights' own.
+    """
+
+    name = "yolov3"
+    fresh_layers = ("network.",)
+    layout: ClassVar[Callable[..., Cfg]] = staticmethod(layouts.yolov3)
+    """The network without a `.cfg`: of the number of classes, and anchors."""
+
+    def __init__(
+        self,
+        classes: tuple[str, ...] = CLASSES,
+        t_star: float = 0.5,
+        anchors: layouts.Anchors | None = None,
+        cfg: Cfg | None = None,
+    ) -> None:
+        """cfg: by default `layout` with these anchors, or those that it has. Raises ValueError where classes are not
+        as many as the file's, and for a number of anchors that the layout does not have.
+        """
+        super().__init__()
+        if cfg is None:
+            cfg = self.layout(len(classes)) if anchors is None else self.layout(len(classes), anchors)
+        if len(classes) != cfg.classes:
+            raise ValueError(f"classes: expected {cfg.classes} as in the cfg, found {len(classes)}")
+        self.cfg = cfg
+        self.classes = tuple(classes)
+        self.t_star = t_star
+        self.network = Network(cfg)
+        self.gradient_precision: torch.dtype | None = None
+        self._nets: dict[torch.dtype, tuple[object, Folded]] = {}
+        self._known_places: dict[object, Places] = {}
+
+    @property
+    def anchors(self) -> layouts.Anchors:
+        """Widths and heights in px of all heads' anchors."""
+        return self.cfg.heads[0][1].anchors_wh
+
+    @torch.no_grad()
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw all weights anew: He for the backbone, near zero for the heads, anchors silent."""
+        for block in self.network.blocks.values():
+            std = (2 / block.conv.weight[0].numel()) ** 0.5
+            block.conv.weight.normal_(0.0, 1e-2 if block.norm is None else std, generator=generator)
+            if block.norm is not None:
+                block.norm.reset_parameters()
+        prior = -torch.log(torch.tensor(1 / PRIOR - 1))
+        for i, head in self.cfg.heads:
+            bias = self.network.blocks[i - 1].conv.bias
+            if bias is not None:
+                bias.zero_()
+                bias.view(len(head.mask), -1)[:, 4] = prior
+
+    def forward(self, images: Tensor) -> RawPredictions:
+        """images (B, 3, H, W), RGB in [0, 1]; A: see `places`."""
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
+        height, width = int(images.shape[2]), int(images.shape[3])
+        stride = self.cfg.stride
+        frozen = not self.training and not any(p.requires_grad for p in self.network.parameters())
+        dtype = next(self.network.parameters()).dtype
+        if not frozen:
+            return self._interpret(self.network(_padded(images, stride)), (height, width))
+        if self.gradient_precision is not None and torch.is_grad_enabled() and images.requires_grad:
+            dtype = self.gradient_precision
+        scaled = _Scale()
+        x = images
+        if dtype in _HALF:
+            x = _ToHalf.apply(images, dtype, scaled)  # pyright: ignore[reportAssignmentType]
+        with torch.autocast(images.device.type, enabled=False):
+            outputs = self._folded(dtype)(_padded(x, stride))
+        return self._interpret(outputs, (height, width), scaled)
+
+    def _folded(self, dtype: torch.dtype) -> Folded:
+        """The network as attacks run it, made anew where the weights have changed since."""
+        tensors = [*self.network.parameters(), *self.network.buffers()]
+        state = [(t.data_ptr(), t._version, t.dtype, t.device) for t in tensors]
+        known = self._nets.get(dtype)
+        if known is None or known[0] != state:
+            known = self._nets[dtype] = (state, self.network.folded(dtype))
+        return known[1]
+
+    def places(self, image_hw: tuple[int, int], like: Tensor) -> Places:
+        """Where the anchors of an image are, in the dtype and on the device of `like`."""
+        key = (image_hw, like.dtype, like.device)
+        if key not in self._known_places:
+            self._known_places[key] = self._places(image_hw, like)
+        return self._known_places[key]
+
+    def _places(self, image_hw: tuple[int, int], like: Tensor) -> Places:
+        sides = [side + -side % self.cfg.stride for side in image_hw]
+        cells, strides, anchors = [], [], []
+        for i, head in self.cfg.heads:
+            stride, count = self.cfg.strides[i], len(head.mask)
+            y, x = (torch.arange(side // stride, dtype=like.dtype, device=like.device) * stride for side in sides)
+            corners = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+            shapes = like.new_tensor([head.anchors_wh[k] for k in head.mask])
+            cells.append(corners.repeat_interleave(count, 0))
+            anchors.append(shapes.repeat(len(corners), 1))
+            strides.append(like.new_full((len(corners) * count,), stride))
+        return Places(torch.cat(cells), torch.cat(strides), torch.cat(anchors))
+
+    def _interpret(
+        self, outputs: Sequence[Tensor], image_hw: tuple[int, int], scaled: _Scale | None = None
+    ) -> RawPredictions:
+        """Heads' channels are, anchor by anchor: x, y, width, height, objectness, classes."""
+        numbers = 5 + len(self.classes)
+        flat = [out.permute(0, 2, 3, 1).reshape(len(out), -1, numbers) for out in outputs]
+        cells = torch.cat(flat, 1)
+        if cells.dtype in _HALF:  # boxes need more than their 8 or 11 bits
+            cells = cells.float() if scaled is None else _FromHalf.apply(cells, scaled)
+        deltas, confidence, class_logits = cells.split((4, 1, len(self.classes)), -1)
+        places = self.places(image_hw, cells)
+        # A cell's edge lies half a pixel before the centre of its first pixel, which is a whole number here.
+        centre = places.cells_xy + torch.sigmoid(deltas[..., :2]) * places.strides[:, None] - 0.5
+        half = places.anchors_wh * torch.exp(deltas[..., 2:].clamp_max(LARGEST_LOG)) / 2
+        return RawPredictions(
+            boxes_xyxy=torch.cat((centre - half, centre + half), -1),
+            deltas=deltas,
+            class_logits=class_logits,
+            confidence_logits=confidence[..., 0],
+            image_hw=image_hw,
+        )
+
+    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """The paper's loss; what it aims at (`assign`) is taken as constant, as in the published code."""
+        return self.loss_terms(raw, self.assign(raw, targets))
+
+    @torch.no_grad()
+    def assign(self, raw: RawPredictions, targets: Sequence[Targets]) -> Assignment:
+        """Give each object, in the cell of its centre, the anchor of all heads whose shape fits it best, and those
+        others that overlap its shape by more than their head's match_threshold.
+
+        Raises ValueError where targets and images differ in number, or a label is no class of this detector.
+        """
+        if len(targets) != len(raw):
+            raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
+        like = raw.boxes_xyxy
+        places = self.places(raw.image_hw, like)
+        negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
+        meets_any = ~negative
+        image, anchor, truth, label, meeting, found_image = [], [], [], [], [], []
+        thresholds = _ignore_thresholds(self.cfg, raw.image_hw, like)
+        for b, target in enumerate(targets):
+            ignore = target.ignore.to(like.device)
+            wanted = target.boxes_xyxy.to(like)[~ignore]
+            labels = target.labels.to(like.device)[~ignore]
+            # Regions are named once for each class.
+            regions = torch.unique(target.boxes_xyxy.to(like)[ignore], dim=0)
+            overlap = boxes.iou_matrix(wanted, raw.boxes_xyxy[b])
+            if len(wanted):
+                negative[b] = overlap.max(0).values <= thresholds
+                meets_any[b] = (overlap >= MEETING_IOU).any(0)
+            if len(regions):
+                negative[b] &= ~(_covered(_anchor_boxes(places), regions) | _covered(raw.boxes_xyxy[b], regions))
+            rows, columns = self._matches(wanted, raw.image_hw, places)
+            image += [b] * len(rows)
+            anchor += columns
+            truth.append(wanted[rows])
+            label.append(labels[rows])
+            found_image += [b] * len(wanted)
+            logits = raw.confidence_logits[b].expand_as(overlap)
+            meeting.append(logits.masked_fill(overlap < MEETING_IOU, -torch.inf).max(1))
+        image = torch.tensor(image, dtype=torch.int64, device=like.device)
+        anchor = torch.tensor(anchor, dtype=torch.int64, device=like.device)
+        truth_xyxy, label = torch.cat(truth), torch.cat(label)
+        if bool(((label < 0) | (label >= len(self.classes))).any()):
+            raise ValueError(f"targets.labels: expected 0..{len(self.classes) - 1}, found {label.tolist()}")
+        negative[image, anchor] = False
+        centre, size = _centre_and_size(truth_xyxy)
+        place = (centre - places.cells_xy[anchor]) / places.strides[anchor, None]
+        share = size.prod(1) / (raw.image_hw[0] * raw.image_hw[1])
+        return Assignment(
+            image=image,
+            anchor=anchor,
+            deltas=torch.cat((place.clamp(0, 1), torch.log(size / places.anchors_wh[anchor])), 1),
+            scales=2 - share.clamp(0, 1),
+            labels=label,
+            negative=negative,
+            found_image=torch.tensor(found_image, dtype=torch.int64, device=like.device),
+            found_by=torch.cat([m.indices for m in meeting]),
+            found=torch.cat([m.values for m in meeting]) > -torch.inf,
+            alarm=negative & ~meets_any,
+        )
+
+    def _matches(
+        self, wanted_xyxy: Tensor, image_hw: tuple[int, int], places: Places
+    ) -> tuple[list[int], list[int]]:
+        """Rows of `wanted_xyxy` (N, 4), and the anchor of each; a row as often as anchors answer for it."""
+        shapes, offsets, strides, thresholds = [], [], [], []
+        start = 0
+        sides = [side + -side % self.cfg.stride for side in image_hw]
+        for i, head in self.cfg.heads:
+            stride, count = self.cfg.strides[i], len(head.mask)
+            for k, index in enumerate(head.mask):
+                shapes.append(head.anchors_wh[index])
+                offsets.append((start + k, count, sides[1] // stride, sides[0] // stride))
+                strides.append(stride)
+                thresholds.append(head.match_threshold)
+            start += count * (sides[0] // stride) * (sides[1] // stride)
+        centre, size = _centre_and_size(wanted_xyxy)
+        overlaps = _shape_iou(size, wanted_xyxy.new_tensor(shapes)).tolist()
+        taken: set[int] = set()
+        rows, columns = [], []
+        further: list[tuple[int, int]] = []
+        for row, ((x, y), fits) in enumerate(zip(centre.tolist(), overlaps, strict=True)):
+            order = sorted(range(len(fits)), key=lambda k: -fits[k])
+            at = []
+            for k in order:
+                first, count, wide, high = offsets[k]
+                column = min(max(int(x // strides[k]), 0), wide - 1)
+                line = min(max(int(y // strides[k]), 0), high - 1)
+                at.append(first + count * (line * wide + column))
+            best = next((k for k in range(len(at)) if at[k] not in taken), 0)
+            taken.add(at[best])
+            rows.append(row)
+            columns.append(at[best])
+            further += [(row, at[k]) for k in range(len(at)) if fits[order[k]] > thresholds[order[k]]]
+        # Only when all objects have their best anchor do others get a further one.
+        for row, index in further:
+            if index not in taken:
+                taken.add(index)
+                rows.append(row)
+                columns.append(index)
+        return rows, columns
+
+    def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
+        """Sums over the batch, divided by its objects (by 1 where there is none); their sum, and what attacks raise.
+
+        Box: binary cross entropy of x and y in their cell, and half the squared error of the logarithms of width and
+        height, both times `scales`; confidence: binary cross entropy of objectness over anchors that answer for an
+        object or must be silent; class: binary cross entropy of each class. Their gradients are those of the
+        published code. There, "squared error" of a sigmoid leaves out the sigmoid's own slope, as here.
+
+        "objectness" is a squared error, so that no object outweighs all others: 1 less the confidence of the most
+        confident anchor whose box meets the object, and the confidences of anchors that meet none.
+        """
+        image, anchor = assignment.image, assignment.anchor
+        objects = max(len(assignment.found), 1)
+        deltas, scales = raw.deltas[image, anchor], assignment.scales[:, None]
+        place = _cross_entropy(deltas[:, :2], assignment.deltas[:, :2])
+        shape = (deltas[:, 2:] - assignment.deltas[:, 2:]).square() / 2
+        logits = raw.confidence_logits
+        missed = F.softplus(-logits[image, anchor]).sum()
+        alarms = torch.where(assignment.negative, F.softplus(logits), 0.0).sum()
+        class_logits = raw.class_logits[image, anchor]
+        wanted = F.one_hot(assignment.labels, len(self.classes)).to(class_logits)
+        terms = {
+            "confidence": (missed + alarms) / objects,
+            "box": ((place + shape) * scales).sum() / objects,
+            "class": _cross_entropy(class_logits, wanted).sum() / objects,
+        }
+        confidence = torch.sigmoid(logits)
+        found = torch.where(assignment.found, confidence[assignment.found_image, assignment.found_by], 0.0)
+        unseen = (1 - found).square().sum()
+        false = torch.where(assignment.alarm, confidence, 0.0).square().sum()
+        return terms | {
+            "total": terms["confidence"] + terms["box"] + terms["class"],
+            "objectness": (unseen + false) / objects,
+        }
+
+    @torch.no_grad()
+    def decode(self, raw: RawPredictions) -> list[Detections]:
+        """Score = objectness x class probability, each class by itself; NMS at 0.45 in it, score >= 0.005."""
+        found = []
+        for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
+            # No score exceeds its confidence, and few of the anchors have any.
+            (likely,) = torch.nonzero(confidence >= SCORE_MINIMUM, as_tuple=True)
+            scores = confidence[likely, None] * torch.sigmoid(raw.class_logits[b, likely])
+            flat = scores.flatten()
+            top = torch.sort(flat, descending=True, stable=True).indices[:TOP_CANDIDATES]
+            top = top[flat[top] >= SCORE_MINIMUM]
+            row, label = top // len(self.classes), top % len(self.classes)
+            clipped = boxes.clip(raw.boxes_xyxy[b, likely[row]], *raw.image_hw)
+            keep = boxes.nms(clipped, flat[top], NMS_IOU, label)
+            found.append(Detections(clipped[keep], label[keep], flat[top][keep]))
+        return found
+
+
+class YoloV3Tiny(YoloV3):
+    """The published small one: poolings instead of residual blocks, two heads."""
+
+    name = "yolov3-tiny"
+    layout = staticmethod(layouts.yolov3_tiny)
+
+
+class YoloV3Slim(YoloV3):
+    """A narrow Darknet with three heads, for processors without a GPU."""
+
+    name = "yolov3-slim"
+    layout = staticmethod(layouts.yolov3_slim)
+
+
+class _Scale:
+    """What a gradient was multiplied by on its way through half precision."""
+
+    def __init__(self) -> None:
+        self.factor: Tensor | None = None
+
+
+class _ToHalf(torch.autograd.Function):
+    """Images into half precision; back, the gradient loses the factor that `_FromHalf` gave it."""
+
+    @staticmethod
+    def forward(ctx: Any, images: Tensor, dtype: torch.dtype, scaled: _Scale) -> Tensor:
+        ctx.dtype, ctx.scaled = images.dtype, scaled
+        return images.to(dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor, None, None]:
+        return gradients[0].to(ctx.dtype) * ctx.scaled.factor, None, None
+
+
+class _FromHalf(torch.autograd.Function):
+    """Half precision to float32. Float16's smallest number is 6e-8, and gradients of one confidence are smaller:
+    back, they are carried relative to the largest.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, cells: Tensor, scaled: _Scale) -> Tensor:
+        ctx.dtype, ctx.scaled = cells.dtype, scaled
+        return cells.float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor, None]:
+        factor = gradients[0].abs().amax().clamp_min(torch.finfo(torch.float16).tiny)
+        ctx.scaled.factor = factor
+        return (gradients[0] / factor).to(ctx.dtype), None
+
+
+def _padded(images: Tensor, stride: int) -> Tensor:
+    height, width = images.shape[2:]
+    x = F.pad(images, (0, -width % stride, 0, -height % stride), value=GREY)
+    return x.contiguous(memory_format=torch.channels_last)
+
+
+def _ignore_thresholds(cfg: Cfg, image_hw: tuple[int, int], like: Tensor) -> Tensor:
+    """(A,) the overlap with an object beyond which an anchor need not be silent."""
+    sides = [side + -side % cfg.stride for side in image_hw]
+    parts = []
+    for i, head in cfg.heads:
+        cells = (sides[0] // cfg.strides[i]) * (sides[1] // cfg.strides[i])
+        parts.append(like.new_full((cells * len(head.mask),), head.ignore_threshold))
+    return torch.cat(parts)
+
+
+def _anchor_boxes(places: Places) -> Tensor:
+    """Anchors (A, 4) px around the middle of their cells."""
+    centre = places.cells_xy + places.strides[:, None] / 2 - 0.5
+    return torch.cat((centre - places.anchors_wh / 2, centre + places.anchors_wh / 2), -1)
+
+
+def _covered(candidates_xyxy: Tensor, regions_xyxy: Tensor) -> Tensor:
+    """Candidates (N,) of which a region covers more than IGNORE_OVERLAP."""
+    shared = boxes.intersection_matrix(regions_xyxy, candidates_xyxy)
+    return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
+
+
+def _centre_and_size(boxes_xyxy: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (N, 2) px from the image's edge, half a pixel before the centre of its first one; sizes (N, 2)."""
+    top_left, bottom_right = boxes_xyxy[:, :2], boxes_xyxy[:, 2:]
+    return (top_left + bottom_right) / 2 + 0.5, (bottom_right - top_left).clamp_min(1e-3)
+
+
+def _shape_iou(first_wh: Tensor, second_wh: Tensor) -> Tensor:
+    """IoU (N, M) of shapes (N, 2) and (M, 2) that have one centre."""
+    shared = torch.minimum(first_wh[:, None], second_wh[None]).prod(-1)
+    return shared / (first_wh.prod(-1)[:, None] + second_wh.prod(-1)[None] - shared)
+
+
+def _cross_entropy(logits: Tensor, wanted: Tensor) -> Tensor:
+    return F.binary_cross_entropy_with_logits(logits, wanted, reduction="none")

@@ -1,0 +1,62 @@
+"""Samples of a box in theta's space: uniform, or from a scrambled Halton or Sobol sequence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from scipy.stats import qmc
+from torch import Tensor
+
+from drivesem.attacks.base import Attack, Problem, Proposals
+from drivesem.attacks.trials import Trials
+from scene_ir.errors import RangeError
+
+Kind = Literal["random", "halton", "sobol"]
+"""random: independent and uniform; halton, sobol: low-discrepancy sequences, scrambled (Owen 2017, Matousek 1998,
+as scipy.stats.qmc has them)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling(Attack):
+    """As many thetas as there are queries, each projected and judged; the detector's gradient is not asked for.
+
+    steps: samples lie within so many steps of theta0, or anywhere within the bounds where it is None. early_stop:
+    end at the first that fails the detector under `moved` labels.
+    """
+
+    kind: Kind = "random"
+    queries: int = 64
+    steps: int | None = None
+    early_stop: bool = False
+
+    needs_gradient: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.queries < 1:
+            raise RangeError("queries", "at least 1", self.queries)
+        if self.steps is not None and self.steps < 1:
+            raise RangeError("steps", "at least 1", self.steps)
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        lower, upper = problem.box(theta0, self.steps)
+        trials = Trials(problem, self.queries, self.early_stop)
+        for place in self._places(len(theta0), generator).to(theta0):
+            if not trials.left:
+                break
+            trials.judge(lower + place * (upper - lower))
+        return trials.proposals()
+
+    def _places(self, dimensions: int, generator: torch.Generator) -> Tensor:
+        """Where in the unit box to look: (queries, dimensions) float64."""
+        if self.kind == "random":
+            return torch.rand(self.queries, dimensions, generator=generator, dtype=torch.float64)
+        seed = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
+        if self.kind == "halton":
+            return torch.from_numpy(qmc.Halton(dimensions, scramble=True, seed=seed).random(self.queries))
+        # A Sobol sequence is balanced in powers of two; fewer are taken from its beginning.
+        points = qmc.Sobol(dimensions, scramble=True, seed=seed).random_base2(math.ceil(math.log2(self.queries)))
+        return torch.from_numpy(points[: self.queries])

@@ -1,0 +1,102 @@
+"""Frames of any data set for training, decoded once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from detectors.anchors import fit_anchors, target_sizes
+from detectors.squeezedet import ANCHOR_SIZES_WH
+from detectors.training import Sample
+from detectors.types import Targets
+from drivesem.data.registry import Dataset
+from drivesem.labels import Difficulty
+from drivesem.pipeline import to_uint8
+from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.types import Labels
+
+PIXELS, INDEX = "pixels.u8", "index.json"
+
+
+class FrameStore(Sequence[Sample]):
+    """Frames with their labels; the pixels lie decoded in one file that is mapped into memory.
+
+    A data set that grows is read on where the file ends.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        names: Iterable[str],
+        cache: Path,
+        classes: Sequence[str],
+        done: Callable[[], object] | None = None,
+    ) -> None:
+        """names: the frames to take; done: called after each. Raises FormatError for a frame that cannot be read,
+        and for one without labels."""
+        cache.mkdir(parents=True, exist_ok=True)
+        index: dict[str, tuple[int, int, int]] = {}
+        if (cache / INDEX).is_file():
+            index = {name: (start, height, width) for name, start, height, width in files.read_json(cache / INDEX)}
+        end = sum(height * width * 3 for _, height, width in index.values())
+        chosen = list(names)
+        with (cache / PIXELS).open("r+b" if (cache / PIXELS).is_file() else "w+b") as file:
+            file.truncate(end)
+            file.seek(end)
+            for name in chosen:
+                if name not in index:
+                    image = to_uint8(dataset.frame(name).photograph)
+                    file.write(image.tobytes())
+                    index[name] = (end, image.shape[0], image.shape[1])
+                    end += image.size
+                if done is not None:
+                    done()
+        rows = [(name, *place) for name, place in index.items()]
+        files.write_text(cache / INDEX, json.dumps(rows))
+        self.classes = tuple(classes)
+        self.names = tuple(chosen)
+        self._places = [index[name] for name in chosen]
+        self._pixels = np.memmap(cache / PIXELS, np.uint8, "r", shape=(max(end, 1),)) if end else np.zeros(0, "u1")
+        self.labels = [_labels(dataset, name) for name in chosen]
+        trained = suited(TRAINED, self.labels)
+        self._targets = [training_targets(labels, trained, self.classes) for labels in self.labels]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def image(self, index: int) -> np.ndarray:
+        """Pixels (H, W, 3) uint8 RGB."""
+        start, height, width = self._places[index]
+        return self._pixels[start : start + height * width * 3].reshape(height, width, 3)
+
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.image(index), self._targets[index]
+
+    def objects(self) -> int:
+        """How many objects there are to learn."""
+        return sum(int((~targets.ignore).sum()) for targets in self._targets)
+
+    def anchors(self, seed: int) -> tuple[tuple[float, float], ...]:
+        """As many anchors as SqueezeDet has published ones, by k-means of the objects' sizes.
+
+        Raises ValueError where fewer sizes differ.
+        """
+        sizes = np.concatenate([target_sizes(targets) for targets in self._targets])
+        return fit_anchors(sizes, len(ANCHOR_SIZES_WH), seed).sizes_wh
+
+    def judged(self, difficulty: Difficulty) -> list[Targets]:
+        """What a detector is judged by, frame by frame."""
+        limits = suited(difficulty, self.labels)
+        return [judged_targets(labels, limits, self.classes) for labels in self.labels]
+
+
+def _labels(dataset: Dataset, name: str) -> Labels:
+    labels = dataset.labels(name)
+    if labels is None:
+        raise FormatError(f"frame {name}", "labels", "none")
+    return labels

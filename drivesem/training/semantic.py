@@ -1,0 +1,113 @@
+"""Frames whose vehicles were moved, turned, bent and painted at random, feasibly, by the project's own renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from detectors.training import Sample
+from drivesem.data import kitti
+from drivesem.data.registry import Dataset
+from drivesem.feasible import FeasibleSet
+from drivesem.labels import Labeller, to_kitti_labels
+from drivesem.pipeline import to_uint8
+from drivesem.space import Parameter, ParameterSpace
+from drivesem.training.frames import FrameStore
+from drivesem.training.targets import TRAINED, training_targets
+from scene_ir import files
+from scene_ir.compositor import Compositor
+from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
+from scene_ir.errors import SceneError
+from scene_ir.types import Frame, Labels
+
+VARIANTS = 4
+"""Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
+PARAMETERS = tuple(Parameter)
+_BENT_BY = 0.3
+"""Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same bound
+on strain."""
+
+
+class SemanticFrames(Sequence[Sample]):
+    """The frames of a store, a share of which is shown perturbed, each time by chance.
+
+    A frame is taken apart when it is first drawn, and its variants stay in `folder`: they depend on the frame, its
+    place and the seed alone. Frames without vehicles, or that cannot be taken apart, are shown as they are.
+    """
+
+    def __init__(self, store: FrameStore, dataset: Dataset, folder: Path, share: float, seed: int) -> None:
+        self._store, self._dataset, self._folder = store, dataset, folder
+        self._share, self._seed = share, seed
+
+    def __len__(self) -> int:
+        return len(self._store)
+
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self._store[index]
+
+    def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
+        """Frame `index`, or one of its variants."""
+        if generator.random() >= self._share:
+            return self._store[index]
+        variant = int(generator.integers(VARIANTS))
+        name = self._store.names[index].replace("/", "_")
+        folder = self._folder / name
+        if not folder.is_dir():
+            self._make(index, folder)
+        if not (folder / f"{variant}.png").is_file():
+            return self._store[index]
+        labels = kitti.read_labels(folder / f"{variant}.txt")
+        return files.read_image(folder / f"{variant}.png"), training_targets(labels, TRAINED, self._store.classes)
+
+    def _make(self, index: int, folder: Path) -> None:
+        """All variants of a frame, whole or not at all; an empty folder where there can be none."""
+        with files.whole_folder(folder) as part:
+            frame = self._dataset.frame(self._store.names[index])
+            try:
+                variants = perturbed(frame, [self._seed, index])
+            except SceneError:
+                return
+            for i, (image, labels) in enumerate(variants):
+                files.write_png(part / f"{i}.png", image)
+                kitti.write_labels(part / f"{i}.txt", labels)
+
+
+@torch.no_grad()
+def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Labels]]:
+    """VARIANTS feasible perturbations of a labelled frame: pixels (H, W, 3) uint8 RGB, and labels that moved along.
+
+    None for a frame without vehicles. Raises SceneError where the frame cannot be taken apart.
+    """
+    scene = derender(frame, DerenderSettings(fit=False))
+    if not len(scene.objects) or frame.labels is None:
+        return []
+    space = ParameterSpace(scene, PARAMETERS)
+    feasible, compositor = FeasibleSet(space), Compositor(scene)
+    labeller = Labeller(scene, compositor.render(scene))
+    generator = np.random.default_rng([*seed, 4])
+    reach = torch.ones(space.dim)
+    reach[space.slice_of(Parameter.MESH)] = _BENT_BY
+    found = []
+    for _ in range(VARIANTS):
+        # Cubed: most codes stay near the photograph, as most days are no storm.
+        drawn = torch.from_numpy(generator.uniform(-1, 1, space.dim).astype(np.float32)) ** 3 * reach
+        theta = torch.where(drawn < 0, -drawn * space.lower, drawn * space.upper)
+        moved = space.apply(scene, feasible.project(theta).theta)
+        render = compositor.render(moved)
+        labels = to_kitti_labels(labeller.moved(moved, render), scene, moved)
+        found.append((to_uint8(render.image), _with_others(labels, frame.labels)))
+    return found
+
+
+def _with_others(moved: Labels, original: Labels) -> Labels:
+    """Labels of vehicles that moved, and those of all else, which did not."""
+    rows = torch.tensor([i for i, kind in enumerate(original.kind) if kind not in VEHICLES], dtype=torch.int64)
+    names = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
+    return Labels(
+        kind=(*moved.kind, *(original.kind[i] for i in rows.tolist())),
+        ignore_xyxy=moved.ignore_xyxy,
+        **{name: torch.cat([getattr(moved, name), getattr(original, name)[rows]]) for name in names},
+    )

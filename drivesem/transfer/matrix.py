@@ -1,0 +1,174 @@
+"""The figures of one run before one detector: benign and attacked, and what of the source's failures it shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.eval_outcome import OVERLAP, Outcome
+from drivesem.evaluation import coco, failures
+from drivesem.evaluation.curves import Tally
+from drivesem.evaluation.resampling import (
+    Averaged,
+    Difference,
+    Figure,
+    Interval,
+    Recalled,
+    differences,
+    intervals,
+)
+from drivesem.judged import HEADLINE, JudgedClasses
+from drivesem.pipeline import as_targets
+from drivesem.results import FrameResult
+from drivesem.transfer.runs import Run
+
+AP50, RECALL = "AP50", "recall"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A detector that is asked: its name as it was given, its judged classes, its threshold."""
+
+    name: str
+    judged: JudgedClasses
+    t_star: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One run before one target. benign, paper, moved: figures in the photographs, and in the counterexamples by
+    either label mode. drops: of AP50 and recall of HEADLINE, by label mode, attacked less benign. shared, lost,
+    broken: shares of failures (see `row`), each with the counts (numerator, denominator).
+    """
+
+    run: Run
+    target: Target
+    frames: int
+    benign: coco.Scores
+    paper: coco.Scores
+    moved: coco.Scores
+    drops: dict[str, tuple[Difference, ...]]
+    shares: dict[str, Interval]
+    counts: dict[str, tuple[int, int]]
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
+        found: dict[str, Any] = {
+            "name": f"{self.run.name} -> {self.target.name}",
+            "source": self.run.name,
+            "source_detector": self.run.detector,
+            "method": self.run.method,
+            "params": self.run.params,
+            "target": self.target.name,
+            "t_star": self.target.t_star,
+            "frames": self.frames,
+            "objects": self.benign.headline.objects,
+        }
+        for name in ("benign", "paper", "moved"):
+            scores: coco.Scores = getattr(self, name)
+            figures = asdict(scores.headline) | {"map50": scores.overall.ap50, "map": scores.overall.ap}
+            figures.pop("objects")
+            found |= {f"{name}_{key}": value for key, value in figures.items()}
+        for mode, pair in self.drops.items():
+            for one in pair:
+                # a drop is a loss: benign less attacked
+                key = f"{'drop' if one.name == AP50 else 'recall_drop'}_{mode}"
+                found[key] = None if one.difference is None else -one.difference
+                found[f"{key}_low"] = None if one.high is None else -one.high
+                found[f"{key}_high"] = None if one.low is None else -one.low
+                found[f"{key}_p"] = one.p
+        for name, share in self.shares.items():
+            found |= {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
+            found[f"{name}_of"] = self.counts[name][1]
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """The flat numbers, and all classes' figures."""
+        attacked = {"paper": self.paper.to_json(), "moved": self.moved.to_json()}
+        return {**self.flat(), "benign": self.benign.to_json(), "attacked": attacked}
+
+
+TRANSFER, LOST, FRAMES = "transfer_rate", "lost_rate", "frame_rate"
+"""Of the objects that the source lost and the target found in the photograph: those that the target loses too. Of
+all that the target found in the photograph: those it loses. Of the frames that fail the source: those that fail the
+target, by a lost object or a phantom. All by `moved` labels."""
+
+
+def row(
+    run: Run,
+    target: Target,
+    results: Sequence[FrameResult],
+    found: dict[str, list[Detections]],
+    draws: int,
+    seed: int,
+) -> Row:
+    """The figures of the run's frames. found: detections in the `benign` and in the `attacked` pictures, one for
+    each result, with labels among the judged classes; draws: of the bootstrap over frames.
+    """
+    judged, names = target.judged, target.judged.names
+    truth = {
+        "benign": [judged.targets(as_targets(r.targets_benign, CLASSES)) for r in results],
+        "moved": [judged.targets(as_targets(r.targets_moved, CLASSES)) for r in results],
+    }
+    truth["paper"] = truth["benign"]
+
+    def scores(labels: str, pictures: str) -> coco.Scores:
+        return coco.evaluate(truth[labels], found[pictures], names, target.t_star, HEADLINE)
+
+    rng = np.random.default_rng(seed)
+    label = names.index(HEADLINE)
+    before = _figures(truth["benign"], found["benign"], label)
+    drops = {
+        mode: tuple(differences(before, _figures(truth[mode], found["attacked"], label), len(results), draws, rng))
+        for mode in ("paper", "moved")
+    }
+    tallies = _tallies(results, truth, found, target.t_star)
+    shares = intervals(
+        [Figure(name, (Recalled(tally),)) for name, tally in tallies.items()], len(results), draws, rng
+    )
+    return Row(
+        run=run,
+        target=target,
+        frames=len(results),
+        benign=scores("benign", "benign"),
+        paper=scores("paper", "attacked"),
+        moved=scores("moved", "attacked"),
+        drops=drops,
+        shares={share.name: share for share in shares},
+        counts={name: (int(t.hits.sum()), int(t.objects.sum())) for name, t in tallies.items()},
+    )
+
+
+def _figures(targets: Sequence[Targets], found: Sequence[Detections], label: int) -> list[Figure]:
+    outcome = Outcome.of(targets, found, label)
+    tally = outcome.candidates.tally(outcome.candidates.coco(OVERLAP), 0)
+    return [Figure(AP50, (Averaged(tally, "coco"),)), Figure(RECALL, (Recalled(tally),))]
+
+
+def _tallies(
+    results: Sequence[FrameResult],
+    truth: dict[str, list[Targets]],
+    found: dict[str, list[Detections]],
+    t_star: float,
+) -> dict[str, Tally]:
+    """Hits and objects of each share, frame by frame."""
+    hits = {name: np.zeros(len(results)) for name in (TRANSFER, LOST, FRAMES)}
+    objects = {name: np.zeros(len(results)) for name in (TRANSFER, LOST, FRAMES)}
+    for i, result in enumerate(results):
+        benign, moved = truth["benign"][i], truth["moved"][i]
+        failed = failures.find(benign, found["benign"][i], moved, found["attacked"][i], t_star)
+        seen = failures.judge(benign, found["benign"][i], t_star).found & ~moved.ignore
+        known = set(seen.nonzero()[:, 0].tolist())
+        theirs = known & {f.index for f in result.failures if f.kind == "lost"}
+        objects[TRANSFER][i], hits[TRANSFER][i] = len(theirs), len(theirs & set(failed.lost))
+        objects[LOST][i], hits[LOST][i] = len(known), len(failed.lost)
+        objects[FRAMES][i], hits[FRAMES][i] = result.success_moved, result.success_moved and failed.success
+    frames = np.arange(len(results))
+    return {
+        name: Tally(np.ones(len(results)), frames, hits[name], np.zeros(len(results)), objects[name])
+        for name in hits
+    }

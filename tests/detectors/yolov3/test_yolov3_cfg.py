@@ -1,0 +1,105 @@
+"""Darknet's `.cfg`: what is read, what is written, what is refused; the published networks."""
+
+from __future__ import annotations
+
+import pytest
+
+from detectors.base import DetectorError
+from detectors.yolov3 import layouts
+from detectors.yolov3.cfg import Convolution, Head, MaxPool, Route, Shortcut, Upsample, parse, write
+from detectors.yolov3.network import Network
+
+
+def test_layers_of_a_file(mini_text: str) -> None:
+    cfg = parse(mini_text, "mini.cfg")
+    assert cfg.layers[0] == Convolution(4, 3, 2, 1, True, True)
+    assert cfg.layers[4] == Shortcut(1)
+    assert cfg.layers[5:7] == (MaxPool(2, 2), MaxPool(2, 1))
+    assert cfg.layers[7] == Convolution(16, 1, 1, 0, False, False)
+    anchors = ((6.0, 6.0), (12.0, 8.0), (20.0, 20.0), (40.0, 24.0))
+    assert cfg.layers[8] == Head(anchors, (2, 3), 3, 0.7, 1.0)
+    assert (cfg.layers[9], cfg.layers[11], cfg.layers[12]) == (Route((6,)), Upsample(2), Route((11, 4)))
+    assert cfg.strides == (2, 4, 4, 4, 4, 8, 8, 8, 8, 8, 8, 4, 4, 4, 4)
+    assert cfg.channels == (4, 8, 4, 8, 8, 8, 8, 16, 16, 8, 4, 4, 12, 16, 16)
+    assert (cfg.stride, cfg.classes, [i for i, _ in cfg.heads]) == (8, 3, [8, 14])
+
+
+def test_what_is_written_is_read_again(mini_text: str) -> None:
+    cfg = parse(mini_text)
+    again = parse(write(cfg))
+    assert again == cfg
+    assert again.sections[0].options["learning_rate"] == "0.001"
+    assert again.sections[9].options["jitter"] == ".3"
+
+
+def test_published_yolov3() -> None:
+    cfg = layouts.yolov3()
+    assert len(cfg.layers) == 107  # numbered 0 to 106
+    assert [i for i, _ in cfg.heads] == [82, 94, 106]
+    assert [cfg.strides[i] for i, _ in cfg.heads] == [32, 16, 8]
+    assert sum(isinstance(layer, Convolution) for layer in cfg.layers) == 75
+    assert sum(isinstance(layer, Convolution) for layer in cfg.layers[:75]) == 52  # Darknet-53 less its last
+    assert (cfg.layers[86], cfg.layers[98]) == (Route((85, 61)), Route((97, 36)))
+    network = Network(cfg)
+    assert sum(p.numel() for p in network.parameters()) == 61_949_149
+    assert parse(write(cfg)) == cfg
+
+
+def test_published_yolov3_tiny() -> None:
+    cfg = layouts.yolov3_tiny()
+    assert len(cfg.layers) == 24
+    assert [i for i, _ in cfg.heads] == [16, 23]
+    assert (cfg.layers[17], cfg.layers[20]) == (Route((13,)), Route((19, 8)))
+    network = Network(cfg)
+    learned = sum(p.numel() for p in network.parameters())
+    measured = sum(b.numel() for name, b in network.named_buffers() if not name.endswith("num_batches_tracked"))
+    assert (learned, learned + measured) == (8_852_366, 8_858_734)  # what the published file holds
+
+
+@pytest.mark.parametrize("layout", [layouts.yolov3, layouts.yolov3_tiny, layouts.yolov3_slim])
+def test_layouts_for_other_classes(layout) -> None:
+    cfg = layout(7)
+    assert cfg.classes == 7
+    assert write(cfg).count("classes=7") == len(cfg.heads)
+    with pytest.raises(ValueError, match=r"anchors: expected \d, found 2"):
+        layout(7, ((10, 10), (20, 20)))
+
+
+def line_of(text: str, part: str) -> int:
+    return text[: text.index(part)].count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "at", "message"),
+    [
+        ("[upsample]", "[deconvolutional]", "[upsample]", r"expected one of \[convolutional\].*found \[deconv"),
+        ("[net]", "[region]", "[net]", r"expected \[net\] first, found \[region\]"),
+        ("batch=64", "batch 64", "batch=64", r"expected \[section\] or key=value, found 'batch 64'"),
+        ("from=-3", "from=-9", "[shortcut]", r"\[shortcut\] from: expected a layer before this one, number 4"),
+        ("from=-3", "from=-4", "[shortcut]", r"from: expected 8 channels at stride 4, found 4 at 2"),
+        ("layers = -1, 4", "layers = -1, 6", "layers = -1, 4", r"expected layers of one stride, found strides \[4, 8"),
+        ("layers = -3", "layers = first", "[route]", r"\[route\] layers: expected integers, found 'first'"),
+        ("num=4", "num=9", "[yolo]", r"\[yolo\] num: expected 4, as many as anchors, found 9"),
+        ("mask = 2,3", "mask = 2,4", "[yolo]", r"mask: expected indices of 4 anchors, found \[2, 4\]"),
+        ("mask = 2,3", "mask = 2", "[yolo]", r"mask, classes: expected 16 numbers a cell .* found 8"),
+        ("ignore_thresh = .7", "ignore_thresh = high", "[yolo]", r"ignore_thresh: expected a number, found 'high'"),
+        ("filters=4", "filters=0", "[convolutional]", r"filters: expected an integer of at least 1, found 0"),
+        ("activation=leaky", "activation=mish", "[convolutional]", r"activation: expected leaky or linear, found mi"),
+        ("channels=3", "channels=1", "[net]", r"channels: expected 3, found 1"),
+    ],
+)
+def test_errors_name_the_line(mini_text: str, before: str, after: str, at: str, message: str) -> None:
+    line = line_of(mini_text, at)
+    if at == "layers = -1, 4":
+        line -= 1  # the section's
+    with pytest.raises(DetectorError, match=message) as caught:
+        parse(mini_text.replace(before, after, 1), "own.cfg")
+    assert str(caught.value).startswith(f"own.cfg:{line}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_heads_agree_on_classes_and_there_is_one() -> None:
+    with pytest.raises(DetectorError, match=r"own\.cfg: expected \[yolo\] sections .* found no \[yolo\]"):
+        parse("[net]\n[convolutional]\nfilters=4\nactivation=linear", "own.cfg")
+    with pytest.raises(DetectorError, match=r"own\.cfg:1: expected \[net\] first, found no section"):
+        parse("# nothing\n", "own.cfg")
