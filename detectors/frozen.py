@@ -3,7 +3,8 @@
 An attack runs the detector thousands of times and never changes it. So here no gradient of a weight is prepared;
 what two expansions of a Fire give is never joined, because the next layer takes each of them by its own part of
 the weights; rectifiers work in place, and after pooling; and the full-resolution stem runs in bands of rows that
-stay in the processor's cache, backwards too.
+stay in the processor's cache, backwards too. In single precision on a CPU, weights lie as oneDNN wants them, where
+each pass would order them anew, and sums and rectifiers are part of the convolution.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ BAND_ROWS = 24
 
 _BACK_POOL = torch.ops.aten.max_pool2d_with_indices_backward
 _BACK_RELU = torch.ops.aten.threshold_backward.grad_input
+_ONEDNN = torch.ops.mkldnn
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,24 +31,24 @@ class Convolution:
     """A convolution of odd size, stride 1, that keeps the image's size. Its input may come in parts.
 
     weights: one (out, part, k, k) for each part of the input channels; back: the weights that take a gradient of
-    the output to one of each part.
+    the output to one of each part. Both as `_ordered` has them.
     """
 
     weights: tuple[Tensor, ...]
     back: tuple[Tensor, ...]
     bias: Tensor
 
-    def __call__(self, parts: Sequence[Tensor]) -> Tensor:
-        reach = self.weights[0].shape[-1] // 2
-        result = F.conv2d(parts[0], self.weights[0], self.bias, padding=reach)
-        for part, weight in zip(parts[1:], self.weights[1:], strict=True):
-            result += F.conv2d(part, weight, padding=reach)
+    def __call__(self, parts: Sequence[Tensor], rectify: bool = False) -> Tensor:
+        reach, last = self.weights[0].shape[-1] // 2, len(parts) - 1
+        result = _convolve(parts[0], self.weights[0], self.bias, padding=reach, rectify=rectify and last == 0)
+        for i, (part, weight) in enumerate(zip(parts[1:], self.weights[1:], strict=True), start=1):
+            result = _convolve_onto(result, part, weight, padding=reach, rectify=rectify and i == last)
         return result
 
     def backward(self, gradient: Tensor) -> list[Tensor]:
         """The gradient to each part."""
         reach = self.weights[0].shape[-1] // 2
-        return [F.conv2d(gradient, weight, padding=reach) for weight in self.back]
+        return [_convolve(gradient, weight, padding=reach) for weight in self.back]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,12 @@ class Stage:
     expansions: tuple[Convolution, Convolution]
     pools: bool
     following: Convolution
+
+    def backward(self, gradients: Sequence[Tensor]) -> Tensor:
+        """The gradient to what both expansions take, of one to each of their outputs."""
+        first, second = self.expansions
+        total = second.backward(gradients[1])[0]
+        return _convolve_onto(total, gradients[0], first.back[0], padding=first.back[0].shape[-1] // 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +120,10 @@ def convolution(layer: nn.Conv2d, parts: Sequence[int], dtype: torch.dtype) -> C
     """A layer as it is needed here. parts: how many input channels come in each part."""
     assert layer.bias is not None
     weight = layer.weight.detach().to(dtype)
-    weights = tuple(_last(part) for part in weight.split(list(parts), 1))
+    weights = weight.split(list(parts), 1)
     return Convolution(
-        weights=weights,
-        back=tuple(_last(part.flip(2, 3).transpose(0, 1)) for part in weights),
+        weights=tuple(_ordered(part) for part in weights),
+        back=tuple(_ordered(part.flip(2, 3).transpose(0, 1)) for part in weights),
         bias=layer.bias.detach().to(dtype),
     )
 
@@ -137,9 +145,9 @@ def stem(layer: nn.Conv2d, bgr_mean: Sequence[float], following: Convolution, dt
     mean = weight.new_tensor(list(reversed(bgr_mean))) / 255
     return Stem(
         mean=mean.view(3, 1, 1),
-        weight=_last(weight.to(dtype)),
+        weight=_ordered(weight.to(dtype), stride=2, padding=0),
         bias=layer.bias.detach().to(dtype),
-        back=_last(back.to(dtype)),
+        back=_ordered(back.to(dtype), padding=back.shape[-1] - 1),
         following=following,
     )
 
@@ -156,14 +164,13 @@ class _Frozen(torch.autograd.Function):
                 squeezed, parts, indices = x, [], []
                 shape = squeezed.shape[2:]
                 for expansion in stage.expansions:
-                    part = expansion([squeezed])
+                    part = expansion([squeezed], rectify=not stage.pools)
                     if stage.pools:
                         part, index = _pool(part)
+                        part.relu_()  # after pooling: the same, of a quarter of the pixels
                         indices.append(index)
-                    parts.append(part.relu_())  # after pooling: the same, of a quarter of the pixels
-                x = stage.following(parts)
-                if stage is not net.stages[-1]:
-                    x.relu_()
+                    parts.append(part)
+                x = stage.following(parts, rectify=stage is not net.stages[-1])
                 if keep:
                     passed.append(_Passed(squeezed, tuple(parts), tuple(indices), shape))
         ctx.net, ctx.bands, ctx.passed = net, bands, passed
@@ -190,8 +197,7 @@ class _Frozen(torch.autograd.Function):
                     _mask(part, passed.parts[i])
                     if stage.pools:
                         parts[i] = _unpool(part, passed.indices[i], passed.shape)
-                x = stage.expansions[1].backward(parts[1])[0]
-                x += stage.expansions[0].backward(parts[0])[0]
+                x = stage.backward(parts)
                 _mask(x, passed.squeezed)
             image = _back_through_stem(net, x, ctx.bands, shape, dtype)
         return (image if scale is None else image * scale), None, None
@@ -217,12 +223,13 @@ def _through_stem(net: FrozenNet, images: Tensor, keep: bool) -> tuple[Tensor, l
     bands: list[_Band] = []
     for several, top, bottom in _bands(batch, squeezed.shape[2], images.device):
         rows = min(2 * bottom + 1, convolved_rows) - 2 * top
-        convolved = F.conv2d(x[several, :, 4 * top : 4 * top + 2 * rows + beyond], layers.weight, layers.bias, 2)
+        seen = x[several, :, 4 * top : 4 * top + 2 * rows + beyond]
+        convolved = _convolve(seen, layers.weight, layers.bias, stride=2)
         pooled, indices = _pool(convolved)
-        squeezed[several, :, top:bottom] = layers.following([pooled[:, :, : bottom - top].relu_()])
+        squeezed[several, :, top:bottom] = layers.following([pooled[:, :, : bottom - top].relu_()], rectify=True)
         if keep:
             bands.append(_Band(several, top, pooled, indices, convolved.shape))
-    return squeezed.relu_(), bands
+    return squeezed, bands
 
 
 def _back_through_stem(
@@ -238,7 +245,7 @@ def _back_through_stem(
         (pooled,) = layers.following.backward(gradient[band.images, :, band.top : bottom])
         _mask(pooled, band.pooled)
         convolved = _unpool(pooled, band.indices, band.convolved_shape[2:])
-        quads = F.conv2d(convolved, layers.back, padding=reach).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
+        quads = _convolve(convolved, layers.back, padding=reach).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
         into = image[band.images, 4 * band.top : 4 * band.top + 2 * quads.shape[1]]
         into = into.unflatten(1, (-1, 2)).unflatten(3, (-1, 2))  # (b, h, 2, w, 2, 3)
         into += quads.unflatten(3, (2, 2, 3)).transpose(2, 3)
@@ -253,6 +260,48 @@ def _bands(batch: int, rows: int, device: torch.device) -> Iterator[tuple[slice,
     for image in range(batch):
         for top in range(0, rows, BAND_ROWS):
             yield slice(image, image + 1), top, min(top + BAND_ROWS, rows)
+
+
+def _ordered(weight: Tensor, stride: int = 1, padding: int | None = None) -> Tensor:
+    """Weights as `_convolve` takes them: in oneDNN's own order where it computes, else channels-last. padding: by
+    default what keeps the size.
+    """
+    weight = _last(weight)
+    if weight.device.type != "cpu" or weight.dtype != torch.float32 or not torch.backends.mkldnn.is_available():
+        return weight
+    reach = weight.shape[-1] // 2 if padding is None else padding
+    ordered: Tensor = _ONEDNN._reorder_convolution_weight(weight, [reach] * 2, [stride] * 2, [1, 1], 1)
+    return ordered
+
+
+def _convolve(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    stride: int = 1,
+    padding: int = 0,
+    rectify: bool = False,
+) -> Tensor:
+    if weight.is_mkldnn:
+        after = "relu" if rectify else "none"
+        result: Tensor = _ONEDNN._convolution_pointwise(
+            x, weight, bias, [padding] * 2, [stride] * 2, [1, 1], 1, after, [], ""
+        )
+        return result
+    result = F.conv2d(x, weight, bias, stride, padding)
+    return result.relu_() if rectify else result
+
+
+def _convolve_onto(total: Tensor, x: Tensor, weight: Tensor, padding: int, rectify: bool = False) -> Tensor:
+    """`total`, in place, plus a convolution."""
+    if weight.is_mkldnn:
+        after = "relu" if rectify else None
+        result: Tensor = _ONEDNN._convolution_pointwise_(
+            total, x, weight, None, [padding] * 2, [1, 1], [1, 1], 1, "add", 1.0, after, [], None
+        )
+        return result
+    total += F.conv2d(x, weight, padding=padding)
+    return total.relu_() if rectify else total
 
 
 def _pool(x: Tensor) -> tuple[Tensor, Tensor]:

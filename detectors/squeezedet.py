@@ -1,8 +1,9 @@
 """SqueezeDet (Wu et al., 2017, arXiv:1612.01051): SqueezeNet 1.1 layers, two more Fire modules, ConvDet.
 
-One departure from the published code: anchor centres lie in the middle of their 16 px cell instead of being
-spread over the image as (i + 1) * width / (cells + 1). So they do not depend on the size of the image, which may
-be any. At 1248x384 the two differ by less than a cell.
+Departures from the published code. Anchor centres lie in the middle of their 16 px cell instead of being spread
+over the image as (i + 1) * width / (cells + 1). So they do not depend on the size of the image, which may be any.
+At 1248x384 the two differ by less than a cell. And the class term is the cross-entropy of the true class, as the
+paper has it; the code adds that of not being any of the others.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -201,6 +203,10 @@ class SqueezeDet(Detector):
         self.overlap_weight = 0.0
         self.gradient_precision: torch.dtype | None = None
         self._nets: dict[torch.dtype, tuple[object, frozen.FrozenNet]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the frozen layers, which are made anew: oneDNN's weights can neither be copied nor pickled."""
+        return self.__dict__ | {"_nets": {}}
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:

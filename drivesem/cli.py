@@ -15,6 +15,7 @@ from drivesem.config import (
     Anchors,
     Attack,
     Bench,
+    Check,
     Command,
     Convert,
     Derender,
@@ -149,6 +150,10 @@ def _run(config: Command) -> int:
         from drivesem import eval_command
 
         return eval_command.run(config)
+    if isinstance(config, Check):
+        from drivesem import check_command
+
+        return check_command.run(config)
     if isinstance(config, Convert):
         from drivesem import convert_command
 

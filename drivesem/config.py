@@ -97,7 +97,7 @@ class Attack(Common):
     queries: int | None = None
     """Of methods without gradient: renders that are judged; by default 64."""
     range: Literal["bounds", "steps"] = "bounds"
-    """Of methods without gradient: search all of the parameters' bounds, or what --steps steps of si-FGSM reach."""
+    """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
     early_stop: Flag = False
     """Stop a frame at its first success instead of using all steps or queries."""
     objective_labels: Literal["moved", "paper"] = "moved"
@@ -228,15 +228,16 @@ class Synth(Common):
 
 @dataclass(frozen=True)
 class Bench(Common):
-    """Measure: one attack step, the renderer, peak memory, the scene generator, or de-rendering."""
+    """Measure: one attack step, the renderer, peak memory, the scene generator, de-rendering, or the detectors."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "synth", "derender", "found", "label-free"]] = (
-        "step"
-    )
+    what: tyro.conf.Positional[
+        Literal["step", "render", "memory", "synth", "derender", "found", "label-free", "detector"]
+    ] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
     memory above the detector's own; synth: the scene generator; derender: de-rendered generated frames beside the
     generator's truth; found: whether a detector finds removed cars again, and moved ones where they are;
-    label-free: vehicles of photographs whose labels are hidden, beside those labels."""
+    label-free: vehicles of photographs whose labels are hidden, beside those labels; detector: forward, backward
+    and decoding of each detector."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
@@ -368,6 +369,22 @@ class Anchors(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Check(Command):
+    """Does a detector keep its contract? Shapes, gradient, loss, decoding; exit code 1 where it does not."""
+
+    detector: str
+    """A shipped detector, a file, or another project's (docs/detectors.md)."""
+    size: str = "320x192"
+    """WIDTHxHEIGHT of the pictures it is tried on, px."""
+    seed: int = 0
+    """Seed of the pictures, and of the directions along which differences are taken."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of an ONNX detector: auto looks at the whole picture and at overlapping parts of it, enlarged."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Convert(Command):
     """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, and say what is lost."""
 
@@ -400,9 +417,9 @@ class Train(Common):
     detector: str = "squeezedet"
     """Architecture: squeezedet, or another one of docs/training.md."""
     dataset: str = "kitti"
-    """kitti, vkitti1, vkitti2, coco or yolo; or synth, frames that the generator makes in the run's folder first."""
+    """kitti, vkitti1, vkitti2, coco or yolo; or synth: the generator makes frames in the run's folder first."""
     root: str | None = None
-    """Folder of the data set."""
+    """Folder of the data set, or several with commas: their frames are joined."""
     held_out: str | None = None
     """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
     also: str | None = None
@@ -412,10 +429,10 @@ class Train(Common):
     held_out_frames: int = 100
     """Synth: how many frames to judge by, of shapes and surroundings of their own; 0 is none."""
     weights: str | None = None
-    """File for the best weights; by default DETECTOR.safetensors in the run's folder. Their card is beside them."""
+    """File for the best weights, with their card beside; by default DETECTOR.safetensors in the run's folder."""
     start: str = "auto"
     """First weights: auto (the shipped ones of this architecture, or none), none, squeezenet (ImageNet backbone),
-    or a .safetensors file: weights, a run's checkpoint, or a backbone."""
+    darknet:FILE.cfg,FILE.weights, or a .safetensors file: weights, a run's checkpoint, or a backbone."""
     anchors: Literal["published", "kmeans"] = "published"
     """SqueezeDet: as published, or as many by k-means of the data's boxes."""
     steps: int = 10000
@@ -463,8 +480,8 @@ class Train(Common):
     thin: int = 1
     """Judge by every n-th held-out frame until the best weights are written."""
     semantic: float = 0.0
-    """Share of the views that show a frame with its vehicles moved, turned, bent and painted at random, weather and
-    foliage changed, by the project's own renderer; data sets with 3D boxes."""
+    """Share of the views that show a frame with its vehicles moved, turned, bent and painted at random, weather
+    and foliage changed, by the project's own renderer; data sets with 3D boxes."""
     loaders: int = 0
     """Threads that make views ready ahead (where a GPU trains); 0 makes them between the steps."""
     note: str = ""
@@ -473,7 +490,7 @@ class Train(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Retrain(Common):
-    """Train a detector on with the counterexamples of a run, and attack it again. Defaults: the paper's protocol."""
+    """Train a detector on with a run's counterexamples, and attack it again. Defaults: the paper's protocol."""
 
     run: str
     """A run's folder, as drivesem attack writes it."""
@@ -528,6 +545,7 @@ COMMANDS: dict[str, type[Command]] = {
     "gradcheck": Gradcheck,
     "eval": Eval,
     "convert": Convert,
+    "check": Check,
     "anchors": Anchors,
     "train": Train,
     "retrain": Retrain,
@@ -681,6 +699,7 @@ def _validate_train(config: Train) -> None:
     for name in ("dropout", "average", "momentum", "semantic"):
         if not 0 <= getattr(config, name) < 1:
             raise UsageError(f"--{name}", "a number in [0, 1)", getattr(config, name))
+    _validate_precision(config)
     if config.drops is not None:
         numbers("--drops", config.drops)
 
@@ -704,6 +723,12 @@ def _validate_retrain(config: Retrain) -> None:
             raise UsageError(f"--{name.replace('_', '-')}", "at least 0", getattr(config, name))
     if config.attack_steps is not None and config.attack_steps < 1:
         raise UsageError("--attack-steps", "at least 1", config.attack_steps)
+    _validate_precision(config)
+
+
+def _validate_precision(config: Train | Retrain) -> None:
+    if config.precision == "float16" and config.device.startswith("cpu"):
+        raise UsageError("--precision", "float32 or bfloat16 on a CPU", config.precision)
 
 
 def size_hw(setting: str, text: str) -> tuple[int, int]:

@@ -16,27 +16,20 @@ from rich.table import Table
 
 from detectors.base import DetectorError, Predictor, predict
 from detectors.registry import load_predictor
-from detectors.types import CLASSES, Detections, Targets
+from detectors.types import Detections, Targets
 from drivesem.config import Eval, UsageError
-from drivesem.data.classes import KITTI, ClassMap
-from drivesem.data.coco import COCO_ROAD_USERS
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.eval_outcome import Outcome, marked
 from drivesem.eval_report import percent
 from drivesem.evaluation import coco
 from drivesem.evaluation.resampling import DRAWS, Interval
+from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
+from drivesem.labels import Difficulty
 from drivesem.pipeline import to_uint8
+from drivesem.training.targets import judged_targets, suited
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.types import Labels
-
-HEADLINE = "Car"
-DEFAULT_T_STAR = 0.3
-"""The score at which recall is also given where a detector has no threshold of its own."""
-_BOTH = ClassMap(
-    classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
-)
-"""KITTI's types and COCO's classes: they differ in letter case at least."""
 
 
 def run(config: Eval) -> int:
@@ -45,8 +38,8 @@ def run(config: Eval) -> int:
     detector = _detector(config)
     names = dataset.identifiers[: config.limit]
     found, targets = _look(config, dataset, detector, names)
-    t_star = float(getattr(detector, "t_star", DEFAULT_T_STAR))
-    judged = _judged(detector)
+    t_star = t_star_of(detector)
+    judged = JudgedClasses.of(detector).names
     scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
     outcome = Outcome.of(targets, found, judged.index(HEADLINE))
     draws = DRAWS if config.bootstrap is None else config.bootstrap
@@ -87,57 +80,29 @@ def _draw(config: Eval, dataset: Dataset, names: Sequence[str], outcome: Outcome
 def _detector(config: Eval) -> Predictor:
     try:
         detector = load_predictor(config.detector or "", config.device, config.tiles)
+        JudgedClasses.of(detector)
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
-    if HEADLINE not in detector.classes:
-        raise UsageError("--detector", f"one that knows {HEADLINE}", ", ".join(detector.classes))
     return detector
-
-
-def _judged(detector: Predictor) -> tuple[str, ...]:
-    """The detector's classes that the labels have too; what it says of others counts nowhere."""
-    return tuple(name for name in CLASSES if name in detector.classes)
 
 
 def _look(
     config: Eval, dataset: Dataset, detector: Predictor, names: Sequence[str]
 ) -> tuple[list[Detections], list[Targets]]:
-    judged = _judged(detector)
-    places = torch.tensor([judged.index(name) if name in judged else -1 for name in detector.classes])
+    judged = JudgedClasses.of(detector)
     found: list[Detections] = []
-    targets: list[Targets] = []
+    labels: list[Labels] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         for name in progress.track(names, description="frames"):
             frame = dataset.frame(name)
             if frame.labels is None:
                 raise FormatError(f"frame {name}", "labels", "none")
-            seen = predict(detector, frame.photograph[None].to(config.device))[0]
-            label = places[seen.labels.cpu()]
-            kept = label >= 0
-            found.append(Detections(seen.boxes_xyxy.cpu()[kept], label[kept], seen.scores.cpu()[kept]))
-            targets.append(_targets(frame.labels, config, judged))
-    return found, targets
-
-
-def _targets(labels: Labels, config: Eval, judged: Sequence[str]) -> Targets:
-    """What is judged, with labels among `judged`. Lower or more hidden objects, and other classes, are regions to
-    ignore, for each class that is judged.
-    """
-    named = _BOTH.targets(labels)
-    objects = len(labels.kind)
-    boxes, ignore = named.boxes_xyxy, named.ignore.clone()
-    height = boxes[:objects, 3] - boxes[:objects, 1]
-    ignore[:objects] |= (height < config.min_height) | (labels.occlusion > config.max_occlusion)
-    # an unknown truncation (NaN) is no reason to leave an object out
-    ignore[:objects] |= labels.truncation > config.max_truncation
-    places = torch.tensor([judged.index(name) if name in judged else -1 for name in CLASSES])
-    own = places[named.labels]
-    # an object of its own class that is not judged, a neighbour of a class, or a region: said for every class
-    every = ignore | (own < 0)
-    rows = torch.cat([torch.arange(len(ignore))[~every], torch.arange(len(ignore))[every].repeat(len(judged))])
-    label = torch.cat([own[~every], torch.arange(len(judged)).repeat_interleave(int(every.sum()))])
-    return Targets(boxes[rows], label, torch.cat([ignore[~every], torch.ones(int(every.sum()) * len(judged)) > 0]))
+            seen = judged.detections(predict(detector, frame.photograph[None].to(config.device))[0])
+            found.append(Detections(seen.boxes_xyxy.cpu(), seen.labels.cpu(), seen.scores.cpu()))
+            labels.append(frame.labels)
+    limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
+    return found, [judged_targets(one, limits, judged.names) for one in labels]
 
 
 def _write(

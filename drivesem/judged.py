@@ -64,7 +64,7 @@ class JudgedClasses:
         )
 
     def own_targets(self, targets: Targets) -> Targets:
-        """Targets with labels among `names`, as a loss of the detector takes them: labels among its own classes."""
+        """Targets with labels among `names`, as the detector's loss takes them: labels among its own classes."""
         if self.own == self.names:
             return targets
         label = _places(self.names, self.own).to(targets.labels.device)[targets.labels]

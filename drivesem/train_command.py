@@ -7,9 +7,10 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +23,22 @@ from detectors.augment import AugmentSettings
 from detectors.base import Detector
 from detectors.registry import read_weights
 from detectors.squeezedet import SqueezeDet
-from detectors.training import CHECKPOINT, LOG, TrainingSettings, train
+from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.config import SYNTH, Train, UsageError, command_line, interval, numbers, processes, size_hw
-from drivesem.data.registry import open_dataset
+from drivesem.data.joined import open_folders
 from drivesem.run_folder import PRESENTATION, claim
 from drivesem.training import keeper
 from drivesem.training.card import Recipe
 from drivesem.training.frames import FrameStore
 from drivesem.training.keeper import HeldOut, Keeper
+from drivesem.training.semantic import SemanticFrames
 from drivesem.training.start import architecture, begin, set_dropout
 from scene_ir import files
 
 CACHES = "cache"
 """Folder of decoded frames in the run's folder."""
+SEMANTIC = "semantic"
+"""Folder of perturbed frames in the run's folder."""
 _FREE = ("minutes", "checkpoint_every", "evaluate_every", "thin", "loaders", "note", "also", "weights", "device")
 """Settings that a run may change on the way."""
 _NOT_IN_COMMAND = ("out", "weights", "json", "resume", "workers", "loaders", "note", "limit")
@@ -54,7 +58,11 @@ def run(config: Train) -> int:
         detector, start = _begin(config, detector, frames)
         detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         weights = Path(config.weights or out / f"{config.detector}.safetensors")
-        judge = Keeper(out, weights, _recipe(config, frames, start), held_out, device, console.print)
+        tell = partial(console.print, soft_wrap=True)
+        judge = Keeper(out, weights, _recipe(config, frames, start), held_out, device, tell)
+        shown: Sequence[Sample] = frames
+        if config.semantic:
+            shown = SemanticFrames(frames, out / SEMANTIC, config.semantic, config.seed)
         pace = _Pace(config.batch)
 
         def evaluate(detector: Detector, step: int) -> None:
@@ -63,7 +71,7 @@ def run(config: Train) -> int:
 
         with _shown(pace, out, console) as progress:
             try:
-                train(detector, frames, settings, out, evaluate, progress=progress, loaders=config.loaders)
+                train(detector, shown, settings, out, evaluate, progress=progress, loaders=config.loaders)
             except FloatingPointError as error:
                 raise UsageError("--rate", "one at which the loss stays finite", error) from error
         if rank == 0:
@@ -189,7 +197,7 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
 def _store(
     config: Train, name: str, root: Path, cache: Path, detector: Detector, console: Console, whole: bool = False
 ) -> FrameStore:
-    dataset = open_dataset(name, root)
+    dataset = open_folders(name, str(root))
     names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
     if not names:
         raise UsageError(str(root), "at least one frame", "none")
@@ -204,9 +212,9 @@ def _recipe(config: Train, frames: FrameStore, start: str) -> Recipe:
     if config.device != "cpu" and torch.cuda.is_available():
         machine = torch.cuda.get_device_name()
     source = "the project's own generator" if config.dataset == SYNTH else f"layout {config.dataset}"
-    folder = "" if config.root is None else f" (`{Path(config.root).name}`)"
+    folders = "" if config.root is None else f" (`{_names(config.root).replace(',', '`, `')}`)"
     return Recipe(
-        data=f"{len(frames):,} frames of {source}{folder}.",
+        data=f"{len(frames):,} frames of {source}{folders}.",
         start=start,
         batch=config.batch,
         seed=config.seed,
@@ -220,7 +228,12 @@ def _recipe(config: Train, frames: FrameStore, start: str) -> Recipe:
 def _portable(config: Train) -> Train:
     """The configuration with folders and files by their names, not where they lay on this machine."""
     names = {key: getattr(config, key) for key in ("root", "held_out", "also", "start")}
-    return replace(config, **{key: Path(value).name for key, value in names.items() if value is not None})
+    return replace(config, **{key: _names(value) for key, value in names.items() if value is not None})
+
+
+def _names(folders: str) -> str:
+    """The last parts of paths with commas between."""
+    return ",".join(Path(part).name for part in folders.split(",") if part)
 
 
 @contextmanager
@@ -311,6 +324,6 @@ def _clear(out: Path) -> None:
     """Remove what an earlier run wrote, and nothing else."""
     for name in (CHECKPOINT, LOG, keeper.EVALUATIONS, keeper.BEST, keeper.CURVES):
         (out / name).unlink(missing_ok=True)
-    for name in (CACHES, "tensorboard"):
+    for name in (CACHES, SEMANTIC, "tensorboard"):
         if (out / name).is_dir():
             shutil.rmtree(out / name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -50,8 +51,8 @@ def run(config: Transfer) -> int:
         frames = [f for f in one.frames if not any(str(p) in failed for p in f.pictures.values())]
         if not frames:
             raise UsageError("--run", "a run with frames that can be read", one.folder)
-        for order, predictor in zip(orders, predictors, strict=True):
-            rows.append(_row(one, order, predictor, frames, config, draws))
+        for name, order, predictor in zip(short_names(specs), orders, predictors, strict=True):
+            rows.append(_row(one, name, order, predictor, frames, config, draws))
     data = {"rows": [r.to_json() for r in rows], "headline": HEADLINE, "bootstrap": draws, "frames_failed": failed}
     files.write_json(out / "transfer.json", data)
     write_report(out, rows, draws)
@@ -83,6 +84,12 @@ def detector_names(text: str) -> list[str]:
         if names.count(name) > 1:
             raise UsageError("--detectors", "each detector once", name)
     return names
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Detectors without the folders of their files, as long as that tells them apart."""
+    short = [re.sub(r"[^,:]*/", "", name) for name in names]
+    return short if len(set(short)) == len(short) else list(names)
 
 
 def _words(text: str) -> list[str]:
@@ -125,11 +132,17 @@ def _look_at_all(
 
 
 def _row(
-    one: Run, order: Order, predictor: Predictor, frames: Sequence[Frame], config: Transfer, draws: int
+    one: Run,
+    name: str,
+    order: Order,
+    predictor: Predictor,
+    frames: Sequence[Frame],
+    config: Transfer,
+    draws: int,
 ) -> Row:
     memory = Memory(order, predictor)
     otherwise = DEFAULT_T_STAR if config.t_star is None else config.t_star
-    target = Target(order.detector, JudgedClasses.of(predictor), t_star_of(predictor, otherwise=otherwise))
+    target = Target(name, order.detector, JudgedClasses.of(predictor), t_star_of(predictor, otherwise=otherwise))
     found = {name: [memory.recall(frame.pictures[name]) for frame in frames] for name in PICTURES}
     with torch.no_grad():
         return row(one, target, [frame.result for frame in frames], found, draws, config.seed)

@@ -41,12 +41,16 @@ def load(place: str, spec: Path | None = None) -> Detector:
 
 def _class(where: str, name: str) -> Any:
     try:
-        holder = _file(Path(where)) if where.endswith(".py") else pkgutil.resolve_name(where)
+        if where.endswith(".py"):
+            found = getattr(_file(Path(where)), name, None)
+        else:
+            found = pkgutil.resolve_name(f"{where}:{name}")
     except ImportError as error:
         raise DetectorError(f"module: expected a module {where}, found {error}") from None
-    found = getattr(holder, name, None)
+    except AttributeError:
+        found = None
     if not isinstance(found, type):
-        raise DetectorError(f"{where}: expected a class {name}, found {'none' if found is None else found!r}")
+        raise DetectorError(f"{where}: expected a class {name}, found {type(found).__name__}")
     return found
 
 

@@ -7,6 +7,7 @@ give each image another number of boxes.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -114,7 +115,10 @@ def torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
     settings = _settings(path, spec, "a TorchScript file")
     facts = {_ULTRALYTICS_FACTS: ""}
     try:
-        network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
+        with warnings.catch_warnings():
+            # torch has a successor for new files; these are there.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
     except (RuntimeError, ValueError) as error:
         raise DetectorError(f"{path}: expected a TorchScript file, found {_last_line(error)}") from None
     names, size = _ultralytics(facts[_ULTRALYTICS_FACTS])

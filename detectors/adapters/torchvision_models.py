@@ -113,7 +113,6 @@ def load(name: str, weights: str = "default", spec: Path | None = None) -> Torch
         raise DetectorError(
             f"torchvision:{name}: needs torchvision: pip install 'drivesem[torchvision]'"
         ) from None
-    families = (detection.FasterRCNN, detection.RetinaNet, detection.SSD, detection.FCOS)
     known = [n for n in list_models(detection) if not n.startswith(("maskrcnn", "keypointrcnn"))]
     if name not in known:
         raise DetectorError(f"torchvision: expected one of {', '.join(known)}, found {name!r}")
@@ -130,7 +129,6 @@ def load(name: str, weights: str = "default", spec: Path | None = None) -> Torch
         names = coco.ours(NO_CLASS if n in ("__background__", "N/A") else n for n in categories)
     else:
         model = get_model(name, weights=None, weights_backbone=None, num_classes=len(names))
-    assert isinstance(model, families)
     if weights not in ("default", "none"):
         _load_into(model, Path(weights))
     found = TorchvisionDetector(name, model, names)

@@ -21,7 +21,7 @@ _NUMBERS_A_BOX = 5
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """[kind] and its `key=value` lines, in their order; line: where it stands in its file, from 1; 0 is nowhere."""
+    """[kind] and its `key=value` lines, in their order; line: where it stands in its file; 0 is nowhere."""
 
     kind: str
     options: Mapping[str, str] = field(default_factory=dict)

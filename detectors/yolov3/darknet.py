@@ -9,7 +9,7 @@ from detectors.base import DetectorError
 from detectors.yolov3 import cfg, weights
 from detectors.yolov3.yolov3 import YoloV3
 
-_OURS = dict(zip(coco.NAMES, coco.CLASSES, strict=True))
+_OURS: dict[str, str] = dict(zip(coco.NAMES, coco.CLASSES, strict=True))
 
 
 def load(cfg_path: Path, weights_path: Path | None = None) -> YoloV3:

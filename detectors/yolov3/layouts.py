@@ -25,8 +25,8 @@ SLIM_ANCHORS: Anchors = (
     *((33, 79), (92, 51), (70, 149)),
     *((151, 79), (228, 134), (390, 223)),
 )
-"""`detectors.anchors.fit_anchors` of the sizes in 3,000 generated frames (objects from 12 px on), zoomed as training
-zooms them; mean IoU 0.67."""
+"""`detectors.anchors.fit_anchors` of the sizes in 3,000 generated frames (objects from 12 px on), zoomed as
+training zooms them; mean IoU 0.67."""
 
 _BLOCKS = ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4))
 """Darknet-53: channels of a stage, and its residual blocks (table 1 of the paper)."""
@@ -36,7 +36,7 @@ channels would cost more than all the rest."""
 _IGNORE = 0.7
 """`ignore_thresh` of the published files; the paper says 0.5."""
 _SLIM_MATCH = 0.35
-"""`iou_thresh`: some three anchors answer for an object. One alone learns slower, and time is what slim is about."""
+"""`iou_thresh`: some three anchors answer for an object. One alone learns slower."""
 
 
 class _Layers:

@@ -79,7 +79,7 @@ class Network(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """Convolutions that took in their normalisation: layer number -> weight, bias. Only the input has a gradient."""
+    """Convolutions that took in their normalisation: layer number -> weight, bias, without a gradient."""
 
     cfg: Cfg
     weights: dict[int, tuple[Tensor, Tensor]]

@@ -1,8 +1,8 @@
 """YOLOv3 (Redmon and Farhadi, 2018, arXiv:1804.02767) for images of any size.
 
 Departures from the published code: images are padded right and below to a multiple of 32 px, with its grey, and
-never resized; an object whose best anchor is taken in its cell gets the next best one; sums of the loss are divided
-by the objects of the batch.
+never resized; an object whose best anchor is taken in its cell gets the next best one; sums of the loss are
+divided by the objects of the batch.
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ IGNORE_OVERLAP = 0.5
 SCORE_MINIMUM = 0.005
 NMS_IOU = 0.45
 """Decoding for evaluation (published code: `validate_detector`)."""
-TOP_CANDIDATES = 256
+TOP_CANDIDATES = 200
 """Boxes of a class each that suppression begins with; of more, the best."""
+KNOWN_SIZES = 16
+"""Of images, whose anchors' places are kept."""
 PRIOR = 0.01
 """Objectness before training: almost all anchors see nothing."""
 _HALF = (torch.bfloat16, torch.float16)
@@ -59,9 +61,9 @@ class Assignment:
 
     image, anchor (K,) int64; deltas (K, 4), what the box head should say: x and y as places in the cell in (0, 1),
     logarithms of width and height in anchors; scales (K,), 2 less the object's share of the image; labels (K,)
-    int64; negative (B, A) bool: the anchors that must be silent. found_image, found_by (M,) int64: an object's image,
-    and the most confident of the anchors whose predicted boxes meet it (IoU of at least 0.5); found (M,) bool:
-    whether there is any; alarm (B, A) bool: negatives that meet no object.
+    int64; negative (B, A) bool: the anchors that must be silent. found_image, found_by (M,) int64: an object's
+    image, and the most confident of the anchors whose predicted boxes meet it (IoU of at least 0.5); found (M,)
+    bool: whether there is any; alarm (B, A) bool: negatives that meet no object.
     """
 
     image: Tensor
@@ -95,8 +97,8 @@ class YoloV3(Detector):
         anchors: layouts.Anchors | None = None,
         cfg: Cfg | None = None,
     ) -> None:
-        """cfg: by default `layout` with these anchors, or those that it has. Raises ValueError where classes are not
-        as many as the file's, and for a number of anchors that the layout does not have.
+        """cfg: by default `layout` with these anchors, or those that it has. Raises ValueError where classes are
+        not as many as the file's, and for a number of anchors that the layout does not have.
         """
         super().__init__()
         if cfg is None:
@@ -164,6 +166,8 @@ class YoloV3(Detector):
         """Where the anchors of an image are, in the dtype and on the device of `like`."""
         key = (image_hw, like.dtype, like.device)
         if key not in self._known_places:
+            if len(self._known_places) >= KNOWN_SIZES:
+                self._known_places.clear()
             self._known_places[key] = self._places(image_hw, like)
         return self._known_places[key]
 
@@ -305,12 +309,13 @@ class YoloV3(Detector):
         return rows, columns
 
     def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
-        """Sums over the batch, divided by its objects (by 1 where there is none); their sum, and what attacks raise.
+        """Sums over the batch, divided by its objects (1 where there is none); their sum, and what attacks raise.
 
-        Box: binary cross entropy of x and y in their cell, and half the squared error of the logarithms of width and
-        height, both times `scales`; confidence: binary cross entropy of objectness over anchors that answer for an
-        object or must be silent; class: binary cross entropy of each class. Their gradients are those of the
-        published code. There, "squared error" of a sigmoid leaves out the sigmoid's own slope, as here.
+        Box: binary cross entropy of x and y in their cell, less what it is where they are right, and half the
+        squared error of the logarithms of width and height, both times `scales`; confidence: binary cross entropy
+        of objectness over anchors that answer for an object or must be silent; class: binary cross entropy of each
+        class. Their gradients are those of the published code, whose squared errors of sigmoids leave out the
+        sigmoid's own slope.
 
         "objectness" is a squared error, so that no object outweighs all others: 1 less the confidence of the most
         confident anchor whose box meets the object, and the confidences of anchors that meet none.
@@ -318,17 +323,18 @@ class YoloV3(Detector):
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(assignment.found), 1)
         deltas, scales = raw.deltas[image, anchor], assignment.scales[:, None]
-        place = _cross_entropy(deltas[:, :2], assignment.deltas[:, :2])
+        wanted = assignment.deltas[:, :2]
+        place = _cross_entropy(deltas[:, :2], wanted) - torch.special.entr(wanted) - torch.special.entr(1 - wanted)
         shape = (deltas[:, 2:] - assignment.deltas[:, 2:]).square() / 2
         logits = raw.confidence_logits
         missed = F.softplus(-logits[image, anchor]).sum()
         alarms = torch.where(assignment.negative, F.softplus(logits), 0.0).sum()
         class_logits = raw.class_logits[image, anchor]
-        wanted = F.one_hot(assignment.labels, len(self.classes)).to(class_logits)
+        true = F.one_hot(assignment.labels, len(self.classes)).to(class_logits)
         terms = {
             "confidence": (missed + alarms) / objects,
             "box": ((place + shape) * scales).sum() / objects,
-            "class": _cross_entropy(class_logits, wanted).sum() / objects,
+            "class": _cross_entropy(class_logits, true).sum() / objects,
         }
         confidence = torch.sigmoid(logits)
         found = torch.where(assignment.found, confidence[assignment.found_image, assignment.found_by], 0.0)

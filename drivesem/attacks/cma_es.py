@@ -48,8 +48,8 @@ class CMAES(Attack):
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)
-        size = (upper - lower).clamp_min(torch.finfo(theta0.dtype).tiny)
-        start = ((theta0 - lower) / size).detach().cpu().double().numpy()
+        size = upper - lower
+        start = ((theta0 - lower) / size.clamp_min(torch.finfo(theta0.dtype).tiny)).detach().cpu().double().numpy()
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         trials = Trials(problem, self.queries, self.early_stop)
         strategy = self._strategy(start, rng)

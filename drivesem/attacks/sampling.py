@@ -54,9 +54,9 @@ class Sampling(Attack):
         """Where in the unit box to look: (queries, dimensions) float64."""
         if self.kind == "random":
             return torch.rand(self.queries, dimensions, generator=generator, dtype=torch.float64)
-        seed = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
+        rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         if self.kind == "halton":
-            return torch.from_numpy(qmc.Halton(dimensions, scramble=True, seed=seed).random(self.queries))
+            return torch.from_numpy(qmc.Halton(dimensions, scramble=True, rng=rng).random(self.queries))
         # A Sobol sequence is balanced in powers of two; fewer are taken from its beginning.
-        points = qmc.Sobol(dimensions, scramble=True, seed=seed).random_base2(math.ceil(math.log2(self.queries)))
+        points = qmc.Sobol(dimensions, scramble=True, rng=rng).random_base2(math.ceil(math.log2(self.queries)))
         return torch.from_numpy(points[: self.queries])

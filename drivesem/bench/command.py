@@ -1,4 +1,4 @@
-"""`drivesem bench step|render|memory|synth|derender|found|label-free`: figures with method, machine, versions."""
+"""`drivesem bench WHAT`: figures with method, machine, versions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import torch
 from rich.console import Console
 
 from detectors.base import DetectorError
-from detectors.registry import load_detector
-from drivesem.bench import derender, found, label_free, memory, render, step, synth, tables
+from detectors.registry import SHIPPED, load_detector
+from drivesem.bench import derender, detector, found, label_free, memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
 from drivesem.config import Bench, UsageError, numbers, processes
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 _LOG_WIDTH = 120
 """Columns of tables that go to a file."""
-_SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0)}
+_SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0), "detector": (20.0, 90.0)}
 """Seconds for measuring, with --quick and without; imports and scenes take some more."""
 
 
@@ -48,6 +48,7 @@ def run(config: Bench) -> int:
         "derender": _derender,
         "found": _found,
         "label-free": _label_free,
+        "detector": _detector,
     }
     console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
     measured = measure[config.what](config, cars, triangles, console)
@@ -181,6 +182,17 @@ def _label_free(config: Bench, cars: list[int], triangles: list[int], console: C
         "summary": label_free.summary(ordered),
         "method": label_free.METHOD,
     }
+
+
+def _detector(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    """All that are shipped, or the one that was asked for."""
+    names = sorted(SHIPPED) if config.detector == Bench.detector else [config.detector]
+    measured = detector.measure(names, _seconds("detector", config), config.seed, config.device)
+    try:
+        rows = list(_watched(measured, len(names) * len(detector.SIZES_HW), console))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector with gradients", error) from error
+    return {"rows": [asdict(row) for row in rows], "method": detector.METHOD}
 
 
 def _watched(rows: Iterator[T], total: int, console: Console) -> Iterator[T]:

@@ -58,6 +58,13 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
         "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
         "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
     },
+    "detector": {
+        "detector": ("detector", "detector"), "size": ("size", "size"), "threads": ("threads", "threads"),
+        "forward_ms": ("forward, ms", "forward ms"), "forward_min_ms": ("fastest", "fastest"),
+        "both_ms": ("forward and backward, ms", "both"), "both_min_ms": ("fastest", "fastest"),
+        "decode_ms": ("decode, ms", "decode"), "decode_worst_ms": ("at worst", "at worst"),
+        "peak_mb": ("peak, MB", "peak MB"), "rounds": ("rounds", None),
+    },
     "found": {
         "which": ("cars", "cars"), "measure": ("figure", "figure"), "cars": ("count", "count"),
         "found": ("found", "found"), "share": ("share", "share"), "low": ("from", "from"), "high": ("to", "to"),
@@ -74,6 +81,7 @@ TITLES = {
     "synth": "The scene generator",
     "derender": "De-rendering beside the generator's truth",
     "label-free": "Photographs without labels, beside labels that were hidden",
+    "detector": "The detectors",
     "found": "Cars that a detector finds, removed and moved",
 }
 

@@ -58,7 +58,7 @@ class FrameStore(Sequence[Sample]):
                     done()
         rows = [(name, *place) for name, place in index.items()]
         files.write_text(cache / INDEX, json.dumps(rows))
-        self.classes = tuple(classes)
+        self.dataset, self.classes = dataset, tuple(classes)
         self.names = tuple(chosen)
         self._places = [index[name] for name in chosen]
         self._pixels = np.memmap(cache / PIXELS, np.uint8, "r", shape=(max(end, 1),)) if end else np.zeros(0, "u1")

@@ -1,4 +1,4 @@
-"""Frames whose vehicles were moved, turned, bent and painted at random, feasibly, by the project's own renderer."""
+"""Frames whose vehicles were moved, turned, bent and painted at random, feasibly, by the project's renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 
 from detectors.training import Sample
 from drivesem.data import kitti
-from drivesem.data.registry import Dataset
 from drivesem.feasible import FeasibleSet
 from drivesem.labels import Labeller, to_kitti_labels
 from drivesem.pipeline import to_uint8
@@ -27,8 +26,8 @@ VARIANTS = 4
 """Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
 PARAMETERS = tuple(Parameter)
 _BENT_BY = 0.3
-"""Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same bound
-on strain."""
+"""Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same
+bound on strain."""
 
 
 class SemanticFrames(Sequence[Sample]):
@@ -38,9 +37,8 @@ class SemanticFrames(Sequence[Sample]):
     place and the seed alone. Frames without vehicles, or that cannot be taken apart, are shown as they are.
     """
 
-    def __init__(self, store: FrameStore, dataset: Dataset, folder: Path, share: float, seed: int) -> None:
-        self._store, self._dataset, self._folder = store, dataset, folder
-        self._share, self._seed = share, seed
+    def __init__(self, store: FrameStore, folder: Path, share: float, seed: int) -> None:
+        self._store, self._folder, self._share, self._seed = store, folder, share, seed
 
     def __len__(self) -> int:
         return len(self._store)
@@ -65,7 +63,7 @@ class SemanticFrames(Sequence[Sample]):
     def _make(self, index: int, folder: Path) -> None:
         """All variants of a frame, whole or not at all; an empty folder where there can be none."""
         with files.whole_folder(folder) as part:
-            frame = self._dataset.frame(self._store.names[index])
+            frame = self._store.dataset.frame(self._store.names[index])
             try:
                 variants = perturbed(frame, [self._seed, index])
             except SceneError:
@@ -77,7 +75,7 @@ class SemanticFrames(Sequence[Sample]):
 
 @torch.no_grad()
 def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Labels]]:
-    """VARIANTS feasible perturbations of a labelled frame: pixels (H, W, 3) uint8 RGB, and labels that moved along.
+    """VARIANTS feasible perturbations of a labelled frame: pixels (H, W, 3) uint8 RGB, and labels that moved too.
 
     None for a frame without vehicles. Raises SceneError where the frame cannot be taken apart.
     """

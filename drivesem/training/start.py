@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import Detector, DetectorError
-from detectors.registry import ARCHITECTURES, SHIPPED, load_detector, read_weights
+from detectors.registry import ARCHITECTURES, DARKNET, SHIPPED, load_detector, read_weights
 from detectors.squeezedet import SeededDropout, SqueezeDet
 from drivesem.config import UsageError
 
@@ -55,6 +55,9 @@ def _load(detector: Detector, start: str) -> str:
     if start in SHIPPED:
         _copy(detector, load_detector(start).state_dict(), SHIPPED[start])
         return f"Training went on from the shipped weights of {start}."
+    if start.startswith(DARKNET):
+        _copy(detector, load_detector(start).state_dict(), Path(start.removeprefix(DARKNET)))
+        return f"Training went on from Darknet's `{Path(start).name}`."
     path = BACKBONE if start == SQUEEZENET else Path(start)
     if start == SQUEEZENET and not path.is_file():
         raise DetectorError(f"{path}: expected the backbone (python tools/fetch_backbone.py), found none")

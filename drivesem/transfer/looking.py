@@ -32,7 +32,7 @@ _FINGERPRINT = 16
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """How to look: a detector by name or file, on a device, with tiles or without. folder: of what is remembered."""
+    """How to look: a detector by name or file, its device, tiles or not. folder: of what is remembered."""
 
     detector: str
     device: str

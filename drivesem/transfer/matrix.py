@@ -31,9 +31,10 @@ AP50, RECALL = "AP50", "recall"
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A detector that is asked: its name as it was given, its judged classes, its threshold."""
+    """A detector that is asked: its name for people, as it was given, its judged classes, its threshold."""
 
     name: str
+    detector: str
     judged: JudgedClasses
     t_star: float
 
@@ -41,8 +42,8 @@ class Target:
 @dataclass(frozen=True, slots=True)
 class Row:
     """One run before one target. benign, paper, moved: figures in the photographs, and in the counterexamples by
-    either label mode. drops: of AP50 and recall of HEADLINE, by label mode, attacked less benign. shared, lost,
-    broken: shares of failures (see `row`), each with the counts (numerator, denominator).
+    either label mode. drops: by how much HEADLINE's AP50 and recall fall from benign to attacked, by label mode.
+    shares: TRANSFER, LOST, FRAMES; counts: their numerators and denominators.
     """
 
     run: Run
@@ -51,7 +52,7 @@ class Row:
     benign: coco.Scores
     paper: coco.Scores
     moved: coco.Scores
-    drops: dict[str, tuple[Difference, ...]]
+    drops: dict[str, tuple[Interval, ...]]
     shares: dict[str, Interval]
     counts: dict[str, tuple[int, int]]
 
@@ -64,6 +65,7 @@ class Row:
             "method": self.run.method,
             "params": self.run.params,
             "target": self.target.name,
+            "target_detector": self.target.detector,
             "t_star": self.target.t_star,
             "frames": self.frames,
             "objects": self.benign.headline.objects,
@@ -75,12 +77,8 @@ class Row:
             found |= {f"{name}_{key}": value for key, value in figures.items()}
         for mode, pair in self.drops.items():
             for one in pair:
-                # a drop is a loss: benign less attacked
                 key = f"{'drop' if one.name == AP50 else 'recall_drop'}_{mode}"
-                found[key] = None if one.difference is None else -one.difference
-                found[f"{key}_low"] = None if one.high is None else -one.high
-                found[f"{key}_high"] = None if one.low is None else -one.low
-                found[f"{key}_p"] = one.p
+                found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
         for name, share in self.shares.items():
             found |= {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
             found[f"{name}_of"] = self.counts[name][1]
@@ -94,8 +92,8 @@ class Row:
 
 TRANSFER, LOST, FRAMES = "transfer_rate", "lost_rate", "frame_rate"
 """Of the objects that the source lost and the target found in the photograph: those that the target loses too. Of
-all that the target found in the photograph: those it loses. Of the frames that fail the source: those that fail the
-target, by a lost object or a phantom. All by `moved` labels."""
+all that the target found in the photograph: those it loses. Of the frames that fail the source: those that fail
+the target, by a lost object or a phantom. All by `moved` labels."""
 
 
 def row(
@@ -123,8 +121,9 @@ def row(
     label = names.index(HEADLINE)
     before = _figures(truth["benign"], found["benign"], label)
     drops = {
-        mode: tuple(differences(before, _figures(truth[mode], found["attacked"], label), len(results), draws, rng))
+        mode: tuple(_fall(one) for one in differences(after, before, len(results), draws, rng))
         for mode in ("paper", "moved")
+        for after in [_figures(truth[mode], found["attacked"], label)]
     }
     tallies = _tallies(results, truth, found, target.t_star)
     shares = intervals(
@@ -141,6 +140,10 @@ def row(
         shares={share.name: share for share in shares},
         counts={name: (int(t.hits.sum()), int(t.objects.sum())) for name, t in tallies.items()},
     )
+
+
+def _fall(one: Difference) -> Interval:
+    return Interval(one.name, one.difference, one.low, one.high)
 
 
 def _figures(targets: Sequence[Targets], found: Sequence[Detections], label: int) -> list[Figure]:

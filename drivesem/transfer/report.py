@@ -10,58 +10,65 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from drivesem.eval_report import percent
+from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Interval
 from drivesem.judged import HEADLINE
 from drivesem.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, Row
 from drivesem.transfer.plot import write_heatmap
 from scene_ir import files
 
-COLUMNS = (
-    *("source", "target", "benign AP50", "paper AP50", "moved AP50", "moved AP70", "benign recall"),
-    *("moved recall", "drop (moved)", "transfer rate", "lost anyway", "frames"),
-)
+_SHARES = {TRANSFER: "transfer rate", LOST: "lost anyway", FRAMES: "frames"}
+_SIDES = ("source", "target")
+_LABELS = "labels"
+"""Of the photographs (benign), or of the counterexamples by either label mode."""
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    """One line of the table, in the order of COLUMNS; percentages."""
-    drop = next(one for one in row.drops["moved"] if one.name == AP50)
-    fallen = Interval(AP50, _less(drop.difference), _less(drop.high), _less(drop.low))
-    return (
-        row.run.name,
-        row.target.name,
-        *(percent(scores.headline.ap50) for scores in (row.benign, row.paper, row.moved)),
-        percent(row.moved.headline.ap70),
-        percent(row.benign.headline.recall_at_t_star),
-        percent(row.moved.headline.recall_at_t_star),
-        _bounded(fallen),
-        *(f"{_bounded(row.shares[name])}, {row.counts[name][0]}/{row.counts[name][1]}" for name in _SHARES),
-    )
-
-
-_SHARES = (TRANSFER, LOST, FRAMES)
+def sheets(rows: Sequence[Row]) -> list[Sheet]:
+    """Two tables, %: precision and recall by picture and label mode; what falls and what transfers."""
+    figures: list[tuple[str, ...]] = []
+    shares: list[tuple[str, ...]] = []
+    for row in rows:
+        sides = (row.run.name, row.target.name)
+        for name in ("benign", "paper", "moved"):
+            scores = getattr(row, name)
+            one = scores.headline
+            values = (one.ap50, one.ap70, one.ap, scores.overall.ap50, one.recall, one.recall_at_t_star)
+            figures.append((*sides, name, *map(percent, values)))
+        fall = {mode: next(one for one in row.drops[mode] if one.name == AP50) for mode in row.drops}
+        counted = [f"{_bounded(row.shares[n])}\n{row.counts[n][0]} of {row.counts[n][1]}" for n in _SHARES]
+        shares.append((*sides, _bounded(fall["paper"]), _bounded(fall["moved"]), *counted))
+    scored = ("AP50", "AP70", "AP50:95", "mAP50", "recall", "recall at t*")
+    fallen = ("AP50 falls, paper", "AP50 falls, moved")
+    return [
+        Sheet(f"{HEADLINE}, %", (*_SIDES, _LABELS, *scored), tuple(figures)),
+        Sheet("transfer, %", (*_SIDES, *fallen, *_SHARES.values()), tuple(shares)),
+    ]
 
 
 def notes(rows: Sequence[Row], draws: int) -> list[str]:
     """What the columns mean."""
-    spread = f", in brackets 95 % of {draws} draws of frames" if draws else ""
+    spread = f" In brackets: 95 % of {draws} draws of frames." if draws else ""
+    stars = "; ".join(dict.fromkeys(f"{r.target.name}: t* {r.target.t_star:.3f}" for r in rows))
     return [
-        f"{HEADLINE}, %; recall at each target's own t*; drop: benign AP50 less attacked{spread}.",
-        "Transfer rate: of the objects that the source lost and the target found in the photograph, those that the "
-        "target loses too. Lost anyway: of all that it found in the photograph, those it loses. Frames: of those "
-        "that fail the source, those that fail the target. All by moved labels.",
-        "; ".join(dict.fromkeys(f"{r.target.name}: t* {r.target.t_star:.3f}" for r in rows)) + ".",
+        "Labels: benign are the photographs, paper and moved the counterexamples by either label mode.",
+        f"mAP50: mean over the target's classes; AP50 falls: benign less attacked.{spread}",
+        "Transfer rate: of the objects that the source lost and the target found in the photograph, those that "
+        "the target loses too. Lost anyway: of all that it found in the photograph, those it loses. Frames: of "
+        "those that fail the source, those that fail the target. All by moved labels.",
+        f"{stars}.",
     ]
 
 
 def print_rows(rows: Sequence[Row], draws: int, console: Console) -> None:
-    """The table, and what it means."""
-    table = Table(title="transfer", title_justify="left")
-    for place, title in enumerate(COLUMNS):
-        table.add_column(title, justify="left" if place < 2 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*cells(row))
-    console.print(table)
+    """The tables, and what they mean."""
+    for sheet in sheets(rows):
+        table = Table(title=sheet.title, title_justify="left", show_lines=len(sheet.rows) == len(rows))
+        for title in sheet.columns:
+            words = title in (*_SIDES, _LABELS)
+            table.add_column(title, justify="left" if words else "right", overflow="fold")
+        for line in sheet.rows:
+            table.add_row(*line)
+        console.print(table)
     for note in notes(rows, draws):
         console.print(note, soft_wrap=True)
 
@@ -74,22 +81,20 @@ def write_report(out: Path, rows: Sequence[Row], draws: int) -> None:
     writer.writeheader()
     writer.writerows(flat)
     files.write_text(out / "transfer.csv", buffer.getvalue())
-    lines = ["# Transfer", "", "![](transfer.png)", "", _line(COLUMNS), _line(("---",) * len(COLUMNS))]
-    lines += [_line(cells(row)) for row in rows]
-    lines += ["", *(f"{note}\n" for note in notes(rows, draws))]
+    lines = ["# Transfer", "", "![](transfer.png)", ""]
+    for sheet in sheets(rows):
+        lines += [f"## {sheet.title}", "", _line(sheet.columns), _line(("---",) * len(sheet.columns))]
+        lines += [*map(_line, sheet.rows), ""]
+    lines += [f"{note}\n" for note in notes(rows, draws)]
     files.write_text(out / "transfer.md", "\n".join(lines))
     write_heatmap(out / "transfer.png", rows)
 
 
 def _line(parts: Sequence[str]) -> str:
-    return "| " + " | ".join(part.replace("|", "\\|") for part in parts) + " |"
+    return "| " + " | ".join(part.replace("|", "\\|").replace("\n", ", ") for part in parts) + " |"
 
 
 def _bounded(one: Interval) -> str:
     if one.value is None or one.low is None or one.high is None:
         return percent(one.value)
     return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"
-
-
-def _less(value: float | None) -> float | None:
-    return None if value is None else -value

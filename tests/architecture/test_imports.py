@@ -18,7 +18,7 @@ TOP_LEVEL_NAMES = {
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
-LOADED_WHERE_USED = ("open3d", "pyrender", "onnxruntime", "torchvision", "ultralytics")
+LOADED_WHERE_USED = ("open3d", "pyrender", "onnxruntime", "torchvision", "ultralytics", "cma")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ _JOINED = ("drivesem.space", "drivesem.feasible", "drivesem.attacks")
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "trimesh", "warp")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
-    *(Rule(package, (*_LOGIC, *_JOINED), _LOGIC_LIBRARIES) for package in _JOINED),
+    *(Rule(package, (*_LOGIC, *_JOINED), (*_LOGIC_LIBRARIES, "cma")) for package in _JOINED),
     # the second, independent judge of what the first one, drivesem.feasible, let through
     Rule("drivesem.feasibility_check", _LOGIC, (*_LOGIC_LIBRARIES, "cv2"), never=("drivesem.feasible",)),
     Rule(

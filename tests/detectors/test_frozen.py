@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -96,6 +99,31 @@ def test_without_gradient_the_numbers_are_the_same() -> None:
     assert differentiable.confidence_logits.requires_grad
     for field in FIELDS:
         assert torch.equal(getattr(judged, field), getattr(differentiable, field))
+
+
+def test_a_detector_that_has_run_can_be_copied_and_pickled() -> None:
+    detector, images = shipped(torch.float32), smooth(1, 48, 64, torch.float32)
+    _, slope = gradient(detector, images)
+    for other in (copy.deepcopy(detector), pickle.loads(pickle.dumps(detector))):
+        assert torch.equal(gradient(other, images)[1], slope)
+    assert torch.equal(gradient(detector, images)[1], slope)
+
+
+@pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (3, 40, 250), (2, 210, 33)])
+def test_onednns_order_of_the_weights_changes_no_number_but_by_rounding(
+    batch: int, height: int, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = smooth(batch, height, width, torch.float32)
+    detector = shipped(torch.float32)
+    raw, slope = gradient(detector, images)
+    assert detector._frozen(images).stem.weight.is_mkldnn
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    other = shipped(torch.float32)
+    plain_raw, plain = gradient(other, images)
+    assert not other._frozen(images).stem.weight.is_mkldnn
+    for field in FIELDS:
+        assert difference(getattr(raw, field), getattr(plain_raw, field)) < 1e-5
+    assert difference(slope, plain) < 1e-4
 
 
 def test_weights_that_changed_are_seen() -> None:

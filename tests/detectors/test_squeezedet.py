@@ -262,6 +262,40 @@ def test_objectness_by_hand() -> None:
     assert terms["confidence"].item() == pytest.approx(75 * (0.6 - 0.4) ** 2 + alarms, rel=1e-4)
 
 
+def test_objectness_of_a_batch_by_hand() -> None:
+    parts = silent(2, 64, 160)
+    at, other = anchor_at(2, 5, 8, 10), anchor_at(0, 0, 0, 10)
+    truth = parts["boxes_xyxy"][0, at].tolist()
+    parts["confidence_logits"][0, at] = math.log(0.4 / 0.6)
+    parts["confidence_logits"][1, other] = math.log(0.2 / 0.8)
+    wanted = [targets([truth], [0]), targets([truth], [0])]  # the second is not seen at all
+    terms = fresh().loss(raw_of(parts, 64, 160), wanted)
+    expected = (75 * ((1 - 0.4) ** 2 + 1) / 2 + 100 * 0.2**2 / (360 - 2)) / 2
+    assert terms["objectness"].item() == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("shift", "meets"), [(22.0, True), (25.0, False)])
+def test_a_box_meets_an_object_from_half_an_overlap_on(shift: float, meets: bool) -> None:
+    # Of 72 px wide boxes that lie 22 and 25 px apart: IoU 50 / 94 and 47 / 97.
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 8, 10)
+    truth = parts["boxes_xyxy"][0, at].tolist()
+    parts["boxes_xyxy"][0, at] += torch.tensor([shift, 0, shift, 0])
+    parts["confidence_logits"][0, at] = math.log(0.4 / 0.6)
+    terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [0])])
+    assert terms["objectness"].item() == pytest.approx(75 * (0.6**2 if meets else 1.0), rel=1e-4)
+
+
+@pytest.mark.parametrize(("covered", "excused"), [(0.55, True), (0.45, False)])
+def test_an_ignored_region_excuses_what_it_covers_by_half(covered: float, excused: bool) -> None:
+    parts = silent(1, 64, 160)
+    at = anchor_at(2, 5, 0, 10)  # 36 x 37
+    left, top, _, bottom = parts["boxes_xyxy"][0, at].tolist()
+    region = [left, top, left + 36 * covered, bottom]
+    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([region], [0], [True])])
+    assert bool(assigned.negative[0, at]) is not excused
+
+
 def test_box_and_class_terms_by_hand() -> None:
     parts = silent(1, 64, 160)
     at = anchor_at(2, 5, 8, 10)
@@ -412,6 +446,26 @@ def test_decode_planted_predictions() -> None:
     )
     assert found.boxes_xyxy[0].tolist() == [0.0, 39.5 - 21.5, 23.5 + 36, 39.5 + 21.5]
     assert found.boxes_xyxy[1, 2] == 159
+
+
+@pytest.mark.parametrize(("shift", "kept"), [(29.4, 1), (32.4, 2)])
+def test_decode_suppresses_from_an_overlap_of_two_fifths_on(shift: float, kept: int) -> None:
+    # 72 px wide boxes: IoU 42.6 / 101.4 = 0.42 and 39.6 / 104.4 = 0.38
+    parts = silent(1, 64, 160)
+    for at, left, confidence in ((40, 10.0, 0.9), (80, 10.0 + shift, 0.8)):
+        parts["boxes_xyxy"][0, at] = torch.tensor([left, 10.0, left + 72, 50.0])
+        parts["confidence_logits"][0, at] = math.log(confidence / (1 - confidence))
+    (found,) = fresh().decode(raw_of(parts, 64, 160))
+    assert len(found) == kept
+
+
+def test_decode_keeps_scores_from_a_two_hundredth_on() -> None:
+    parts = silent(1, 64, 160)
+    for at, confidence in ((40, 0.0052), (2000 // 9, 0.0048)):
+        parts["confidence_logits"][0, at] = math.log(confidence / (1 - confidence))
+        parts["class_logits"][0, at, 1] = 20.0
+    (found,) = fresh().decode(raw_of(parts, 64, 160))
+    assert found.scores.tolist() == pytest.approx([0.0052], rel=1e-3)
 
 
 def test_decode_returns_at_most_64() -> None:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
+from torch.nn import functional
 
 from detectors.augment import AugmentSettings
+from detectors.base import DetectorError, RawPredictions
 from detectors.boxes import iou_matrix
-from detectors.squeezedet import SqueezeDet
+from detectors.registry import read_weights, write_weights
+from detectors.squeezedet import SeededDropout, SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, batch_of, schedule, train
 from detectors.types import Targets
 
+KEPT = ("total", "objectness")
 SMALL = TrainingSettings(
     steps=6,
     batch=2,
@@ -48,9 +54,18 @@ def fresh() -> SqueezeDet:
     return detector
 
 
-@pytest.mark.parametrize("optimiser", ["adamw", "sgd"])
-def test_resumed_equals_uninterrupted(tmp_path: Path, optimiser: str) -> None:
-    settings = replace(SMALL, optimiser=optimiser)
+def with_batch_norm() -> SqueezeDet:
+    """A detector that counts and measures as it is trained."""
+    detector = fresh()
+    detector.dropout = nn.Sequential(SeededDropout(0.5), nn.BatchNorm2d(768))  # pyright: ignore[reportAttributeAccessIssue]
+    return detector
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "precision"), [("adamw", "float32"), ("sgd", "float32"), ("sgd", "bfloat16")]
+)
+def test_resumed_equals_uninterrupted(tmp_path: Path, optimiser: str, precision: str) -> None:
+    settings = replace(SMALL, optimiser=optimiser, precision=precision)
     whole = train(fresh(), painted(3), settings, tmp_path / "whole")
     train(fresh(), painted(3), settings, tmp_path / "parts", stop_after=5)  # killed after the checkpoint of step 4
     parts = train(fresh(), painted(3), settings, tmp_path / "parts")
@@ -60,6 +75,96 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, optimiser: str) -> None:
     assert [row["step"] for row in log[0]] == ["1", "2", "3", "4", "5", "6"]
     for first, second in zip(*log, strict=True):
         assert {**first, "seconds": ""} == {**second, "seconds": ""}
+
+
+class Pooled(SqueezeDet):
+    """ConvDet on mean colours: small enough for float16, which CPUs compute very slowly."""
+
+    def forward(self, images: torch.Tensor) -> RawPredictions:
+        cells = functional.avg_pool2d(images, 16).repeat(1, 256, 1, 1)
+        return self._interpret(self.convdet(self.dropout(cells)), (int(images.shape[2]), int(images.shape[3])))
+
+
+def test_float16_scales_its_loss_and_resumes(tmp_path: Path) -> None:
+    def pooled() -> SqueezeDet:
+        detector = Pooled(classes=("Car", "Truck"))
+        detector.initialise(torch.Generator().manual_seed(0))
+        return detector
+
+    settings = replace(SMALL, precision="float16", rate=1e-3)
+    whole = train(pooled(), painted(3), settings, tmp_path / "whole").state_dict()
+    train(pooled(), painted(3), settings, tmp_path / "parts", stop_after=5)
+    parts = train(pooled(), painted(3), settings, tmp_path / "parts").state_dict()
+    assert all(torch.equal(parts[name], value) for name, value in whole.items())
+    scaler = json.loads(read_weights(tmp_path / "whole" / CHECKPOINT)[0]["scaler"])
+    assert scaler["scale"] > 1
+    exact = train(pooled(), painted(3), replace(settings, precision="float32"), tmp_path / "exact").state_dict()
+    moved = (exact["convdet.weight"] - pooled().convdet.weight).norm()
+    assert 0 < (exact["convdet.weight"] - whole["convdet.weight"]).norm() < 0.2 * moved
+
+
+def test_buffers_are_averaged_and_resumed(tmp_path: Path) -> None:
+    whole = train(with_batch_norm(), painted(3), SMALL, tmp_path / "whole").state_dict()
+    train(with_batch_norm(), painted(3), SMALL, tmp_path / "parts", stop_after=5)
+    parts = train(with_batch_norm(), painted(3), SMALL, tmp_path / "parts").state_dict()
+    assert all(torch.equal(parts[name], value) for name, value in whole.items())
+    assert int(whole["dropout.1.num_batches_tracked"]) == SMALL.steps
+    _, tensors = read_weights(tmp_path / "whole" / CHECKPOINT)
+    last, average = (tensors[f"{part}.dropout.1.running_mean"] for part in ("weights", "average"))
+    assert torch.equal(whole["dropout.1.running_mean"], average)
+    assert not torch.equal(last, average)
+
+
+def test_a_checkpoint_of_before_there_were_precisions_is_read(tmp_path: Path) -> None:
+    whole = train(fresh(), painted(3), SMALL, tmp_path / "whole").state_dict()
+    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5)
+    facts, tensors = read_weights(tmp_path / "parts" / CHECKPOINT)
+    known = json.loads(facts["settings"])
+    for name in ("precision", "momentum", "drops", "drop_factor", "warmup_power"):
+        del known[name]
+    write_weights(
+        tmp_path / "parts" / CHECKPOINT, facts | {"settings": json.dumps(known | {"bfloat16": False})}, tensors
+    )
+    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts").state_dict()
+    assert all(torch.equal(parts[name], value) for name, value in whole.items())
+
+
+def test_threads_that_load_ahead_change_nothing(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        plain = train(fresh(), painted(3), SMALL, tmp_path / "plain").state_dict()
+        ahead = train(fresh(), painted(3), SMALL, tmp_path / "ahead", loaders=2).state_dict()
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(ahead[name], value) for name, value in plain.items())
+
+
+def test_a_data_set_may_choose_what_to_show() -> None:
+    class Choosing(list[Sample]):
+        def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
+            image, targets = self[index]
+            return np.full_like(image, 10 * step + int(generator.integers(2))), targets
+
+    plain = replace(
+        SMALL, augment=replace(SMALL.augment, brightness=0.0, contrast=0.0, gamma=0.0, channel_gain=0.0)
+    )
+    plain = replace(plain, augment=replace(plain.augment, noise_probability=0, jpeg_probability=0, hue_rad=0.0))
+    shown = [batch_of(Choosing(painted(2)), step, plain)[0].mean() * 255 for step in (3, 3, 8)]
+    assert shown[0] == shown[1]
+    assert 30 <= shown[0] <= 31
+    assert 80 <= shown[2] <= 81
+
+
+def test_the_log_has_the_detectors_own_terms(tmp_path: Path) -> None:
+    class Named(SqueezeDet):
+        def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
+            terms = super().loss(raw, targets)
+            return {"boxes": terms["box"], "rest": terms["total"] - terms["box"], **{k: terms[k] for k in KEPT}}
+
+    train(Named(classes=("Car", "Truck")), painted(2), replace(SMALL, steps=1), tmp_path)
+    (row,) = csv.DictReader((tmp_path / LOG).read_text().splitlines())
+    assert list(row) == ["step", "seconds", "rate", "boxes", "rest", "total", "norm"]
 
 
 def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
@@ -140,16 +245,32 @@ def test_schedule_warms_up_and_falls() -> None:
     assert rates[-1] < 0.02
 
 
+def test_published_schedules() -> None:
+    squeezedet = replace(SMALL, rate=0.01, warmup_steps=0, drops=(10, 20, 30), drop_factor=0.5)
+    assert [schedule(0.9, step, squeezedet) for step in (0, 9, 10, 29, 30)] == pytest.approx(
+        [0.01, 0.01, 0.005, 0.0025, 0.00125]
+    )
+    darknet = replace(SMALL, rate=0.001, warmup_steps=1000, warmup_power=4, drops=(4000, 4500))
+    assert schedule(0.0, 499, darknet) == pytest.approx(0.001 * 0.5**4)
+    assert [schedule(0.0, step, darknet) for step in (999, 3999, 4000, 4500)] == pytest.approx(
+        [1e-3, 1e-3, 1e-4, 1e-5]
+    )
+
+
 def test_what_cannot_be_used_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="dataset: expected at least one frame, found 0"):
         train(fresh(), [], SMALL, tmp_path)
     with pytest.raises(ValueError, match="optimiser: expected adamw or sgd, found 'lion'"):
         replace(SMALL, optimiser="lion")
+    with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, float16, found 'int8'"):
+        replace(SMALL, precision="int8")
     with pytest.raises(ValueError, match="batch: expected a number above 0"):
         replace(SMALL, batch=0)
     train(fresh(), painted(2), replace(SMALL, steps=2), tmp_path)
     with pytest.raises(ValueError, match=rf"{CHECKPOINT}: steps: expected 3 as set, found 2"):
         train(fresh(), painted(2), replace(SMALL, steps=3), tmp_path)
+    with pytest.raises(DetectorError, match="expected the tensors of squeezedet, found others"):
+        train(with_batch_norm(), painted(2), replace(SMALL, steps=2), tmp_path)
 
 
 def test_a_loss_that_is_not_finite_names_the_step(tmp_path: Path) -> None:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
+import torch
 
+from detectors.types import Detections
+from drivesem import attack_command
 from drivesem.cli import main
+from drivesem.config import GRADIENT_FREE, Attack
 from drivesem.feasibility_check import check_scene
 from drivesem.results import load_frame
 from drivesem.synth.write import Order, synthesise
@@ -137,3 +141,71 @@ def test_kitti_folder(kitti_folder: Path, tmp_path: Path, capsys: pytest.Capture
     assert list(figures["frames_failed"]) == ["000002"]
     assert figures["feasible_fraction"] == 1.0
     assert "000002" in (tmp_path / "run" / "report.html").read_text()
+
+
+class Blinking:
+    """A detector without gradient: a car in the middle of the picture, surer the brighter that is."""
+
+    name, classes = "blinking", ("bus", "Car")
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        self.size_hw = images.shape[2:]
+        return images.mean(dim=(1, 2, 3))
+
+    def decode(self, raw: torch.Tensor) -> list[Detections]:
+        h, w = self.size_hw
+        box = torch.tensor([[w / 4, h / 4, 3 * w / 4, 3 * h / 4]])
+        return [Detections(box, torch.tensor([1]), mean[None].clamp(0, 1)) for mean in raw]
+
+
+@pytest.mark.parametrize("method", ["random", "cma-es"])
+def test_searches_run_on_a_detector_without_gradient(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attack_command, "load_predictor", lambda *_: Blinking())
+    words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--json", "--out", str(tmp_path)]
+    figures = attack([*words, "--method", method, "--queries", "2", "--t-star", "0.2"], capsys)
+    assert figures["queries"] == 2
+    assert figures["t_star"] == 0.2
+    assert figures["feasible_fraction"] == 1.0
+    assert list(figures["benign"]["per_class"]) == ["Car"]
+    result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
+    assert len(result.loss_trace) == 3
+    assert [d.label for d in result.detections_attacked] == ["Car"]
+    assert ("cma" in json.loads((tmp_path / "manifest.json").read_text())["versions"]) == (method == "cma-es")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            [],
+            "--method: expected one of random, halton, sobol, cma-es for any, which has no gradient",
+        ),
+        (["--method", "sobol", "--objective", "confidence"], "--objective: expected objectness for any"),
+        (["--queries", "3"], "--queries: expected a method without gradient (random, halton"),
+        (["--method", "fgsm", "--range", "steps"], "--range: expected a method without gradient"),
+        (["--method", "random", "--queries", "0"], "--queries: expected at least 1, found 0"),
+        (["--method", "random", "--precision", "bfloat16"], "--precision: expected float32 with random"),
+        (["--method", "fgsm", "--early-stop"], "--early-stop: expected a method of several steps"),
+        (["--t-star", "1.5"], "--t-star: expected a score in (0, 1], found 1.5"),
+    ],
+)
+def test_what_does_not_go_together_is_named(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(attack_command, "load_predictor", lambda *_: Blinking())
+    assert main(["attack", "--detector", "any", "--out", str(tmp_path / "run"), *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"drivesem: {message}")
+    assert not (tmp_path / "run").exists()
+
+
+def test_methods_are_those_that_need_no_gradient() -> None:
+    names = get_args(get_type_hints(Attack)["method"])
+    free = [name for name in names if not attack_command.attack_method(Attack(method=name)).needs_gradient]
+    assert tuple(free) == GRADIENT_FREE

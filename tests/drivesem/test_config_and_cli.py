@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivesem.cli import main, parse
-from drivesem.config import Attack, Synth, UsageError, to_yaml, yaml_arguments
+from drivesem.config import COMMANDS, Attack, Synth, UsageError, to_yaml, yaml_arguments
 
 
 def test_defaults() -> None:
@@ -32,11 +32,17 @@ def test_resolved_configuration_reads_back(tmp_path: Path) -> None:
     assert parse(["attack", f"--config={path}"]) == config
 
 
+_NEEDED = {"train": ("--root", "frames"), "retrain": ("--run", "run")}
+"""Options without which a command does not begin."""
+
+
 def test_shipped_presets_parse() -> None:
     presets = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
     assert presets
     for preset in presets:
-        assert parse(["attack", "--config", str(preset)]) != Attack()
+        command = preset.stem.split("-")[0]
+        command = command if command in COMMANDS else "attack"
+        assert isinstance(parse([command, "--config", str(preset), *_NEEDED.get(command, ())]), COMMANDS[command])
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import torch
 from detectors.base import Detector, RawPredictions
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES, Detections
+from drivesem.attacks.sampling import Sampling
 from drivesem.attacks.si_fgsm import SiFGSM
 from drivesem.feasibility_check import check_scene
 from drivesem.feasible import FeasibleSet
@@ -140,6 +141,73 @@ def test_both_label_modes_are_judged(street):
     still = _objective(scene, StubDetector(scene.objects.box2d))
     stayed = still.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
     assert (stayed.lost, stayed.phantoms, stayed.success, stayed.success_paper) == (1, 1, True, False)
+
+
+class Spotter:
+    """A detector without gradient, of COCO-like classes: finds given boxes, surer the brighter the image."""
+
+    name, classes = "spotter", ("person", "Car")
+
+    def __init__(self, boxes_xyxy) -> None:
+        self.boxes_xyxy, self.looks = boxes_xyxy, 0
+
+    def forward(self, images):
+        self.looks += len(images)
+        return images.mean(dim=(1, 2, 3)).tolist()
+
+    def decode(self, raw):
+        n = len(self.boxes_xyxy)
+        person = Detections(self.boxes_xyxy[:1], torch.tensor([0]), torch.tensor([0.99]))
+        scores = [torch.full((n,), min(2 * mean, 1.0)) for mean in raw]
+        return [
+            Detections(
+                torch.cat([person.boxes_xyxy, self.boxes_xyxy]),
+                torch.cat([person.labels, torch.ones(n, dtype=torch.int64)]),
+                torch.cat([person.scores, score]),
+            )
+            for score in scores
+        ]
+
+
+def test_a_detector_without_gradient_is_judged_by_its_detections(street):
+    scene = street(positions_xz=NEAR)
+    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
+    assert objective.judged.names == ("Car",)
+    assert objective.t_star == 0.3
+    # mean 0.22 of the image, rounded to 8 bits: both cars are found with a score of 0.44
+    score = 2 * round(0.22 * 255) / 255
+    assert objective.benign.loss == pytest.approx(2 * (1 - score) ** 2, abs=1e-5)
+    assert objective.benign.detections.labels.tolist() == [0, 0]
+    # its boxes stay behind when a car drives off across: one car is lost, and its box a phantom
+    stayed = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
+    assert (stayed.lost, stayed.phantoms, stayed.success, stayed.success_paper) == (1, 1, True, False)
+    assert stayed.loss > objective.benign.loss
+
+
+def test_a_threshold_of_choice(street):
+    scene = street(positions_xz=NEAR)
+    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness", t_star=0.9)
+    assert not objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0])).success
+
+
+def test_what_a_detector_without_gradient_lacks_is_named(street):
+    scene = street(positions_xz=NEAR)
+    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
+    with pytest.raises(RangeError, match="detector: expected one with a gradient, found spotter"):
+        objective.loss_and_grad(objective.space.theta0)
+    with pytest.raises(RangeError, match="objective term: expected one of objectness, found 'confidence'"):
+        _objective(scene, Spotter(scene.objects.box2d))
+
+
+def test_a_search_pays_for_each_theta_once(street):
+    scene = street(positions_xz=NEAR)
+    detector = Spotter(scene.objects.box2d)
+    objective = _objective(scene, detector, term="objectness")
+    problem = objective.problem(FeasibleSet(objective.space))
+    result = Sampling("halton", queries=6)(problem, objective.space.theta0, seed=1)
+    assert result.queries == 6
+    assert detector.looks == 7
+    assert result.score == objective.score(result.theta)
 
 
 def _real(scene, params) -> Objective:

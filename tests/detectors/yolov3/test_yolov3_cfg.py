@@ -10,6 +10,12 @@ from detectors.yolov3.cfg import Convolution, Head, MaxPool, Route, Shortcut, Up
 from detectors.yolov3.network import Network
 
 
+def numbers(network: Network) -> tuple[int, int]:
+    """How many are learned, and how many are measured: means and variances."""
+    norms = [block.norm for block in network.blocks.values() if block.norm is not None]
+    return sum(p.numel() for p in network.parameters()), sum(2 * norm.num_features for norm in norms)
+
+
 def test_layers_of_a_file(mini_text: str) -> None:
     cfg = parse(mini_text, "mini.cfg")
     assert cfg.layers[0] == Convolution(4, 3, 2, 1, True, True)
@@ -40,8 +46,9 @@ def test_published_yolov3() -> None:
     assert sum(isinstance(layer, Convolution) for layer in cfg.layers) == 75
     assert sum(isinstance(layer, Convolution) for layer in cfg.layers[:75]) == 52  # Darknet-53 less its last
     assert (cfg.layers[86], cfg.layers[98]) == (Route((85, 61)), Route((97, 36)))
-    network = Network(cfg)
-    assert sum(p.numel() for p in network.parameters()) == 61_949_149
+    learned, measured = numbers(Network(cfg))
+    assert learned == 61_949_149
+    assert 20 + 4 * (learned + measured) == 248_007_048  # bytes of the published yolov3.weights
     assert parse(write(cfg)) == cfg
 
 
@@ -50,10 +57,9 @@ def test_published_yolov3_tiny() -> None:
     assert len(cfg.layers) == 24
     assert [i for i, _ in cfg.heads] == [16, 23]
     assert (cfg.layers[17], cfg.layers[20]) == (Route((13,)), Route((19, 8)))
-    network = Network(cfg)
-    learned = sum(p.numel() for p in network.parameters())
-    measured = sum(b.numel() for name, b in network.named_buffers() if not name.endswith("num_batches_tracked"))
-    assert (learned, learned + measured) == (8_852_366, 8_858_734)  # what the published file holds
+    learned, measured = numbers(Network(cfg))
+    assert (learned, learned + measured) == (8_852_366, 8_858_734)  # 8.86 M, as the published file holds them
+    assert 20 + 4 * (learned + measured) == 35_434_956  # bytes of the published yolov3-tiny.weights
 
 
 @pytest.mark.parametrize("layout", [layouts.yolov3, layouts.yolov3_tiny, layouts.yolov3_slim])
@@ -77,14 +83,29 @@ def line_of(text: str, part: str) -> int:
         ("batch=64", "batch 64", "batch=64", r"expected \[section\] or key=value, found 'batch 64'"),
         ("from=-3", "from=-9", "[shortcut]", r"\[shortcut\] from: expected a layer before this one, number 4"),
         ("from=-3", "from=-4", "[shortcut]", r"from: expected 8 channels at stride 4, found 4 at 2"),
-        ("layers = -1, 4", "layers = -1, 6", "layers = -1, 4", r"expected layers of one stride, found strides \[4, 8"),
+        (
+            "layers = -1, 4",
+            "layers = -1, 6",
+            "layers = -1, 4",
+            r"expected layers of one stride, found strides \[4, 8",
+        ),
         ("layers = -3", "layers = first", "[route]", r"\[route\] layers: expected integers, found 'first'"),
         ("num=4", "num=9", "[yolo]", r"\[yolo\] num: expected 4, as many as anchors, found 9"),
         ("mask = 2,3", "mask = 2,4", "[yolo]", r"mask: expected indices of 4 anchors, found \[2, 4\]"),
         ("mask = 2,3", "mask = 2", "[yolo]", r"mask, classes: expected 16 numbers a cell .* found 8"),
-        ("ignore_thresh = .7", "ignore_thresh = high", "[yolo]", r"ignore_thresh: expected a number, found 'high'"),
+        (
+            "ignore_thresh = .7",
+            "ignore_thresh = high",
+            "[yolo]",
+            r"ignore_thresh: expected a number, found 'high'",
+        ),
         ("filters=4", "filters=0", "[convolutional]", r"filters: expected an integer of at least 1, found 0"),
-        ("activation=leaky", "activation=mish", "[convolutional]", r"activation: expected leaky or linear, found mi"),
+        (
+            "activation=leaky",
+            "activation=mish",
+            "[convolutional]",
+            r"activation: expected leaky or linear, found mi",
+        ),
         ("channels=3", "channels=1", "[net]", r"channels: expected 3, found 1"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Darknet's `.weights`: the same outputs after writing and reading; order and header by hand; files that do not fit."""
+"""Darknet's `.weights`: equal outputs after writing and reading; order by hand; files that do not fit."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ def test_order_and_header_by_hand(version: tuple[int, int, int], seen: str, tmp_
 def test_files_of_another_length(extra: int, found: str, tmp_path: Path) -> None:
     path = tmp_path / "two.weights"
     path.write_bytes(struct.pack("<3iq", 0, 2, 0, 0) + bytes(4 * (NUMBERS + extra)))
-    with pytest.raises(DetectorError, match=rf"two\.weights: expected 32 numbers after the header, found {found}$"):
+    with pytest.raises(
+        DetectorError, match=rf"two\.weights: expected 32 numbers after the header, found {found}$"
+    ):
         weights.read(Network(parse(TWO)), path)
 
 
@@ -103,9 +105,7 @@ def test_darknet_files_by_name(mini: YoloV3, mini_text: str, tmp_path: Path) -> 
         detector = load_detector(name)
         assert detector.classes == ("Car", "Truck", "Cyclist")
         assert not any(p.requires_grad for p in detector.parameters())
-        torch.testing.assert_close(
-            detector(image).boxes_xyxy, mini(image).boxes_xyxy, rtol=0, atol=1e-6
-        )
+        torch.testing.assert_close(detector(image).boxes_xyxy, mini(image).boxes_xyxy, rtol=0, atol=1e-6)
     with pytest.raises(DetectorError, match=r"other\.weights: expected Darknet weights, found No such file"):
         load_detector(f"darknet:{path},{tmp_path / 'other.weights'}")
     with pytest.raises(DetectorError, match=r"gone\.cfg: expected a Darknet \.cfg, found No such file"):

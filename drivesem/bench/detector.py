@@ -1,0 +1,129 @@
+"""What the detectors cost: forward, forward and backward to the image, decoding, and peak memory."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors.base import Detector, RawPredictions
+from detectors.registry import load_detector
+from drivesem.bench import memory
+from drivesem.bench.detector_probe import Order, both
+from drivesem.bench.scenes import bench_scene
+from drivesem.bench.timing import Budget, Clock, Spread, rounds
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+METHOD = (
+    "A generated street of 8 cars, resized to each size. forward: without gradient, up to the raw predictions; "
+    "forward and backward: raw predictions, the loss that attacks raise for one object, and its gradient to the "
+    "image; decode: scores, the best of them and non-maximum suppression, of what was predicted and, at worst, "
+    "with every anchor confident. The four are measured in turn in one process after a warm-up; the median of the "
+    "rounds stands beside the fastest, which is what an idle machine does. Peak memory is that of a process of "
+    "its own, forward and backward, above what it holds once the detector is loaded."
+)
+SIZES_HW = ((384, 1248), (192, 624))
+_CARS, _TRIANGLES = 8, 600
+_FEWEST, _MOST = 3, 400
+_SURE = 30.0
+"""Added to the logits of all confidences: every anchor is a candidate."""
+_KB = 1024.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One detector at one size, width x height. Times in ms, medians, and the fastest; peak_mb: MB above the
+    loaded detector, None where it is not measured; rounds: how often each was done.
+    """
+
+    detector: str
+    size: str
+    threads: int
+    forward_ms: float
+    forward_min_ms: float
+    both_ms: float
+    both_min_ms: float
+    decode_ms: float
+    decode_min_ms: float
+    decode_worst_ms: float
+    peak_mb: float | None
+    rounds: int
+
+
+def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Iterator[Row]:
+    """One row a detector and size, within about `seconds` for all of them.
+
+    DetectorError for a detector that cannot be had or has no gradient, FormatError where the process that tells
+    the memory ends without a result.
+    """
+    photograph = bench_scene(_CARS, _TRIANGLES, seed).scene.photograph[None].float()
+    budget = Budget(seconds, len(names) * len(SIZES_HW))
+    for name in names:
+        detector = load_detector(name, device)
+        for size in SIZES_HW:
+            image = F.interpolate(photograph, size, mode="bilinear").clamp(0, 1).to(device)
+            image = image.contiguous(memory_format=torch.channels_last)
+            yield _row(name, detector, image, Clock(device), budget.share())
+
+
+def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: float) -> Row:
+    height, width = image.shape[2:]
+    with torch.no_grad():
+        raw = detector(image)
+    sure = replace(raw, confidence_logits=raw.confidence_logits + _SURE)
+    calls: dict[str, Callable[[], object]] = {
+        "forward": lambda: _judge(detector, image),
+        "both": lambda: both(detector, image),
+        "decode": lambda: detector.decode(raw),
+        "worst": lambda: detector.decode(sure),
+    }
+    for call in calls.values():
+        call()
+    times: dict[str, list[float]] = {key: [] for key in calls}
+    for _ in rounds(seconds, _FEWEST, _MOST):
+        for key, call in calls.items():
+            times[key].append(clock.ms(call))
+    median = {key: round(Spread.of(found).median, 3) for key, found in times.items()}
+    fastest = {key: round(min(found), 3) for key, found in times.items()}
+    return Row(
+        detector=name,
+        size=f"{width}x{height}",
+        threads=torch.get_num_threads(),
+        forward_ms=median["forward"],
+        forward_min_ms=fastest["forward"],
+        both_ms=median["both"],
+        both_min_ms=fastest["both"],
+        decode_ms=median["decode"],
+        decode_min_ms=fastest["decode"],
+        decode_worst_ms=median["worst"],
+        peak_mb=_peak_mb(name, height, width) if image.device.type == "cpu" and memory.supported() else None,
+        rounds=len(times["both"]),
+    )
+
+
+@torch.no_grad()
+def _judge(detector: Detector, image: Tensor) -> RawPredictions:
+    return detector(image)
+
+
+def _peak_mb(name: str, height: int, width: int) -> float:
+    """Peak of a fresh process above what it holds with the detector loaded, MB."""
+    order = Order(name, height, width, torch.get_num_threads())
+    with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as folder:
+        answer = Path(folder) / "found.json"
+        words = [sys.executable, "-m", "drivesem.bench.detector_probe", json.dumps(asdict(order)), str(answer)]
+        done = subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+        if done.returncode != 0 or not answer.is_file():
+            last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+            raise FormatError("bench detector: process", "a result", f"exit code {done.returncode}: {last}")
+        found = files.read_json(answer)
+    return round((found["peak_kb"] - found["loaded_kb"]) / _KB, 1)

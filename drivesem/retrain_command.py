@@ -1,0 +1,310 @@
+"""`drivesem retrain`: a detector trained on with counterexamples, before and after, and attacked again."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from detectors.augment import AugmentSettings
+from detectors.base import Detector, DetectorError
+from detectors.registry import load_detector, save_detector
+from detectors.squeezedet import SqueezeDet
+from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
+from detectors.types import CLASSES, Detections
+from drivesem.attack_command import attack_frames
+from drivesem.config import Attack, Retrain, UsageError, size_hw
+from drivesem.data.registry import open_dataset
+from drivesem.eval_report import percent
+from drivesem.evaluation.coco import ClassScores
+from drivesem.judged import JudgedClasses
+from drivesem.labels import LabelMode
+from drivesem.pipeline import as_targets
+from drivesem.run_folder import CONFIG, PRESENTATION, claim
+from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
+from drivesem.training.curves import draw
+from drivesem.training.frames import FrameStore
+from drivesem.training.judging import judge
+from drivesem.training.mixture import Mixture, Shares
+from scene_ir import files
+
+WEIGHTS, FIGURES, CURVES = "retrained.safetensors", "retrain.json", "curves.png"
+TABLES = ("retrain.csv", "retrain.md")
+FRESH, CACHE = "fresh", "cache"
+"""Folders: the new attack's run, decoded frames."""
+_FRESH_OF = "fresh_of.txt"
+"""Digest of the weights that the new attack was against."""
+_FREE = ("minutes", "checkpoint_every", "fresh")
+"""Settings that a run may change on the way."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A set of frames and what two detectors find in it. broken: share of frames in which an attack made one lose
+    an object or see a phantom, None where nothing was attacked.
+    """
+
+    frames: str
+    labels: str
+    detector: str
+    count: int
+    scores: ClassScores
+    broken: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Flat, figures by name."""
+        told = {"set": self.frames, "labels": self.labels, "detector": self.detector, "frames": self.count}
+        return told | asdict(self.scores) | {"broken": self.broken}
+
+
+def run(config: Retrain) -> int:
+    """Retrain, or go on with it; exit code 0. Raises UsageError or SceneError for bad input."""
+    console = Console(stderr=True)
+    attack = _attack_of(Path(config.run))
+    frames = frames_of(Path(config.run))
+    kept_out, learned = _divided(frames, config)
+    start = config.start or attack.detector
+    before, after = _detector(start, config.device), _detector(start, config.device)
+    out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
+    claim(out, config, _clear, (*PRESENTATION, *_FREE))
+    mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)
+    _train(config, after, mixture, out, console)
+    found = look(after, kept_out, "benign", config.device)
+    after.t_star = _t_star(after, kept_out, found)
+    save_detector(after, out / WEIGHTS, {"retrained_from": Path(start).name, "steps": str(config.steps)})
+    rows = _known(before, "before", kept_out, config.device) + _known(after, "after", kept_out, config.device)
+    rows += _fresh(config, attack, kept_out, out)
+    data = {
+        "out": str(out),
+        "weights": str(out / WEIGHTS),
+        "run": config.run,
+        "detector": start,
+        "frames": len(mixture),
+        "counterexamples": len(mixture.shown),
+        "held_out": len(kept_out),
+        "t_star": {"before": before.t_star, "after": after.t_star},
+        "rows": [row.to_json() for row in rows],
+    }
+    files.write_json(out / FIGURES, data)
+    _write(out, rows)
+    draw(out / LOG, out / "evaluations.csv", out / CURVES, f"{before.name}, retrained")
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    _print(rows, console)
+    console.print(f"weights: {out / WEIGHTS}", soft_wrap=True)
+    return 0
+
+
+def _attack_of(run: Path) -> Attack:
+    """The configuration of a run. Raises UsageError where the folder is none."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise UsageError("--run", "a run's folder, with its config.yaml", run)
+    loaded = yaml.safe_load(files.read_text(path))
+    known = {field.name for field in fields(Attack)}
+    if not isinstance(loaded, dict) or not set(loaded) <= known:
+        raise UsageError("--run", "a run of drivesem attack", run)
+    return Attack(**loaded)
+
+
+def _detector(name: str, device: str) -> Detector:
+    try:
+        detector = load_detector(name, device)
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--start", "a detector that can be trained", error) from error
+    return detector
+
+
+def _divided(frames: Sequence[AttackedFrame], config: Retrain) -> tuple[list[AttackedFrame], list[AttackedFrame]]:
+    """Frames that are never trained on, drawn at random, and the others."""
+    order = np.random.default_rng([config.seed, 6]).permutation(len(frames))
+    count = max(round(config.validation * len(frames)), 1)
+    if count >= len(frames):
+        raise UsageError("--run", "at least 2 frames, some to train on and some to judge by", len(frames))
+    kept_out = {int(i) for i in order[:count]}
+    chosen = [[f for i, f in enumerate(frames) if (i in kept_out) == wanted] for wanted in (True, False)]
+    return chosen[0], chosen[1]
+
+
+def _mixture(
+    config: Retrain,
+    attack: Attack,
+    learned: Sequence[AttackedFrame],
+    kept_out: set[str],
+    out: Path,
+    after: Detector,
+) -> Mixture:
+    mode, classes = config.label_mode, after.classes
+    failed = [f for f in learned if (f.result.success_moved if mode == "moved" else f.result.success_paper)]
+    if not failed:
+        raise UsageError("--run", f"counterexamples that break the detector, by {mode} labels", "none")
+    counterexamples = AttackedSamples(failed, "counterexample", mode, classes)
+    benign: Sequence[Sample]
+    if config.dataset is None:
+        benign = AttackedSamples(learned, "benign", "paper", classes)
+    else:
+        dataset = open_dataset(config.dataset, Path(config.root or ""))
+        names = list(dataset.identifiers[: config.limit])
+        if config.dataset == attack.dataset:  # what is judged by is not trained on, wherever it lies
+            names = [name for name in names if name not in kept_out]
+        if not names:
+            raise UsageError("--root", "frames that are not held out", "none")
+        benign = FrameStore(dataset, names, out / CACHE, classes)
+    shares = Shares(config.fraction, config.mix, round(config.ramp * config.steps), config.seed)
+    return Mixture(benign, counterexamples, shares)
+
+
+def _train(config: Retrain, detector: Detector, mixture: Mixture, out: Path, console: Console) -> None:
+    settings = TrainingSettings(
+        steps=config.steps,
+        minutes=config.minutes,
+        batch=config.batch,
+        rate=config.rate,
+        backbone_rate=1.0,  # nothing starts anew
+        warmup_steps=config.warmup,
+        precision=config.precision,
+        seed=config.seed,
+        checkpoint_every=config.checkpoint_every,
+        augment=AugmentSettings(window_hw=size_hw("--window", config.window)),
+    )
+    if isinstance(detector, SqueezeDet):
+        detector.overlap_weight = config.overlap_weight
+    detector.requires_grad_(True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("retraining", total=config.steps)
+
+        def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
+            bar.update(task, completed=done, description=f"loss {row['total']:.3f}")
+
+        try:
+            train(detector, mixture, settings, out, progress=progress)
+        except FloatingPointError as error:
+            raise UsageError("--rate", "one at which the loss stays finite", error) from error
+    detector.requires_grad_(False)
+
+
+def _t_star(detector: Detector, frames: Sequence[AttackedFrame], found: Sequence[Detections]) -> float:
+    """The score of best F1 on the benign frames that were held out."""
+    judged = JudgedClasses.of(detector)
+    wanted = [judged.targets(as_targets(frame.result.targets_benign, CLASSES)) for frame in frames]
+    return judge(found, wanted, judged.names).t_star
+
+
+def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], device: str) -> list[Row]:
+    """Benign frames, and the counterexamples that the run found against the detector as it was."""
+    rows = []
+    stages: tuple[tuple[Stage, tuple[LabelMode, ...]], ...] = (
+        ("benign", ("paper",)),
+        ("counterexample", ("moved", "paper")),
+    )
+    for stage, modes in stages:
+        found = look(detector, frames, stage, device)
+        for mode in modes:
+            scores = figures(detector, detector.t_star, frames, found, mode)
+            broken = None
+            if stage == "counterexample" and name == "before":
+                won = [f.result.success_moved if mode == "moved" else f.result.success_paper for f in frames]
+                broken = sum(won) / len(won)
+            label = "benign" if stage == "benign" else "counterexamples of the run"
+            rows.append(Row(label, mode, name, len(frames), scores, broken))
+    return rows
+
+
+def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], out: Path) -> list[Row]:
+    """The same attack on the same frames, against the retrained detector."""
+    names = [frame.name for frame in kept_out][: config.fresh]
+    if not names:
+        return []
+    again = replace(
+        attack,
+        detector=str(out / WEIGHTS),
+        steps=config.attack_steps or attack.steps,
+        out=None,
+        json=False,
+        resume=config.resume,
+        workers=config.workers,
+        device=config.device,
+        t_star=None,
+    )
+    _forget_other_weights(out)
+    summary = attack_frames(again, names, out / FRESH)
+    rows = []
+    for mode, scores, won in (
+        ("moved", summary.attacked_moved, summary.successes_moved),
+        ("paper", summary.attacked_paper, summary.successes_paper),
+    ):
+        share = won / summary.frames if summary.frames else None
+        rows.append(Row("fresh counterexamples", mode, "after", summary.frames, scores.headline, share))
+    return rows
+
+
+def _forget_other_weights(out: Path) -> None:
+    """Remove what was attacked with other weights than those that are there now."""
+    digest = hashlib.sha256(files.read_bytes(out / WEIGHTS)).hexdigest()
+    stamp = out / _FRESH_OF
+    if (out / FRESH).is_dir() and (not stamp.is_file() or files.read_text(stamp) != digest):
+        shutil.rmtree(out / FRESH)
+    files.write_text(stamp, digest)
+
+
+_COLUMNS = ("ap50", "ap70", "ap", "recall", "recall_at_t_star")
+_TITLES = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
+
+
+def _write(out: Path, rows: Sequence[Row]) -> None:
+    """The table as CSV and as Markdown."""
+    flat = [row.to_json() for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(flat[0]))
+    writer.writeheader()
+    writer.writerows(flat)
+    lines = [
+        "| frames | labels | detector | " + " | ".join(_TITLES) + " | objects | frames broken |",
+        "| --- | --- | --- |" + " ---: |" * (len(_TITLES) + 2),
+    ]
+    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
+    csv_name, markdown_name = TABLES
+    files.write_text(out / csv_name, text.getvalue())
+    files.write_text(out / markdown_name, "\n".join(lines) + "\n")
+
+
+def _cells(row: Row) -> list[str]:
+    facts = asdict(row.scores)
+    broken = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
+    numbers = [percent(facts[name]) for name in _COLUMNS]
+    return [row.frames, row.labels, row.detector, *numbers, str(row.scores.objects), broken]
+
+
+def _print(rows: Sequence[Row], console: Console) -> None:
+    table = Table(title="Car, %, on frames that were not trained on", title_justify="left")
+    for title in ("frames", "labels", "detector"):
+        table.add_column(title)
+    for title in (*_TITLES, "objects", "frames broken"):
+        table.add_column(title, justify="right")
+    for row in rows:
+        table.add_row(*_cells(row))
+    console.print(table)
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run wrote, and nothing else."""
+    for name in (WEIGHTS, FIGURES, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES):
+        (out / name).unlink(missing_ok=True)
+    for name in (FRESH, CACHE):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)

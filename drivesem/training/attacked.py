@@ -1,0 +1,101 @@
+"""The frames of an attack's run as training and evaluation take them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from detectors.base import Predictor, predict
+from detectors.training import Sample
+from detectors.types import CLASSES, Detections
+from drivesem.data import kitti
+from drivesem.evaluation.coco import ClassScores, evaluate
+from drivesem.judged import HEADLINE, JudgedClasses
+from drivesem.labels import LabelMode
+from drivesem.pipeline import RESULT, as_targets
+from drivesem.results import FrameResult, load_frame
+from drivesem.training.targets import TRAINED, training_targets
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+Stage = Literal["benign", "counterexample"]
+
+
+@dataclass(frozen=True)
+class AttackedFrame:
+    """One frame's folder in a run."""
+
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    @cached_property
+    def result(self) -> FrameResult:
+        """What came of the attack."""
+        return load_frame(self.folder / RESULT)
+
+    def image(self, stage: Stage) -> np.ndarray:
+        """Pixels (H, W, 3) uint8 RGB."""
+        return files.read_image(self.folder / f"{stage}.png")
+
+
+class AttackedSamples(Sequence[Sample]):
+    """To train on: photographs with benign labels, or counterexamples with those of a mode; read each time."""
+
+    def __init__(
+        self, frames: Sequence[AttackedFrame], stage: Stage, mode: LabelMode, classes: Sequence[str]
+    ) -> None:
+        self._frames = frames
+        self._stage: Stage = stage
+        name = f"labels_{'paper' if stage == 'benign' else mode}.txt"
+        self._targets = [
+            training_targets(kitti.read_labels(frame.folder / name), TRAINED, classes) for frame in frames
+        ]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self._frames[index].image(self._stage), self._targets[index]
+
+
+def frames_of(run: Path) -> list[AttackedFrame]:
+    """The finished frames of a run of `drivesem attack`, by name. Raises FormatError where there are none."""
+    found = [AttackedFrame(path.parent) for path in sorted((run / "frames").glob(f"*/{RESULT}"))]
+    if not found:
+        raise FormatError(str(run), "a run of drivesem attack with finished frames", "none")
+    return found
+
+
+def look(detector: Predictor, frames: Sequence[AttackedFrame], stage: Stage, device: str) -> list[Detections]:
+    """What a detector finds in photographs or counterexamples: labels among the judged classes, on the CPU."""
+    judged = JudgedClasses.of(detector)
+    found = []
+    for frame in frames:
+        image = torch.from_numpy(np.array(frame.image(stage))).permute(2, 0, 1)[None].float() / 255
+        one = judged.detections(predict(detector, image.to(device))[0])
+        found.append(Detections(one.boxes_xyxy.cpu(), one.labels.cpu(), one.scores.cpu()))
+    return found
+
+
+def figures(
+    detector: Predictor,
+    t_star: float,
+    frames: Sequence[AttackedFrame],
+    found: Sequence[Detections],
+    mode: LabelMode,
+) -> ClassScores:
+    """The headline's figures of detections beside the labels of a mode, as `drivesem attack` judges them."""
+    judged = JudgedClasses.of(detector)
+    results = [frame.result for frame in frames]
+    records = [r.targets_benign if mode == "paper" else r.targets_moved for r in results]
+    targets = [judged.targets(as_targets(record, CLASSES)) for record in records]
+    return evaluate(targets, found, judged.names, t_star, HEADLINE).headline

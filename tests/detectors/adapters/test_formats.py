@@ -1,0 +1,179 @@
+"""Outputs of the known families, planted by hand, and the YAML files that say how to read others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from detectors.adapters.coco import CLASSES, CLASSES_91
+from detectors.adapters.formats import flat, reading
+from detectors.adapters.spec import Spec, fit, load_spec, prepare
+from detectors.base import DetectorError
+
+INPUT_HW = (64, 128)
+BOX = [10.0, 20.0, 50.0, 40.0]
+CENTRED = [30.0, 30.0, 40.0, 20.0]
+
+
+def yolov8(classes: int = 3, places: int = 40) -> torch.Tensor:
+    output = torch.zeros(1, 4 + classes, places)
+    output[0, :4, 7], output[0, 4 + 2, 7] = torch.tensor(CENTRED), 0.75
+    return output
+
+
+def yolov5(classes: int = 3, places: int = 40) -> torch.Tensor:
+    output = torch.zeros(1, places, 5 + classes)
+    output[0, 7] = torch.tensor([*CENTRED, 0.8, *[0.0] * classes])
+    output[0, 7, 5 + 2] = 0.5
+    return output
+
+
+def read(outputs, settings=None, names=("a", "b", "c")):
+    shapes = [tuple(output.shape) for output in outputs]
+    found = reading(shapes, INPUT_HW, settings or {}, names, "own")
+    boxes, scores = found.read(outputs, INPUT_HW)
+    image, place, label = (scores > 0.1).nonzero()[0].tolist()
+    return found, boxes[image, place].tolist(), found.classes[label], float(scores[image, place, label])
+
+
+def end_to_end() -> torch.Tensor:
+    rows = torch.zeros(1, 300, 6)
+    rows[0, 4] = torch.tensor([*BOX, 0.75, 2])
+    return rows
+
+
+CHOSEN = [torch.tensor([BOX]), torch.tensor([2]), torch.tensor([0.75])]
+ANCHORS = torch.tensor(BOX).expand(1, 9, 4) * (torch.arange(9) == 3)[None, :, None]
+SCORES = torch.tensor([0.0, 0.0, 0.75]).expand(1, 9, 3) * (torch.arange(9) == 3)[None, :, None]
+
+
+@pytest.mark.parametrize(
+    ("name", "outputs", "score"),
+    [
+        ("yolov8", [yolov8()], 0.75),
+        ("yolov5", [yolov5()], 0.4),
+        ("end2end", [end_to_end()], 0.75),
+        ("torchvision", CHOSEN, 0.75),
+        ("torchvision", [CHOSEN[2][None], CHOSEN[0][None], CHOSEN[1][None]], 0.75),
+        ("ssd", [ANCHORS, SCORES], 0.75),
+        ("ssd", [SCORES, ANCHORS], 0.75),
+    ],
+)
+def test_a_planted_box_is_read(name: str, outputs: list[torch.Tensor], score: float) -> None:
+    found, box, label, value = read(outputs)
+    assert found.format.name == name
+    assert label == "c"
+    assert box == pytest.approx(BOX)
+    assert value == pytest.approx(score)
+
+
+def test_other_boxes_and_activations() -> None:
+    shares = [value / side for value, side in zip(BOX, (128, 64) * 2, strict=True)]
+    boxes = torch.tensor([shares[1], shares[0], shares[3], shares[2]]).expand(1, 9, 4)
+    logits = torch.tensor([0.0, 0.0, 3.0]).expand(1, 9, 3)
+    settings = {"boxes": "yxyx", "normalised": True, "activation": "softmax", "classes": ("", "car", "bus")}
+    found, box, label, value = read([boxes, logits], settings)
+    assert box == pytest.approx(BOX)
+    # the column without a name is no class, but counts in the softmax; at 0.1 the first class found is "car"
+    assert found.classes == ("car", "bus")
+    assert (label, value) == ("car", pytest.approx(1 / (2 + torch.e**3), abs=0.06)) or label == "bus"
+    _, box, _, _ = read([torch.tensor([10.0, 20, 40, 20]).expand(1, 9, 4), logits], {"boxes": "xywh"})
+    assert box == pytest.approx(BOX)
+    _, _, _, value = read([torch.logit(yolov5(), 1e-4) * (torch.arange(8) > 3)], {"activation": "sigmoid"})
+    assert value == pytest.approx(0.4, abs=1e-3)
+
+
+def test_classes_come_from_the_spec_the_file_or_their_number() -> None:
+    assert read([yolov8(80, 100)], names=None)[0].classes == CLASSES
+    assert read([ANCHORS, SCORES[..., :1].expand(1, 9, 91)], names=None)[0].classes[2] == "Car"
+    assert read([yolov8()], {"classes": ("x", "y", "z")})[0].classes == ("x", "y", "z")
+    with pytest.raises(DetectorError, match="own: classes: expected 3 names in a YAML file, found none"):
+        read([yolov8()], names=None)
+    with pytest.raises(DetectorError, match="own: classes: expected 3, one a column of scores, found 2"):
+        read([yolov8()], names=("a", "b"))
+
+
+def test_cocos_numbers_with_gaps() -> None:
+    assert (CLASSES_91[0], CLASSES_91[1], CLASSES_91[3], CLASSES_91[12], CLASSES_91[90]) == (
+        *("", "person", "Car"),
+        *("", "toothbrush"),
+    )
+    assert tuple(name for name in CLASSES_91 if name) == CLASSES
+
+
+def test_what_no_format_reads() -> None:
+    with pytest.raises(DetectorError, match=r"own: expected the outputs of nanodet or .*, found \[1, 5\]"):
+        read([torch.zeros(1, 5)])
+    with pytest.raises(DetectorError, match=r"own: expected the outputs of yolov5, found \[1, 7, 40\]"):
+        read([yolov8()], {"format": "yolov5"})
+    with pytest.raises(DetectorError, match=r"own: format: expected one of nanodet, .*, found 'yolo9'"):
+        read([yolov8()], {"format": "yolo9"})
+
+
+def test_labels_beyond_the_classes_are_nothing() -> None:
+    found = reading([(1, 4), (1,), (1,)], INPUT_HW, {}, ("a",), "own")
+    assert float(found.read(CHOSEN, INPUT_HW)[1].sum()) == 0
+
+
+def test_tensors_are_found_wherever_they_are() -> None:
+    a, b, c = CHOSEN
+    assert [t.shape for t in flat(({}, [{"scores": c, "boxes": a, "labels": b}]))] == [a.shape, b.shape, c.shape]
+
+
+def test_letterbox_and_stretch_bring_boxes_back() -> None:
+    image = torch.zeros(1, 3, 32, 128)
+    image[:, :, 8:16, 64:96] = 1
+    for resize, size in (("letterbox", (64, 64)), ("stretch", (64, 64)), ("letterbox", (96, 200))):
+        fed, fitted = fit(image, Spec(size=size, resize=resize, pad=0.0))
+        assert tuple(fed.shape[2:]) == size
+        rows, columns = (fed[0, 0] > 0.5).nonzero().unbind(1)
+        edges = torch.tensor([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
+        # the block's first and last pixel, half a pixel outside their centres
+        torch.testing.assert_close(fitted.back(edges), torch.tensor([63.5, 7.5, 95.5, 15.5]), atol=1.1, rtol=0)
+    fed, fitted = fit(image[..., :120], Spec(multiple=32, centred=False, pad=0.25))
+    assert tuple(fed.shape) == (1, 3, 32, 128)
+    assert bool((fed[..., 120:] == 0.25).all())
+    assert fitted.back(torch.tensor([0.0, 0, 4, 4])).tolist() == [-0.5, -0.5, 3.5, 3.5]
+
+
+def test_what_a_network_is_fed() -> None:
+    image = torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1)
+    spec = Spec(channels="bgr", scale=255.0, mean=(1.0, 2.0, 3.0), std=(2.0, 2.0, 4.0))
+    assert prepare(image, spec).flatten().tolist() == [-0.5, 62.75, 63.0]
+
+
+def test_a_yaml_file(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text("size: [384, 1248]\nmean: 0.5\nstd: [1, 2, 3]\nclasses: [car, '-', bus]\nresize: stretch\n")
+    assert load_spec(path) == {
+        "size": (384, 1248),
+        "mean": (0.5, 0.5, 0.5),
+        "std": (1.0, 2.0, 3.0),
+        "classes": ("car", "", "bus"),
+        "resize": "stretch",
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1, 2]", "expected a mapping of settings, found list"),
+        ("sise: 3", "sise: expected one of .*, found an unknown key"),
+        ("size: [1, 2, 3]", r"size: expected a number of px, or \[height, width\], found \[1, 2, 3\]"),
+        ("size: 0", "size: expected a number of px"),
+        ("std: 0", "std: expected a positive number, or three, found 0"),
+        ("resize: crop", "resize: expected letterbox or stretch, found 'crop'"),
+        ("classes: [car, car]", "classes: expected coco, coco91, or a list of names, each once"),
+        ("classes: kitti", "classes: expected coco, coco91"),
+        ("normalised: 1", "normalised: expected true or false, found 1"),
+        ("t_star: 2", r"t_star: expected a number in \[0, 1\], found 2"),
+        ("a: [", "expected a YAML file, found"),
+    ],
+)
+def test_yaml_files_that_are_wrong(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(DetectorError, match=rf"own\.yaml: {message}"):
+        load_spec(path)

@@ -1,0 +1,155 @@
+"""TorchScript and torch.export files and users' classes, with gradients; and what is none of them."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from detectors.base import DetectorError, predict
+from detectors.check import check_detector
+from detectors.registry import load_detector, load_predictor
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "detectors.md"
+SIDE = 64
+CLASSES = "[Car, bus, person]"
+
+
+class Tiny(nn.Module):
+    """YOLOv8's output for an image of 64 x 64: a box of 24 px around each cell of 8 px."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(3, 3, 8, stride=8)
+        with torch.no_grad():
+            self.head.weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+        y, x = torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")
+        centre = torch.stack((x, y)).float().view(1, 2, 64) * 8 + 4
+        self.register_buffer("boxes", torch.cat((centre, torch.full_like(centre, 24.0)), 1))
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.cat((self.boxes, self.head(images).flatten(2).sigmoid()), 1)
+
+
+@pytest.fixture
+def scripted(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.pt"
+    with warnings.catch_warnings():
+        # torch deprecates the writing of TorchScript; files of it stay
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.script(Tiny().eval()).save(str(path))
+    path.with_suffix(".yaml").write_text(f"size: {SIDE}\nclasses: {CLASSES}\nt_star: 0.4\n")
+    return path
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.pt2"
+    torch.export.save(torch.export.export(Tiny().eval(), (torch.zeros(1, 3, SIDE, SIDE),)), path)
+    path.with_suffix(".yaml").write_text(f"classes: {CLASSES}\nt_star: 0.4\n")
+    return path
+
+
+def test_a_torchscript_file_keeps_the_contract(scripted: Path) -> None:
+    detector = load_detector(f"torchscript:{scripted}")
+    assert (detector.name, detector.classes, detector.t_star) == ("tiny", ("Car", "bus", "person"), 0.4)
+    assert check_detector(detector, (64, 96)).require().gradients
+
+
+def test_a_program_of_torch_export_keeps_the_contract(program: Path) -> None:
+    detector = load_detector(f"export:{program}")
+    assert detector.classes == ("Car", "bus", "person")
+    assert check_detector(detector, (64, 96)).require().gradients
+
+
+def test_both_say_what_the_network_says(scripted: Path, program: Path) -> None:
+    image = torch.rand(1, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    raw = Tiny()(image)
+    for name in (f"torchscript:{scripted}", f"export:{program}"):
+        said = load_detector(name)(image)
+        torch.testing.assert_close(said.probabilities, raw[:, 4:].transpose(1, 2))
+        # pixel centres lie at integers, the network counts from the corner
+        torch.testing.assert_close(said.boxes_xyxy[0, 0, 0], torch.tensor([-8.5, -8.5, 15.5, 15.5]))
+
+
+def test_a_file_of_settings_may_be_named(scripted: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.yml"
+    other.write_text(f"size: {SIDE}\nclasses: [a, b, c]\n")
+    assert load_predictor(f"torchscript:{scripted},{other}").classes == ("a", "b", "c")
+
+
+def test_files_that_are_none(tmp_path: Path, scripted: Path) -> None:
+    noise = tmp_path / "noise.pt"
+    noise.write_bytes(b"no network")
+    for kind, what in (("torchscript", "a TorchScript file"), ("export", "a program of torch.export")):
+        with pytest.raises(DetectorError, match=rf"noise\.pt: expected {what}, found \S"):
+            load_detector(f"{kind}:{noise}")
+        with pytest.raises(DetectorError, match=rf"gone\.pt: expected {what}, found none"):
+            load_detector(f"{kind}:{tmp_path / 'gone.pt'}")
+    scripted.with_suffix(".yaml").write_text(f"size: 72\nclasses: {CLASSES}\n")
+    with pytest.raises(DetectorError, match=r"tiny\.pt: expected a network that takes an image of 72 x 72 px"):
+        load_detector(f"torchscript:{scripted}")
+    for name in ("torchscript:", f"torchscript:{scripted},more", "torchvision:a,b,c"):
+        with pytest.raises(DetectorError, match=r"detector: expected torch\w+:WHAT"):
+            load_detector(name)
+    with pytest.raises(DetectorError, match="expected float32 for its gradients"):
+        load_detector(f"torchscript:{scripted}", gradient_precision=torch.bfloat16)
+
+
+@pytest.fixture
+def documented(tmp_path: Path) -> Path:
+    """The class that the docs show."""
+    shown = re.search(r"```python\n# my_detector\.py\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    assert shown is not None
+    assert len(shown[1].splitlines()) <= 30
+    path = tmp_path / "my_detector.py"
+    path.write_text(shown[1])
+    return path
+
+
+def test_the_documented_class_keeps_the_contract(documented: Path) -> None:
+    detector = load_detector(f"module:{documented}:Blobs")
+    assert detector.classes == ("Car", "Pedestrian")
+    assert not any(parameter.requires_grad for parameter in detector.parameters())
+    check_detector(detector, (64, 96)).require()
+    dark = torch.full((1, 3, 64, 96), 0.9)
+    dark[:, :, 16:32, 32:64] = 0.1
+    found = predict(detector, dark)[0]
+    assert len(found)
+    centre = (found.boxes_xyxy[0, :2] + found.boxes_xyxy[0, 2:]) / 2
+    assert 32 <= float(centre[0]) <= 64
+    assert 16 <= float(centre[1]) <= 32
+
+
+def test_a_class_of_an_installed_module() -> None:
+    assert load_detector("module:detectors.squeezedet:SqueezeDet").name == "squeezedet"
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("module:detectors.squeezedet", "module: expected FILE.py:CLASS or PACKAGE.MODULE:CLASS"),
+        ("module:detectors.gone:Net", "module: expected a module detectors.gone"),
+        ("module:gone.py:Net", "gone.py: expected a Python file, found none"),
+        ("module:detectors.squeezedet:Gone", "expected a class Gone, found NoneType"),
+        ("module:pathlib:Path", "expected a Detector or a torch.nn.Module, found PosixPath"),
+    ],
+)
+def test_places_without_a_class(place: str, message: str) -> None:
+    with pytest.raises(DetectorError, match=message):
+        load_detector(place)
+
+
+def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import sys
+
+    for library, name in (("torchvision", "fcos_resnet50_fpn,none"), ("ultralytics", str(tmp_path / "a.pt"))):
+        for module in [m for m in sys.modules if m.split(".")[0] == library]:
+            monkeypatch.delitem(sys.modules, module)
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(DetectorError, match=rf"pip install 'drivesem\[{library}\]'"):
+            load_detector(f"{library}:{name}")

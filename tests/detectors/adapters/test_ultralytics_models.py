@@ -1,0 +1,38 @@
+"""A detector of the Ultralytics package behind the contract; untrained, as its own file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from detectors.base import DetectorError
+from detectors.check import check_detector
+from detectors.registry import load_detector
+
+ultralytics = pytest.importorskip(
+    "ultralytics", reason="Ultralytics is optional: pip install 'drivesem[ultralytics]'"
+)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path / "yolov8n.pt"
+    ultralytics.YOLO("yolov8n.yaml").save(str(path))
+    return path
+
+
+def test_the_contract_is_kept(weights: Path) -> None:
+    detector = load_detector(f"ultralytics:{weights}")
+    assert len(detector.classes) == 80
+    check_detector(detector, (64, 96)).require()
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    noise = tmp_path / "noise.pt"
+    noise.write_bytes(b"nothing")
+    for path, found in ((noise, r"\S"), (tmp_path / "gone.pt", "none")):
+        with pytest.raises(DetectorError, match=rf"{path.name}: expected a \.pt file of Ultralytics, found {found}"):
+            load_detector(f"ultralytics:{path}")

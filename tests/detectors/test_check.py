@@ -1,0 +1,219 @@
+"""The check of the contract: a small detector keeps it, and each way of breaking it is named."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from detectors.adapters.dense import DenseDetector, DensePredictions
+from detectors.base import DetectorError, predict
+from detectors.check import check_detector
+from detectors.squeezedet import SqueezeDet
+from detectors.types import Detections
+
+IMAGE_HW = (64, 96)
+
+
+class Small(DenseDetector):
+    """A convolution over cells of 16 px, each with a box around it."""
+
+    def __init__(self) -> None:
+        super().__init__("small", ("Car", "bus"), 0.5)
+        self.head = nn.Conv2d(3, 2, 16, stride=16)
+        generator = torch.Generator().manual_seed(3)
+        with torch.no_grad():
+            self.head.weight.normal_(0, 0.2, generator=generator)
+
+    def predict(self, images: torch.Tensor) -> DensePredictions:
+        high, wide = images.shape[2:]
+        cells = self.head(F.pad(images, (0, -wide % 16, 0, -high % 16)))
+        rows, columns = cells.shape[2:]
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        corner = torch.stack((x, y), -1).view(1, -1, 1, 2).to(cells) * 16
+        boxes = torch.cat((corner - 12, corner + 28), -1).expand(len(images), -1, -1, -1)
+        return DensePredictions(boxes, cells.flatten(2).transpose(1, 2).sigmoid(), (high, wide))
+
+
+class Detached(Small):
+    def predict(self, images):
+        return super().predict(images.detach() + 0 * images)
+
+
+class Doubled(Small):
+    """A gradient of twice the length."""
+
+    def predict(self, images):
+        return super().predict(2 * images - images.detach())
+
+
+class Painter(Small):
+    def predict(self, images):
+        images.data[:, :, 0, 0] = 0
+        return super().predict(images)
+
+
+class Outside(Small):
+    def decode(self, raw):
+        return [Detections(d.boxes_xyxy + 5, d.labels, d.scores) for d in super().decode(raw)]
+
+
+class WorstFirst(Small):
+    def decode(self, raw):
+        return [Detections(d.boxes_xyxy.flip(0), d.labels.flip(0), d.scores.flip(0)) for d in super().decode(raw)]
+
+
+class OtherLabels(Small):
+    def decode(self, raw):
+        return [Detections(d.boxes_xyxy, d.labels + 1, d.scores) for d in super().decode(raw)]
+
+
+class Moving(Small):
+    """Another answer each time."""
+
+    calls = 0
+
+    def predict(self, images):
+        self.calls += 1
+        return super().predict(images * (1 + 0.1 * self.calls))
+
+
+class Silent(Small):
+    def decode(self, raw):
+        return [Detections(d.boxes_xyxy[:0], d.labels[:0], d.scores[:0]) for d in super().decode(raw)]
+
+
+class Unnamed(Small):
+    def loss(self, raw, targets):
+        return {"total": super().loss(raw, targets)["total"]}
+
+
+class Upwards(Small):
+    """Falls as objects fade: a loss of the wrong sign has its gradient right, but is not the contract's."""
+
+    def loss(self, raw, targets):
+        return {name: term / 0 for name, term in super().loss(raw, targets).items()}
+
+
+class Mixing(Small):
+    """What one image shows changes what is said of the other."""
+
+    def predict(self, images):
+        return super().predict(images + images.mean(0, keepdim=True))
+
+
+class Training(Small):
+    """Dropout that does not ask whether anything can be trained."""
+
+    def train(self, mode=True):
+        self.shaken = mode
+        return self
+
+    def predict(self, images):
+        return super().predict(images * 2 if getattr(self, "shaken", False) else images)
+
+
+def test_a_small_detector_keeps_its_contract() -> None:
+    report = check_detector(Small(), IMAGE_HW)
+    assert report.require() is report
+    assert {finding.verdict for finding in report.findings} == {"ok"}
+    assert report.gradients
+
+
+@pytest.mark.parametrize(
+    ("broken", "promise", "said"),
+    [
+        (Detached, "gradient to the image", "found zero everywhere"),
+        (Doubled, "gradient to the image", "off differences in float64"),
+        (Painter, "image untouched", "found them changed"),
+        (Outside, "detections", "expected inside 0..95 x 0..63"),
+        (WorstFirst, "detections", "expected best first"),
+        (OtherLabels, "detections", "labels: expected 0..1, found 1 to 2"),
+        (Moving, "deterministic", "found another"),
+        (Silent, "planted prediction", "expected the planted box alone, found 0"),
+        (Unnamed, "loss terms", "expected total and objectness, found total"),
+        (Upwards, "loss terms", "expected a finite number"),
+        (Mixing, "batch as singles", "of the detections differ"),
+        (Training, "frozen", "differ after train()"),
+    ],
+)
+def test_what_is_broken_is_named(broken: type[Small], promise: str, said: str) -> None:
+    report = check_detector(broken(), IMAGE_HW)
+    found = {finding.name: finding for finding in report.failed}
+    assert promise in found, report
+    assert said in found[promise].said
+    with pytest.raises(DetectorError, match=f"'small' does not keep its contract: .*{promise}"):
+        report.require()
+
+
+def test_a_detector_without_gradients_is_tried_on_what_it_promises() -> None:
+    class Told:
+        name, classes = "told", ("Car",)
+
+        def forward(self, images):
+            return images
+
+        def decode(self, raw):
+            box = torch.tensor([[1.0, 2, 30, 40]])
+            return [Detections(box, torch.tensor([0]), torch.tensor([0.5])) for _ in raw]
+
+    report = check_detector(Told(), IMAGE_HW)
+    assert not report.failed
+    assert not report.gradients
+    tried = {finding.name for finding in report.findings if finding.verdict == "ok"}
+    assert tried == {"name, classes, t*", "detections", "image untouched", "deterministic", "batch as singles"}
+
+
+def test_raw_predictions_of_ones_own_need_a_hook() -> None:
+    class Own(Small):
+        def predict(self, images):
+            said = super().predict(images)
+            return _Plain(said.boxes_xyxy, said.probabilities, said.image_hw)
+
+    class _Plain(DensePredictions):
+        planted = None
+
+        def one(self, index):
+            said = super().one(index)
+            return _Plain(said.boxes_xyxy, said.probabilities, said.image_hw)
+
+    def plant(raw, box, label):
+        return DensePredictions(raw.boxes_xyxy, raw.probabilities, raw.image_hw).planted(box, label)
+
+    def verdict(report):
+        return next(f.verdict for f in report.findings if f.name == "planted prediction")
+
+    assert verdict(check_detector(Own(), IMAGE_HW, plant=plant)) == "ok"
+    assert verdict(check_detector(Own(), IMAGE_HW, plant=lambda raw, box, label: plant(raw, box + 9, label))) == (
+        "failed"
+    )
+
+
+def test_squeezedet_keeps_the_contract() -> None:
+    detector = SqueezeDet()
+    detector.initialise(torch.Generator().manual_seed(0))
+    check_detector(detector, (64, 128)).require()
+
+
+def test_frozen_weights_stay_in_eval_mode() -> None:
+    detector = SqueezeDet()
+    detector.train()
+    assert detector.training
+    detector.requires_grad_(False)
+    assert not detector.training
+    assert not detector.dropout.training
+    assert not detector.train().training
+    detector.requires_grad_(True)
+    assert detector.train().dropout.training
+
+
+def test_a_planted_prediction_of_squeezedet_is_found() -> None:
+    detector = SqueezeDet()
+    raw = detector(torch.full((1, 3, 64, 128), 0.5))
+    box = torch.tensor([20.0, 10, 90, 50])
+    (found,) = detector.decode(raw.planted(box, 2))
+    assert found.labels.tolist() == [2]
+    torch.testing.assert_close(found.boxes_xyxy, box[None])
+    assert float(found.scores[0]) > 0.999
+    assert len(predict(detector, torch.full((1, 3, 64, 128), 0.5))) == 1

@@ -1,0 +1,48 @@
+"""`drivesem check`: the table, the JSON, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from drivesem.cli import main
+
+BROKEN = """
+import torch
+from detectors.squeezedet import SqueezeDet
+
+class Broken(SqueezeDet):
+    def loss(self, raw, targets):
+        return {"total": super().loss(raw, targets)["total"]}
+"""
+
+
+def test_a_detector_that_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--detector", "module:detectors.squeezedet:SqueezeDet", "--size", "96x64", "--json"]) in (0, 1)
+    said = json.loads(capsys.readouterr().out)
+    verdicts = {finding["name"]: finding["verdict"] for finding in said["findings"]}
+    assert said["gradients"]
+    assert verdicts["planted prediction"] == verdicts["gradient to the image"] == verdicts["frozen"] == "ok"
+
+
+def test_a_broken_one_ends_in_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "broken.py"
+    path.write_text(BROKEN)
+    assert main(["check", "--detector", f"module:{path}:Broken", "--size", "96x64"]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "loss terms failed loss: expected total and objectness, found total" in said
+    assert "broken" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--detector", "yolo9"], "--detector: expected a detector, found detector: expected one of"),
+        (["--detector", "squeezedet", "--size", "32x32"], "--size: expected WIDTHxHEIGHT, each at least 64 px"),
+    ],
+)
+def test_bad_input_ends_in_2(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", *words]) == 2
+    assert message in capsys.readouterr().err
