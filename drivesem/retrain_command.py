@@ -33,7 +33,7 @@ from drivesem.evaluation.coco import ClassScores
 from drivesem.judged import JudgedClasses
 from drivesem.labels import LabelMode
 from drivesem.pipeline import as_targets
-from drivesem.run_folder import CONFIG, PRESENTATION, claim
+from drivesem.run_folder import CONFIG, claim
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore
@@ -47,7 +47,7 @@ FRESH, CACHE = "fresh", "cache"
 """Folders: the new attack's run, decoded frames."""
 _FRESH_OF = "fresh_of.txt"
 """Digest of the weights that the new attack was against."""
-_FREE = ("minutes", "checkpoint_every", "fresh")
+_FREE = ("out", "workers", "keep_going", "resume", "json", "minutes", "checkpoint_every", "fresh")
 """Settings that a run may change on the way."""
 
 
@@ -79,7 +79,7 @@ def run(config: Retrain) -> int:
     start = config.start or attack.detector
     before, after = _detector(start, config.device), _detector(start, config.device)
     out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
-    claim(out, config, _clear, (*PRESENTATION, *_FREE))
+    claim(out, config, _clear, _FREE)
     mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)
     _train(config, after, mixture, out, console)
     found = look(after, kept_out, "benign", config.device)

@@ -26,7 +26,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.config import SYNTH, Train, UsageError, command_line, interval, numbers, processes, size_hw
 from drivesem.data.joined import open_folders
-from drivesem.run_folder import PRESENTATION, claim
+from drivesem.run_folder import claim
 from drivesem.training import keeper
 from drivesem.training.card import Recipe
 from drivesem.training.frames import FrameStore
@@ -39,7 +39,10 @@ CACHES = "cache"
 """Folder of decoded frames in the run's folder."""
 SEMANTIC = "semantic"
 """Folder of perturbed frames in the run's folder."""
-_FREE = ("minutes", "checkpoint_every", "evaluate_every", "thin", "loaders", "note", "also", "weights", "device")
+_FREE = (
+    *("out", "workers", "keep_going", "resume", "json", "device", "loaders"),
+    *("minutes", "checkpoint_every", "evaluate_every", "thin", "note", "also", "weights"),
+)
 """Settings that a run may change on the way."""
 _NOT_IN_COMMAND = ("out", "weights", "json", "resume", "workers", "loaders", "note", "limit")
 """Settings that a card's command need not repeat."""
@@ -53,7 +56,7 @@ def run(config: Train) -> int:
         detector = architecture(config.detector)
         out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
         if rank == 0:
-            claim(out, config, _clear, (*PRESENTATION, *_FREE))
+            claim(out, config, _clear, _FREE)
         frames, held_out = _data(config, out, detector, rank, console)
         detector, start = _begin(config, detector, frames)
         detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

@@ -20,7 +20,7 @@ class Broken(SqueezeDet):
 
 
 def test_a_detector_that_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "--detector", "module:detectors.squeezedet:SqueezeDet", "--size", "96x64", "--json"]) in (0, 1)
+    assert main(["check", "--detector", "squeezedet", "--size", "96x64", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     verdicts = {finding["name"]: finding["verdict"] for finding in said["findings"]}
     assert said["gradients"]

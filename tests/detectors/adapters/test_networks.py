@@ -48,7 +48,7 @@ def scripted(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def program(tmp_path: Path) -> Path:
-    path = tmp_path / "tiny.pt2"
+    path = tmp_path / "exported.pt2"
     torch.export.save(torch.export.export(Tiny().eval(), (torch.zeros(1, 3, SIDE, SIDE),)), path)
     path.with_suffix(".yaml").write_text(f"classes: {CLASSES}\nt_star: 0.4\n")
     return path

@@ -1,4 +1,4 @@
-"""torchvision's detection models behind the contract; untrained, with their normalisation settled on one picture."""
+"""torchvision's detection models behind the contract; untrained, their normalisation settled on one picture."""
 
 from __future__ import annotations
 

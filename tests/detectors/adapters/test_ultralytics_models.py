@@ -34,5 +34,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     noise = tmp_path / "noise.pt"
     noise.write_bytes(b"nothing")
     for path, found in ((noise, r"\S"), (tmp_path / "gone.pt", "none")):
-        with pytest.raises(DetectorError, match=rf"{path.name}: expected a \.pt file of Ultralytics, found {found}"):
+        with pytest.raises(
+            DetectorError, match=rf"{path.name}: expected a \.pt file of Ultralytics, found {found}"
+        ):
             load_detector(f"ultralytics:{path}")
