@@ -292,12 +292,13 @@ def _cells(row: Row) -> list[str]:
 
 def _print(rows: Sequence[Row], console: Console) -> None:
     table = Table(title="Car, %, on frames that were not trained on", title_justify="left")
-    for title in ("frames", "labels", "detector"):
-        table.add_column(title)
-    for title in (*_TITLES, "objects", "frames broken"):
+    table.add_column("frames, labels")
+    table.add_column("detector")
+    for title in ("AP50", "recall", "at t*", "broken"):
         table.add_column(title, justify="right")
     for row in rows:
-        table.add_row(*_cells(row))
+        numbers = (row.scores.ap50, row.scores.recall, row.scores.recall_at_t_star, row.broken)
+        table.add_row(f"{row.frames}, {row.labels}", row.detector, *(percent(number) for number in numbers))
     console.print(table)
 
 
