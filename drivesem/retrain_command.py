@@ -185,7 +185,7 @@ def _train(config: Retrain, detector: Detector, mixture: Mixture, out: Path, con
         detector.overlap_weight = config.overlap_weight
     detector.requires_grad_(True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("retraining", total=config.steps)
 
         def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
