@@ -54,11 +54,14 @@ def run(config: Train) -> int:
         console = Console(stderr=True, quiet=rank > 0)
         settings = _settings(config)
         detector = architecture(config.detector)
+        start = _begin(config, detector)  # before the folder is made: bad settings leave nothing behind
         out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
         if rank == 0:
             claim(out, config, _clear, _FREE)
         frames, held_out = _data(config, out, detector, rank, console)
-        detector, start = _begin(config, detector, frames)
+        if config.anchors == "kmeans":
+            detector = _with_own_anchors(config, frames)
+            start = _begin(config, detector)
         detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         weights = Path(config.weights or out / f"{config.detector}.safetensors")
         tell = partial(console.print, soft_wrap=True)
@@ -140,20 +143,23 @@ def _settings(config: Train) -> TrainingSettings:
     )
 
 
-def _begin(config: Train, detector: Detector, frames: FrameStore) -> tuple[Detector, str]:
-    if config.anchors == "kmeans":
-        try:
-            anchors = frames.anchors(config.seed)
-        except ValueError as error:
-            raise UsageError("--anchors", "more different boxes for kmeans", error) from error
-        detector = architecture(config.detector, anchors)
+def _begin(config: Train, detector: Detector) -> str:
+    """Give the detector its first weights and settings; a sentence about where they come from."""
     start = begin(detector, config.start, config.seed)
     set_dropout(detector, config.dropout)
     if isinstance(detector, SqueezeDet):
         detector.overlap_weight = config.overlap_weight
     elif config.overlap_weight:
         raise UsageError("--overlap-weight", f"0 with --detector {config.detector}", config.overlap_weight)
-    return detector, start
+    return start
+
+
+def _with_own_anchors(config: Train, frames: FrameStore) -> Detector:
+    try:
+        anchors = frames.anchors(config.seed)
+    except ValueError as error:
+        raise UsageError("--anchors", "more different boxes for kmeans", error) from error
+    return architecture(config.detector, anchors)
 
 
 def _data(

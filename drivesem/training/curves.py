@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drivesem.eval_plots import COLOURS, LINES, STYLE
 from scene_ir import files
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _SIZE_IN, _DPI = (7.0, 7.4), 130
 _SMOOTHED_OVER = 0.02
@@ -50,7 +54,9 @@ def draw(log: Path, evaluations: Path, out: Path, title: str) -> None:
         return
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        loss, marks, rate = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2.2, 1))
+        heights = (3, 2.2, 1) if judged else (3, 1)
+        panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+        loss, rate = panels[0], panels[-1]
         over = max(round(len(steps["step"]) * _SMOOTHED_OVER), 1)
         terms = [name for name in steps if name not in _FACTS]
         for i, name in enumerate(terms):
@@ -67,20 +73,8 @@ def draw(log: Path, evaluations: Path, out: Path, title: str) -> None:
         loss.set(ylabel="loss", yscale="log")
         loss.set_title(title, loc="left", fontsize=11)
         loss.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=max(len(terms), 1))
-        for i, name in enumerate(name for name in EVALUATED if name in judged):
-            marks.plot(
-                judged["step"],
-                100 * judged[name],
-                LINES[i % len(LINES)],
-                color=COLOURS[i],
-                label=name.replace("_", " ").replace("ap50", "AP50").replace("car", "Car").replace("f1", "F1"),
-                linewidth=1.8,
-                marker="o",
-                markersize=4,
-            )
-        marks.set(ylabel="held out, %", ylim=(0, 102))
         if judged:
-            marks.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(EVALUATED))
+            _draw_marks(panels[1], judged)
         rate.plot(steps["step"], steps["rate"], color=COLOURS[0], linewidth=1.5)
         rate.set(ylabel="rate", xlabel="steps", ylim=(0, None))
         rate.ticklabel_format(axis="y", style="sci", scilimits=(-_MOST_DIGITS, _MOST_DIGITS))
@@ -88,3 +82,19 @@ def draw(log: Path, evaluations: Path, out: Path, title: str) -> None:
         # no date and no version in the file: equal figures give equal bytes
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     files.write_bytes(out, buffer.getvalue())
+
+
+def _draw_marks(axes: Axes, judged: Mapping[str, np.ndarray]) -> None:
+    for i, name in enumerate(name for name in EVALUATED if name in judged):
+        axes.plot(
+            judged["step"],
+            100 * judged[name],
+            LINES[i % len(LINES)],
+            color=COLOURS[i],
+            label=name.replace("_", " ").replace("ap50", "AP50").replace("car", "Car").replace("f1", "F1"),
+            linewidth=1.8,
+            marker="o",
+            markersize=4,
+        )
+    axes.set(ylabel="held out, %", ylim=(0, 102))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(EVALUATED))
