@@ -89,8 +89,8 @@ class Unnamed(Small):
         return {"total": super().loss(raw, targets)["total"]}
 
 
-class Upwards(Small):
-    """Falls as objects fade: a loss of the wrong sign has its gradient right, but is not the contract's."""
+class Boundless(Small):
+    """A loss that is no finite number."""
 
     def loss(self, raw, targets):
         return {name: term / 0 for name, term in super().loss(raw, targets).items()}
@@ -133,7 +133,7 @@ def test_a_small_detector_keeps_its_contract() -> None:
         (Moving, "deterministic", "found another"),
         (Silent, "planted prediction", "expected the planted box alone, found 0"),
         (Unnamed, "loss terms", "expected total and objectness, found total"),
-        (Upwards, "loss terms", "expected a finite number"),
+        (Boundless, "loss terms", "expected a finite number"),
         (Mixing, "batch as singles", "of the detections differ"),
         (Training, "frozen", "differ after train()"),
     ],

@@ -80,7 +80,7 @@ def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
     data = transfer("--run", run, "--detectors", "squeezedet", "--bootstrap", "10")
     out = run / "transfer"
     assert json.loads((out / "transfer.json").read_text()) == data
-    (line,) = csv.DictReader((out / "transfer.csv").open())
+    (line,) = csv.DictReader((out / "transfer.csv").read_text().splitlines())
     assert float(line["moved_ap50"]) == data["rows"][0]["moved_ap50"]
     assert "| source | squeezedet | moved |" in (out / "transfer.md").read_text()
     picture = cv2.imread(str(out / "transfer.png"))

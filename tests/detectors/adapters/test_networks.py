@@ -27,6 +27,7 @@ class Tiny(nn.Module):
         self.head = nn.Conv2d(3, 3, 8, stride=8)
         with torch.no_grad():
             self.head.weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+            self.head.bias.zero_()
         y, x = torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")
         centre = torch.stack((x, y)).float().view(1, 2, 64) * 8 + 4
         self.register_buffer("boxes", torch.cat((centre, torch.full_like(centre, 24.0)), 1))
