@@ -141,11 +141,25 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 
 
 def write_weights(path: Path, metadata: dict[str, str], tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file, so that a reader sees the old or the new one, never a part. Makes the folder."""
+    """Write a safetensors file, so that a reader sees the old or the new one, never a part. Makes the folder.
+
+    The same content gives the same bytes.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(save(tensors, metadata))
+    temporary.write_bytes(_in_order(save(tensors, metadata)))
     os.replace(temporary, path)
+
+
+def _in_order(data: bytes) -> bytes:
+    """A safetensors file with its metadata sorted by name: the library writes them in an order of chance."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start])
+    if "__metadata__" in header:
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of 8
+    return len(text).to_bytes(8, "little") + text + data[start:]
 
 
 def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:

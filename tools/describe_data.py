@@ -1,6 +1,6 @@
 """What folders of generated frames were made of: the vehicle shapes and surroundings that their frames show.
 
-    python tools/describe_data.py build/plain build/pack --out detectors/weights/train_data.json
+    python tools/describe_data.py build/plain build/pack --out detectors/weights/squeezedet_data.json
 
 The result goes beside the weights that were trained on the folders, so that a test can show that no demo scene,
 and no frame that they were judged by, shares anything with them.

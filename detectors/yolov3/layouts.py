@@ -1,4 +1,4 @@
-"""The published networks, and the slim one that is shipped, as `.cfg` descriptions for any number of classes."""
+"""The published networks, and a slim one, as `.cfg` descriptions for any number of classes."""
 
 from __future__ import annotations
 

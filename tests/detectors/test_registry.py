@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from detectors.base import DetectorError
-from detectors.registry import SHIPPED, load_detector, save_detector
+from detectors.registry import SHIPPED, load_detector, read_weights, save_detector, write_weights
 from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet, SqueezeDetPlus
 
 
@@ -122,3 +122,14 @@ def test_shipped_detector_is_whole() -> None:
     assert isinstance(detector, SqueezeDet)
     assert detector.anchors == ANCHOR_SIZES_WH
     assert f"{detector.t_star:.3f}" in card.read_text()
+
+
+def test_the_same_weights_give_the_same_bytes(tmp_path: Path) -> None:
+    facts = dict.fromkeys("zyxwvutsrq", "größer")
+    tensors = {"a": torch.arange(5.0), "b.c": torch.ones(3, 2, dtype=torch.float16)}
+    for i in range(6):
+        write_weights(tmp_path / f"{i}.safetensors", facts, tensors)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+    found, read = read_weights(tmp_path / "0.safetensors")
+    assert found == facts
+    assert all(torch.equal(read[name], tensor) for name, tensor in tensors.items())

@@ -21,7 +21,7 @@ SHAPES = ("vehicles", "building", "tree", "bush", "surface")
     ids=lambda i: f"demo-{i:03d}",
 )
 def test_demo_scenes_are_held_out(index: int) -> None:
-    trained_on = json.loads((WEIGHTS / "train_data.json").read_text())
+    trained_on = json.loads((WEIGHTS / "squeezedet_data.json").read_text())
     provenance = demo_scene(0, index).provenance
     assert int(provenance["seed"]) not in trained_on["seed"] or provenance["split"] not in trained_on["split"]
     for kind in SHAPES:
@@ -31,7 +31,7 @@ def test_demo_scenes_are_held_out(index: int) -> None:
 
 
 def test_the_cards_held_out_frames_are_held_out() -> None:
-    trained_on = json.loads((WEIGHTS / "train_data.json").read_text())
+    trained_on = json.loads((WEIGHTS / "squeezedet_data.json").read_text())
     judged_by = json.loads((WEIGHTS / "heldout_data.json").read_text())
     assert judged_by["frames"] >= 500
     for kind in ("split", "seed", *SHAPES):
