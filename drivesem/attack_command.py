@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import shlex
 import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,8 @@ from drivesem.attacks.cma_es import CMAES
 from drivesem.attacks.fgsm import FGSM
 from drivesem.attacks.sampling import Sampling
 from drivesem.attacks.si_fgsm import SiFGSM
-from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError
+from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError, command_line
+from drivesem.devices import check_device
 from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
@@ -42,6 +42,8 @@ from scene_ir import files
 from scene_ir.compositor import RenderSettings
 from scene_ir.errors import SceneError
 
+_NOT_TOLD = ("out", "json", "resume", "workers")
+"""Settings that change nothing in the result: left out of the report's command line."""
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -58,7 +60,7 @@ def run(config: Attack) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     params = _params(config)
-    _check_device(config.device)
+    check_device(config.device)
     worker = _Worker(config, params)
     out = Path(config.out) if config.out else Path("runs") / _name(config, params)
     claim(out, config, _clear)
@@ -92,7 +94,8 @@ def _attacked(
     summary = _summary(config, worker.params, worker.detector, results, without_vehicles, failed, out, start)
     files.write_json(out / "metrics.json", summary.to_json())
     files.write_json(out / "manifest.json", _manifest(config, out, done))
-    files.write_text(out / "report.html", render_report(summary, results, out, _command(config)))
+    command = command_line("attack", config, _NOT_TOLD)
+    files.write_text(out / "report.html", render_report(summary, results, out, command))
     return summary
 
 
@@ -138,7 +141,7 @@ def attack_method(config: Attack) -> AttackMethod:
     steps = config.steps if config.range == "steps" else None
     if config.method == "cma-es":
         return CMAES(queries, steps, config.early_stop)
-    return Sampling(config.method, queries, steps, config.early_stop)
+    return Sampling(queries, steps, config.early_stop, config.method)
 
 
 def _detector(config: Attack, needs_gradient: bool) -> Predictor:
@@ -218,15 +221,6 @@ def _clear(out: Path) -> None:
         shutil.rmtree(out / "frames")
 
 
-def _check_device(device: str) -> None:
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(
-            "--device", "a torch device of this machine", f"{device!r}: {error}".split("\n")[0]
-        ) from error
-
-
 def _summary(
     config: Attack,
     params: tuple[Parameter, ...],
@@ -293,20 +287,6 @@ def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(files.read_bytes(path)).hexdigest()
-
-
-def _command(config: Attack) -> str:
-    """The command line that gives this configuration."""
-    words = ["drivesem", "attack"]
-    default = Attack()
-    for key, value in asdict(config).items():
-        if value == getattr(default, key) or key in ("out", "json", "resume", "workers"):
-            continue
-        flag = key.replace("_", "-")
-        words += (
-            [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
-        )
-    return shlex.join(words)
 
 
 def _print(summary: RunSummary, console: Console) -> None:

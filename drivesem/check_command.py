@@ -15,6 +15,7 @@ from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
 from drivesem.config import Check, UsageError
+from drivesem.devices import check_device
 
 LEAST_SIDE = 64
 """Of a picture, px: its blocks must be larger than a network's stride."""
@@ -24,6 +25,7 @@ _STYLES = {"ok": "green", "failed": "bold red", "not tried": "dim"}
 def run(config: Check) -> int:
     """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input."""
     width, height = _size(config.size)
+    check_device(config.device)
     try:
         detector = load_predictor(config.detector, config.device, config.tiles)
     except DetectorError as error:

@@ -19,6 +19,7 @@ from detectors.registry import load_predictor
 from detectors.types import Detections, Targets
 from drivesem.config import Eval, UsageError
 from drivesem.data.registry import Dataset, open_dataset
+from drivesem.devices import check_device
 from drivesem.eval_outcome import Outcome, marked
 from drivesem.eval_report import percent
 from drivesem.evaluation import coco
@@ -34,6 +35,7 @@ from scene_ir.types import Labels
 
 def run(config: Eval) -> int:
     """Run the detector over the frames, count, report; exit code 0. UsageError or SceneError for bad input."""
+    check_device(config.device)
     dataset = open_dataset(config.dataset, Path(config.root or ""))
     detector = _detector(config)
     names = dataset.identifiers[: config.limit]

@@ -40,6 +40,7 @@ from detectors.base import DetectorError, RawPredictions
 from detectors.registry import load_detector
 from detectors.squeezedet import Assignment, SqueezeDet
 from drivesem.config import Attack, Gradcheck, UsageError, processes
+from drivesem.devices import check_device
 from drivesem.feasible import FeasibleSet
 from drivesem.labels import Labeller
 from drivesem.pool import outcomes
@@ -457,6 +458,7 @@ class _Worker:
 
     def __init__(self, config: Gradcheck) -> None:
         self.config = config
+        check_device(config.device)
         attack = Attack(
             dataset=config.dataset, root=config.root, fit=config.fit, seed=config.seed, limit=config.limit
         )

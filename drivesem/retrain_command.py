@@ -28,6 +28,7 @@ from detectors.types import CLASSES, Detections
 from drivesem.attack_command import attack_frames
 from drivesem.config import Attack, Retrain, UsageError, size_hw
 from drivesem.data.registry import open_dataset
+from drivesem.devices import check_device
 from drivesem.eval_report import percent
 from drivesem.evaluation.coco import ClassScores
 from drivesem.judged import JudgedClasses
@@ -73,6 +74,7 @@ class Row:
 def run(config: Retrain) -> int:
     """Retrain, or go on with it; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
+    check_device(config.device)
     attack = _attack_of(Path(config.run))
     frames = frames_of(Path(config.run))
     kept_out, learned = _divided(frames, config)

@@ -26,6 +26,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.config import SYNTH, Train, UsageError, command_line, interval, numbers, processes, size_hw
 from drivesem.data.joined import open_folders
+from drivesem.devices import check_device
 from drivesem.run_folder import claim
 from drivesem.training import keeper
 from drivesem.training.card import Recipe
@@ -249,27 +250,19 @@ def _names(folders: str) -> str:
 def _processes(config: Train) -> Iterator[tuple[int, str]]:
     """This process's number and its device; a process group where torchrun started several."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        _check_device(config.device)
+        check_device(config.device)
         yield 0, config.device
         return
     device = config.device
     if device == "cuda":
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
         torch.cuda.set_device(device)
-    _check_device(device)
+    check_device(device)
     distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
     try:
         yield distributed.get_rank(), device
     finally:
         distributed.destroy_process_group()
-
-
-def _check_device(device: str) -> None:
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        found = f"{device!r}: {error}".split("\n")[0]
-        raise UsageError("--device", "a torch device of this machine", found) from error
 
 
 def _bar(console: Console) -> Progress:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.attacks.base import Attack, Problem, Proposals
-from drivesem.attacks.trials import Trials
-from scene_ir.errors import RangeError
+from drivesem.attacks.base import Problem, Proposals
+from drivesem.attacks.trials import Search, Trials
 
 _SIGMA = 0.25
 """First standard deviation, as a share of the box: the library's advice is a quarter of a search interval."""
@@ -27,24 +26,8 @@ tell nothing about. Above, its diagonal (Ros and Hansen 2008)."""
 
 
 @dataclass(frozen=True, slots=True)
-class CMAES(Attack):
-    """Starts at theta0; each sample is projected and judged. The library sees the sample, and the loss of its
-    projection.
-
-    steps, early_stop: as of `drivesem.attacks.sampling.Sampling`.
-    """
-
-    queries: int = 64
-    steps: int | None = None
-    early_stop: bool = False
-
-    needs_gradient: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if self.queries < 1:
-            raise RangeError("queries", "at least 1", self.queries)
-        if self.steps is not None and self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+class CMAES(Search):
+    """Starts at theta0. The library sees the sample, and the loss of its projection."""
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from scipy.stats import qmc
 from torch import Tensor
 
-from drivesem.attacks.base import Attack, Problem, Proposals
-from drivesem.attacks.trials import Trials
-from scene_ir.errors import RangeError
+from drivesem.attacks.base import Problem, Proposals
+from drivesem.attacks.trials import Search, Trials
 
 Kind = Literal["random", "halton", "sobol"]
 """random: independent and uniform; halton, sobol: low-discrepancy sequences, scrambled (Owen 2017, Matousek 1998,
@@ -21,25 +20,10 @@ as scipy.stats.qmc has them)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sampling(Attack):
-    """As many thetas as there are queries, each projected and judged; the detector's gradient is not asked for.
-
-    steps: samples lie within so many steps of theta0, or anywhere within the bounds where it is None. early_stop:
-    end at the first that fails the detector under `moved` labels.
-    """
+class Sampling(Search):
+    """Thetas that do not depend on what was found before."""
 
     kind: Kind = "random"
-    queries: int = 64
-    steps: int | None = None
-    early_stop: bool = False
-
-    needs_gradient: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if self.queries < 1:
-            raise RangeError("queries", "at least 1", self.queries)
-        if self.steps is not None and self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)

@@ -7,10 +7,33 @@ set leaves the cache (measured: 97 ms for an image by itself, 123 ms in a batch 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torch import Tensor
 
-from drivesem.attacks.base import Problem, Proposals
+from drivesem.attacks.base import Attack, Problem, Proposals
+from scene_ir.errors import RangeError
+
+
+@dataclass(frozen=True, slots=True)
+class Search(Attack):
+    """An attack that projects and judges `queries` thetas; the detector's gradient is not asked for.
+
+    steps: thetas lie within so many steps of theta0, or anywhere within the bounds where it is None. early_stop:
+    end at the first that fails the detector under `moved` labels. RangeError for fewer than 1 query or step.
+    """
+
+    queries: int = 64
+    steps: int | None = None
+    early_stop: bool = False
+
+    needs_gradient: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.queries < 1:
+            raise RangeError("queries", "at least 1", self.queries)
+        if self.steps is not None and self.steps < 1:
+            raise RangeError("steps", "at least 1", self.steps)
 
 
 @dataclass(slots=True)

@@ -204,7 +204,7 @@ def test_a_search_pays_for_each_theta_once(street):
     detector = Spotter(scene.objects.box2d)
     objective = _objective(scene, detector, term="objectness")
     problem = objective.problem(FeasibleSet(objective.space))
-    result = Sampling("halton", queries=6)(problem, objective.space.theta0, seed=1)
+    result = Sampling(queries=6, kind="halton")(problem, objective.space.theta0, seed=1)
     assert result.queries == 6
     assert detector.looks == 7
     assert result.score == objective.score(result.theta)

@@ -16,7 +16,7 @@ STEP = torch.tensor([0.01, 0.02, 0.0, 0.05])
 LOWER, UPPER = torch.tensor([-0.5, -0.5, -0.5, 0.0]), torch.tensor([0.5, 0.5, 0.5, 1.0])
 START = torch.zeros(4)
 GOAL = torch.tensor([0.3, -0.4, 0.1, 0.8])
-SEARCHES = [Sampling("random"), Sampling("halton"), Sampling("sobol"), CMAES()]
+SEARCHES = [Sampling(kind="random"), Sampling(kind="halton"), Sampling(kind="sobol"), CMAES()]
 
 
 class World:
@@ -98,7 +98,7 @@ def test_small_range_is_what_steps_reach_inside_the_bounds(kind):
     assert bool((found[:, 2] == 0).all())
 
 
-@pytest.mark.parametrize("attack", [Sampling("halton", early_stop=True), CMAES(early_stop=True)])
+@pytest.mark.parametrize("attack", [Sampling(kind="halton", early_stop=True), CMAES(early_stop=True)])
 def test_early_stop_ends_at_the_first_success(attack):
     world = World()
     proposals = attack._propose(world.problem, START, torch.Generator().manual_seed(1))
@@ -108,7 +108,7 @@ def test_early_stop_ends_at_the_first_success(attack):
 
 def test_sequences_fill_the_box_more_evenly_than_chance():
     def emptiest(kind: str) -> int:
-        places = Sampling(kind, queries=64)._places(2, torch.Generator().manual_seed(0))
+        places = Sampling(kind=kind, queries=64)._places(2, torch.Generator().manual_seed(0))
         cells = (places * 4).long()
         return int(torch.bincount(cells[:, 0] * 4 + cells[:, 1], minlength=16).min())
 
@@ -119,7 +119,7 @@ def test_sequences_fill_the_box_more_evenly_than_chance():
 
 @pytest.mark.parametrize("queries", [1, 3, 17])
 def test_any_number_of_queries_is_kept_to(queries):
-    for attack in (Sampling("sobol", queries), Sampling("halton", queries), CMAES(queries)):
+    for attack in (Sampling(queries, kind="sobol"), Sampling(queries, kind="halton"), CMAES(queries)):
         assert attack(World().problem, START).queries == queries
 
 

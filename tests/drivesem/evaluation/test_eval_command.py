@@ -313,6 +313,7 @@ def test_one_line_and_exit_code_2(run: Run, tmp_path: Path, name: str, message: 
             "--pictures: expected --detector and --out",
         ),
         (("--detector", "squeezedet", "--root", ".", "--pictures", "-1"), "--pictures: expected at least 0"),
+        (("--detector", "squeezedet", "--root", ".", "--device", "fpga"), "--device: expected a torch device"),
         (("--detector", "squeezedet"), "--root: expected the folder of data set 'kitti', found nothing"),
         (("--gt", "a", "--pred", "b", "--bootstrap", "-1"), "--bootstrap: expected at least 0, found -1"),
         (("--detector", "retinanot", "--root", "."), "image_2"),
