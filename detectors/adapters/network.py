@@ -92,7 +92,7 @@ class NetworkDetector(DenseDetector):
         size = asked.size or PROBE_HW
         try:
             outputs = self._outputs(torch.full((1, 3, *size), 0.5), asked)
-        except (RuntimeError, TypeError, ValueError, AssertionError, NotImplementedError) as error:
+        except (RuntimeError, TypeError, ValueError, AssertionError) as error:
             raise DetectorError(
                 f"{where}: expected a network that takes an image of {size[0]} x {size[1]} px (`size` and `input` "
                 f"in a YAML file say otherwise), found {_last_line(error)}"
