@@ -1,9 +1,12 @@
-"""ONNX files made by hand: a graph with one image input and constant outputs, as protocol buffers."""
+"""ONNX files made by hand: a graph with one image input and constant outputs, as protocol buffers; and random
+networks that are fit to be tested."""
 
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pytest
+import torch
+from torch import nn
 
 
 def _number(value: int) -> bytes:
@@ -48,3 +51,20 @@ def _constant_graph(input_shape: Sequence[int | str], outputs: Mapping[str, np.n
 def constant_graph() -> Callable[..., bytes]:
     """The maker of such files."""
     return _constant_graph
+
+
+@pytest.fixture
+def settle() -> Callable[[nn.Module, object], None]:
+    """Gives a random network the statistics of what it is fed, and eval mode. With those that it is made with,
+    activations fade from layer to layer until gradients are lost in rounding.
+    """
+
+    @torch.no_grad()
+    def settle(network: nn.Module, fed: object) -> None:
+        for norm in (m for m in network.modules() if isinstance(m, nn.BatchNorm2d)):
+            norm.momentum = 1.0
+            norm.training = True
+        network(fed)
+        network.eval()
+
+    return settle

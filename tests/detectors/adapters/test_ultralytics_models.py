@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from detectors.base import DetectorError
 from detectors.check import check_detector
@@ -17,10 +19,12 @@ ultralytics = pytest.importorskip(
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def weights(tmp_path: Path, settle: Callable[[nn.Module, object], None]) -> Path:
     torch.manual_seed(0)
     path = tmp_path / "yolov8n.pt"
-    ultralytics.YOLO("yolov8n.yaml").save(str(path))
+    yolo = ultralytics.YOLO("yolov8n.yaml")
+    settle(yolo.model, torch.rand(2, 3, 64, 96))
+    yolo.save(str(path))
     return path
 
 
