@@ -11,19 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors import boxes, frozen
+from detectors import boxes, frozen, grid, quality
 from detectors.base import Detector, RawPredictions
 from detectors.types import CLASSES, Detections, Targets
-
-STRIDE = 16
-"""Pixels a grid cell: conv1 and three poolings halve the image."""
 
 ANCHOR_SIZES_WH = (
     (36.0, 37.0),
@@ -41,28 +37,17 @@ ANCHOR_SIZES_WH = (
 BGR_MEAN = (103.939, 116.779, 123.68)
 """Subtracted from pixels in 0..255: the mean of ImageNet that the backbone's weights were trained with."""
 
-EXP_THRESHOLD = 1.0
-"""Beyond this log-size the exponential goes on as its tangent (published code, EXP_THRESH)."""
-
 WEIGHT_BOX = 5.0
 WEIGHT_CONFIDENCE_POSITIVE = 75.0
 WEIGHT_CONFIDENCE_NEGATIVE = 100.0
 WEIGHT_CLASS = 1.0
 """Weights of the loss terms (published code, LOSS_COEF_*)."""
 
-MEETING_IOU = 0.5
-"""Overlap from which a predicted box meets an object, as in the evaluation."""
-
-TOP_DETECTIONS = 64
+TOP_DETECTIONS = 256
 NMS_IOU = 0.4
 SCORE_MINIMUM = 0.005
-"""Decoding (published code: TOP_N_DETECTION, NMS_THRESH, PROB_THRESH)."""
-
-IGNORE_OVERLAP = 0.5
-"""An anchor that overlaps an ignored box more than this is no negative."""
-
-Sizes = tuple[tuple[float, float], ...]
-"""Width and height of each anchor, px."""
+"""Decoding (published code: TOP_N_DETECTION, NMS_THRESH, PROB_THRESH). It takes the 64 best: in full streets these
+are the many boxes of the near cars, and far ones are lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +137,9 @@ class Assignment:
     """Which anchors answer for which objects; holds no gradient. K objects of the batch that are not ignored.
 
     image, anchor (K,) int64; confidence (K,), the IoU of predicted and true box; deltas (K, 4); labels (K,) int64;
-    negative (B, A) bool, the anchors that must stay silent. found_by (K,) int64: the most confident of the anchors
-    whose predicted boxes meet the object (IoU of at least 0.5); found (K,) bool: whether there is any.
+    negative (B, A) bool, the anchors that must stay silent; alarm (B, A) bool, those of them whose predicted boxes
+    meet no object (IoU of at least 0.5). found_by (K,) int64: the most confident of the anchors whose predicted
+    boxes meet the object; found (K,) bool: whether there is any.
     """
 
     image: Tensor
@@ -162,6 +148,7 @@ class Assignment:
     deltas: Tensor
     labels: Tensor
     negative: Tensor
+    alarm: Tensor
     found_by: Tensor
     found: Tensor
 
@@ -171,7 +158,7 @@ class SqueezeDet(Detector):
 
     In eval mode with all weights frozen it runs as `detectors.frozen` has it. gradient_precision: what passes
     compute in that a gradient to the images may follow; the others, which judge, always use the weights' own.
-    overlap_weight: of 1 - generalised IoU, averaged over objects, in the box term; 0 is the published loss.
+    trained_by: the loss, as published or `detectors.quality`'s; weights files do not carry it.
     """
 
     name = "squeezedet"
@@ -200,7 +187,7 @@ class SqueezeDet(Detector):
         self.fires = nn.ModuleDict(fires)
         self.dropout = SeededDropout(dropout)
         self.convdet = nn.Conv2d(inputs, len(self.anchors) * (len(self.classes) + 1 + 4), 3, padding=1)
-        self.overlap_weight = 0.0
+        self.trained_by: Literal["published", "quality"] = "published"
         self.gradient_precision: torch.dtype | None = None
         self._nets: dict[torch.dtype, tuple[object, frozen.FrozenNet]] = {}
 
@@ -250,7 +237,7 @@ class SqueezeDet(Detector):
         # To a multiple of 16, and for conv1 as TensorFlow's SAME: stride 2 needs an odd number of rows more,
         # the larger half of them below and to the right. Zeros here are the mean colour.
         before = frozen.rows_before(self.layout.kernel)
-        x = F.pad(x, (before, -width % STRIDE + before + 1, before, -height % STRIDE + before + 1))
+        x = F.pad(x, (before, -width % grid.STRIDE + before + 1, before, -height % grid.STRIDE + before + 1))
         x = x.contiguous(memory_format=torch.channels_last)
         x = F.relu(_pool(self.conv1(x)), inplace=True)  # the order does not matter, a quarter of the pixels does
         for name, fire in self.fires.items():
@@ -288,11 +275,19 @@ class SqueezeDet(Detector):
             for name, fire, after in zip(self.fires, fires, following, strict=True)
         ]
         first = frozen.convolution(fires[0].squeeze, [self.conv1.out_channels], dtype)
-        return frozen.FrozenNet(frozen.stem(self.conv1, BGR_MEAN, first, dtype), tuple(stages), STRIDE)
+        return frozen.FrozenNet(frozen.stem(self.conv1, BGR_MEAN, first, dtype), tuple(stages), grid.STRIDE)
 
     def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """The published loss; what it aims at (`assign`) is taken as constant, as in the published code."""
-        return self.loss_terms(raw, self.assign(raw, targets))
+        """The terms of `loss_terms`, or those of `detectors.quality` in their place where it trains. What they aim
+        at is taken as constant, as in the published code.
+        """
+        assignment = self.assign(raw, targets)
+        terms = self.loss_terms(raw, assignment)
+        if self.trained_by == "quality":
+            own = assignment.image, assignment.anchor
+            learned = quality.terms(raw, targets, self.anchors, own, assignment.negative)
+            terms |= learned | {"total": learned["confidence"] + learned["box"] + learned["class"]}
+        return terms
 
     @torch.no_grad()
     def assign(self, raw: RawPredictions, targets: Sequence[Targets]) -> Assignment:
@@ -304,10 +299,11 @@ class SqueezeDet(Detector):
             raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
         height, width = raw.image_hw
         like = raw.deltas
-        grid = -(-height // STRIDE), -(-width // STRIDE)
-        anchors_cxcywh = _anchors(self.anchors, *grid, like.dtype, like.device)
-        anchors_xyxy = _anchor_corners(self.anchors, *grid, like.dtype, like.device)
+        cells = grid.cells(raw.image_hw)
+        anchors_cxcywh = grid.anchors(self.anchors, *cells, like.dtype, like.device)
+        anchors_xyxy = grid.anchor_corners(self.anchors, *cells, like.dtype, like.device)
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
+        met = torch.zeros_like(negative)
         image, anchor, true_boxes, labels, meeting = [], [], [], [], []
         for b, target in enumerate(targets):
             ignore = target.ignore.to(like.device)
@@ -315,11 +311,14 @@ class SqueezeDet(Detector):
             ignored_xyxy = torch.unique(target.boxes_xyxy.to(like)[ignore], dim=0)
             wanted_xyxy = target.boxes_xyxy.to(like)[~ignore]
             if len(ignored_xyxy):
-                negative[b] = ~(_covered(anchors_xyxy, ignored_xyxy) | _covered(raw.boxes_xyxy[b], ignored_xyxy))
-            anchor += _distribute(wanted_xyxy, anchors_cxcywh, anchors_xyxy)
+                negative[b] = ~(
+                    grid.covered(anchors_xyxy, ignored_xyxy) | grid.covered(raw.boxes_xyxy[b], ignored_xyxy)
+                )
+            anchor += grid.distribute(wanted_xyxy, anchors_cxcywh, anchors_xyxy)
             image += [b] * len(wanted_xyxy)
             true_boxes.append(wanted_xyxy)
-            meets = boxes.iou_matrix(wanted_xyxy, raw.boxes_xyxy[b]) >= MEETING_IOU
+            meets = boxes.iou_matrix(wanted_xyxy, raw.boxes_xyxy[b]) >= grid.MEETING_IOU
+            met[b] = meets.any(0)
             meeting.append(raw.confidence_logits[b].expand_as(meets).masked_fill(~meets, -torch.inf).max(1))
             labels.append(target.labels.to(like.device)[~ignore])
         image = torch.tensor(image, dtype=torch.int64, device=like.device)
@@ -328,15 +327,14 @@ class SqueezeDet(Detector):
         if bool(((label < 0) | (label >= len(self.classes))).any()):
             raise ValueError(f"targets.labels: expected 0..{len(self.classes) - 1}, found {label.tolist()}")
         negative[image, anchor] = False
-        chosen, truth = anchors_cxcywh[anchor], _centred(truth_xyxy)
-        shift, scale = (truth[:, :2] - chosen[:, :2]) / chosen[:, 2:], truth[:, 2:] / chosen[:, 2:]
         return Assignment(
             image=image,
             anchor=anchor,
             confidence=boxes.paired_iou(boxes.clip(raw.boxes_xyxy[image, anchor], height, width), truth_xyxy),
-            deltas=torch.cat((shift, _safe_log(scale)), 1),
+            deltas=grid.offsets(truth_xyxy, anchors_cxcywh[anchor]),
             labels=label,
             negative=negative,
+            alarm=negative & ~met,
             found_by=torch.cat([m.indices for m in meeting]),
             found=torch.cat([m.values for m in meeting]) > -torch.inf,
         )
@@ -349,8 +347,9 @@ class SqueezeDet(Detector):
         mean over images. So false alarms weigh the more, against misses, the larger the batch.
 
         "objectness" is the confidence term as attacks want it: an object counts by the most confident of the
-        anchors whose boxes meet it, and the target is 1. A trained detector meets the published target, so that
-        term starts at its minimum, and raising it makes an object more certain as readily as less.
+        anchors whose boxes meet it, and the target is 1; the others that meet it, which decoding drops, are no
+        false alarms. A trained detector meets the published target, so that term starts at its minimum, and
+        raising it makes an object more certain as readily as less.
         """
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(image), 1)
@@ -360,19 +359,15 @@ class SqueezeDet(Detector):
         unseen = (1 - found).square().sum() / objects
         batch, anchors = confidence.shape
         silent = max(anchors - len(image), 1)
-        alarms = torch.where(assignment.negative, confidence, 0.0).square().sum() / silent
+        active = torch.where(assignment.negative, confidence, 0.0).square()
+        heard, alarms = active.sum() / silent, torch.where(assignment.alarm, active, 0.0).sum() / silent
         box = (raw.deltas[image, anchor] - assignment.deltas).square().sum() / objects
         classes = F.cross_entropy(raw.class_logits[image, anchor], assignment.labels, reduction="sum") / objects
         terms = {
-            "confidence": (WEIGHT_CONFIDENCE_POSITIVE * missed + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
+            "confidence": (WEIGHT_CONFIDENCE_POSITIVE * missed + WEIGHT_CONFIDENCE_NEGATIVE * heard) / batch,
             "box": WEIGHT_BOX * box,
             "class": WEIGHT_CLASS * classes,
         }
-        if self.overlap_weight:
-            # Four offsets, each judged by itself, leave boxes loose. In units of their anchor, boxes overlap as in
-            # pixels.
-            apart = 1 - boxes.paired_giou(_boxes_of(raw.deltas[image, anchor]), _boxes_of(assignment.deltas))
-            terms["box"] = terms["box"] + self.overlap_weight * apart.sum() / objects
         return terms | {
             "total": terms["confidence"] + terms["box"] + terms["class"],
             "objectness": (WEIGHT_CONFIDENCE_POSITIVE * unseen + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
@@ -380,7 +375,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:
-        """Score = confidence x class probability; the 64 best, NMS at 0.4 in each class, score >= 0.005."""
+        """Score = confidence x class probability; the 256 best, NMS at 0.4 in each class, score >= 0.005."""
         found = []
         for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
             # No score exceeds its confidence, and few of the anchors have any.
@@ -402,10 +397,10 @@ class SqueezeDet(Detector):
         if cells.dtype in (torch.bfloat16, torch.float16):  # boxes need more than their 8 or 11 bits
             cells = cells.float()
         class_logits, confidence, deltas = cells.split((count * classes, count, count * 4), -1)
-        anchors = _anchors(self.anchors, rows, columns, cells.dtype, cells.device)
+        anchors = grid.anchors(self.anchors, rows, columns, cells.dtype, cells.device)
         deltas = deltas.reshape(batch, -1, 4)
         centre = anchors[:, :2] + deltas[..., :2] * anchors[:, 2:]
-        size = anchors[:, 2:] * _safe_exp(deltas[..., 2:])
+        size = anchors[:, 2:] * grid.safe_exp(deltas[..., 2:])
         return RawPredictions(
             boxes_xyxy=torch.cat((centre - size / 2, centre + size / 2), -1),
             deltas=deltas,
@@ -425,7 +420,7 @@ class SqueezeDetPlus(SqueezeDet):
     layout = _LAYOUT_PLUS
 
 
-def _checked_sizes(anchors: Sequence[Sequence[float]]) -> Sizes:
+def _checked_sizes(anchors: Sequence[Sequence[float]]) -> grid.Sizes:
     sizes = tuple(tuple(float(number) for number in size) for size in anchors)
     if not sizes or any(len(size) != 2 or not all(0 < number < math.inf for number in size) for size in sizes):
         raise ValueError(f"anchors: expected pairs of positive px, at least one, found {sizes}")
@@ -435,73 +430,3 @@ def _checked_sizes(anchors: Sequence[Sequence[float]]) -> Sizes:
 def _pool(x: Tensor) -> Tensor:
     # TensorFlow's SAME on an even size: the last window reaches one pixel beyond the edge.
     return F.max_pool2d(x, 3, stride=2, ceil_mode=True)
-
-
-@lru_cache(maxsize=16)
-def _anchors(sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Anchors (K * rows * columns, 4) as centre x, centre y, width, height in px; cells row by row, K each."""
-    y = torch.arange(rows, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
-    x = torch.arange(columns, dtype=dtype, device=device) * STRIDE + (STRIDE - 1) / 2
-    centres = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (rows, columns, 2)
-    sizes = torch.tensor(sizes_wh, dtype=dtype, device=device)
-    shape = (rows, columns, len(sizes_wh), 2)
-    return torch.cat((centres[:, :, None].expand(shape), sizes.expand(shape)), -1).reshape(-1, 4)
-
-
-@lru_cache(maxsize=16)
-def _anchor_corners(sizes_wh: Sizes, rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    return _corners(_anchors(sizes_wh, rows, columns, dtype, device))
-
-
-def _corners(boxes_cxcywh: Tensor) -> Tensor:
-    half = boxes_cxcywh[..., 2:] / 2
-    return torch.cat((boxes_cxcywh[..., :2] - half, boxes_cxcywh[..., :2] + half), -1)
-
-
-def _centred(boxes_xyxy: Tensor) -> Tensor:
-    top_left, bottom_right = boxes_xyxy[..., :2], boxes_xyxy[..., 2:]
-    return torch.cat(((top_left + bottom_right) / 2, bottom_right - top_left), -1)
-
-
-def _distribute(wanted_xyxy: Tensor, anchors_cxcywh: Tensor, anchors_xyxy: Tensor) -> list[int]:
-    """An anchor for each box (N, 4): the best that is not taken yet, the nearest where none overlaps."""
-    if not len(wanted_xyxy):
-        return []
-    overlaps = boxes.iou_matrix(wanted_xyxy, anchors_xyxy)
-    highest, best = overlaps.max(1)
-    taken: list[int] = []
-    for row, (value, index) in enumerate(zip(highest.tolist(), best.tolist(), strict=True)):
-        if value <= 0 or index in taken:
-            fit = overlaps[row].index_fill(0, best.new_tensor(taken), 0)
-            if float(fit.max()) <= 0:
-                distance = (_centred(wanted_xyxy[row]) - anchors_cxcywh).square().sum(-1)
-                fit = -distance.index_fill(0, best.new_tensor(taken), torch.inf)
-            index = int(fit.argmax())
-        taken.append(index)
-    return taken
-
-
-def _covered(candidates_xyxy: Tensor, ignored_xyxy: Tensor) -> Tensor:
-    """Candidates (N,) of which an ignored box covers more than IGNORE_OVERLAP. No IoU exceeds that share."""
-    shared = boxes.intersection_matrix(ignored_xyxy, candidates_xyxy)
-    return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
-
-
-def _boxes_of(deltas: Tensor) -> Tensor:
-    """Boxes (N, 4) as left, top, right, bottom, in units of their anchor's size, around its centre."""
-    return _corners(torch.cat((deltas[:, :2], _safe_exp(deltas[:, 2:])), 1))
-
-
-def _safe_exp(x: Tensor) -> Tensor:
-    """exp up to EXP_THRESHOLD, its tangent beyond: an untrained box cannot overflow."""
-    slope = torch.exp(x.new_tensor(EXP_THRESHOLD))
-    return torch.where(x > EXP_THRESHOLD, slope * (x - EXP_THRESHOLD + 1), torch.exp(x.clamp_max(EXP_THRESHOLD)))
-
-
-def _safe_log(ratio: Tensor) -> Tensor:
-    """Inverse of _safe_exp for positive ratios. The published code takes the plain logarithm here, so a box more
-    than e times its anchor had a target that its own decoding did not hit.
-    """
-    slope = torch.exp(ratio.new_tensor(EXP_THRESHOLD))
-    logarithm = torch.log(ratio.clamp(torch.finfo(ratio.dtype).tiny, float(slope)))
-    return torch.where(ratio > slope, ratio / slope + EXP_THRESHOLD - 1, logarithm)

@@ -469,8 +469,8 @@ class Train(Common):
     """Decay a step of the moving average of the weights, which is what is judged and kept."""
     dropout: float = 0.5
     """Of detectors that have dropout."""
-    overlap_weight: float = 0.0
-    """SqueezeDet: weight of 1 - generalised IoU in the box term; 0 is the published loss."""
+    loss: Literal["published", "quality"] = "published"
+    """SqueezeDet: the published loss, or the one of detectors/quality.py (confidence is the overlap)."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the network computes in: bfloat16 where the processor has it, float16 on GPUs."""
     checkpoint_every: int = 50
@@ -526,8 +526,8 @@ class Retrain(Common):
     """Peak learning rate of AdamW; it falls in a half cosine."""
     warmup: int = 60
     """Steps in which the rate rises."""
-    overlap_weight: float = 0.0
-    """SqueezeDet: weight of 1 - generalised IoU in the box term; 0 is the published loss."""
+    loss: Literal["published", "quality"] = "published"
+    """SqueezeDet: the published loss, or the one of detectors/quality.py (confidence is the overlap)."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the network computes in when it is trained."""
     checkpoint_every: int = 50
@@ -693,7 +693,7 @@ def _validate_train(config: Train) -> None:
     for name in ("steps", "batch", "rate", "clip", "checkpoint_every", "thin", "frames"):
         if not getattr(config, name) > 0:
             raise UsageError(f"--{name.replace('_', '-')}", "a number above 0", getattr(config, name))
-    for name in ("minutes", "evaluate_every", "loaders", "held_out_frames", "warmup", "overlap_weight"):
+    for name in ("minutes", "evaluate_every", "loaders", "held_out_frames", "warmup"):
         if not getattr(config, name) >= 0:
             raise UsageError(f"--{name.replace('_', '-')}", "at least 0", getattr(config, name))
     for name in ("dropout", "average", "momentum", "semantic"):
@@ -718,7 +718,7 @@ def _validate_retrain(config: Retrain) -> None:
     for name in ("steps", "batch", "rate", "checkpoint_every"):
         if not getattr(config, name) > 0:
             raise UsageError(f"--{name.replace('_', '-')}", "a number above 0", getattr(config, name))
-    for name in ("minutes", "warmup", "overlap_weight", "fresh"):
+    for name in ("minutes", "warmup", "fresh"):
         if (getattr(config, name) or 0) < 0:
             raise UsageError(f"--{name.replace('_', '-')}", "at least 0", getattr(config, name))
     if config.attack_steps is not None and config.attack_steps < 1:

@@ -184,7 +184,7 @@ def _train(config: Retrain, detector: Detector, mixture: Mixture, out: Path, con
         augment=AugmentSettings(window_hw=size_hw("--window", config.window)),
     )
     if isinstance(detector, SqueezeDet):
-        detector.overlap_weight = config.overlap_weight
+        detector.trained_by = config.loss
     detector.requires_grad_(True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

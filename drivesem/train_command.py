@@ -149,9 +149,9 @@ def _begin(config: Train, detector: Detector) -> str:
     start = begin(detector, config.start, config.seed)
     set_dropout(detector, config.dropout)
     if isinstance(detector, SqueezeDet):
-        detector.overlap_weight = config.overlap_weight
-    elif config.overlap_weight:
-        raise UsageError("--overlap-weight", f"0 with --detector {config.detector}", config.overlap_weight)
+        detector.trained_by = config.loss
+    elif config.loss != "published":
+        raise UsageError("--loss", f"published with --detector {config.detector}", config.loss)
     return start
 
 

@@ -15,12 +15,8 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import Detector
-from detectors.squeezedet import (
-    IGNORE_OVERLAP,
-    MEETING_IOU,
-    WEIGHT_CONFIDENCE_NEGATIVE,
-    WEIGHT_CONFIDENCE_POSITIVE,
-)
+from detectors.grid import IGNORE_OVERLAP, MEETING_IOU
+from detectors.squeezedet import WEIGHT_CONFIDENCE_NEGATIVE, WEIGHT_CONFIDENCE_POSITIVE
 from detectors.types import CLASSES, Detections, Targets
 
 LEAST_SCORE = 0.05

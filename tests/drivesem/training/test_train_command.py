@@ -94,7 +94,7 @@ def test_it_starts_from_weights_and_checkpoints(tmp_path: Path, frames: list[str
         (["--device", "quantum"], "--device: expected a torch device"),
         (["--start", "nowhere.safetensors"], "--start: expected weights for squeezedet"),
         (["--start", "squeezenet"], "python tools/fetch_backbone.py"),
-        (["--detector", "yolov3-slim", "--overlap-weight", "2"], "--overlap-weight: expected 0 with --detector"),
+        (["--detector", "yolov3-slim", "--loss", "quality"], "--loss: expected published with --detector"),
         (["--anchors", "kmeans"], "--anchors: expected more different boxes"),
     ],
 )
