@@ -78,16 +78,25 @@ def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float, labels: Tensor
     on nothing but its input.
     """
     order = torch.sort(scores, descending=True, stable=True).indices
-    rivals = iou_matrix(boxes_xyxy[order], boxes_xyxy[order]) > iou_threshold
-    if labels is not None:
-        rivals &= labels[order][:, None] == labels[order][None, :]
-    # Greedy choice is sequential: one row of a numpy matrix a step is far cheaper than a tensor operation.
-    suppresses = rivals.cpu().numpy()
-    alive = np.ones(len(order), dtype=bool)
-    for i in range(len(order)):
-        if alive[i]:
-            alive[i + 1 :] &= ~suppresses[i, i + 1 :]
-    return order[torch.from_numpy(alive).to(order.device)]
+    # Greedy choice is sequential, and numpy is far cheaper a step than a tensor operation. Of a thousand boxes most
+    # go with the first few kept ones, so that few of all pairs are ever looked at.
+    left, top, right, bottom = boxes_xyxy[order].detach().cpu().numpy().T
+    areas = area(boxes_xyxy[order]).detach().cpu().numpy()
+    group = None if labels is None else labels[order].cpu().numpy()
+    kept: list[int] = []
+    rest = np.arange(len(order))
+    while len(rest):
+        best, rest = rest[0], rest[1:]
+        kept.append(int(best))
+        width = np.minimum(right[best], right[rest]) - np.maximum(left[best], left[rest])
+        height = np.minimum(bottom[best], bottom[rest]) - np.maximum(top[best], top[rest])
+        shared = np.maximum(width, 0) * np.maximum(height, 0)
+        union = areas[best] + areas[rest] - shared
+        stays = shared / np.maximum(union, np.finfo(union.dtype).tiny) <= iou_threshold
+        if group is not None:
+            stays |= group[rest] != group[best]
+        rest = rest[stays]
+    return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
 
 
 def _quotient(part: Tensor, whole: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ WEIGHT_CONFIDENCE_NEGATIVE = 100.0
 WEIGHT_CLASS = 1.0
 """Weights of the loss terms (published code, LOSS_COEF_*)."""
 
-TOP_DETECTIONS = 256
+TOP_DETECTIONS = 1024
 NMS_IOU = 0.4
 SCORE_MINIMUM = 0.005
 """Decoding (published code: TOP_N_DETECTION, NMS_THRESH, PROB_THRESH). It takes the 64 best: in full streets these
@@ -375,7 +375,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:
-        """Score = confidence x class probability; the 256 best, NMS at 0.4 in each class, score >= 0.005."""
+        """Score = confidence x class probability; the 1024 best, NMS at 0.4 in each class, score >= 0.005."""
         found = []
         for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
             # No score exceeds its confidence, and few of the anchors have any.

@@ -444,13 +444,13 @@ def test_decode_keeps_scores_from_a_two_hundredth_on() -> None:
     assert found.scores.tolist() == pytest.approx([0.0052], rel=1e-3)
 
 
-def test_decode_returns_at_most_256() -> None:
+def test_decode_returns_at_most_1024() -> None:
     parts = silent(1, 256, 256)
     parts["confidence_logits"][:] = 2.0
     count = torch.arange(len(parts["boxes_xyxy"][0]))
-    corner = torch.stack((count % 48 * 5.0, count // 48 * 5.0), 1)  # none touches another
+    corner = torch.stack((count % 50 * 5.0, count // 50 * 5.0), 1)  # none touches another
     parts["boxes_xyxy"][0] = torch.cat((corner, corner + 4.0), 1)
-    assert len(fresh().decode(raw_of(parts, 256, 256))[0]) == 256
+    assert len(fresh().decode(raw_of(parts, 256, 256))[0]) == 1024
 
 
 def test_gradient_to_the_image_agrees_with_differences() -> None:
