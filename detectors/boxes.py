@@ -78,8 +78,8 @@ def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float, labels: Tensor
     on nothing but its input.
     """
     order = torch.sort(scores, descending=True, stable=True).indices
-    # Greedy choice is sequential, and numpy is far cheaper a step than a tensor operation. Of a thousand boxes most
-    # go with the first few kept ones, so that few of all pairs are ever looked at.
+    # Greedy choice is sequential, and numpy is far cheaper a step than a tensor operation. Of a thousand boxes
+    # most go with the first few kept ones, so that few of all pairs are ever looked at.
     left, top, right, bottom = boxes_xyxy[order].detach().cpu().numpy().T
     areas = area(boxes_xyxy[order]).detach().cpu().numpy()
     group = None if labels is None else labels[order].cpu().numpy()

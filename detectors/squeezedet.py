@@ -44,10 +44,11 @@ WEIGHT_CLASS = 1.0
 """Weights of the loss terms (published code, LOSS_COEF_*)."""
 
 TOP_DETECTIONS = 1024
-NMS_IOU = 0.4
+NMS_IOU = 0.35
 SCORE_MINIMUM = 0.005
 """Decoding (published code: TOP_N_DETECTION, NMS_THRESH, PROB_THRESH). It takes the 64 best: in full streets these
-are the many boxes of the near cars, and far ones are lost."""
+are the many boxes of the near cars, and far ones are lost. And it suppresses from 0.4 on: on training frames 0.35
+was better (Car AP50 0.982, at 0.4 0.974, at 0.3 0.976)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,7 +376,7 @@ class SqueezeDet(Detector):
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:
-        """Score = confidence x class probability; the 1024 best, NMS at 0.4 in each class, score >= 0.005."""
+        """Score = confidence x class probability; the 1024 best, NMS at 0.35 in each class, score >= 0.005."""
         found = []
         for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
             # No score exceeds its confidence, and few of the anchors have any.

@@ -272,7 +272,9 @@ class _Level:
 
     def _patches(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         index = self._flat(rows, columns)[:, None] + self.offsets
-        return self.padded.reshape(-1, 3).take(index, axis=0, mode="clip").reshape(rows.size, -1)
+        values = self.padded.reshape(-1, 3).take(index, axis=0, mode="clip")
+        # Not -1: there may be no row.
+        return values.reshape(rows.size, 3 * self.offsets.size)
 
     def _cost(
         self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]

@@ -107,3 +107,15 @@ def test_push_pull_keeps_known_pixels_and_continues_a_constant():
     image[hole()] = 9
     result = push_pull(image, (~hole()).astype(np.float32))
     assert result == pytest.approx(np.full((*SHAPE, 2), 0.4), abs=1e-5)
+
+
+@pytest.mark.parametrize("side", [1, 4])
+def test_a_hole_with_hardly_a_pixel_to_copy_from_is_filled(side: int):
+    """Where all neighbours have the same source there is nothing left to try."""
+    forbidden = np.ones(SHAPE, bool)
+    forbidden[10 : 10 + side, 10 : 10 + side] = False
+    image = textured()
+    result = filled(image, forbidden)
+    assert np.array_equal(result[~hole()], image[~hole()])
+    assert result.min() >= 0
+    assert result.max() <= 1
