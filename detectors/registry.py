@@ -22,7 +22,9 @@ _KINDS = (SqueezeDet, SqueezeDetPlus, YoloV3, YoloV3Tiny, YoloV3Slim)
 ARCHITECTURES: dict[str, type[SqueezeDet] | type[YoloV3]] = {kind.name: kind for kind in _KINDS}
 """Name of an architecture, as weights files carry it in their metadata, and its class."""
 
-SHIPPED = {"squeezedet": Path(__file__).parent / "weights" / "squeezedet.safetensors"}
+SHIPPED = {
+    name: Path(__file__).parent / "weights" / f"{name}.safetensors" for name in (SqueezeDet.name, YoloV3Slim.name)
+}
 """Detectors that come with the package."""
 
 

@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,14 @@ from detectors.types import CLASSES
 from drivesem.attacks.base import Attack as AttackMethod
 from drivesem.attacks.cma_es import CMAES
 from drivesem.attacks.fgsm import FGSM
+from drivesem.attacks.placebo import Placebo
+from drivesem.attacks.restarts import Restarted
 from drivesem.attacks.sampling import Sampling
+from drivesem.attacks.scw import SCW
+from drivesem.attacks.sgd import SGD
 from drivesem.attacks.si_fgsm import SiFGSM
+from drivesem.attacks.subsets import Subsets
+from drivesem.budgets import budget_of, written
 from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError, command_line
 from drivesem.devices import check_device
 from drivesem.evaluation import coco
@@ -36,11 +42,12 @@ from drivesem.pool import outcomes
 from drivesem.report.html import render_report
 from drivesem.results import FrameResult, RunSummary, load_frame
 from drivesem.run_folder import claim
-from drivesem.sources import SceneSource, open_source
+from drivesem.sources import NoVehicleError, SceneSource, open_source
 from drivesem.space import Parameter, combo, parse_params
 from scene_ir import files
 from scene_ir.compositor import RenderSettings
 from scene_ir.errors import SceneError
+from scene_ir.types import SceneIR
 
 _NOT_TOLD = ("out", "json", "resume", "workers")
 """Settings that change nothing in the result: left out of the report's command line."""
@@ -59,12 +66,12 @@ _PACKAGES = (
 def run(config: Attack) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
-    params = _params(config)
+    config = _settled(config)
     check_device(config.device)
-    worker = _Worker(config, params)
-    out = Path(config.out) if config.out else Path("runs") / _name(config, params)
+    worker = Worker.of(config)
+    out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, _clear)
-    summary = _attacked(worker, _select(worker.source, config), out, start)
+    summary = _attacked(worker, select_frames(worker.source, config), out, start)
     if config.json:
         sys.stdout.write(json.dumps(summary.to_json()) + "\n")
     else:
@@ -72,26 +79,28 @@ def run(config: Attack) -> int:
     return 0
 
 
-def attack_frames(config: Attack, names: Sequence[str], out: Path) -> RunSummary:
-    """Attack these frames, of all that the configuration's source has, into the run folder `out`; those that are
-    there already stay. Raises as `run`.
+def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary:
+    """Attack these frames, of all that the worker's source has, into the run folder `out`; those that are there
+    already stay. Raises as `run`.
     """
     start = time.perf_counter()
-    claim(out, config, _clear)
-    return _attacked(_Worker(config, _params(config)), (list(names), 0, {}), out, start)
+    claim(out, worker.config, _clear)
+    return _attacked(worker, (list(names), 0, {}), out, start)
 
 
 def _attacked(
-    worker: _Worker, selected: tuple[list[str], int, dict[str, str]], out: Path, start: float
+    worker: Worker, selected: tuple[list[str], int, dict[str, str]], out: Path, start: float
 ) -> RunSummary:
-    """Attack what `_select` chose, as far as it is not done, and write what is said of all frames."""
+    """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames."""
     names, without_vehicles, failed = selected
     config = worker.config
     todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
-    _attack_all(worker, todo, out, failed, Console(stderr=True))
-    done = [name for name in names if name not in failed]
+    empty = _attack_all(worker, todo, out, failed, Console(stderr=True))
+    done = [name for name in names if name not in failed and name not in empty]
     results = [load_frame(out / "frames" / name / RESULT) for name in done]
-    summary = _summary(config, worker.params, worker.detector, results, without_vehicles, failed, out, start)
+    summary = _summary(
+        config, worker.params, worker.detector, results, without_vehicles + len(empty), failed, out, start
+    )
     files.write_json(out / "metrics.json", summary.to_json())
     files.write_json(out / "manifest.json", _manifest(config, out, done))
     command = command_line("attack", config, _NOT_TOLD)
@@ -100,48 +109,98 @@ def _attacked(
 
 
 def _params(config: Attack) -> tuple[Parameter, ...]:
-    return parse_params(config.params) if config.params is not None else combo(config.combo or DEFAULT_COMBO)
+    if config.params is not None:
+        return parse_params(config.params)
+    if config.method == "subsets" and config.combo is None:
+        return tuple(Parameter)
+    return combo(config.combo or DEFAULT_COMBO)
 
 
-@dataclass
-class _Worker:
+def _settled(config: Attack) -> Attack:
+    """The configuration with the budget's numbers in place of its file, so that a run can be repeated without."""
+    return replace(config, budget=written(budget_of(config.budget)))
+
+
+@dataclass(frozen=True)
+class Worker:
     """What one process needs: built once, used for many frames."""
 
     config: Attack
     params: tuple[Parameter, ...]
+    method: AttackMethod
+    source: SceneSource
+    detector: Predictor
 
-    def __post_init__(self) -> None:
-        self.source: SceneSource = open_source(self.config)
-        self.method = attack_method(self.config)
-        self.detector = _detector(self.config, self.method.needs_gradient)
+    @classmethod
+    def of(cls, config: Attack) -> Worker:
+        """Raises UsageError for a detector that cannot be used, SceneError for a source that cannot be read."""
+        config = _settled(config)
+        source, method = open_source(config), attack_method(config)
+        return cls(config, _params(config), method, source, _detector(config, method.needs_gradient))
+
+    def beside(self, config: Attack) -> Worker:
+        """For another attack on the same source and detector, which are shared."""
+        config = _settled(config)
+        return replace(self, config=config, params=_params(config), method=attack_method(config))
 
     def attack(self, identifier: str, out: Path) -> FrameResult:
         """One frame, from the source to its folder."""
+        return self.attack_scene(identifier, self.source.scene(identifier), out)
+
+    def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
+        """One frame that has been taken apart. Raises NoVehicleError where it has none."""
+        if len(scene.objects) == 0:
+            raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
         config = self.config
         settings = FrameSettings(
-            attack=self.method,
+            attack=self.method if config.like is None else _placebo(Path(config.like), identifier),
             params=self.params,
             label_mode=config.objective_labels,
             term=config.objective,
             render=RenderSettings(backend=config.backend),
             seed=config.seed,
             t_star=config.t_star,
+            budget=budget_of(config.budget),
         )
-        scene = self.source.scene(identifier)
         return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
 
 
 def attack_method(config: Attack) -> AttackMethod:
     """The algorithm that the settings ask for."""
-    if config.method == "si-fgsm":
-        return SiFGSM(steps=config.steps, early_stop=config.early_stop)
-    if config.method == "fgsm":
-        return FGSM(steps=config.steps)
-    queries = config.queries or DEFAULT_QUERIES
-    steps = config.steps if config.range == "steps" else None
-    if config.method == "cma-es":
-        return CMAES(queries, steps, config.early_stop)
-    return Sampling(queries, steps, config.early_stop, config.method)
+    if config.restarts:
+        return Restarted(_from_theta0(config), config.restarts, config.steps, config.early_stop)
+    return _from_theta0(config)
+
+
+def _from_theta0(config: Attack) -> AttackMethod:
+    steps, early_stop, queries = config.steps, config.early_stop, config.queries or DEFAULT_QUERIES
+    match config.method:
+        case "si-fgsm":
+            return SiFGSM(steps, early_stop, config.momentum, config.rate)
+        case "fgsm":
+            return FGSM(steps)
+        case "sgd":
+            return SGD(steps, early_stop, config.momentum, config.rate, config.step_form)
+        case "scw":
+            return SCW(queries, steps, config.norm, config.rate, early_stop)
+        case "placebo":
+            return Placebo()
+        case "subsets":
+            return Subsets(queries, steps)
+        case "cma-es":
+            return CMAES(queries, _reach(config), early_stop)
+        case "random" | "halton" | "sobol":
+            return Sampling(queries, _reach(config), early_stop, config.method)
+
+
+def _placebo(run: Path, identifier: str) -> Placebo:
+    """An edit as large as what a run did to the frame. Raises FormatError where the run has no such frame."""
+    return Placebo(tuple(c.value for c in load_frame(run / "frames" / identifier / RESULT).theta))
+
+
+def _reach(config: Attack) -> int | None:
+    """Steps around theta0 within which a search without gradient looks; None for all of the bounds."""
+    return config.steps if config.range == "steps" else None
 
 
 def _detector(config: Attack, needs_gradient: bool) -> Predictor:
@@ -166,27 +225,35 @@ def _detector(config: Attack, needs_gradient: bool) -> Predictor:
     return detector
 
 
-def _in_process(config: Attack, params: tuple[Parameter, ...], out: Path) -> Callable[[str], FrameResult]:
-    return partial(_Worker(config, params).attack, out=out)
+def _in_process(config: Attack, out: Path) -> Callable[[str], FrameResult]:
+    return partial(Worker.of(config).attack, out=out)
 
 
-def _attack_all(worker: _Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console) -> None:
-    """Attack the frames of `todo`, in this process or in several; a bad frame goes to `failed` or ends the run."""
+def _attack_all(
+    worker: Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console
+) -> set[str]:
+    """Attack the frames of `todo`, in this process or in several; a bad frame goes to `failed` or ends the run.
+    Those without a vehicle are returned.
+    """
+    empty: set[str] = set()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not todo) as progress:
         task = progress.add_task("attacking frames", total=len(todo))
-        build = partial(_in_process, worker.config, worker.params, out)
+        build = partial(_in_process, worker.config, out)
         for identifier, outcome in outcomes(partial(worker.attack, out=out), build, todo, worker.config):
             try:
                 outcome()
+            except NoVehicleError:
+                empty.add(identifier)
             except SceneError as error:
                 if not worker.config.keep_going:
                     raise
                 failed[identifier] = str(error)
             progress.advance(task)
+    return empty
 
 
-def _select(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
+def select_frames(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
     """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
     names: list[str] = []
     failed: dict[str, str] = {}

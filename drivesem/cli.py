@@ -17,13 +17,17 @@ from drivesem.config import (
     Bench,
     Check,
     Command,
+    Confirm,
     Convert,
     Derender,
     Edit,
     Eval,
+    Explain,
     Gradcheck,
+    Plausibility,
     Render,
     Retrain,
+    Study,
     Synth,
     Train,
     Transfer,
@@ -122,6 +126,22 @@ def _run(config: Command) -> int:
         from drivesem import transfer_command
 
         return transfer_command.run(config)
+    if isinstance(config, Explain):
+        from drivesem import explain_command
+
+        return explain_command.run(config)
+    if isinstance(config, Study):
+        from drivesem import study_command
+
+        return study_command.run(config)
+    if isinstance(config, Confirm):
+        from drivesem import confirm_command
+
+        return confirm_command.run(config)
+    if isinstance(config, Plausibility):
+        from drivesem import plausibility_command
+
+        return plausibility_command.run(config)
     if isinstance(config, Derender):
         from drivesem import derender_command
 

@@ -29,6 +29,10 @@ SYNTH = "synth"
 """What --dataset takes for training: frames that the generator makes."""
 GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
 """Attacks that ask a detector only what it finds."""
+COUNTED = (*GRADIENT_FREE, "scw", "subsets")
+"""Attacks that end after --queries."""
+RESTARTED = ("si-fgsm", "fgsm", "sgd", "scw")
+"""Attacks that may begin elsewhere."""
 DEFAULT_QUERIES = 64
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
@@ -89,13 +93,30 @@ class Attack(Common):
     detector: str = "squeezedet"
     """A shipped detector, a file, or another project's (docs/detectors.md); without a gradient, such as an ONNX
     graph, for the methods that need none."""
-    method: Literal["si-fgsm", "fgsm", "random", "halton", "sobol", "cma-es"] = "si-fgsm"
-    """si-fgsm and fgsm follow the gradient; random (uniform), halton, sobol (scrambled sequences) and cma-es ask
-    only what the detector finds."""
+    method: Literal[
+        "si-fgsm", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
+    ] = "si-fgsm"
+    """si-fgsm, fgsm, sgd follow the gradient; scw (Carlini-Wagner) also keeps the change small; subsets finds the
+    fewest parameters that are enough; random (uniform), halton, sobol (scrambled sequences) and cma-es ask only
+    what the detector finds."""
     steps: int = 10
-    """si-FGSM steps, each one query of the detector's gradient; FGSM goes as far in one."""
+    """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
     queries: int | None = None
-    """Of methods without gradient: renders that are judged; by default 64."""
+    """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
+    step_form: Literal["raw", "l2"] = "l2"
+    """Of sgd: the gradient as it is, or its direction, each parameter's as long as a step of si-fgsm."""
+    rate: float = 1.0
+    """Of si-fgsm, sgd and scw: length of a step in units of each parameter's own step."""
+    momentum: float = 0.0
+    """Of si-fgsm and sgd: what is left of earlier gradients after a step, 0 to 1 (MI-FGSM: 1)."""
+    norm: Literal[1, 2] = 2
+    """Of scw: the norm of the change that is kept small."""
+    restarts: int = 0
+    """Of si-fgsm, fgsm, sgd and scw: how often to begin again at random near the photograph."""
+    like: str | None = None
+    """Of placebo, one random edit of each frame: the run whose counterexamples are as large."""
+    budget: str = "paper"
+    """How far parameters may go: paper; parking (0.5 m, 5 degrees); a YAML file; or translate=0.5m,rotate=5deg."""
     range: Literal["bounds", "steps"] = "bounds"
     """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
     early_stop: Flag = False
@@ -115,6 +136,43 @@ class Attack(Common):
     """Score from which a detection counts; by default the detector's own, or 0.3 where it has none."""
     tiles: Literal["auto", "off"] = "auto"
     """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Common):
+    """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
+
+    name: Annotated[
+        tyro.conf.Positional[Literal["single", "multi", "samples", "steps", "labels"]],
+        tyro.conf.arg(metavar="{single,multi,samples,steps,labels}"),
+    ]
+    """single: the six parameters, each alone; multi: the combinations 1 to 4; samples: success against queries for
+    each algorithm; steps: success against number and size of steps; labels: what labels that stay behind make of
+    an attack."""
+    quick: Flag = False
+    """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder."""
+    dataset: str = DEMO
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str | None = None
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
+    detector: str = "squeezedet"
+    """A shipped detector, a file, or another project's that has a gradient (docs/detectors.md)."""
+    steps: int = 10
+    """Steps of the attack; steps goes twice as far."""
+    queries: int = 64
+    """Samples: queries of each method without gradient."""
+    budget: str = "paper"
+    """How far parameters may go: paper; parking (0.5 m, 5 degrees); a YAML file; or translate=0.5m,rotate=5deg."""
+    objective_labels: Literal["moved", "paper"] = "moved"
+    """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
+    controls: bool = True
+    """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
+    fit: bool = True
+    """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+    t_star: float | None = None
+    """Score from which a detection counts; by default the detector's own, or 0.3 where it has none."""
+    bootstrap: int | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +216,48 @@ class Transfer(Common):
     """Score from which a detection counts, of detectors that have no threshold of their own; by default 0.3."""
     bootstrap: int | None = None
     """Draws of frames for intervals, by default 200; 0 leaves them out."""
+
+
+@dataclass(frozen=True)
+class Explain(Common):
+    """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
+
+    run: str | None = None
+    """Folder of a run of drivesem attack."""
+    frame: str | None = None
+    """Frames of the run by name, with commas; by default all that fail by moved labels."""
+    least: Literal["fails", "lost"] = "fails"
+    """What the least change must still do: fail in any way, or lose an object where the counterexample does."""
+    points: int = 16
+    """How many scales of a change are looked at before the smallest that fails is bisected."""
+    permutations: int = 32
+    """Walks through the cars, in random orders and back, where more than 6 moved; up to 6, all subsets are
+    judged."""
+    bootstrap: int | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
+
+
+@dataclass(frozen=True)
+class Confirm(Common):
+    """Draw a run's counterexamples again by the scene generator: which failures survive another renderer?"""
+
+    run: str | None = None
+    """Folder of a run of drivesem attack on generated frames: the embedded scenes, or drivesem synth's in KITTI's
+    layout."""
+    root: str | None = None
+    """Folder of the run's data set, where it is no longer where the run found it."""
+
+
+@dataclass(frozen=True)
+class Plausibility(Command):
+    """How common the vehicles of a run stand and are built, before and after the attack, by KITTI's labels."""
+
+    run: str | None = None
+    """Folder of a run of drivesem attack."""
+    out: str | None = None
+    """Folder for the results; by default plausibility in the run's folder."""
+    limit: int | None = None
+    """Take the first N frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -537,6 +637,10 @@ class Retrain(Common):
 COMMANDS: dict[str, type[Command]] = {
     "attack": Attack,
     "transfer": Transfer,
+    "study": Study,
+    "explain": Explain,
+    "confirm": Confirm,
+    "plausibility": Plausibility,
     "derender": Derender,
     "render": Render,
     "edit": Edit,
@@ -564,7 +668,7 @@ def validate(config: Command) -> None:
             raise UsageError("--workers", "at least 1", config.workers)
         if config.limit is not None and config.limit < 1:
             raise UsageError("--limit", "at least 1", config.limit)
-    if isinstance(config, Attack | Derender | Gradcheck | Bench):
+    if isinstance(config, Attack | Study | Derender | Gradcheck | Bench):
         if config.dataset not in DATASETS:
             raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(config.dataset))
         if config.dataset != DEMO and config.root is None:
@@ -609,18 +713,21 @@ def validate(config: Command) -> None:
         if config.queries is not None and config.queries < 1:
             raise UsageError("--queries", "at least 1", config.queries)
         if config.method not in GRADIENT_FREE:
-            without = f"a method without gradient ({', '.join(GRADIENT_FREE)}) beside it"
-            if config.queries is not None:
-                raise UsageError("--queries", without, config.method)
             if config.range != "bounds":
+                without = f"a method without gradient ({', '.join(GRADIENT_FREE)}) beside it"
                 raise UsageError("--range", without, config.method)
         elif config.precision != "float32":
             raise UsageError(
                 "--precision", f"float32 with {config.method}, which takes no gradient", config.precision
             )
-        if config.method == "fgsm" and config.early_stop:
-            raise UsageError("--early-stop", "a method of several steps or queries", config.method)
-    if isinstance(config, Attack | Transfer) and config.t_star is not None and not 0 < config.t_star <= 1:
+        _validate_method(config)
+    if isinstance(config, Study):
+        for name in ("steps", "queries"):
+            if getattr(config, name) < 1:
+                raise UsageError(f"--{name}", "at least 1", getattr(config, name))
+        if config.bootstrap is not None and config.bootstrap < 0:
+            raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+    if isinstance(config, Attack | Study | Transfer) and config.t_star is not None and not 0 < config.t_star <= 1:
         raise UsageError("--t-star", "a score in (0, 1]", config.t_star)
     if isinstance(config, Transfer):
         if not config.run:
@@ -629,6 +736,19 @@ def validate(config: Command) -> None:
             raise UsageError("--detectors", "detectors with commas", "nothing")
         if config.bootstrap is not None and config.bootstrap < 0:
             raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+    if isinstance(config, Explain):
+        if not config.run:
+            raise UsageError("--run", "a folder of drivesem attack", "nothing")
+        if config.points < 1:
+            raise UsageError("--points", "at least 1", config.points)
+        if config.permutations < 2 or config.permutations % 2:
+            raise UsageError("--permutations", "an even number, at least 2", config.permutations)
+        if config.bootstrap is not None and config.bootstrap < 0:
+            raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+    if isinstance(config, Confirm | Plausibility) and not config.run:
+        raise UsageError("--run", "a folder of drivesem attack", "nothing")
+    if isinstance(config, Plausibility) and config.limit is not None and config.limit < 1:
+        raise UsageError("--limit", "at least 1", config.limit)
     if isinstance(config, Synth):
         if config.frames < 1:
             raise UsageError("--frames", "at least 1", config.frames)
@@ -663,6 +783,39 @@ def validate(config: Command) -> None:
         _validate_train(config)
     if isinstance(config, Retrain):
         _validate_retrain(config)
+
+
+def _validate_method(config: Attack) -> None:
+    """Options that only some methods have, and what they may be."""
+    own = {
+        "queries": COUNTED,
+        "step_form": ("sgd",),
+        "rate": ("si-fgsm", "sgd", "scw"),
+        "momentum": ("si-fgsm", "sgd"),
+        "norm": ("scw",),
+        "restarts": RESTARTED,
+        "like": ("placebo",),
+    }
+    for name, methods in own.items():
+        if getattr(config, name) != getattr(Attack, name) and config.method not in methods:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(flag, f"--method {', '.join(methods)} beside it", config.method)
+    if config.early_stop and config.method in ("fgsm", "placebo"):
+        raise UsageError("--early-stop", "a method of several steps or queries", config.method)
+    if config.early_stop and config.method == "subsets":
+        raise UsageError("--early-stop", "a method that may end at the first success", config.method)
+    if not (math.isfinite(config.rate) and config.rate > 0):
+        raise UsageError("--rate", "a number above 0", config.rate)
+    if not 0 <= config.momentum <= 1:
+        raise UsageError("--momentum", "a number in [0, 1]", config.momentum)
+    if config.method == "placebo" and config.like is None:
+        raise UsageError("--like", "a run of drivesem attack, for --method placebo", "nothing")
+    if config.like is not None and not Path(config.like).is_dir():
+        raise UsageError("--like", "a run of drivesem attack", config.like)
+    if config.restarts < 0:
+        raise UsageError("--restarts", "at least 0", config.restarts)
+    if config.method == "subsets" and config.queries is not None and config.queries < 2:
+        raise UsageError("--queries", "at least 2 with subsets", config.queries)
 
 
 def _validate_eval(config: Eval) -> None:

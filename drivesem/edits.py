@@ -44,8 +44,8 @@ WEATHERS: Mapping[str, Mapping[str, float]] = {
 """Weather by name, as codes; those not named are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "remove")
 FRAME_KEYS = ("objects", "weather", "foliage")
-_LENGTH_UNITS = {"m": 1.0}
-_ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
+LENGTH_UNITS = {"m": 1.0}
+ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
 _PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage)\.(\w+)")
 _TRUTH = {"true": True, "false": False}
 
@@ -90,7 +90,7 @@ def read_edits(path: Path) -> Edits:
 
     FormatError naming the file and the place in it.
     """
-    frames = mapping_of(f"{path}", _load(path), ("frames",)).get("frames", {})
+    frames = mapping_of(f"{path}", load_yaml(path), ("frames",)).get("frames", {})
     found: dict[int | str, FrameEdit] = {}
     for key, value in mapping_of(f"{path}: frames", frames).items():
         number = _number_or_all(f"{path}: frames", key)
@@ -100,7 +100,7 @@ def read_edits(path: Path) -> Edits:
 
 def read_frame_edit(path: Path) -> dict[str, Any]:
     """The mappings of a YAML file of one frame's edit, checked. FormatError naming the file and the place."""
-    loaded = _load(path)
+    loaded = load_yaml(path)
     content = {} if loaded is None else mapping_of(str(path), loaded, FRAME_KEYS)
     frame_edit(str(path), content)
     return content
@@ -174,7 +174,8 @@ def frame_edit(where: str, value: Any) -> FrameEdit:
     )
 
 
-def _load(path: Path) -> Any:
+def load_yaml(path: Path) -> Any:
+    """What a YAML file holds. FormatError naming the file."""
     try:
         return yaml.safe_load(files.read_text(path))
     except yaml.YAMLError as error:
@@ -186,9 +187,9 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
     own, metres = [0.0, 0.0], [0.0, 0.0]
     for i, item in enumerate(_list(f"{where}: translate", entry.get("translate", [0, 0]), 2)):
         if isinstance(item, str):
-            metres[i] = _measure(f"{where}: translate", item, _LENGTH_UNITS)
+            metres[i] = measure(f"{where}: translate", item, LENGTH_UNITS)
         else:
-            own[i] = _float(f"{where}: translate", item)
+            own[i] = finite_number(f"{where}: translate", item)
     mesh = entry.get("mesh")
     remove = entry.get("remove", False)
     if not isinstance(remove, bool):
@@ -223,10 +224,11 @@ def _list(where: str, value: Any, length: int) -> list[Any]:
 
 
 def _floats(where: str, value: Any, length: int) -> tuple[float, ...]:
-    return tuple(_float(where, item) for item in _list(where, value, length))
+    return tuple(finite_number(where, item) for item in _list(where, value, length))
 
 
-def _float(where: str, value: Any) -> float:
+def finite_number(where: str, value: Any) -> float:
+    """`value` as a number. FormatError."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -237,15 +239,15 @@ def _float(where: str, value: Any) -> float:
 
 
 def _angle(where: str, value: Any) -> float:
-    return _measure(where, value, _ANGLE_UNITS) if isinstance(value, str) else _float(where, value)
+    return measure(where, value, ANGLE_UNITS) if isinstance(value, str) else finite_number(where, value)
 
 
-def _measure(where: str, text: str, units: Mapping[str, float]) -> float:
-    """Text with a unit, such as 10deg; 0 needs none."""
+def measure(where: str, text: str, units: Mapping[str, float]) -> float:
+    """Text with a unit, such as 10deg; 0 needs none. FormatError."""
     for unit, factor in units.items():
         if text.strip().endswith(unit):
-            return _float(where, text.strip().removesuffix(unit)) * factor
-    if _float(where, text) != 0:
+            return finite_number(where, text.strip().removesuffix(unit)) * factor
+    if finite_number(where, text) != 0:
         raise FormatError(where, f"a unit: {' or '.join(text.strip() + unit for unit in units)}", repr(text))
     return 0.0
 
@@ -258,7 +260,7 @@ def _number_or_all(where: str, key: Any) -> int | str:
 
 def _codes(where: str, value: Any, names: tuple[str, ...], low: float) -> tuple[float, ...]:
     entry = mapping_of(where, {} if value is None else value, names)
-    codes = tuple(_float(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
+    codes = tuple(finite_number(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
     for name, code in zip(names, codes, strict=True):
         if not low <= code <= 1:
             raise FormatError(f"{where}.{name}", f"a code in [{low:g}, 1]", code)

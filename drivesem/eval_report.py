@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +36,13 @@ class Sheet:
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+    def markdown(self, words: Collection[str]) -> list[str]:
+        """Lines: a heading, and the table. words: columns of words; the others hold numbers."""
+        sides = ("---" if name in words else "---:" for name in self.columns)
+        lines = (self.columns, sides, *self.rows)
+        cells = [[cell.replace("|", "\\|").replace("\n", ", ") for cell in line] for line in lines]
+        return [f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in cells)]
 
 
 def percent(value: float | None) -> str:
@@ -222,9 +229,7 @@ def _markdown(result: Result, pictures: Mapping[str, str]) -> str:
     lines += [f"- {key}: {value}" for key, value in facts.items()]
     lines += [f"- {note}" for note in result.notes]
     for sheet in sheets(result):
-        lines += ["", f"## {sheet.title}", "", f"| {' | '.join(sheet.columns)} |"]
-        lines.append("|" + "|".join("---" if name in _WORDS else "---:" for name in sheet.columns) + "|")
-        lines += [f"| {' | '.join(row)} |" for row in sheet.rows]
+        lines += ["", *sheet.markdown(_WORDS)]
     for file, text in pictures.items():
         lines += ["", f"![{text}]({file})"]
     return "\n".join(lines) + "\n"

@@ -12,7 +12,7 @@ from torch import Tensor
 from detectors.base import Detector, Predictor, RawPredictions, predict
 from detectors.types import Detections, Targets
 from drivesem import detection_loss
-from drivesem.attacks.base import Problem, Score
+from drivesem.attacks.base import Group, Problem, Score
 from drivesem.evaluation import failures
 from drivesem.feasible import FeasibleSet
 from drivesem.judged import JudgedClasses, t_star_of
@@ -149,6 +149,7 @@ class Objective:
             step=self.space.step,
             lower=self.space.lower,
             upper=self.space.upper,
+            groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
         )
 
     @property

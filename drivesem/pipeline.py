@@ -22,7 +22,7 @@ from drivesem.labels import LabelMode, to_kitti_labels
 from drivesem.objective import Objective, Rendered
 from drivesem.report import pictures
 from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
-from drivesem.space import Parameter, ParameterSpace
+from drivesem.space import Budget, Parameter, ParameterSpace
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.io import load_scene, save_scene
@@ -35,7 +35,8 @@ RESULT = "result.json"
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
-    to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's.
+    to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
+    budget: how far theta may go, by default as far as the paper's.
     """
 
     attack: AttackMethod
@@ -45,6 +46,7 @@ class FrameSettings:
     render: RenderSettings
     seed: int
     t_star: float | None = None
+    budget: Budget | None = None
 
 
 def attack_frame(
@@ -56,7 +58,7 @@ def attack_frame(
     detector knows no cars.
     """
     start = time.perf_counter()
-    space = ParameterSpace(scene, settings.params)
+    space = ParameterSpace(scene, settings.params, settings.budget)
     compositor = Compositor(scene, settings.render)
     objective = Objective(compositor, space, detector, settings.label_mode, settings.term, t_star=settings.t_star)
     attacked = settings.attack(objective.problem(FeasibleSet(space)), space.theta0, settings.seed)
@@ -83,21 +85,7 @@ def _result(
 ) -> FrameResult:
     names = objective.judged.names
     scene = objective.space.scene
-    found = objective.failures(rendered, "moved")
     moved = rendered.moved.targets
-    failures = [
-        Failure("lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i) for i in found.lost
-    ]
-    for i in found.phantoms:
-        detections = rendered.detections
-        failures.append(
-            Failure(
-                "phantom",
-                names[int(detections.labels[i])],
-                _xyxy(detections.boxes_xyxy[i]),
-                score=float(detections.scores[i]),
-            )
-        )
     return FrameResult(
         identifier=identifier,
         objects=len(scene.objects),
@@ -114,7 +102,7 @@ def _result(
         detections_benign=detection_records(benign, names),
         detections_rerendered=detection_records(objective.benign.detections, names),
         detections_attacked=detection_records(rendered.detections, names),
-        failures=tuple(failures),
+        failures=failure_records(objective, rendered),
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
         success_paper=attacked.success_paper,
         success_moved=attacked.success_moved,
@@ -149,6 +137,26 @@ def _write(part: Path, scene: SceneIR, objective: Objective, rendered: Rendered,
 def to_uint8(image: Tensor) -> np.ndarray:
     """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+
+def failure_records(objective: Objective, rendered: Rendered) -> tuple[Failure, ...]:
+    """What the detector gets wrong in `rendered`, by moved labels, as records: lost objects, then phantoms."""
+    names = objective.judged.names
+    found = objective.failures(rendered, "moved")
+    moved, detections = rendered.moved.targets, rendered.detections
+    lost = [
+        Failure("lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i) for i in found.lost
+    ]
+    phantoms = [
+        Failure(
+            "phantom",
+            names[int(detections.labels[i])],
+            _xyxy(detections.boxes_xyxy[i]),
+            score=float(detections.scores[i]),
+        )
+        for i in found.phantoms
+    ]
+    return (*lost, *phantoms)
 
 
 def target_records(targets: Targets, names: tuple[str, ...], objects: int) -> tuple[BoxRecord, ...]:

@@ -9,12 +9,11 @@ import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -25,7 +24,7 @@ from detectors.registry import load_detector, save_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from detectors.types import CLASSES, Detections
-from drivesem.attack_command import attack_frames
+from drivesem.attack_command import Worker, attack_frames
 from drivesem.config import Attack, Retrain, UsageError, size_hw
 from drivesem.data.registry import open_dataset
 from drivesem.devices import check_device
@@ -34,7 +33,7 @@ from drivesem.evaluation.coco import ClassScores
 from drivesem.judged import JudgedClasses
 from drivesem.labels import LabelMode
 from drivesem.pipeline import as_targets
-from drivesem.run_folder import CONFIG, claim
+from drivesem.run_folder import attack_of, claim
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore
@@ -75,7 +74,7 @@ def run(config: Retrain) -> int:
     """Retrain, or go on with it; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
     check_device(config.device)
-    attack = _attack_of(Path(config.run))
+    attack = attack_of(Path(config.run))
     frames = frames_of(Path(config.run))
     kept_out, learned = _divided(frames, config)
     start = config.start or attack.detector
@@ -108,18 +107,6 @@ def run(config: Retrain) -> int:
     _print(rows, console)
     console.print(f"weights: {out / WEIGHTS}", soft_wrap=True)
     return 0
-
-
-def _attack_of(run: Path) -> Attack:
-    """The configuration of a run. Raises UsageError where the folder is none."""
-    path = run / CONFIG
-    if not path.is_file():
-        raise UsageError("--run", "a run's folder, with its config.yaml", run)
-    loaded = yaml.safe_load(files.read_text(path))
-    known = {field.name for field in fields(Attack)}
-    if not isinstance(loaded, dict) or not set(loaded) <= known:
-        raise UsageError("--run", "a run of drivesem attack", run)
-    return Attack(**loaded)
 
 
 def _detector(name: str, device: str) -> Detector:
@@ -244,7 +231,7 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
         t_star=None,
     )
     _forget_other_weights(out)
-    summary = attack_frames(again, names, out / FRESH)
+    summary = attack_frames(Worker.of(again), names, out / FRESH)
     rows = []
     for mode, scores, won in (
         ("moved", summary.attacked_moved, summary.successes_moved),

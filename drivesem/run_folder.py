@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from drivesem.config import Common, UsageError, to_yaml
+from drivesem.config import Attack, Common, UsageError, to_yaml
 from scene_ir import files
 
 CONFIG = "config.yaml"
@@ -36,6 +36,18 @@ def claim(
     elif out.is_dir() and any(out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     files.write_text(path, to_yaml(config))
+
+
+def attack_of(run: Path) -> Attack:
+    """The configuration of a run of `drivesem attack`. Raises UsageError where the folder is none."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise UsageError("--run", "a run's folder, with its config.yaml", run)
+    loaded = yaml.safe_load(files.read_text(path))
+    known = {field.name for field in fields(Attack)}
+    if not isinstance(loaded, dict) or not set(loaded) <= known:
+        raise UsageError("--run", "a run of drivesem attack", run)
+    return Attack(**loaded)
 
 
 def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:

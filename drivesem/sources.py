@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from drivesem.config import DEMO, Attack, Derender
+from scene_ir.errors import SceneError
 from scene_ir.types import Frame, SceneIR
 
 if TYPE_CHECKING:
@@ -32,6 +33,10 @@ class SceneSource(Protocol):
     def scene(self, identifier: str) -> SceneIR:
         """The frame taken apart. Raises SceneError for a frame that cannot be used."""
         ...
+
+
+class NoVehicleError(SceneError):
+    """A frame of whose labelled vehicles none could be taken apart: all are too small, or outside the image."""
 
 
 class DemoSource:

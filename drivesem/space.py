@@ -7,7 +7,7 @@ photographed is theta = 0. What is *feasible* inside the bounds is decided by `d
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
@@ -76,8 +76,9 @@ COMBOS: dict[int, tuple[Parameter, ...]] = {
 @dataclass(frozen=True, slots=True)
 class Budget:
     """How far each parameter may go from the photograph, at most. Codes end at these values whatever they start
-    from; the others are distances from the photographed scene. translate: own lengths; rotate: rad; mesh: unit
-    boxes (the bound on strain in `drivesem.feasible` is the one that binds).
+    from; the others are distances from the photographed scene. translate: own lengths; translate_m: metres, the
+    same for long and short cars, and the nearer of both binds; rotate: rad; mesh: unit boxes (the bound on strain
+    in `drivesem.feasible` is the one that binds).
     """
 
     color: float = 1.0
@@ -86,9 +87,10 @@ class Budget:
     translate: float = 0.25
     rotate: float = 0.35
     mesh: float = 0.25
+    translate_m: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_positive("budget", self)
+        _check_positive("budget", self, unbounded=("translate_m",))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +108,10 @@ class StepSizes:
         _check_positive("steps", self)
 
 
-def _check_positive(what: str, values: Budget | StepSizes) -> None:
+def _check_positive(what: str, values: Budget | StepSizes, unbounded: Collection[str] = ()) -> None:
     for entry in fields(values):
         value = getattr(values, entry.name)
-        if not (math.isfinite(value) and value > 0):
+        if not (value > 0 and (math.isfinite(value) or entry.name in unbounded)):
             raise RangeError(f"{what}.{entry.name}", "a positive number", value)
 
 
@@ -192,6 +194,11 @@ class ParameterSpace:
             self.lower[where] = low
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
+
+    @property
+    def blocks(self) -> Mapping[Parameter, slice]:
+        """Where theta holds each of its parameters, in its order."""
+        return self._slices
 
     def slice_of(self, parameter: Parameter) -> slice | None:
         """Where theta holds `parameter`, or None where it is held."""
@@ -327,6 +334,10 @@ class ParameterSpace:
             start, low = self.scene.environment.weather, 0.0
         elif parameter is Parameter.FOLIAGE:
             start, low = self.scene.environment.foliage, -limit
+        elif parameter is Parameter.TRANSLATE:
+            length_m = self.scene.objects.size_lhw[:, :1].detach()
+            reach = (self.budget.translate_m / length_m).clamp(max=limit).expand(-1, 2).reshape(-1)
+            return -reach, reach
         else:
             return -limit, limit
         start = start.detach()

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from drivesem.feasible import Projected
 
 
+_TINY = 1e-30
+"""Keeps a division defined where its result is not used."""
+
+
 @dataclass(frozen=True, slots=True)
 class Score:
     """What the detector makes of one theta. loss: the attack's objective, to be raised. lost: objects found in the
@@ -33,12 +37,23 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
+class Group:
+    """A block of theta that belongs together: one parameter of the scene, or of all its cars. where: its
+    coordinates.
+    """
+
+    name: str
+    where: slice
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
-    """What an attack sees of scene and detector: callables of theta (D,).
+    """What an attack sees of scene and detector: callables of theta (D,), which is 0 as photographed.
 
     loss_and_grad: the objective to be raised, and its gradient (D,); for detectors that have one. project: onto
     the feasible set. score: re-render and judge, without a gradient; what was judged once is not rendered again.
-    step (D,): the step alpha of each coordinate; lower, upper (D,): its bounds.
+    step (D,): the step alpha of each coordinate, 0 where it is held; lower, upper (D,): its bounds. groups: the
+    blocks of theta, which cover it; by default it is one.
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
@@ -47,6 +62,27 @@ class Problem:
     step: Tensor
     lower: Tensor
     upper: Tensor
+    groups: tuple[Group, ...] = (Group("theta", slice(None)),)
+
+    def in_steps(self, theta: Tensor) -> Tensor:
+        """theta (D,) in steps alpha; 0 where a coordinate is held. Differentiable."""
+        return torch.where(self.step > 0, theta / self.step.clamp_min(_TINY), 0)
+
+    def size(self, theta: Tensor, p: int = 2) -> Tensor:
+        """How large a change is: the p-norm () of theta (D,) in sign steps; differentiable.
+
+        Of each group the p-mean of its coordinates counts, in steps alpha: k sign steps of any group alone have
+        size k, whether it has one coordinate or a thousand, and groups can be compared.
+        """
+        weight = torch.zeros_like(self.step)
+        for group in self.groups:
+            block = weight[group.where]
+            block.fill_(max(len(block), 1) ** (-1 / p))
+        return torch.linalg.vector_norm(weight * self.in_steps(theta), p)
+
+    def moved(self, theta: Tensor) -> tuple[Group, ...]:
+        """The groups that theta (D,) changes."""
+        return tuple(group for group in self.groups if bool((theta[group.where] != 0).any()))
 
     def box(self, theta0: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """Where a search may look: lower and upper (D,), so many steps around theta0, within the bounds; the whole
@@ -61,7 +97,7 @@ class Problem:
 @dataclass(frozen=True, slots=True)
 class Proposals:
     """What `_propose` hands over. thetas: the iterates in order; losses: one each, None where it was not computed;
-    queries: gradients taken, or thetas judged by a search without gradient; active_constraints: what projections
+    queries: gradients taken, and thetas judged by a search without gradient; active_constraints: what projections
     on the way held back.
     """
 
@@ -100,10 +136,16 @@ class Attack(ABC):
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         """Iterates from theta0 (D,), feasible or not; all randomness from `generator`."""
 
+    def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
+        """What the winner among feasible, newly scored thetas (D,) has most of, the more important first. Here:
+        failures (lost objects and phantoms) under `moved` labels, then the loss.
+        """
+        return (score.lost + score.phantoms, score.loss)
+
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
-        """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one with most
-        failures (lost objects and phantoms) under `moved` labels wins; then the highest loss.
+        """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one that ranks
+        highest (`_rank`) wins; of equals the first.
 
         All are scored because a detector's loss says only roughly what is lost: on the embedded scenes the iterate
         of highest loss loses fewer objects than the best one. A score takes no gradient and counts as no query.
@@ -116,7 +158,8 @@ class Attack(ABC):
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)
         scores = [problem.score(p.theta) for p in projected]
-        best = max(range(len(scores)), key=lambda i: (scores[i].lost + scores[i].phantoms, scores[i].loss, -i))
+        ranks = [self._rank(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
+        best = max(range(len(ranks)), key=lambda i: (*ranks[i], -i))
         score = scores[best]
         trace = [loss for loss in proposals.losses if loss is not None]
         return AttackResult(

@@ -43,7 +43,8 @@ class CMAES(Search):
             losses: list[float] = []
             for place in places:
                 if trials.left:
-                    losses.append(trials.judge(lower + torch.from_numpy(np.asarray(place)).to(theta0) * size))
+                    theta = lower + torch.from_numpy(np.asarray(place)).to(theta0) * size
+                    losses.append(trials.judge(theta).loss)
             if len(losses) == len(places):
                 strategy.tell(places, [-loss for loss in losses])
         return trials.proposals()

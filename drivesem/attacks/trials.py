@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from drivesem.attacks.base import Attack, Problem, Proposals
+from drivesem.attacks.base import Attack, Problem, Proposals, Score
 from scene_ir.errors import RangeError
 
 
@@ -53,15 +53,15 @@ class Trials:
         """How many thetas may still be tried."""
         return 0 if self.early_stop and self._failed else self.queries - len(self._thetas)
 
-    def judge(self, theta: Tensor) -> float:
-        """The loss at the feasible theta (D,) nearest to this one. Costs a query."""
+    def judge(self, theta: Tensor) -> Score:
+        """What comes of the feasible theta (D,) nearest to this one. Costs a query."""
         feasible = self.problem.project(theta)
         score = self.problem.score(feasible.theta)
         self._thetas.append(feasible.theta)
         self._losses.append(score.loss)
         self._active.extend(feasible.active)
         self._failed |= score.success
-        return score.loss
+        return score
 
     def proposals(self) -> Proposals:
         """All that was tried, in order."""

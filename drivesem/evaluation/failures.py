@@ -41,17 +41,17 @@ class Failures:
         return bool(self.lost or self.phantoms)
 
 
-def judge(targets: Targets, detections: Detections, threshold: float) -> Judgement:
-    """Match detections to targets of their class at IoU 0.5, best score first (COCO's greedy matching).
+def judge(targets: Targets, detections: Detections, threshold: float, iou: float = IOU) -> Judgement:
+    """Match detections to targets of their class from that IoU on, best score first (COCO's greedy matching).
 
-    A detection without a target is excused where at least half of it lies on an ignored target of its class.
+    A detection without a target is excused where at least that share of it lies on an ignored one of its class.
     """
     overlap = boxes.iou_matrix(detections.boxes_xyxy, targets.boxes_xyxy.to(detections.boxes_xyxy))
     share = boxes.ioa_matrix(detections.boxes_xyxy, targets.boxes_xyxy.to(detections.boxes_xyxy))
     same = detections.labels[:, None] == targets.labels.to(detections.labels)[None]
     ignore = targets.ignore.to(detections.labels.device)
     candidates = torch.where(same & ~ignore, overlap, torch.zeros_like(overlap))
-    excused = (same & ignore & (share >= IOU)).any(dim=1)
+    excused = (same & ignore & (share >= iou)).any(dim=1)
     found = [False] * len(targets)
     false_positive = [False] * len(detections)
     order = torch.argsort(detections.scores, descending=True, stable=True).tolist()
@@ -59,7 +59,7 @@ def judge(targets: Targets, detections: Detections, threshold: float) -> Judgeme
     for d in order:
         if scores[d] < threshold:
             break
-        free = [(rows[d][t], -t) for t in range(len(found)) if not found[t] and rows[d][t] >= IOU]
+        free = [(rows[d][t], -t) for t in range(len(found)) if not found[t] and rows[d][t] >= iou]
         if free:
             found[-max(free)[1]] = True
         else:
@@ -75,16 +75,18 @@ def find(
     targets: Targets,
     detections: Detections,
     threshold: float,
+    iou: float = IOU,
 ) -> Failures:
     """What was right on the benign re-render and is wrong now. The i-th targets of both are the same object.
 
-    Objects that are ignored now are not lost. A false positive is a phantom unless it overlaps (IoU over 0.5) a
-    false positive of its class in the benign re-render. Raises ValueError where the targets do not correspond.
+    iou: from which a detection meets a target. Objects that are ignored now are not lost. A false positive is a
+    phantom unless it overlaps (IoU over 0.5) a false positive of its class in the benign re-render. Raises
+    ValueError where the targets do not correspond.
     """
     if len(benign_targets) != len(targets) or not torch.equal(benign_targets.labels, targets.labels):
         raise ValueError(f"targets: expected the {len(benign_targets)} benign objects, found {len(targets)}")
-    before = judge(benign_targets, benign_detections, threshold)
-    after = judge(targets, detections, threshold)
+    before = judge(benign_targets, benign_detections, threshold, iou)
+    after = judge(targets, detections, threshold, iou)
     lost = before.found & ~after.found & ~targets.ignore.cpu()
     old = before.false_positive.to(benign_detections.labels.device)
     repeated = boxes.iou_matrix(detections.boxes_xyxy, benign_detections.boxes_xyxy[old]) > IOU

@@ -135,7 +135,7 @@ def _shown(value: float | None, decimals: int) -> str:
     return "-" if value is None else f"{value:.{decimals}f}"
 
 
-def _values(labels: Labels) -> dict[str, np.ndarray]:
+def values_of(labels: Labels) -> dict[str, np.ndarray]:
     """Every quantity of one frame's vehicles; those of unknown pose (NaN) are left out of what needs one."""
     rows = np.array([i for i, kind in enumerate(labels.kind) if kind in VEHICLES], np.int64)
     boxes = labels.boxes_xyxy.double().numpy()[rows]
@@ -167,7 +167,7 @@ def histograms(frames: Iterable[Labels]) -> Histograms:
     """The distributions of the vehicles in many frames' labels."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in QUANTITIES}
     for labels in frames:
-        for name, values in _values(labels).items():
+        for name, values in values_of(labels).items():
             found[name].append(values)
     values = {name: np.concatenate(parts) if parts else np.zeros(0) for name, parts in found.items()}
     means = {

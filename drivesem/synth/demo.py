@@ -89,6 +89,15 @@ def _accepted(truths: Sequence[Truth], count: int) -> bool:
     )
 
 
+def demo_plan(seed: int, index: int, attempt: int) -> Plan | None:
+    """What an attempt at embedded scene `index` of stream `seed` would show; None where too few vehicles of it can
+    be seen. A scene's provenance names its attempt.
+    """
+    layout = replace(_LAYOUT, kinds=(_KINDS[index % len(_KINDS)],))
+    settings = SynthSettings(layout, sunny=True, tilt_rad=0.004)
+    return _thinned(plan_frame(seed, index, "heldout", settings, attempt))
+
+
 def demo_scene(seed: int, index: int) -> SceneIR:
     """Embedded scene `index` of stream `seed`: shapes, surroundings and seeds that no training frame has.
 
@@ -97,10 +106,8 @@ def demo_scene(seed: int, index: int) -> SceneIR:
     """
     if index < 0:
         raise RangeError("demo scene", "an index of at least 0", index)
-    layout = replace(_LAYOUT, kinds=(_KINDS[index % len(_KINDS)],))
-    settings = SynthSettings(layout, sunny=True, tilt_rad=0.004)
     for attempt in range(_ATTEMPTS):
-        plan = _thinned(plan_frame(seed, index, "heldout", settings, attempt))
+        plan = demo_plan(seed, index, attempt)
         if plan is None:
             continue
         count = len(plan.actors)

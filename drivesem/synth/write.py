@@ -183,15 +183,10 @@ def _rendered(plan: Plan) -> SynthFrame:
     return frame
 
 
-def make_frame(job: Job) -> int:
-    """Make one frame, with all its files, and leave its entry; the frame's number. Done before: nothing to do."""
-    order, place = job.order, job.place
-    writer = _writer(order)
-    entry_path = _entry_path(order.out, place.number)
-    if order.resume and entry_path.exists() and writer.exists(place):
-        return place.number
-    split = "heldout" if place.part == "val" else order.split
-    virtual = order.layout.startswith("vkitti")
+def plan_of(job: Job) -> Plan:
+    """What the frame will show, before it is rendered."""
+    order = job.order
+    split = "heldout" if job.place.part == "val" else order.split
     pack = _pack(order.meshes, order.assets)
     settings = SynthSettings(
         layout=LayoutSettings(variants=VARIANTS[split], people=order.people, fleet=of_split(pack.vehicles, split)),
@@ -203,9 +198,19 @@ def make_frame(job: Job) -> int:
     )
     attempt = _busy_attempt(order.seed, job.index - job.index % order.sequence, split, settings)
     plan = variation_of(plan_frame(order.seed, job.index, split, settings, attempt), job.variation)
-    plan = apply_edits(plan, _edits_of(order.edits), job.index)
+    return apply_edits(plan, _edits_of(order.edits), job.index)
+
+
+def make_frame(job: Job) -> int:
+    """Make one frame, with all its files, and leave its entry; the frame's number. Done before: nothing to do."""
+    order, place = job.order, job.place
+    writer = _writer(order)
+    entry_path = _entry_path(order.out, place.number)
+    if order.resume and entry_path.exists() and writer.exists(place):
+        return place.number
+    plan = plan_of(job)
     first_track = 0
-    if virtual and order.sequence == 1:
+    if order.layout.startswith("vkitti") and order.sequence == 1:
         first_track = TRACKS_A_STREET * (job.index % _STREETS_A_SCENE)
     exposure = expose(_rendered(plan), first_track)
     written = []
@@ -248,6 +253,15 @@ def in_processes(workers: int, apart: bool = False) -> Engine:
     return run
 
 
+def jobs_of(order: Order) -> list[Job]:
+    """All frames of the data set, in order."""
+    variations = order.variations
+    return [
+        Job(order, place, place.number // len(variations), variations[place.number % len(variations)])
+        for place in order.places()
+    ]
+
+
 def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
     """Make the data set that `order` asks for, yielding each frame's number as it is done.
 
@@ -264,11 +278,7 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
         raise FormatError(f"{stamp}: {key}", repr(recipe.get(key)), repr(found.get(key)))
     if not order.resume or not stamp.exists():
         files.write_json(stamp, recipe)
-    variations = order.variations
-    jobs = [
-        Job(order, place, place.number // len(variations), variations[place.number % len(variations)])
-        for place in order.places()
-    ]
+    jobs = jobs_of(order)
     yield from engine(make_frame, jobs)
     _finish(order, jobs)
 

@@ -35,8 +35,8 @@ def sheets(rows: Sequence[Row]) -> list[Sheet]:
             values = (one.ap50, one.ap70, one.ap, scores.overall.ap50, one.recall, one.recall_at_t_star)
             figures.append((*sides, name, *map(percent, values)))
         fall = {mode: next(one for one in row.drops[mode] if one.name == AP50) for mode in row.drops}
-        counted = [f"{_bounded(row.shares[n])}\n{row.counts[n][0]} of {row.counts[n][1]}" for n in _SHARES]
-        shares.append((*sides, _bounded(fall["paper"]), _bounded(fall["moved"]), *counted))
+        counted = [f"{bounded(row.shares[n])}\n{row.counts[n][0]} of {row.counts[n][1]}" for n in _SHARES]
+        shares.append((*sides, bounded(fall["paper"]), bounded(fall["moved"]), *counted))
     scored = ("AP50", "AP70", "AP50:95", "mAP50", "recall", "recall at t*")
     fallen = ("AP50 falls, paper", "AP50 falls, moved")
     return [
@@ -83,18 +83,14 @@ def write_report(out: Path, rows: Sequence[Row], draws: int) -> None:
     files.write_text(out / "transfer.csv", buffer.getvalue())
     lines = ["# Transfer", "", "![](transfer.png)", ""]
     for sheet in sheets(rows):
-        lines += [f"## {sheet.title}", "", _line(sheet.columns), _line(("---",) * len(sheet.columns))]
-        lines += [*map(_line, sheet.rows), ""]
+        lines += [*sheet.markdown((*_SIDES, _LABELS)), ""]
     lines += [f"{note}\n" for note in notes(rows, draws)]
     files.write_text(out / "transfer.md", "\n".join(lines))
     write_heatmap(out / "transfer.png", rows)
 
 
-def _line(parts: Sequence[str]) -> str:
-    return "| " + " | ".join(part.replace("|", "\\|").replace("\n", ", ") for part in parts) + " |"
-
-
-def _bounded(one: Interval) -> str:
+def bounded(one: Interval) -> str:
+    """A fraction and its bounds as percentages."""
     if one.value is None or one.low is None or one.high is None:
         return percent(one.value)
     return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"

@@ -280,7 +280,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         frame.photograph.float(),
         picture,
         depth,
-        labels.ignore_xyxy,
+        _not_judged(labels, [cut.row for cut in cuts]),
         provenance,
         tuple(front.layer(a, thing.depth_m) for a, thing in zip(opacities, things, strict=True) if a.any()),
     )
@@ -295,6 +295,15 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         margins,
     )
     return paint.with_regions(solved, settings.backend)
+
+
+def _not_judged(labels: Labels, rows: Sequence[int]) -> torch.Tensor:
+    """Boxes (K, 4) px in which no detection counts: regions, and what was labelled but is none of the vehicles
+    `rows`: people, trams, vehicles that could not be taken apart. They stay in the picture as they are.
+    """
+    others = torch.ones(len(labels.kind), dtype=torch.bool)
+    others[list(rows)] = False
+    return torch.cat([labels.ignore_xyxy, labels.boxes_xyxy[others]])
 
 
 def _bytes(image: Array) -> NDArray[np.uint8]:

@@ -69,7 +69,7 @@ def _street(
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def street() -> Callable[..., SceneIR]:
     """The factory of streets."""
     return _street

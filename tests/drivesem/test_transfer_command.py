@@ -40,7 +40,7 @@ class Blind:
 def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two embedded frames."""
     out = tmp_path_factory.mktemp("runs") / "source"
-    words = ["attack", "--method", "halton", "--queries", "3", "--limit", "2", "--workers", "1", "--json"]
+    words = ["attack", "--combo", "2", "--limit", "2", "--workers", "1", "--json"]
     assert main([*words, "--out", str(out)]) == 0
     return out
 

@@ -1,4 +1,4 @@
-"""The shipped detector on pictures of the generator that it was trained with, from the held-out split."""
+"""The shipped detectors on pictures of the generator that they were trained with, from the held-out split."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from drivesem.data.classes import KITTI
 from drivesem.synth.frames import generate_frame
 
 SEED, INDEX = 2026, 13
-"""A held-out street; no frame that the detector was trained, chosen or judged on."""
+"""A held-out street; no frame that the detectors were trained, chosen or judged on."""
 
 
-@pytest.mark.skipif(
-    not SHIPPED["squeezedet"].is_file(), reason="detectors/weights/squeezedet.safetensors is not there"
-)
-def test_near_cars_are_found() -> None:
+@pytest.mark.parametrize("name", SHIPPED)
+def test_near_cars_are_found(name: str) -> None:
     frame = generate_frame(SEED, INDEX, "heldout")
     targets = KITTI.targets(frame.labels)
     objects = len(frame.labels.kind)  # regions to ignore stand behind them
@@ -26,7 +24,7 @@ def test_near_cars_are_found() -> None:
     near = (targets.labels[:objects] == CLASSES.index("Car")) & (boxes_xyxy[:, 3] - boxes_xyxy[:, 1] >= 40)
     near &= (frame.labels.occlusion == 0) & (frame.labels.truncation < 0.1)
     assert int(near.sum()) >= 1
-    detector = load_detector("squeezedet")
+    detector = load_detector(name)
     image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].float() / 255
     found = detector.decode(detector(image))[0]
     sure = (found.scores >= detector.t_star) & (found.labels == CLASSES.index("Car"))

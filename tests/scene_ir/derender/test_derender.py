@@ -130,6 +130,17 @@ def test_a_frame_without_vehicles_is_a_scene_without_objects(street, change):
     assert len(scene.objects) == 0
     assert torch.equal(scene.background, street.frame.photograph)
     assert torch.equal(render(scene), street.frame.photograph)
+    assert torch.equal(scene.ignore, street.frame.labels.boxes_xyxy)  # nothing that is found there counts
+
+
+def test_what_is_labelled_and_no_vehicle_is_a_region_beside_those_of_the_labels(street):
+    one, region = street.frame.labels, torch.tensor([[1.0, 2.0, 30.0, 40.0]])
+    walker = torch.tensor([[300.0, 90.0, 320.0, 150.0]])
+    twice = (torch.cat([t, t]) for t in (one.truncation, one.occlusion, one.translation, one.yaw, one.size_lhw))
+    both = Labels(("Pedestrian", *one.kind), torch.cat([walker, one.boxes_xyxy]), *twice, region)
+    scene = derender(replace(street.frame, labels=both), DerenderSettings(fit=False))
+    assert len(scene.objects) == 1
+    assert torch.equal(scene.ignore, torch.cat([region, walker]))
 
 
 def test_vans_are_cars_and_trucks_are_trucks(street):

@@ -1,0 +1,1 @@
+"""Counterexamples rendered again by the scene generator, the second renderer."""

@@ -1,0 +1,162 @@
+"""One frame: the change drawn by the generator, the detector asked before and after, its folder on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from detectors.base import Predictor, predict
+from detectors.types import CLASSES, Detections
+from drivesem.confirm.carry import carried
+from drivesem.confirm.judge import Finding, Stand, exact_labels, findings, stands
+from drivesem.confirm.plans import Plans
+from drivesem.confirm.sheet import sheet_of
+from drivesem.judged import JudgedClasses
+from drivesem.pipeline import RESULT, detection_records, target_records
+from drivesem.results import BoxRecord
+from drivesem.synth.edits import apply_edit
+from drivesem.synth.frames import Plan, SynthFrame, render_frame
+from drivesem.transfer.runs import Frame
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
+
+SCHEMA = 1
+PICTURE, SHEET = "generator.png", "sheet.png"
+_ROUNDING = 1
+"""Levels of 255 by which the same picture may differ from one processor to another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmed:
+    """What came of one frame. source: fingerprint of the run's result. compositor, generator: failures in either
+    picture; targets, detections: in the generator's pictures, boxes with their track as index; not_carried: what
+    of the change the plan has no counterpart for. `seconds` alone may differ between two calls.
+    """
+
+    identifier: str
+    source: str
+    compositor: tuple[Finding, ...]
+    generator: tuple[Finding, ...]
+    stands: tuple[Stand, ...]
+    targets_benign: tuple[BoxRecord, ...]
+    targets_changed: tuple[BoxRecord, ...]
+    detections_benign: tuple[BoxRecord, ...]
+    detections_changed: tuple[BoxRecord, ...]
+    not_carried: tuple[str, ...]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """How the detector is asked. t_star: score from which a detection counts."""
+
+    device: str
+    t_star: float
+
+    @torch.no_grad()
+    def detect(self, detector: Predictor, image: np.ndarray) -> Detections:
+        """What it finds in a picture (H, W, 3) uint8, of judged classes, on the CPU."""
+        picture = torch.from_numpy(image).permute(2, 0, 1).to(self.device) / 255
+        found = JudgedClasses.of(detector).detections(predict(detector, picture[None])[0])
+        return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
+
+
+def confirm_frame(
+    frame: Frame, source: Path, plans: Plans, detector: Predictor, ask: Asked, folder: Path
+) -> Confirmed:
+    """Draw one frame of a run again and write `folder`, whole or not at all. source: the frame's folder in the
+    run.
+
+    Raises FormatError where the plan is not that of the frame, as its picture without the change tells.
+    """
+    start = time.perf_counter()
+    changed = load_scene(source / "scene")
+    still = changed.as_photographed()
+    identifier = frame.result.identifier
+    planned = plans.planned(identifier, changed)
+    before = _rendered(planned.plan)
+    _check_same(frame.pictures["benign"], before.image)
+    change = carried(still, changed, planned)
+    after = _rendered(apply_edit(planned.plan, change.edit, f"frame {identifier}"))
+    exact = exact_labels(before, after)
+    seen = [ask.detect(detector, image) for image in (before.image, after.image)]
+    found = findings(frame.result, planned.tracks, exact, seen, JudgedClasses.of(detector), ask.t_star)
+    targets = [target_records(t, CLASSES, len(exact.tracks)) for t in (exact.benign, exact.changed)]
+    names = JudgedClasses.of(detector).names
+    result = Confirmed(
+        identifier=identifier,
+        source=fingerprint(source),
+        compositor=found[0],
+        generator=found[1],
+        stands=stands(frame.result, planned.tracks, exact, before, after),
+        targets_benign=_by_track(targets[0], exact.tracks),
+        targets_changed=_by_track(targets[1], exact.tracks),
+        detections_benign=detection_records(seen[0], names),
+        detections_changed=detection_records(seen[1], names),
+        not_carried=change.missing,
+        seconds=round(time.perf_counter() - start, 3),
+    )
+    with files.whole_folder(folder) as part:
+        files.write_png(part / PICTURE, after.image)
+        files.write_png(part / SHEET, sheet_of(frame, result, after.image, ask.t_star))
+        files.write_text(part / RESULT, dump(result))
+    return result
+
+
+def fingerprint(source: Path) -> str:
+    """Of a frame's result in the run: another result is another frame."""
+    return hashlib.sha256(files.read_bytes(source / RESULT)).hexdigest()
+
+
+def _rendered(plan: Plan) -> SynthFrame:
+    frame = render_frame(plan)
+    assert frame is not None
+    return frame
+
+
+def _check_same(path: Path, image: np.ndarray) -> None:
+    """Raises FormatError where the run's photograph is not the picture that the generator makes."""
+    given = files.read_image(path, image.shape[:2])
+    apart = int(np.abs(given.astype(np.int16) - image).max(initial=0))
+    if apart > _ROUNDING:
+        raise FormatError(
+            str(path), "the picture that the generator makes of this frame", f"one {apart} levels off"
+        )
+
+
+def _by_track(records: Sequence[BoxRecord], tracks: Sequence[int]) -> tuple[BoxRecord, ...]:
+    return tuple(r if r.index is None else dataclasses.replace(r, index=tracks[r.index]) for r in records)
+
+
+def dump(result: Confirmed) -> str:
+    """JSON text of one frame's result."""
+    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
+
+
+def load(path: Path) -> Confirmed:
+    """Read what `dump` wrote. Raises FormatError naming the file."""
+    data = files.read_json(path)
+    try:
+        if data.pop("schema") != SCHEMA:
+            raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
+        kinds: dict[str, Callable[..., Any]] = {"compositor": Finding, "generator": Finding, "stands": Stand}
+        kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
+        for name, kind in kinds.items():
+            data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])
+        return Confirmed(**{**data, "not_carried": tuple(data["not_carried"])})
+    except (AttributeError, KeyError, TypeError) as error:
+        raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
+
+
+def _box_of(entry: dict[str, Any]) -> dict[str, Any]:
+    return {"xyxy": tuple(entry["xyxy"])} if "xyxy" in entry else {}

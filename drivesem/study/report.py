@@ -1,0 +1,248 @@
+"""A study for people: tables on the terminal and in Markdown, with what they mean."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from drivesem.config import Study
+from drivesem.eval_report import Sheet, percent
+from drivesem.evaluation.resampling import Difference, Interval
+from drivesem.judged import HEADLINE
+from drivesem.study.arms import PAPER_BENIGN, PLACEBO, RANDOM
+from drivesem.study.labels import OVERLAPS, LabelSets
+from drivesem.study.rows import FIGURES, MODES, Row, feasible_fraction
+from drivesem.study.running import Ran
+from drivesem.study.success import Curve
+from drivesem.transfer.report import bounded
+from scene_ir import files
+
+_ARM, _MEASURE = "arm", "figure"
+_WORDS = (_ARM, _MEASURE)
+_MARKS = (1, 2, 5, 10, 20, 64)
+"""Queries at which a curve is told in a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
+    within `within` queries less what that arm does at its end. label_sets: of the study `labels`.
+    """
+
+    study: Study
+    draws: int
+    ran: Ran
+    rows: Sequence[Row]
+    curves: Sequence[Curve] = ()
+    beside: Mapping[str, Difference] | None = None
+    within: int = 0
+    label_sets: Sequence[LabelSets] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        results = [result for run in self.ran.runs for result in run.results]
+        data: dict[str, Any] = {
+            "study": self.study.name,
+            "headline": HEADLINE,
+            "frames": len(self.ran.runs[0].results),
+            "frames_without_vehicles": self.ran.without_vehicles,
+            "frames_failed": self.ran.failed,
+            "feasible_fraction": feasible_fraction(results),
+            "bootstrap": self.draws,
+            "rows": [row.flat() for row in self.rows],
+        }
+        if self.curves:
+            data["curves"] = [point for curve in self.curves for point in curve.to_json()]
+        if self.label_sets:
+            data["label_sets"] = [one.flat() for one in self.label_sets]
+        return data
+
+
+def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
+    """The study's own question first. whole: with the figures that only some ask for."""
+    tables: list[Sheet] = []
+    if found.curves:
+        tables.append(_success(found))
+    if found.label_sets:
+        tables += [_label_sets(found.label_sets), _counterexamples(found.label_sets)]
+    tables.append(_precision(found.rows))
+    if any(row.controls for row in found.rows):
+        tables.append(_controls(found.rows))
+    return [*tables, *([_further(found.rows)] if whole else []), _frames(found.rows)]
+
+
+def _precision(rows: Sequence[Row]) -> Sheet:
+    told = any(row.run.arm.reference is not None for row in rows)
+    columns = [_ARM, "benign", *(f"{mode} labels" for mode in MODES), *(f"falls, {mode}" for mode in MODES)]
+    lines = []
+    for row in rows:
+        reference = row.run.arm.reference
+        cells = [row.name, *(percent(scores.ap50) for scores in (row.benign, row.paper, row.moved))]
+        cells += [bounded(row.drops[mode]["ap50"]) for mode in MODES]
+        if told:
+            cells += [percent(reference), "-" if reference is None else f"{100 * (PAPER_BENIGN - reference):.1f}"]
+        lines.append(tuple(cells))
+    columns += ["mAP there", "falls there"] if told else []
+    return Sheet(f"{HEADLINE} AP50, %", tuple(columns), tuple(lines))
+
+
+def _controls(rows: Sequence[Row]) -> Sheet:
+    lines = []
+    for row in rows:
+        cells = [row.name]
+        for name in (RANDOM, PLACEBO):
+            control = row.controls[name]
+            falls = control.drops["moved"]["ap50"].value
+            cells += ["-" if falls is None else f"{100 * falls:.1f}", bounded(row.effects[name]["moved"])]
+        size = row.controls[PLACEBO].size
+        cells.append("-" if size is None else f"{size:.2f}")
+        lines.append(tuple(cells))
+    columns = (
+        _ARM,
+        f"{RANDOM} falls",
+        f"attack less {RANDOM}",
+        f"{PLACEBO} falls",
+        f"attack less {PLACEBO}",
+        f"size of {PLACEBO}",
+    )
+    return Sheet("Controls: AP50, moved labels, points", columns, tuple(lines))
+
+
+def _further(rows: Sequence[Row]) -> Sheet:
+    lines = []
+    for row in rows:
+        for key, name in FIGURES.items():
+            if key == "ap50":
+                continue
+            scores = (getattr(one, key) for one in (row.benign, row.paper, row.moved))
+            falls = (bounded(row.drops[mode][key]) for mode in MODES)
+            lines.append((row.name, name, *map(percent, scores), *falls))
+    columns = (_ARM, _MEASURE, "benign", *MODES, *(f"falls, {mode}" for mode in MODES))
+    return Sheet(f"{HEADLINE}, further figures, %", columns, tuple(lines))
+
+
+def _frames(rows: Sequence[Row]) -> Sheet:
+    controls = [name for name in (RANDOM, PLACEBO) if any(name in row.controls for row in rows)]
+    lines = []
+    for row in rows:
+        flat = row.flat()
+        keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
+        lines.append((row.name, *(str(flat[key]) for key in ("frames", *keys, "queries"))))
+    columns = (_ARM, "frames", *MODES, *controls, "queries")
+    return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
+
+
+def _success(found: Findings) -> Sheet:
+    most = max(curve.most for curve in found.curves)
+    marks = [mark for mark in _MARKS if mark <= most]
+    lines = []
+    for curve in found.curves:
+        shares = [bounded(curve.at(mark)) if mark <= curve.most else "-" for mark in marks]
+        last = bounded(curve.at(curve.most))
+        mean = "-" if curve.mean is None else f"{curve.mean:.1f}"
+        cells = [curve.name, *shares, f"{last} of {curve.most}", mean]
+        if found.beside is not None:
+            one = found.beside[curve.name]
+            cells.append(bounded(Interval(one.name, one.difference, one.low, one.high)))
+        lines.append(tuple(cells))
+    columns = [_ARM, *(f"{mark}" for mark in marks), "at the end", "mean queries"]
+    if found.beside is not None:
+        columns.append(f"{found.curves[0].name} in {found.within}, less this at the end")
+    return Sheet("Frames broken after so many queries, %", tuple(columns), tuple(lines))
+
+
+def _label_sets(sets: Sequence[LabelSets]) -> Sheet:
+    lines = []
+    for one in sets:
+        iou = ("-" if value is None else f"{value:.3f}" for value in one.iou.values())
+        lines.append((one.name, str(one.objects), *iou, *(percent(one.below[o]) for o in OVERLAPS)))
+    columns = (_ARM, "objects", *sets[0].iou, *(f"below {o:g}, %" for o in OVERLAPS))
+    return Sheet("IoU of benign and moved labels", columns, tuple(lines))
+
+
+def _counterexamples(sets: Sequence[LabelSets]) -> Sheet:
+    lines = [
+        (one.name, f"{overlap:g}", *(str(count) for count in (one.frames, *astuple(at))))
+        for one in sets
+        for overlap, at in one.counted.items()
+    ]
+    columns = (_ARM, "IoU", "frames", "paper", "moved", "paper only", "lost, paper", "lost, paper only")
+    return Sheet("Counterexamples by benign (paper) and by moved labels", columns, tuple(lines))
+
+
+def notes(found: Findings) -> list[str]:
+    """What the columns mean."""
+    spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
+    told = [
+        f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
+    ]
+    if any(row.run.arm.reference is not None for row in found.rows):
+        told.append(
+            f"There: in the paper, with its own detector on Virtual KITTI; mAP {100 * PAPER_BENIGN:.1f} before."
+        )
+    if any(row.controls for row in found.rows):
+        told.append(
+            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead. "
+            "Placebo: one random edit as large as the attack's, through the same pipeline; its size beside the "
+            "attack's, which projection onto what is feasible may lessen. The attack's effect is what it lowers "
+            "AP50 by more than the placebo."
+        )
+    if found.curves:
+        told.append(
+            "Each frame ends at its first success by moved labels. A query is one gradient, or one judged render; "
+            "methods without gradient look where si-FGSM's steps may lead, or in all of the bounds."
+        )
+    if found.label_sets:
+        told.append(
+            "Attacks aim at the benign labels where the arm says nothing else. Paper only: counterexamples by the "
+            "benign labels which are none by moved ones, where a detection meets a label from that IoU on. Of an "
+            "attack's iterates the one that fails most by moved labels at IoU 0.5 is kept: chosen by the benign "
+            "labels there would be more."
+        )
+    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
+    told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
+    if found.ran.without_vehicles:
+        told.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
+    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.ran.failed.items()]
+    return told
+
+
+def print_findings(found: Findings, console: Console) -> None:
+    """The tables, and what they mean."""
+    for sheet in sheets(found, whole=False):
+        table = Table(title=sheet.title, title_justify="left")
+        for name in sheet.columns:
+            words = name in _WORDS
+            table.add_column(name, justify="left" if words else "right", no_wrap=words, overflow="fold")
+        for line in sheet.rows:
+            table.add_row(*line)
+        console.print(table)
+    for note in notes(found):
+        console.print(note, soft_wrap=True)
+
+
+def write_tables(out: Path, found: Findings, picture: str, command: str) -> None:
+    """study.csv, further CSVs, and study.md. picture: its file's name; command: what repeats the study."""
+    tables = {"study": [row.flat() for row in found.rows]}
+    if found.curves:
+        tables["curves"] = [point for curve in found.curves for point in curve.to_json()]
+    if found.label_sets:
+        tables["label_sets"] = [one.flat() for one in found.label_sets]
+    for name, rows in tables.items():
+        buffer = io.StringIO()
+        writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        files.write_text(out / f"{name}.csv", buffer.getvalue())
+    lines = [f"# Study: {found.study.name}", "", f"    {command}", "", f"![]({picture})", ""]
+    for sheet in sheets(found):
+        lines += [*sheet.markdown(_WORDS), ""]
+    lines += [f"{note}\n" for note in notes(found)]
+    files.write_text(out / "study.md", "\n".join(lines))

@@ -1,0 +1,106 @@
+"""The arms of a study run frame by frame: a scene is taken apart once, then each arm attacks it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from drivesem.attack_command import Worker, attack_frames, select_frames
+from drivesem.judged import JudgedClasses
+from drivesem.pipeline import RESULT
+from drivesem.pool import outcomes
+from drivesem.results import FrameResult, RunSummary, load_frame
+from drivesem.run_folder import claim
+from drivesem.sources import NoVehicleError
+from drivesem.study.arms import Arm
+from scene_ir.errors import SceneError
+
+ARMS = "arms"
+"""Folder of the arms' runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmRun:
+    """What came of an arm. results: of the frames that all arms have, in one order; judged: the detector's classes
+    that count.
+    """
+
+    arm: Arm
+    summary: RunSummary
+    results: tuple[FrameResult, ...]
+    judged: JudgedClasses
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """All arms. without_vehicles: frames that were passed over; failed: those that could not be used, and why."""
+
+    runs: tuple[ArmRun, ...]
+    without_vehicles: int
+    failed: dict[str, str]
+
+
+def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console: Console) -> Ran:
+    """Run or continue all arms in `out / ARMS`. workers: of the arms, as `workers_of` makes them.
+
+    Raises UsageError or SceneError for bad input.
+    """
+    first = workers[0]
+    names, without, failed = select_frames(first.source, first.config)
+    folders = [out / ARMS / arm.folder for arm in arms]
+    for worker, folder in zip(workers, folders, strict=True):
+        claim(folder, worker.config, shutil.rmtree)
+    todo = [name for name in names if not all(_done(folder, name) for folder in folders)]
+    empty: set[str] = set()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not todo) as progress:
+        task = progress.add_task(f"frames, {len(arms)} attacks each", total=len(todo))
+        work = partial(_attack, workers=workers, folders=folders)
+        for name, outcome in outcomes(work, partial(_in_process, arms, folders), todo, first.config):
+            try:
+                outcome()
+            except NoVehicleError:
+                empty.add(name)
+            except SceneError as error:
+                if not first.config.keep_going:
+                    raise
+                failed[name] = str(error)
+            progress.advance(task)
+    names = [name for name in names if name not in failed and name not in empty]
+    judged = JudgedClasses.of(first.detector)
+    runs = []
+    for arm, worker, folder in zip(arms, workers, folders, strict=True):
+        summary = attack_frames(worker, names, folder)
+        results = tuple(load_frame(folder / "frames" / name / RESULT) for name in names)
+        runs.append(ArmRun(arm, summary, results, judged))
+    return Ran(tuple(runs), without + len(empty), dict(sorted(failed.items())))
+
+
+def workers_of(arms: Sequence[Arm]) -> list[Worker]:
+    """One for each arm, with one source and one detector for all. The first arm needs of both what any
+    other needs. Raises UsageError or SceneError for settings that cannot be.
+    """
+    first = Worker.of(arms[0].config)
+    return [first.beside(arm.config) for arm in arms]
+
+
+def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> None:
+    """One frame by all arms that have not done it, in their order."""
+    todo = [(w, folder) for w, folder in zip(workers, folders, strict=True) if not _done(folder, name)]
+    scene = workers[0].source.scene(name)
+    for worker, folder in todo:
+        worker.attack_scene(name, scene, folder)
+
+
+def _in_process(arms: Sequence[Arm], folders: Sequence[Path]) -> Callable[[str], None]:
+    return partial(_attack, workers=workers_of(arms), folders=folders)
+
+
+def _done(folder: Path, name: str) -> bool:
+    return (folder / "frames" / name / RESULT).is_file()
