@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -43,6 +43,16 @@ class Sheet:
         lines = (self.columns, sides, *self.rows)
         cells = [[cell.replace("|", "\\|").replace("\n", ", ") for cell in line] for line in lines]
         return [f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in cells)]
+
+    def table(self, words: Collection[str], unbroken: Collection[str] = (), **looks: Any) -> Table:
+        """The same for a terminal. unbroken: columns that are never wrapped; looks: of rich's Table."""
+        table = Table(title=self.title, title_justify="left", **looks)
+        for name in self.columns:
+            side = "left" if name in words else "right"
+            table.add_column(name, justify=side, no_wrap=name in unbroken, overflow="fold")
+        for row in self.rows:
+            table.add_row(*row)
+        return table
 
 
 def percent(value: float | None) -> str:
@@ -143,12 +153,7 @@ def _wide_parts(result: Result) -> Sheet:
 def print_result(result: Result, console: Console) -> None:
     """The tables, and what a reader must know."""
     for sheet in sheets(result, wide=True):
-        table = Table(title=sheet.title, title_justify="left", min_width=min(len(sheet.title) + 4, console.width))
-        for name in sheet.columns:
-            table.add_column(name, justify="left" if name in _WORDS else "right")
-        for row in sheet.rows:
-            table.add_row(*row)
-        console.print(table)
+        console.print(sheet.table(_WORDS, min_width=min(len(sheet.title) + 4, console.width)))
     facts = result.facts
     counted = f", counted by {facts['engine']}" if "engine" in facts else ""
     console.print(

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from drivesem.config import Plausibility as Config
 from drivesem.config import UsageError
@@ -159,10 +158,5 @@ def _markdown(data: dict[str, Any]) -> str:
 
 def _print(data: dict[str, Any], console: Console) -> None:
     sheet = _sheet(data)
-    table = Table(title=sheet.title, title_justify="left")
-    for i, title in enumerate(sheet.columns):
-        table.add_column(title, justify="right" if i else "left")
-    for line in sheet.rows:
-        table.add_row(*line)
-    console.print(table)
+    console.print(sheet.table(sheet.columns[:1]))
     console.print(_NOTE, soft_wrap=True)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from detectors.types import CLASSES
 from drivesem.bench.found import wilson
@@ -172,12 +171,7 @@ def notes(report: Report) -> list[str]:
 def print_report(report: Report, console: Console) -> None:
     """The tables, and what they mean."""
     for sheet in sheets(report):
-        table = Table(title=sheet.title, title_justify="left")
-        for i, title in enumerate(sheet.columns):
-            table.add_column(title, justify="right" if i else "left")
-        for line in sheet.rows:
-            table.add_row(*line)
-        console.print(table)
+        console.print(sheet.table(sheet.columns[:1]))
     for note in notes(report):
         console.print(note, soft_wrap=True)
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from drivesem.eval_report import Sheet
 from drivesem.evaluation.curves import Tally
@@ -130,12 +129,7 @@ def notes(draws: int) -> list[str]:
 def print_tables(explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, console: Console) -> None:
     """The tables, and what they mean."""
     for sheet in sheets(explanations, rows):
-        table = Table(title=sheet.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for title in sheet.columns:
-            table.add_column(title, justify="left" if title in _WORDS else "right")
-        for line in sheet.rows:
-            table.add_row(*line)
-        console.print(table)
+        console.print(sheet.table(_WORDS, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)))
     for note in notes(draws):
         console.print(note, soft_wrap=True)
 

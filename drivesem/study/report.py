@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from drivesem.config import Study
 from drivesem.eval_report import Sheet, percent
@@ -217,13 +216,7 @@ def notes(found: Findings) -> list[str]:
 def print_findings(found: Findings, console: Console) -> None:
     """The tables, and what they mean."""
     for sheet in sheets(found, whole=False):
-        table = Table(title=sheet.title, title_justify="left")
-        for name in sheet.columns:
-            words = name in _WORDS
-            table.add_column(name, justify="left" if words else "right", no_wrap=words, overflow="fold")
-        for line in sheet.rows:
-            table.add_row(*line)
-        console.print(table)
+        console.print(sheet.table(_WORDS, unbroken=_WORDS))
     for note in notes(found):
         console.print(note, soft_wrap=True)
 

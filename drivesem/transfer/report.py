@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Interval
@@ -62,13 +61,7 @@ def notes(rows: Sequence[Row], draws: int) -> list[str]:
 def print_rows(rows: Sequence[Row], draws: int, console: Console) -> None:
     """The tables, and what they mean."""
     for sheet in sheets(rows):
-        table = Table(title=sheet.title, title_justify="left", show_lines=len(sheet.rows) == len(rows))
-        for title in sheet.columns:
-            words = title in (*_SIDES, _LABELS)
-            table.add_column(title, justify="left" if words else "right", overflow="fold")
-        for line in sheet.rows:
-            table.add_row(*line)
-        console.print(table)
+        console.print(sheet.table((*_SIDES, _LABELS), show_lines=len(sheet.rows) == len(rows)))
     for note in notes(rows, draws):
         console.print(note, soft_wrap=True)
 
