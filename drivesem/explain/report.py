@@ -129,7 +129,7 @@ def notes(draws: int) -> list[str]:
 def print_tables(explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, console: Console) -> None:
     """The tables, and what they mean."""
     for sheet in sheets(explanations, rows):
-        console.print(sheet.table(_WORDS, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)))
+        console.print(sheet.table(_WORDS, unbroken=_WORDS, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)))
     for note in notes(draws):
         console.print(note, soft_wrap=True)
 
