@@ -15,9 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from drivesem.config import Confirm, UsageError
-from drivesem.confirm.frame import Asked, Confirmed, confirm_frame, fingerprint, load
+from drivesem.confirm.frame import Asked, confirm_frame, fingerprint
 from drivesem.confirm.plans import open_plans
 from drivesem.confirm.report import print_report, summarise, write_report
+from drivesem.confirm.results import Confirmed, load
 from drivesem.devices import check_device
 from drivesem.judged import JudgedClasses
 from drivesem.pipeline import RESULT

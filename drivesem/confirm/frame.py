@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +15,9 @@ import torch
 from detectors.base import Predictor, predict
 from detectors.types import CLASSES, Detections
 from drivesem.confirm.carry import carried
-from drivesem.confirm.judge import Finding, Stand, exact_labels, findings, stands
+from drivesem.confirm.judge import exact_labels, findings, stands
 from drivesem.confirm.plans import Plans
+from drivesem.confirm.results import Confirmed, dump
 from drivesem.confirm.sheet import sheet_of
 from drivesem.judged import JudgedClasses
 from drivesem.pipeline import RESULT, detection_records, target_records
@@ -30,30 +29,9 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
 
-SCHEMA = 1
 PICTURE, SHEET = "generator.png", "sheet.png"
 _ROUNDING = 1
 """Levels of 255 by which the same picture may differ from one processor to another."""
-
-
-@dataclass(frozen=True, slots=True)
-class Confirmed:
-    """What came of one frame. source: fingerprint of the run's result. compositor, generator: failures in either
-    picture; targets, detections: in the generator's pictures, boxes with their track as index; not_carried: what
-    of the change the plan has no counterpart for. `seconds` alone may differ between two calls.
-    """
-
-    identifier: str
-    source: str
-    compositor: tuple[Finding, ...]
-    generator: tuple[Finding, ...]
-    stands: tuple[Stand, ...]
-    targets_benign: tuple[BoxRecord, ...]
-    targets_changed: tuple[BoxRecord, ...]
-    detections_benign: tuple[BoxRecord, ...]
-    detections_changed: tuple[BoxRecord, ...]
-    not_carried: tuple[str, ...]
-    seconds: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,27 +114,3 @@ def _check_same(path: Path, image: np.ndarray) -> None:
 
 def _by_track(records: Sequence[BoxRecord], tracks: Sequence[int]) -> tuple[BoxRecord, ...]:
     return tuple(r if r.index is None else dataclasses.replace(r, index=tracks[r.index]) for r in records)
-
-
-def dump(result: Confirmed) -> str:
-    """JSON text of one frame's result."""
-    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
-
-
-def load(path: Path) -> Confirmed:
-    """Read what `dump` wrote. Raises FormatError naming the file."""
-    data = files.read_json(path)
-    try:
-        if data.pop("schema") != SCHEMA:
-            raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        kinds: dict[str, Callable[..., Any]] = {"compositor": Finding, "generator": Finding, "stands": Stand}
-        kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
-        for name, kind in kinds.items():
-            data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])
-        return Confirmed(**{**data, "not_carried": tuple(data["not_carried"])})
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
-
-
-def _box_of(entry: dict[str, Any]) -> dict[str, Any]:
-    return {"xyxy": tuple(entry["xyxy"])} if "xyxy" in entry else {}

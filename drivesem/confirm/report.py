@@ -13,7 +13,7 @@ from rich.console import Console
 
 from detectors.types import CLASSES
 from drivesem.bench.found import wilson
-from drivesem.confirm.frame import Confirmed
+from drivesem.confirm.results import Confirmed
 from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses

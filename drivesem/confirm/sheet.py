@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from drivesem.confirm.judge import Finding
+from drivesem.confirm.results import Confirmed
 from drivesem.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, text_extent, write_text
 from drivesem.report.pictures import overlay
 from drivesem.results import BoxRecord, Failure
 from drivesem.transfer.runs import Frame
 from scene_ir import files
-
-if TYPE_CHECKING:
-    from drivesem.confirm.frame import Confirmed
 
 _ENLARGED = 3
 """Cars that are shown enlarged, lost ones first."""

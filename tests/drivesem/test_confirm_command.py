@@ -15,6 +15,7 @@ import yaml
 
 from drivesem.cli import main
 from drivesem.confirm import frame as confirm_frame
+from drivesem.confirm.results import load
 from drivesem.results import load_frame
 from scene_ir import files
 
@@ -62,7 +63,7 @@ def test_vehicles_stand_where_the_compositor_put_them(run: Path) -> None:
     frame = run / "frames" / "demo-000"
     result, found = (
         load_frame(frame / "result.json"),
-        confirm_frame.load(out / "frames" / "demo-000" / "result.json"),
+        load(out / "frames" / "demo-000" / "result.json"),
     )
     assert len(found.compositor) == len(result.failures)
     assert [s.iou_benign for s in found.stands] == pytest.approx([1.0] * result.objects, abs=1e-4)

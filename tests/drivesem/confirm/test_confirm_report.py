@@ -10,9 +10,9 @@ import pytest
 
 from detectors.types import CLASSES
 from drivesem.bench.found import wilson
-from drivesem.confirm.frame import Confirmed, dump, load
 from drivesem.confirm.judge import Finding, Stand
 from drivesem.confirm.report import Share, summarise, write_report
+from drivesem.confirm.results import Confirmed, dump, load
 from drivesem.results import BoxRecord, FrameResult
 from scene_ir.errors import FormatError
 
