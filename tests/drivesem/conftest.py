@@ -1,10 +1,13 @@
-"""A street of a few cars, without any photograph behind it: what space, feasibility and labels need of a scene."""
+"""A street of a few cars, without any photograph behind it: what space, feasibility and labels need of a scene.
+And the command line given bad input."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import pytest
 import torch
 
+from drivesem.cli import main
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.templates import template
 from scene_ir.types import Camera, Environment, Objects, SceneIR
@@ -73,3 +76,21 @@ def _street(
 def street() -> Callable[..., SceneIR]:
     """The factory of streets."""
     return _street
+
+
+@pytest.fixture
+def refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """The one line that a command says of bad input; it leaves no file behind."""
+
+    def call(*words: str) -> str:
+        folder = tmp_path / "empty"
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        assert main(list(words)) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert not list(folder.iterdir())
+        return line
+
+    return call

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -144,15 +145,5 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
         (["--budget", "spin=1"], "--budget: spin: expected one of color, weather"),
     ],
 )
-def test_options_that_do_not_fit_are_named(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main([*WORDS, "--out", str(tmp_path / "run"), *words]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"drivesem: {message}")
-    assert not (tmp_path / "run").exists()
+def test_options_that_do_not_fit_are_named(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert refused(*WORDS, *words).startswith(f"drivesem: {message}")
