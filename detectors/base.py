@@ -93,6 +93,28 @@ class RawPredictions:
         return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
 
 
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """What a detector would choose from in one image, before suppression; differentiable.
+
+    boxes_xyxy (A, K, 4) px, not clipped: K is 1, or C where each class has a box of its own; log_scores (A, C):
+    logarithms of the scores that `decode` gives, class by class.
+    """
+
+    boxes_xyxy: Tensor
+    log_scores: Tensor
+
+    def __post_init__(self) -> None:
+        a, c = self.log_scores.shape
+        found = tuple(self.boxes_xyxy.shape)
+        if found not in ((a, 1, 4), (a, c, 4)):
+            raise ValueError(f"candidates: expected boxes of shape {(a, 1, 4)} or {(a, c, 4)}, found {found}")
+
+    def boxes_of(self, label: int) -> Tensor:
+        """Boxes (A, 4) px for one class."""
+        return self.boxes_xyxy[:, label if self.boxes_xyxy.shape[1] > 1 else 0]
+
+
 class Predictor(Protocol):
     """A detector that need have no gradient: what `Detector` is, less loss and t*; detectors of other projects.
 
@@ -150,6 +172,13 @@ class Detector(nn.Module, ABC):
     @abstractmethod
     def decode(self, raw: Any) -> list[Detections]:
         """One Detections for each image, best first, boxes inside the image; carries no gradient."""
+
+    def candidates(self, raw: Any) -> Candidates:
+        """What `decode` chooses from, of a batch of one image, for the objectives of drivesem/goals.py.
+
+        Raises DetectorError where a detector does not tell.
+        """
+        raise DetectorError(f"detector {self.name}: expected one that tells its candidates")
 
     @contextmanager
     def holding(self, raw: Any) -> Iterator[None]:

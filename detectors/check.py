@@ -242,17 +242,9 @@ def _well_formed(found: Detections, image_hw: tuple[int, int], classes: int) -> 
 
 def _planted(trial: Trial) -> str:
     detector = trial.differentiable
-    height, width = trial.images.shape[2:]
-    box = torch.tensor([0.25 * width, 0.3 * height, 0.6 * width, 0.75 * height], device=trial.images.device)
-    label = len(detector.classes) - 1
     with torch.no_grad():
         raw = detector(trial.images)
-    if trial.plant is not None:
-        raw = trial.plant(raw, box, label)
-    elif isinstance(raw, Plantable):
-        raw = raw.planted(box, label)
-    else:
-        raise _NotTried(f"{type(raw).__name__} has no `planted`, and no `plant` was given")
+    box, label, raw = _with_plant(trial, raw)
     for found in detector.decode(raw):
         sure = found.scores > 0.5
         if int(sure.sum()) != 1:
@@ -264,6 +256,18 @@ def _planted(trial: Trial) -> str:
                 f"{_numbers(found.boxes_xyxy[sure][0])}"
             )
     return "found where it was put"
+
+
+def _with_plant(trial: Trial, raw: Any) -> tuple[Tensor, int, Any]:
+    """A box (4,) px, its label, and raw predictions with it alone."""
+    height, width = trial.images.shape[2:]
+    box = torch.tensor([0.25 * width, 0.3 * height, 0.6 * width, 0.75 * height], device=trial.images.device)
+    label = len(trial.detector.classes) - 1
+    if trial.plant is not None:
+        return box, label, trial.plant(raw, box, label)
+    if isinstance(raw, Plantable):
+        return box, label, raw.planted(box, label)
+    raise _NotTried(f"{type(raw).__name__} has no `planted`, and no `plant` was given")
 
 
 def _untouched(trial: Trial) -> str:
@@ -353,6 +357,31 @@ def _loss(trial: Trial) -> str:
     except ValueError:
         return ", ".join(f"{name} {float(term):.4g}" for name, term in terms.items())
     raise _Broken("loss of two images and one Targets: expected a ValueError, found none")
+
+
+def _candidates(trial: Trial) -> str:
+    """Every detection is one of the candidates, with its score."""
+    detector = trial.differentiable
+    if type(detector).candidates is Detector.candidates:
+        raise _NotTried("a detector that tells none")
+    height, width = trial.images.shape[-2:]
+    limit = trial.images.new_tensor([width - 1.0, height - 1.0] * 2)
+    found = 0
+    with torch.no_grad():
+        raw = detector(trial.images)
+        raws = [raw.one(i) for i in range(len(raw))]
+        if trial.plant is not None or isinstance(raw, Plantable):
+            raws.append(_with_plant(trial, raws[0])[2])
+        for one in raws:
+            told, (detections,) = detector.candidates(one), detector.decode(one)
+            rows = zip(detections.boxes_xyxy, detections.labels.tolist(), detections.scores, strict=True)
+            for box, label, score in rows:
+                scored = (told.log_scores[:, label].exp() - score).abs() <= SAME_SCORE
+                placed = torch.minimum(told.boxes_of(label)[scored].clamp_min(0), limit.to(box))
+                if not bool(((placed - box).abs() <= SAME_PX).all(1).any()):
+                    raise _Broken(f"candidates: expected every detection among them, found none at {box.tolist()}")
+            found += len(detections)
+    return f"{found} detections among them"
 
 
 def _check_terms(terms: Any, case: str) -> None:
@@ -504,6 +533,7 @@ _PROMISES: tuple[tuple[str, Callable[[Trial], str]], ...] = (
     ("batch as singles", _batch),
     ("frozen", _frozen),
     ("loss terms", _loss),
+    ("candidates", _candidates),
     ("gradient to the image", _gradient),
     ("image along the gradient", _image_descent),
     ("weights along the gradient", _weight_descent),

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes, frozen, grid, quality
-from detectors.base import Detector, RawPredictions
+from detectors.base import Candidates, Detector, RawPredictions
 from detectors.types import CLASSES, Detections, Targets
 
 ANCHOR_SIZES_WH = (
@@ -373,6 +373,11 @@ class SqueezeDet(Detector):
             "total": terms["confidence"] + terms["box"] + terms["class"],
             "objectness": (WEIGHT_CONFIDENCE_POSITIVE * unseen + WEIGHT_CONFIDENCE_NEGATIVE * alarms) / batch,
         }
+
+    def candidates(self, raw: RawPredictions) -> Candidates:
+        """Every anchor; score = confidence x class probability."""
+        logs = F.logsigmoid(raw.confidence_logits[0])[:, None] + F.log_softmax(raw.class_logits[0], -1)
+        return Candidates(raw.boxes_xyxy[0][:, None], logs)
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:

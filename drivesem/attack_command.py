@@ -22,6 +22,8 @@ from rich.table import Table
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.registry import ONNX, load_detector, load_predictor
 from detectors.types import CLASSES
+from drivesem.aims import Aim
+from drivesem.attacks.apgd import APGD
 from drivesem.attacks.base import Attack as AttackMethod
 from drivesem.attacks.cma_es import CMAES
 from drivesem.attacks.fgsm import FGSM
@@ -37,6 +39,7 @@ from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attac
 from drivesem.devices import check_device
 from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
+from drivesem.objective import OF_DETECTIONS
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
 from drivesem.pool import outcomes
 from drivesem.report.html import render_report
@@ -67,6 +70,7 @@ def run(config: Attack) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     config = _settled(config)
+    aim_of(config)
     check_device(config.device)
     worker = Worker.of(config)
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
@@ -152,6 +156,10 @@ class Worker:
         if len(scene.objects) == 0:
             raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
         config = self.config
+        aim = aim_of(config)
+        if aim.objects is not None and aim.objects[-1] >= len(scene.objects):
+            count = f"{len(scene.objects)} of them"
+            raise NoVehicleError(f"frame {identifier}", f"objects up to the {aim.objects[-1]}th from 0", count)
         settings = FrameSettings(
             attack=self.method if config.like is None else _placebo(Path(config.like), identifier),
             params=self.params,
@@ -161,8 +169,14 @@ class Worker:
             seed=config.seed,
             t_star=config.t_star,
             budget=budget_of(config.budget),
+            aim=aim,
         )
         return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+
+
+def aim_of(config: Attack) -> Aim:
+    """What the settings ask the attack to be after. Raises UsageError."""
+    return Aim.of(config.target_objects, config.target_classes)
 
 
 def attack_method(config: Attack) -> AttackMethod:
@@ -177,6 +191,8 @@ def _from_theta0(config: Attack) -> AttackMethod:
     match config.method:
         case "si-fgsm":
             return SiFGSM(steps, early_stop, config.momentum, config.rate)
+        case "apgd":
+            return APGD(steps, early_stop, config.rate)
         case "fgsm":
             return FGSM(steps)
         case "sgd":
@@ -218,10 +234,9 @@ def _detector(config: Attack, needs_gradient: bool) -> Predictor:
     if needs_gradient:
         expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
         raise UsageError("--method", expected, config.method)
-    if config.objective != "objectness":
-        raise UsageError(
-            "--objective", f"objectness for {config.detector}, which has no gradient", config.objective
-        )
+    if config.objective not in OF_DETECTIONS:
+        expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"
+        raise UsageError("--objective", expected, config.objective)
     return detector
 
 

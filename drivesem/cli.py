@@ -32,6 +32,7 @@ from drivesem.config import (
     Train,
     Transfer,
     UsageError,
+    Verify,
     validate,
     yaml_arguments,
 )
@@ -142,6 +143,10 @@ def _run(config: Command) -> int:
         from drivesem import plausibility_command
 
         return plausibility_command.run(config)
+    if isinstance(config, Verify):
+        from drivesem import verify_command
+
+        return verify_command.run(config)
     if isinstance(config, Derender):
         from drivesem import derender_command
 

@@ -31,7 +31,7 @@ GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
 """Attacks that ask a detector only what it finds."""
 COUNTED = (*GRADIENT_FREE, "scw", "subsets")
 """Attacks that end after --queries."""
-RESTARTED = ("si-fgsm", "fgsm", "sgd", "scw")
+RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
 """Attacks that may begin elsewhere."""
 DEFAULT_QUERIES = 64
 _MOST_PROCESSES = 4
@@ -94,9 +94,9 @@ class Attack(Common):
     """A shipped detector, a file, or another project's (docs/detectors.md); without a gradient, such as an ONNX
     graph, for the methods that need none."""
     method: Literal[
-        "si-fgsm", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
+        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
     ] = "si-fgsm"
-    """si-fgsm, fgsm, sgd follow the gradient; scw (Carlini-Wagner) also keeps the change small; subsets finds the
+    """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw (Carlini-Wagner) also keeps the change small; subsets finds the
     fewest parameters that are enough; random (uniform), halton, sobol (scrambled sequences) and cma-es ask only
     what the detector finds."""
     steps: int = 10
@@ -106,13 +106,13 @@ class Attack(Common):
     step_form: Literal["raw", "l2"] = "l2"
     """Of sgd: the gradient as it is, or its direction, each parameter's as long as a step of si-fgsm."""
     rate: float = 1.0
-    """Of si-fgsm, sgd and scw: length of a step in units of each parameter's own step."""
+    """Of si-fgsm, apgd, sgd and scw: length of a (first) step in units of each parameter's own step."""
     momentum: float = 0.0
     """Of si-fgsm and sgd: what is left of earlier gradients after a step, 0 to 1 (MI-FGSM: 1)."""
     norm: Literal[1, 2] = 2
     """Of scw: the norm of the change that is kept small."""
     restarts: int = 0
-    """Of si-fgsm, fgsm, sgd and scw: how often to begin again at random near the photograph."""
+    """Of si-fgsm, apgd, fgsm, sgd and scw: how often to begin again at random near the photograph."""
     like: str | None = None
     """Of placebo, one random edit of each frame: the run whose counterexamples are as large."""
     budget: str = "paper"
@@ -123,9 +123,17 @@ class Attack(Common):
     """Stop a frame at its first success instead of using all steps or queries."""
     objective_labels: Literal["moved", "paper"] = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
-    objective: Literal["objectness", "confidence"] = "objectness"
-    """What the attack raises: SqueezeDet's confidence term with 1 as the target of what finds the true objects, or
-    as published, with the IoU of the predicted box, which a trained detector meets already."""
+    objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (
+        "objectness"
+    )
+    """What the attack raises. objectness: the detector's confidence term, with 1 as the target of what finds the
+    true objects; confidence: SqueezeDet's as published, with the IoU of the predicted box; total: its whole loss;
+    hide: objects fall below t*; phantom: something rises to t* where nothing is; failure: both; localisation:
+    boxes leave their objects."""
+    target_objects: str | None = None
+    """Only these objects of each frame, such as 0,2: others may be lost, which is no success; nor are phantoms."""
+    target_classes: str | None = None
+    """Only objects and phantoms of these classes, such as Car,Pedestrian."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     backend: Literal["warp", "reference"] = "warp"
@@ -143,12 +151,13 @@ class Study(Common):
     """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
 
     name: Annotated[
-        tyro.conf.Positional[Literal["single", "multi", "samples", "steps", "labels"]],
-        tyro.conf.arg(metavar="{single,multi,samples,steps,labels}"),
+        tyro.conf.Positional[Literal["single", "multi", "samples", "steps", "labels", "transfer", "retrain"]],
+        tyro.conf.arg(metavar="{single,multi,samples,steps,labels,transfer,retrain}"),
     ]
     """single: the six parameters, each alone; multi: the combinations 1 to 4; samples: success against queries for
     each algorithm; steps: success against number and size of steps; labels: what labels that stay behind make of
-    an attack."""
+    an attack; transfer: counterexamples of combination 2 before other detectors; retrain: detectors trained on with
+    counterexamples, before benign frames, known and fresh counterexamples."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder."""
     dataset: str = DEMO
@@ -165,8 +174,34 @@ class Study(Common):
     """How far parameters may go: paper; parking (0.5 m, 5 degrees); a YAML file; or translate=0.5m,rotate=5deg."""
     objective_labels: Literal["moved", "paper"] = "moved"
     """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
+    objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (
+        "objectness"
+    )
+    """What the attacks raise, as in drivesem attack."""
+    method: Literal["si-fgsm", "apgd"] = "si-fgsm"
+    """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the detector computes gradients in; failures are always judged in float32."""
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
+    detectors: str = "squeezedet,yolov3-slim"
+    """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
+    sources: str | None = None
+    """Transfer: detectors that are attacked, with commas; by default --detector alone."""
+    benign_root: str | None = None
+    """Retrain: folders of further benign frames to train on, with commas; by default all of --root."""
+    held_out: str | None = None
+    """Retrain: folder of frames that are never trained on; by default a quarter of --root's."""
+    benign_frames: int | None = None
+    """Retrain: the first so many of these judge what is benign; by default 1000, 12 with --quick."""
+    fresh: int | None = None
+    """Retrain: the first so many of these are attacked, with every detector; by default 200, 3 with --quick."""
+    train_steps: int | None = None
+    """Retrain: steps of training; by default 1500, of the paper's protocol 6000; 40 with --quick."""
+    mix: Literal["add", "replace"] = "add"
+    """Retrain: counterexamples beside benign frames, or in the place of some; of ours, not the paper's protocol."""
+    label_mode: Literal["moved", "paper"] = "moved"
+    """Retrain: labels of counterexamples in training; of ours, not the paper's protocol."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     t_star: float | None = None
@@ -258,6 +293,24 @@ class Plausibility(Command):
     """Folder for the results; by default plausibility in the run's folder."""
     limit: int | None = None
     """Take the first N frames."""
+
+
+@dataclass(frozen=True)
+class Verify(Command):
+    """Is a finished run what it says it is? Every frame computed again from its files; exit code 1 where not."""
+
+    run: str | None = None
+    """Folder of a run of drivesem attack."""
+    out: str | None = None
+    """JSON file to write; by default verify.json in the run's folder."""
+    limit: int | None = None
+    """Check the first N frames."""
+    workers: int | None = None
+    """Processes that share the frames; by default one a core, at most 4."""
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, ..."""
+    keep_going: Flag = False
+    """List a frame whose files are missing or damaged in the results, and go on with the rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -622,6 +675,8 @@ class Retrain(Common):
     """Views a step."""
     window: str = "640x224"
     """WIDTHxHEIGHT of the views, px."""
+    scale: str = "0.5,1.35"
+    """LOW,HIGH of the zoom of views."""
     rate: float = 3e-4
     """Peak learning rate of AdamW; it falls in a half cosine."""
     warmup: int = 60
@@ -641,6 +696,7 @@ COMMANDS: dict[str, type[Command]] = {
     "explain": Explain,
     "confirm": Confirm,
     "plausibility": Plausibility,
+    "verify": Verify,
     "derender": Derender,
     "render": Render,
     "edit": Edit,
@@ -663,7 +719,7 @@ def processes(config: Common) -> int:
 
 def validate(config: Command) -> None:
     """Raise UsageError for values that no command accepts."""
-    if isinstance(config, Common):
+    if isinstance(config, Common | Verify):
         if config.workers is not None and config.workers < 1:
             raise UsageError("--workers", "at least 1", config.workers)
         if config.limit is not None and config.limit < 1:
@@ -722,9 +778,12 @@ def validate(config: Command) -> None:
             )
         _validate_method(config)
     if isinstance(config, Study):
-        for name in ("steps", "queries"):
-            if getattr(config, name) < 1:
-                raise UsageError(f"--{name}", "at least 1", getattr(config, name))
+        for name in ("steps", "queries", "benign_frames", "fresh", "train_steps"):
+            value = getattr(config, name)
+            if value is not None and value < 1:
+                raise UsageError(f"--{name.replace('_', '-')}", "at least 1", value)
+        if config.dataset == DEMO and (config.held_out, config.benign_root) != (None, None):
+            raise UsageError("--held-out, --benign-root", "none with the embedded frames", "one")
         if config.bootstrap is not None and config.bootstrap < 0:
             raise UsageError("--bootstrap", "at least 0", config.bootstrap)
     if isinstance(config, Attack | Study | Transfer) and config.t_star is not None and not 0 < config.t_star <= 1:
@@ -745,7 +804,7 @@ def validate(config: Command) -> None:
             raise UsageError("--permutations", "an even number, at least 2", config.permutations)
         if config.bootstrap is not None and config.bootstrap < 0:
             raise UsageError("--bootstrap", "at least 0", config.bootstrap)
-    if isinstance(config, Confirm | Plausibility) and not config.run:
+    if isinstance(config, Confirm | Plausibility | Verify) and not config.run:
         raise UsageError("--run", "a folder of drivesem attack", "nothing")
     if isinstance(config, Plausibility) and config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)
@@ -790,7 +849,7 @@ def _validate_method(config: Attack) -> None:
     own = {
         "queries": COUNTED,
         "step_form": ("sgd",),
-        "rate": ("si-fgsm", "sgd", "scw"),
+        "rate": ("si-fgsm", "apgd", "sgd", "scw"),
         "momentum": ("si-fgsm", "sgd"),
         "norm": ("scw",),
         "restarts": RESTARTED,

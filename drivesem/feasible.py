@@ -177,6 +177,20 @@ class FeasibleSet:
         self._everyone = np.arange(space.count)
         self._bounds = _Bounds.around(self._street, cars, self.limits)
 
+    @property
+    def violated_at_start(self) -> tuple[str, ...]:
+        """What theta = 0 violates, as `objects[3]: collision`: labels that overlap (or leave less than the
+        clearance), cars off the road, out of the picture or too small in it, hidden by others, fits that are
+        strained. Such a start is kept, and may only not get worse.
+        """
+        if self.space.count == 0:
+            return ()
+        strained = [f"objects[{i}]: strain" for i in np.flatnonzero(self._strain.violated_at_start)]
+        low, high = _extents(self._surface.rest)
+        cars = _Cars.of(low, high, self._yaw, self._translation)
+        asked = _Bounds.alike(self.space.count, self.limits)
+        return (*strained, *self._examine(cars, asked).names())
+
     def project(self, theta: Tensor) -> Projected:
         """The nearest feasible theta (D,) we can find; `theta` itself where it is feasible.
 
@@ -206,7 +220,7 @@ class FeasibleSet:
             wrong = self._strained(self._strain.change(mesh))
             found += [f"objects[{i}]: strain" for i in np.flatnonzero(wrong)]
         surface = None if mesh is None else self._surface.deformed(mesh)
-        return tuple(found + self._examine(self._cars(values, surface)).names())
+        return tuple(found + self._examine(self._cars(values, surface), self._bounds).names())
 
     def _project(self, values: Values) -> tuple[Values, list[str]]:
         boxed = self._box(values)
@@ -219,7 +233,7 @@ class FeasibleSet:
             active += [f"objects[{i}]: strain" for i in np.flatnonzero(self._bound_strain(mesh))]
             surface = self._surface.deformed(mesh)
         cars = self._cars(boxed, surface)
-        found = self._examine(cars)
+        found = self._examine(cars, self._bounds)
         offenders = found.cars()
         if offenders.any():
             active += found.names()
@@ -270,9 +284,9 @@ class FeasibleSet:
         shift = self._shift[rows]
         return self._translation[rows] + translate[:, :1] * shift[:, 0] + translate[:, 1:] * shift[:, 1]
 
-    def _examine(self, cars: _Cars) -> _Found:
+    def _examine(self, cars: _Cars, bounds: _Bounds) -> _Found:
         """All that the cars violate."""
-        street, bounds = self._street, self._bounds
+        street = self._street
         view = street.view(cars, self._everyone)
         sight = street.sight(cars, self._everyone)
         return _Found(
@@ -475,8 +489,8 @@ class _Surface:
 class _StrainBound:
     """Bounds on the deformation of N cars: singular values, determinant of its Jacobian, nothing below y = 0.
 
-    A bound that a car violates at theta = 0 is widened to what it has there. All is measured at P points of the
-    unit box.
+    A bound that a car violates at theta = 0 is widened to what it has there; violated_at_start (N,) says who does.
+    All is measured at P points of the unit box.
     """
 
     def __init__(self, source: Array, strain: tuple[float, float]) -> None:
@@ -495,12 +509,19 @@ class _StrainBound:
         self._start = _jacobian_and_height(jacobian, height)
         values = np.linalg.svd(jacobian.numpy(), compute_uv=False)
         self._smallest, largest = values.min(axis=2), values.max(axis=2)
+        self._inverted = (np.linalg.det(jacobian.numpy()) <= 0).any(axis=1)
+        deepest = height.numpy().max(axis=1)
+        self.violated_at_start: Flags = (
+            (self._smallest.min(axis=1) < strain[0] - _TOLERANCE)
+            | (largest.max(axis=1) > strain[1] + _TOLERANCE)
+            | (deepest > _TOLERANCE)
+            | self._inverted
+        )
         self._low = np.minimum(strain[0], self._smallest.min(axis=1)) - _TOLERANCE
         self._high = np.maximum(strain[1], largest.max(axis=1)) + _TOLERANCE
-        self._floor = np.maximum(0.0, height.numpy().max(axis=1)) + _TOLERANCE
+        self._floor = np.maximum(0.0, deepest) + _TOLERANCE
         # A Jacobian that changes by less, in Frobenius' norm, stays within the bounds (Weyl's inequality).
         self._room = np.minimum(self._smallest - self._low[:, None], self._high[:, None] - largest)
-        self._inverted = (np.linalg.det(jacobian.numpy()) <= 0).any(axis=1)
 
     def change(self, mesh: Values) -> Array:
         """By how much mesh codes (N, 96) change Jacobian and height: (N, 10, P)."""
@@ -731,6 +752,24 @@ class _Bounds:
             height=limits.height_kept * sight.height - _TOLERANCE,
             area=np.minimum(sight.area, limits.area_kept) - _TOLERANCE,
             size=size - _TOLERANCE,
+            gap=gap - _TOLERANCE,
+            overlap=overlap + _TOLERANCE,
+        )
+
+    @classmethod
+    def alike(cls, count: int, limits: Limits) -> _Bounds:
+        """What is asked of `count` cars wherever they stood before."""
+        gap, overlap = np.full((count, count), limits.clearance_m), np.zeros((count, count))
+        np.fill_diagonal(gap, -np.inf)
+        np.fill_diagonal(overlap, np.inf)
+        everyone = np.ones(count)
+        return cls(
+            road=everyone * (1 - limits.road_loss - _TOLERANCE),
+            in_frame=everyone * (limits.in_frame - _TOLERANCE),
+            near=everyone * (limits.near_m - _TOLERANCE),
+            height=0 * everyone,
+            area=everyone * (limits.area_kept - _TOLERANCE),
+            size=np.full((count, 2), limits.minimum_px - _TOLERANCE),
             gap=gap - _TOLERANCE,
             overlap=overlap + _TOLERANCE,
         )

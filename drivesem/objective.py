@@ -11,7 +11,8 @@ from torch import Tensor
 
 from detectors.base import Detector, Predictor, RawPredictions, predict
 from detectors.types import Detections, Targets
-from drivesem import detection_loss
+from drivesem import detection_loss, goals
+from drivesem.aims import EVERYTHING, Aim
 from drivesem.attacks.base import Group, Problem, Score
 from drivesem.evaluation import failures
 from drivesem.feasible import FeasibleSet
@@ -22,7 +23,7 @@ from scene_ir.compositor import Compositor, render_batch
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Render, SceneIR
 
-_OF_DETECTIONS = ("objectness",)
+OF_DETECTIONS = ("objectness", *goals.GOALS)
 """Terms that need no more than detections."""
 _REMEMBERED = 3
 """Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
@@ -43,12 +44,14 @@ class Rendered:
 
 
 class Objective:
-    """A term of the detector's loss as a function of theta (D,), to be raised by an attack.
+    """What an attack raises, as a function of theta (D,).
 
     label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
-    away from the label. They are constant in the gradient. term: a key of `Detector.loss`; a detector without a
-    gradient has "objectness" only, of its detections. t_star: score from which a detection counts; by default the
-    detector's own. Raises DetectorError where the detector knows no cars, RangeError where it has no such term.
+    away from the label. They are constant in the gradient. term: one of `goals.GOALS`, or a key of
+    `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. t_star: score from which a detection
+    counts; by default the detector's own. aim: what counts as a failure, and is raised; by default everything.
+    Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
+    RangeError where it has no such term.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Objective:
         term: str = "objectness",
         difficulty: Difficulty | None = None,
         t_star: float | None = None,
+        aim: Aim = EVERYTHING,
     ) -> None:
         self.compositor = compositor
         self.space = space
@@ -68,12 +72,14 @@ class Objective:
         self.term = term
         self.t_star = t_star_of(detector, t_star)
         self.judged = JudgedClasses.of(detector)
+        self.aim = aim
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, difficulty)
         self._benign = self._judged(space.scene, base_render)
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
         self._scores: dict[bytes, Score] = {}
+        self._previews: dict[bytes, Score] = {}
 
     @property
     def benign(self) -> Rendered:
@@ -114,31 +120,44 @@ class Objective:
     def failures(self, rendered: Rendered, mode: LabelMode) -> failures.Failures:
         """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""
         labels = rendered.moved if mode == "moved" else rendered.paper
-        return failures.find(
+        return self._failures(labels, rendered.detections)
+
+    def _failures(self, labels: MovedLabels, detections: Detections) -> failures.Failures:
+        found = failures.find(
             self.judged.targets(self._benign.paper.targets),
             self._benign.detections,
             self.judged.targets(labels.targets),
-            rendered.detections,
+            detections,
             self.t_star,
         )
+        return self.aim.failures(found, labels.targets, detections, self.judged.names)
 
     def score(self, theta: Tensor) -> Score:
         """What the detector makes of theta (D,): a render of its own, judged under both label modes.
 
         Scores are kept, which are small, so that a search without gradient pays for each theta once.
         """
-        key = theta.detach().cpu().numpy().tobytes()
+        key = _key(theta)
         if key not in self._scores:
             rendered = self.evaluate(theta)
-            moved = self.failures(rendered, "moved")
-            self._scores[key] = Score(
-                loss=rendered.loss,
-                lost=len(moved.lost),
-                phantoms=len(moved.phantoms),
-                success=moved.success,
-                success_paper=self.failures(rendered, "paper").success,
-            )
+            self._scores[key] = self._score(rendered.loss, rendered.moved, rendered.detections)
         return self._scores[key]
+
+    def preview(self, theta: Tensor) -> Score | None:
+        """What the gradient pass at theta (D,) saw, if there was one: of an image that is not rounded to 8 bits, and
+        in the precision of gradients.
+        """
+        return self._previews.get(_key(theta))
+
+    def _score(self, loss: float, moved: MovedLabels, detections: Detections) -> Score:
+        failed = self._failures(moved, detections)
+        return Score(
+            loss=loss,
+            lost=len(failed.lost),
+            phantoms=len(failed.phantoms),
+            success=failed.success,
+            success_paper=self._failures(self._labeller.paper(), detections).success,
+        )
 
     def problem(self, feasible: FeasibleSet) -> Problem:
         """This objective as attacks see it."""
@@ -150,6 +169,7 @@ class Objective:
             lower=self.space.lower,
             upper=self.space.upper,
             groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
+            preview=self.preview,
         )
 
     @property
@@ -169,29 +189,52 @@ class Objective:
         labels = self._labeller.labels(self.label_mode, scene, render)
         return self._loss(self.differentiable, raw, labels.targets)
 
+    def loss_at(self, theta: Tensor, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
+        """The same at theta (D,); what is seen there is kept for `preview`."""
+        moved = self._labeller.moved(scene, render)
+        aimed = moved if self.label_mode == "moved" else self._labeller.paper()
+        loss = self._loss(self.differentiable, raw, aimed.targets)
+        with torch.no_grad():
+            found = self.judged.detections(self.differentiable.decode(raw)[0])
+        self._previews[_key(theta)] = self._score(float(loss.detach()), moved, found)
+        return loss
+
     @torch.no_grad()
     def _judged(self, scene: SceneIR, render: Render) -> Rendered:
         # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
-        aim = (moved if self.label_mode == "moved" else paper).targets
+        labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
             raw = self.detector(render.image[None])
-            loss = float(self._loss(self.detector, raw, aim))
+            loss = float(self._loss(self.detector, raw, labels))
             found = self.judged.detections(self.detector.decode(raw)[0])
         else:
-            self._check_term(_OF_DETECTIONS)
             found = self.detect(render.image)
-            loss = detection_loss.objectness(self.judged.targets(aim), found)
+            loss = self._loss_of_detections(found, labels)
         return Rendered(scene, render, found, paper, moved, loss)
 
-    def _loss(self, detector: Detector, raw: RawPredictions, aim: Targets) -> Tensor:
-        terms = detector.loss(raw, [self.judged.own_targets(self.judged.targets(aim))])
-        self._check_term(terms)
-        loss = terms[self.term]
+    def _loss(self, detector: Detector, raw: RawPredictions, labels: Targets) -> Tensor:
+        targets = self.judged.own_targets(self.judged.targets(self.aim.targets(labels)))
+        if self.term in goals.GOALS:
+            known = [detector.classes.index(name) for name in self.aim.classes_of(self.judged.names)]
+            loss = goals.goal(self.term, detector.candidates(raw), targets, self.t_star, known)
+        else:
+            terms = detector.loss(raw, [targets])
+            self._check_term((*terms, *goals.GOALS))
+            loss = terms[self.term]
         if not bool(torch.isfinite(loss)):
             raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
         return loss
+
+    def _loss_of_detections(self, found: Detections, labels: Targets) -> float:
+        """The same where there is no gradient, of judged detections."""
+        self._check_term(OF_DETECTIONS)
+        names, targets = self.judged.names, self.judged.targets(self.aim.targets(labels))
+        if self.term not in goals.GOALS:
+            return detection_loss.objectness(targets, found)
+        known = [names.index(name) for name in self.aim.classes_of(names)]
+        return float(goals.goal(self.term, goals.of_detections(found, len(names)), targets, self.t_star, known))
 
     def _check_term(self, terms: Collection[str]) -> None:
         if self.term not in terms:
@@ -216,6 +259,10 @@ class BatchObjective:
             raise ShapeError("thetas", f"{len(self.objectives)}, one for each scene", len(thetas))
         outcome = _losses_and_gradients(self.objectives, thetas)
         return [(float(loss), gradient) for loss, gradient in outcome]
+
+
+def _key(theta: Tensor) -> bytes:
+    return theta.detach().cpu().numpy().tobytes()
 
 
 def _losses_and_gradients(
@@ -245,5 +292,5 @@ def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[T
         raw = objectives[members[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
         for row, i in enumerate(members):
             # Each by itself: the loss of a batch is a mean over its images, and weighs them by their objects.
-            losses[i] = objectives[i].loss_of(raw.one(row), scenes[i], renders[i])
+            losses[i] = objectives[i].loss_at(thetas[i], raw.one(row), scenes[i], renders[i])
     return [losses[i] for i in range(len(renders))]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
+from drivesem.aims import EVERYTHING, Aim
 from drivesem.attacks.base import Attack as AttackMethod
 from drivesem.attacks.base import AttackResult
 from drivesem.data import kitti
@@ -36,7 +37,7 @@ RESULT = "result.json"
 class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
-    budget: how far theta may go, by default as far as the paper's.
+    budget: how far theta may go, by default as far as the paper's; aim: what the attack is after.
     """
 
     attack: AttackMethod
@@ -47,6 +48,7 @@ class FrameSettings:
     seed: int
     t_star: float | None = None
     budget: Budget | None = None
+    aim: Aim = EVERYTHING
 
 
 def attack_frame(
@@ -60,8 +62,17 @@ def attack_frame(
     start = time.perf_counter()
     space = ParameterSpace(scene, settings.params, settings.budget)
     compositor = Compositor(scene, settings.render)
-    objective = Objective(compositor, space, detector, settings.label_mode, settings.term, t_star=settings.t_star)
-    attacked = settings.attack(objective.problem(FeasibleSet(space)), space.theta0, settings.seed)
+    objective = Objective(
+        compositor,
+        space,
+        detector,
+        settings.label_mode,
+        settings.term,
+        t_star=settings.t_star,
+        aim=settings.aim,
+    )
+    feasible = FeasibleSet(space)
+    attacked = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
     rendered = objective.evaluate(attacked.theta)
     benign = objective.detect(scene.photograph)
     with files.whole_folder(folder) as part:
@@ -70,7 +81,8 @@ def attack_frame(
         result = _result(
             identifier, objective, attacked, rendered, benign, tuple(check_scene(saved.as_photographed(), saved))
         )
-        result = replace(result, seconds=round(time.perf_counter() - start, 3))
+        seconds = round(time.perf_counter() - start, 3)
+        result = replace(result, seconds=seconds, violated_at_start=feasible.violated_at_start)
         _write(part, scene, objective, rendered, result)
     return result
 

@@ -57,7 +57,8 @@ class Failure:
 @dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame of a run. Lists of boxes are in the frame's pixels; `seconds` is the only field that may differ
-    between two runs with the same configuration.
+    between two runs with the same configuration. violated_at_start: constraints that the photographed scene does
+    not meet, and that may only not get worse.
     """
 
     identifier: str
@@ -78,6 +79,7 @@ class FrameResult:
     success_moved: bool
     identity_psnr_db: float | None
     seconds: float
+    violated_at_start: tuple[str, ...] = ()
 
     @property
     def feasible(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,9 @@ def _check_settings(path: Path, config: Common, presentation: Collection[str]) -
         return {key: value for key, value in settings.items() if key not in presentation}
 
     before = yaml.safe_load(files.read_text(path))
-    known = identity(before) if isinstance(before, dict) else {}
+    # A setting that came with a later version had its default before.
+    defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
+    known = identity(defaults | before) if isinstance(before, dict) else {}
     wanted = identity(asdict(config))
     if known != wanted:
         changed = [key for key, value in wanted.items() if known.get(key) != value]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from detectors import boxes
-from detectors.base import Detector
+from detectors.base import Candidates, Detector
 from detectors.grid import IGNORE_OVERLAP, MEETING_IOU
 from detectors.squeezedet import WEIGHT_CONFIDENCE_NEGATIVE, WEIGHT_CONFIDENCE_POSITIVE
 from detectors.types import CLASSES, Detections, Targets
@@ -26,6 +26,8 @@ CANDIDATES = 1000
 TOP_DETECTIONS = 100
 """Of an image, after suppression, as in COCO's evaluation."""
 NMS_IOU = 0.5
+LEAST_PROBABILITY = 1e-12
+"""Whose logarithm is still a number."""
 T_STAR = 0.3
 """Where nobody has measured the score of best F1."""
 
@@ -97,6 +99,10 @@ class DenseDetector(Detector):
     def loss(self, raw: DensePredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
         """`dense_loss`, for attacks: it says nothing of where boxes should be."""
         return dense_loss(raw, targets, self.classes)
+
+    def candidates(self, raw: DensePredictions) -> Candidates:
+        """Every prediction; what has no area inside the image is none."""
+        return Candidates(raw.boxes_xyxy[0], raw.probabilities[0].clamp_min(LEAST_PROBABILITY).log())
 
     @torch.no_grad()
     def decode(self, raw: DensePredictions) -> list[Detections]:

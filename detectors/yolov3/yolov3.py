@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from detectors import boxes
-from detectors.base import Detector, RawPredictions
+from detectors.base import Candidates, Detector, RawPredictions
 from detectors.types import CLASSES, Detections, Targets
 from detectors.yolov3 import layouts
 from detectors.yolov3.cfg import Cfg
@@ -344,6 +344,11 @@ class YoloV3(Detector):
             "total": terms["confidence"] + terms["box"] + terms["class"],
             "objectness": (unseen + false) / objects,
         }
+
+    def candidates(self, raw: RawPredictions) -> Candidates:
+        """Every anchor; score = objectness x class probability."""
+        logs = F.logsigmoid(raw.confidence_logits[0])[:, None] + F.logsigmoid(raw.class_logits[0])
+        return Candidates(raw.boxes_xyxy[0][:, None], logs)
 
     @torch.no_grad()
     def decode(self, raw: RawPredictions) -> list[Detections]:

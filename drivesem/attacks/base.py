@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from drivesem.feasible import Projected
 
 
+LOOKED_AT = 5
+"""Of the iterates that a gradient pass saw, so many of the most promising are rendered and judged."""
 _TINY = 1e-30
 """Keeps a division defined where its result is not used."""
 
@@ -34,6 +36,10 @@ class Score:
     phantoms: int
     success: bool
     success_paper: bool
+
+
+def _unseen(theta: Tensor) -> Score | None:
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +59,8 @@ class Problem:
     loss_and_grad: the objective to be raised, and its gradient (D,); for detectors that have one. project: onto
     the feasible set. score: re-render and judge, without a gradient; what was judged once is not rendered again.
     step (D,): the step alpha of each coordinate, 0 where it is held; lower, upper (D,): its bounds. groups: the
-    blocks of theta, which cover it; by default it is one.
+    blocks of theta, which cover it; by default it is one. preview: what the gradient pass at theta saw, roughly
+    what `score` will say and without a cost; None where there was no such pass.
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
@@ -63,6 +70,7 @@ class Problem:
     lower: Tensor
     upper: Tensor
     groups: tuple[Group, ...] = (Group("theta", slice(None)),)
+    preview: Callable[[Tensor], Score | None] = _unseen
 
     def in_steps(self, theta: Tensor) -> Tensor:
         """theta (D,) in steps alpha; 0 where a coordinate is held. Differentiable."""
@@ -144,11 +152,12 @@ class Attack(ABC):
 
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
-        """Run from theta0 (D,). Of theta0 and all proposals, each projected and scored anew, the one that ranks
-        highest (`_rank`) wins; of equals the first.
+        """Run from theta0 (D,). Of theta0 and the proposals, projected and scored anew, the one that ranks highest
+        (`_rank`) wins; of equals the first.
 
-        All are scored because a detector's loss says only roughly what is lost: on the embedded scenes the iterate
-        of highest loss loses fewer objects than the best one. A score takes no gradient and counts as no query.
+        Scored are all that no gradient pass saw, and of the others the LOOKED_AT that rank highest by what it saw:
+        failures, and not the loss alone, which says only roughly what is lost. A score takes no gradient and
+        counts as no query.
         """
         generator = torch.Generator(device="cpu").manual_seed(seed)
         proposals = self._propose(problem, theta0, generator)
@@ -157,6 +166,7 @@ class Attack(ABC):
             feasible = problem.project(candidate.detach())
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)
+        projected = self._promising(problem, projected)
         scores = [problem.score(p.theta) for p in projected]
         ranks = [self._rank(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
         best = max(range(len(ranks)), key=lambda i: (*ranks[i], -i))
@@ -173,3 +183,13 @@ class Attack(ABC):
             seed=seed,
             active_constraints=tuple(dict.fromkeys((*proposals.active_constraints, *projected[best].active))),
         )
+
+    def _promising(self, problem: Problem, projected: list[Projected]) -> list[Projected]:
+        """What is worth a render, in its order; the first, where the attack began, always is."""
+        seen: dict[int, tuple[float, ...]] = {}
+        for i, candidate in enumerate(projected[1:], start=1):
+            preview = problem.preview(candidate.theta)
+            if preview is not None:
+                seen[i] = self._rank(problem, candidate.theta, preview)
+        best = sorted(seen, key=lambda i: (seen[i], -i), reverse=True)[:LOOKED_AT]
+        return [candidate for i, candidate in enumerate(projected) if i not in seen or i in best]

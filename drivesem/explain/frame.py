@@ -15,6 +15,7 @@ from torch import Tensor
 
 from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
+from drivesem.aims import Aim
 from drivesem.attacks.base import Problem, Score
 from drivesem.config import Attack
 from drivesem.explain import players, sensitivity
@@ -169,7 +170,8 @@ def rebuild(
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
     compositor = Compositor(scene, RenderSettings(backend=attack.backend))
     labels, term = attack.objective_labels, attack.objective
-    return Objective(compositor, space, detector, labels, term, t_star=attack.t_star), theta
+    aim = Aim.of(attack.target_objects, attack.target_classes)
+    return Objective(compositor, space, detector, labels, term, t_star=attack.t_star, aim=aim), theta
 
 
 def weigh(

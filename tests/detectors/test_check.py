@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from detectors.adapters.dense import DenseDetector, DensePredictions
-from detectors.base import DetectorError, predict
+from detectors.base import Candidates, DetectorError, predict
 from detectors.check import check_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.types import Detections
@@ -96,6 +96,14 @@ class Boundless(Small):
         return {name: term / 0 for name, term in super().loss(raw, targets).items()}
 
 
+class Elsewhere(Small):
+    """Candidates with other scores than the detections'."""
+
+    def candidates(self, raw):
+        told = super().candidates(raw)
+        return Candidates(told.boxes_xyxy, told.log_scores - 1)
+
+
 class Mixing(Small):
     """What one image shows changes what is said of the other."""
 
@@ -134,6 +142,7 @@ def test_a_small_detector_keeps_its_contract() -> None:
         (Silent, "planted prediction", "expected the planted box alone, found 0"),
         (Unnamed, "loss terms", "expected total and objectness, found total"),
         (Boundless, "loss terms", "expected a finite number"),
+        (Elsewhere, "candidates", "expected every detection among them"),
         (Mixing, "batch as singles", "of the detections differ"),
         (Training, "frozen", "differ after train()"),
     ],

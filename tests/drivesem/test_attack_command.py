@@ -111,6 +111,18 @@ def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture
     assert contents(finished) == before
 
 
+def test_a_run_of_an_earlier_version_goes_on(finished: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    lines = (out / "config.yaml").read_text().splitlines()
+    assert "target_classes: null" in lines
+    (out / "config.yaml").write_text("\n".join(line for line in lines if line != "target_classes: null"))
+    assert attack([*WORDS, "--limit", "2", "--out", str(out)], capsys)["frames"] == 2
+    capsys.readouterr()
+    assert main([*WORDS, "--limit", "2", "--target-classes", "Car", "--out", str(out)]) == 2
+    assert "found other values of target_classes" in capsys.readouterr().err
+
+
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     assert main([*WORDS, "--limit", "1", "--out", str(tmp_path)]) == 2
@@ -184,7 +196,7 @@ def test_searches_run_on_a_detector_without_gradient(
             [],
             "--method: expected one of random, halton, sobol, cma-es for any, which has no gradient",
         ),
-        (["--method", "sobol", "--objective", "confidence"], "--objective: expected objectness for any"),
+        (["--method", "sobol", "--objective", "confidence"], "--objective: expected one of objectness, hide"),
         (["--queries", "3"], "--queries: expected --method random, halton"),
         (["--method", "fgsm", "--range", "steps"], "--range: expected a method without gradient"),
         (["--method", "random", "--queries", "0"], "--queries: expected at least 1, found 0"),
@@ -204,3 +216,27 @@ def test_methods_are_those_that_need_no_gradient() -> None:
     names = get_args(get_type_hints(Attack)["method"])
     free = [name for name in names if not attack_command.attack_method(Attack(method=name)).needs_gradient]
     assert set(free) == {*GRADIENT_FREE, "placebo"}
+
+
+@pytest.mark.parametrize("objective", ["failure", "hide", "phantom", "localisation", "total"])
+def test_objectives_are_recorded_and_raised(
+    objective: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["attack", "--params", "rotate", "--steps", "2", "--limit", "1", "--json", "--objective", objective]
+    attack([*words, "--out", str(tmp_path / "run")], capsys)
+    (folder,) = (tmp_path / "run" / "frames").iterdir()
+    result = load_frame(folder / "result.json")
+    if not result.failures:  # then the loss alone chose among the iterates
+        assert result.loss_trace[-1] >= result.loss_trace[0] - 1e-3
+    assert f"objective: {objective}" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    aimed = [*WORDS, "--limit", "2", "--target-objects", "0"]
+    attack([*aimed, "--out", str(tmp_path / "one")], capsys)
+    for folder in (tmp_path / "one" / "frames").iterdir():
+        result = load_frame(folder / "result.json")
+        assert all(failure.kind == "lost" and failure.index == 0 for failure in result.failures)
+        assert result.success_moved == bool(result.failures)
+    beyond = attack([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")], capsys)
+    assert (beyond["frames"], beyond["frames_without_vehicles"]) == (0, 1)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -95,7 +97,7 @@ def test_a_gradient_that_is_not_finite_names_the_coordinate(street):
 
 def test_an_unknown_term_is_named(street):
     scene = street(positions_xz=NEAR)
-    with pytest.raises(RangeError, match="objective term: expected one of confidence, found 'class'"):
+    with pytest.raises(RangeError, match=r"objective term: expected one of confidence, hide, .*, found 'class'"):
         _objective(scene, StubDetector(scene.objects.box2d), term="class")
 
 
@@ -195,7 +197,9 @@ def test_what_a_detector_without_gradient_lacks_is_named(street):
     objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
     with pytest.raises(RangeError, match="detector: expected one with a gradient, found spotter"):
         objective.loss_and_grad(objective.space.theta0)
-    with pytest.raises(RangeError, match="objective term: expected one of objectness, found 'confidence'"):
+    with pytest.raises(
+        RangeError, match=r"objective term: expected one of objectness, hide, .*, found 'confidence'"
+    ):
         _objective(scene, Spotter(scene.objects.box2d))
 
 
@@ -329,3 +333,34 @@ def test_batches_that_do_not_fit_are_refused(street):
         first.loss_and_grad_many(first.space.theta0)
     with pytest.raises(ShapeError, match=r"thetas: expected \(B, 4\)"):
         first.loss_and_grad_many(torch.zeros(0, 4))
+
+
+def test_a_gradient_pass_previews_what_the_score_will_say(street):
+    scene = street(positions_xz=NEAR)
+    space = ParameterSpace(scene, ("translate",))
+    ways = [torch.full((4,), 0.2), torch.full((4,), -0.2)]
+    light = [float(StubCompositor().render(space.apply(scene, way)).image.mean()) for way in ways]
+    benign = float(StubCompositor().render(scene).image.mean())
+    # Blind at the brighter of the two only.
+    objective = _objective(scene, StubDetector(scene.objects.box2d, blind_above=(benign + max(light)) / 2))
+    lost = set()
+    for way in ways:
+        assert objective.preview(way) is None
+        objective.loss_and_grad(way)
+        preview, score = objective.preview(way), objective.score(way)
+        assert preview is not None
+        assert (preview.lost, preview.phantoms) == (score.lost, score.phantoms)
+        assert (preview.success, preview.success_paper) == (score.success, score.success_paper)
+        assert preview.loss == pytest.approx(score.loss, abs=1e-2)
+        lost.add(score.lost)
+    assert lost == {1, 2}  # detections stay, so the nearer car leaves its own either way
+
+
+@pytest.mark.parametrize("mode", ["moved", "paper"])
+def test_goals_are_raised_without_a_gradient_too(street, mode):
+    scene = street(positions_xz=NEAR)
+    objective = _objective(scene, Spotter(scene.objects.box2d), mode, term="failure")
+    certain = 2 * math.log(objective.t_star / (1 - objective.t_star))
+    assert objective.benign.loss < certain
+    with pytest.raises(RangeError, match="detector: expected one with a gradient"):
+        objective.loss_and_grad(objective.space.theta0)

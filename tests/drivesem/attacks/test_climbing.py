@@ -9,7 +9,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attacks.base import Attack, Group, Problem, Proposals, Score
+from drivesem.attacks.apgd import APGD
+from drivesem.attacks.base import LOOKED_AT, Attack, Group, Problem, Proposals, Score
 from drivesem.attacks.fgsm import FGSM
 from drivesem.attacks.restarts import Restarted
 from drivesem.attacks.scw import SCW
@@ -23,6 +24,7 @@ START = torch.zeros(6)
 METHODS = {
     "si-fgsm": SiFGSM(),
     "momentum": SiFGSM(momentum=1.0),
+    "apgd": APGD(),
     "sgd": SGD(),
     "sgd raw": SGD(form="raw", rate=0.2, momentum=0.5),
     "scw": SCW(queries=15, steps=5),
@@ -265,3 +267,57 @@ def test_an_attack_may_rank_otherwise_but_not_judge():
 def test_settings_that_cannot_be(make, message):
     with pytest.raises(RangeError, match=message):
         make()
+
+
+def test_apgd_begins_with_the_papers_step_and_halves_it_on_rough_ground():
+    # A maximum within half a step: sign steps pass over it, and over it again.
+    hill = Hill(lambda theta: -(theta - 0.03).abs().sum())
+    proposals = APGD(steps=20)._propose(hill.problem, torch.zeros(2), torch.Generator())
+    assert proposals.thetas[1].tolist() == pytest.approx([0.1, 0.1])
+    assert proposals.queries == 20
+    wandering = SiFGSM(steps=20)._propose(hill.problem, torch.zeros(2), torch.Generator())
+    assert max(loss for loss in wandering.losses if loss is not None) == pytest.approx(-0.06, abs=1e-6)
+    assert max(loss for loss in proposals.losses if loss is not None) > -0.03
+
+
+def test_apgd_keeps_its_step_while_the_loss_rises():
+    hill = Hill(lambda theta: theta.sum())
+    proposals = APGD(steps=10, rate=0.5)._propose(hill.problem, torch.zeros(2), torch.Generator())
+    assert proposals.thetas[1].tolist() == pytest.approx([0.05, 0.05])
+    gone = torch.stack(proposals.thetas)[:, 0]
+    # With momentum each move is 0.75 of a step and a quarter of the move before, in the end one step again.
+    assert float(gone[-1] - gone[-2]) == pytest.approx(0.05, rel=1e-3)
+
+
+def test_apgd_stops_at_its_first_success(slope):
+    result = APGD(steps=40, early_stop=True)(slope(need=3).problem, START)
+    assert result.success_moved
+    assert result.queries < 40
+
+
+@pytest.mark.parametrize(("settings_", "named"), [({"steps": 0}, "steps"), ({"rate": 0.0}, "rate")])
+def test_apgd_refuses_what_cannot_be(settings_, named):
+    with pytest.raises(RangeError, match=named):
+        APGD(**settings_)
+
+
+def test_of_what_was_seen_only_the_most_promising_is_judged():
+    judged: list[float] = []
+    step, limit = torch.ones(1), torch.full((1,), 100.0)
+
+    def score(theta: torch.Tensor) -> Score:
+        judged.append(float(theta))
+        return Score(float(theta), 0, 0, False, False)
+
+    def preview(theta: torch.Tensor) -> Score | None:
+        # The last iterate was never seen. The 4th promises a lost object, later ones a higher loss.
+        k = round(float(theta))
+        return None if k == 20 else Score(float(k), int(k == 4), 0, k == 4, False)
+
+    problem = Problem(
+        lambda t: (0.0, torch.ones(1)), lambda t: Projected(t, ()), score, step, -limit, limit, preview=preview
+    )
+    result = SiFGSM(steps=20)(problem, torch.zeros(1))
+    assert sorted(judged) == [0, 4, 16, 17, 18, 19, 20]
+    assert len(judged) == LOOKED_AT + 2
+    assert float(result.theta) == 20

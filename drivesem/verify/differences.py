@@ -1,0 +1,56 @@
+"""What was compared, and what differed: the terms in which a run is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+CHECKS: Mapping[str, str] = {
+    "files": "pictures, labels and theta.json have the hashes of manifest.json",
+    "pictures": "the saved scene, rendered again, gives the three pictures",
+    "detections": "the detector finds in the three pictures what is recorded",
+    "labels": "the saved scene gives both label files and the recorded targets",
+    "success": "lost, phantoms, and success under both label modes, from label files and detections",
+    "feasibility": "the second check says the same of the saved scene, and all lies within the budget",
+    "theta": "theta.json, result.json and the saved scene say the same change",
+    "totals": "metrics.json adds up what the frames hold",
+}
+"""Names of the checks, in the order in which they are told, and what holds where nothing differs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One thing that is not as the run says. field: such as `success_moved` or `objects[3].yaw`; expected: what
+    the run's result says; found: what its files give.
+    """
+
+    check: str
+    field: str
+    expected: str
+    found: str
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts comparisons by check, and keeps what differs."""
+
+    compared: dict[str, int] = field(default_factory=dict)
+    differences: list[Difference] = field(default_factory=list)
+
+    def same(self, check: str, name: str, expected: object, found: object) -> None:
+        """Compare exactly."""
+        self.told(check, name, expected, found, agrees=expected == found)
+
+    def told(self, check: str, name: str, expected: object, found: object, agrees: bool) -> None:
+        """Count a comparison whose outcome is known."""
+        self.compared[check] = self.compared.get(check, 0) + 1
+        if not agrees:
+            self.differences.append(Difference(check, name, _text(expected), _text(found)))
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "; ".join(_text(part) for part in value) or "none"
+    return str(value)
