@@ -49,7 +49,7 @@ from drivesem.sources import NoVehicleError, SceneSource, open_source
 from drivesem.space import Parameter, combo, parse_params
 from scene_ir import files
 from scene_ir.compositor import RenderSettings
-from scene_ir.errors import SceneError
+from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.types import SceneIR
 
 _NOT_TOLD = ("out", "json", "resume", "workers")
@@ -171,7 +171,11 @@ class Worker:
             budget=budget_of(config.budget),
             aim=aim,
         )
-        return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+        try:
+            return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+        except (RangeError, ShapeError) as error:
+            # A loss or gradient that is no number says where in the scene, and not in which.
+            raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
 
 
 def aim_of(config: Attack) -> Aim:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -17,7 +18,7 @@ from detectors.registry import load_predictor
 from drivesem.config import Confirm, UsageError
 from drivesem.confirm.frame import Asked, confirm_frame, fingerprint
 from drivesem.confirm.plans import open_plans
-from drivesem.confirm.report import print_report, summarise, write_report
+from drivesem.confirm.report import Report, print_report, summarise, write_report
 from drivesem.confirm.results import Confirmed, load
 from drivesem.devices import check_device
 from drivesem.judged import JudgedClasses
@@ -35,12 +36,26 @@ _WRITTEN = ("confirm.json", "confirm.md", "confirm.csv")
 def run(config: Confirm) -> int:
     """Draw, ask, report; exit code 0. Raises UsageError or SceneError for bad input."""
     check_device(config.device)
+    console = Console(stderr=True)
+    report, data, out = confirm_run(config, console)
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    print_report(report, console if config.json else Console())
+    for name, reason in data["frames_failed"].items():
+        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True)
+    return 0
+
+
+def confirm_run(config: Confirm, console: Console) -> tuple[Report, dict[str, Any], Path]:
+    """Confirm a run's frames, or go on with it. Returns the figures, what `--json` prints, and the folder in which
+    all is. Raises UsageError or SceneError for bad input.
+    """
     (one,) = load_runs([config.run or ""], config.limit)
     out = Path(config.out) if config.out else one.folder / "confirm"
     worker = _Worker(config, one)
     # Frames are kept by the result they belong to, so that another name of the run's folder is not in the way.
     claim(out, config, _clear, (*PRESENTATION, "run", "root", "seed"))
-    console = Console(stderr=True)
     failed: dict[str, str] = {}
     todo = [frame for frame in one.frames if not _is_done(one, frame, out)]
     _confirm_all(worker, todo, out, failed, console)
@@ -59,13 +74,7 @@ def run(config: Confirm) -> int:
     }
     files.write_json(out / "confirm.json", data)
     write_report(out, report, found)
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    print_report(report, console if config.json else Console())
-    for name, reason in failed.items():
-        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
-    console.print(f"written to {out}", soft_wrap=True)
-    return 0
+    return report, data, out
 
 
 class _Worker:

@@ -422,9 +422,11 @@ def _largest_scales(
             good.append(scale)
     scale = np.where(search, low, full)
     moved, known = np.flatnonzero(search), any(np.array_equal(scale, well) for well in good)
-    # Scales found side by side may clash together: the cars involved fall back to 0, which is known to be good.
+    # Scales found side by side may clash together: the cars involved fall back to 0, which is known to be good,
+    # and so do those that were well at 1 only as long as another had made way.
     while (wrong := settle(moved, scale, known) & (scale > 0)).any():
-        scale = np.where(wrong, 0.0, scale)
+        scale, search = np.where(wrong, 0.0, scale), search | wrong
+        moved = np.flatnonzero(search)
 
 
 def project(space: ParameterSpace, scene: SceneIR, theta: Tensor, limits: Limits | None = None) -> Projected:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from drivesem.config import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 from drivesem.space import Parameter
+from drivesem.transfer.asking import detector_names, short_names
 
 QUICK_FRAMES, FRAMES = 6, 200
 """Frames of a study with --quick, and without."""
@@ -25,9 +26,13 @@ PAPER_SINGLE = {
 }
 PAPER_COMBOS = {1: 0.82, 2: 0.659, 3: 0.808, 4: 0.987}
 """The paper's mAP after the attack, by parameter and by combination."""
+PAPER_TRANSFER = (0.9128, 0.875)
+"""The paper's mAP of a YOLOv3, trained on KITTI: on benign frames, and on counterexamples against SqueezeDet."""
 RANDOM, PLACEBO = "random", "placebo"
 """Controls: the best of as many random samples as the attack takes steps, of the box that those steps reach; and
 one random edit as large as the attack's own."""
+_LONGER = 4
+"""Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
 _FAR = 2
 """Steps of the study `steps`, in multiples of --steps: far enough to see where more are of no use."""
 
@@ -46,9 +51,9 @@ class Arm:
     of: str | None = None
 
 
-def arms_of(study: Study, out: Path) -> list[Arm]:
-    """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
-    base = Attack(
+def attack_of(study: Study) -> Attack:
+    """The attack that a study's arms vary."""
+    return Attack(
         limit=study.limit or (QUICK_FRAMES if study.quick else FRAMES),
         seed=study.seed,
         workers=study.workers,
@@ -57,22 +62,37 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
         dataset=study.dataset,
         root=study.root,
         detector=study.detector,
+        method=study.method,
         steps=study.steps,
         budget=study.budget,
         objective_labels=study.objective_labels,
+        objective=study.objective,
+        precision=study.precision,
         fit=study.fit,
         t_star=study.t_star,
     )
+
+
+def arms_of(study: Study, out: Path) -> list[Arm]:
+    """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
+    base = attack_of(study)
     if study.name == "single":
         single = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in Parameter]
         return _controlled(single, out) if study.controls else single
     if study.name == "multi":
         multi = [_combo(base, number) for number in COMBO_NUMBERS]
+        if study.method == "si-fgsm":
+            longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
+            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer, PAPER_COMBOS[DEFAULT_COMBO]))
         return _controlled(multi, out) if study.controls else multi
     if study.name == "samples":
         return _samples(replace(base, combo=DEFAULT_COMBO), study)
+    if study.name == "transfer":
+        sources = _sources(base, study)
+        return _controlled(sources, out, (PLACEBO,)) if study.controls else sources
     if study.name == "steps":
-        far = replace(base, combo=DEFAULT_COMBO, steps=_FAR * study.steps, early_stop=True)
+        steps = _FAR * study.steps
+        far = replace(base, combo=DEFAULT_COMBO, method="si-fgsm", steps=steps, early_stop=True)
         rates = (0.5, 1.0, 2.0) if study.quick else (0.25, 0.5, 1.0, 2.0, 4.0)
         return [_arm(f"rate {rate:g}", replace(far, rate=rate)) for rate in rates]
     return _labels(base, study.quick)
@@ -86,19 +106,32 @@ def _combo(base: Attack, number: int) -> Arm:
     return _arm(f"combo {number}", replace(base, combo=number), PAPER_COMBOS[number])
 
 
-def _controlled(arms: Sequence[Arm], out: Path) -> list[Arm]:
-    """Each arm, followed by its two controls."""
+def _controlled(arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO)) -> list[Arm]:
+    """Each arm, followed by its controls."""
     found: list[Arm] = []
     for arm in arms:
-        samples = replace(arm.config, method="random", range="steps", queries=arm.config.steps)
         # As the run's own settings say it: relative to where the command is called.
-        edit = replace(arm.config, method="placebo", like=os.path.join(out, "arms", arm.folder))
-        found += [
-            arm,
-            Arm(f"{arm.name} {RANDOM}", f"{arm.folder}-{RANDOM}", samples, control=RANDOM, of=arm.name),
-            Arm(f"{arm.name} {PLACEBO}", f"{arm.folder}-{PLACEBO}", edit, control=PLACEBO, of=arm.name),
-        ]
+        size_of = os.path.join(out, "arms", arm.folder)
+        configs = {
+            RANDOM: replace(arm.config, method="random", range="steps", queries=arm.config.steps),
+            PLACEBO: replace(arm.config, method="placebo", like=size_of),
+        }
+        found.append(arm)
+        for kind in kinds:
+            name, folder = f"{arm.name} {kind}", f"{arm.folder}-{kind}"
+            found.append(Arm(name, folder, configs[kind], control=kind, of=arm.name))
     return found
+
+
+def _sources(base: Attack, study: Study) -> list[Arm]:
+    """The default combination against each source: the arm of the first has the name that `multi` gives it."""
+    sources = detector_names(study.sources or study.detector, "--sources")
+    arms = []
+    for place, (source, short) in enumerate(zip(sources, short_names(sources), strict=True)):
+        arm = _combo(replace(base, detector=source), DEFAULT_COMBO)
+        folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
+        arms.append(replace(arm, name=short, folder=folder))
+    return arms
 
 
 def _samples(base: Attack, study: Study) -> list[Arm]:
@@ -106,7 +139,8 @@ def _samples(base: Attack, study: Study) -> list[Arm]:
     study also lets it look in all of the bounds.
     """
     arms = [
-        _arm("si-fgsm", replace(base, early_stop=True)),
+        _arm("si-fgsm", replace(base, method="si-fgsm", early_stop=True)),
+        _arm("apgd", replace(base, method="apgd", early_stop=True)),
         _arm("fgsm", replace(base, method="fgsm")),
     ]
     searches = ("random", "halton", "sobol", "cma-es")

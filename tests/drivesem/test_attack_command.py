@@ -240,3 +240,29 @@ def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.Captu
         assert result.success_moved == bool(result.failures)
     beyond = attack([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")], capsys)
     assert (beyond["frames"], beyond["frames_without_vehicles"]) == (0, 1)
+
+
+def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = torch.autograd.grad
+    frames: list[int] = []
+
+    def broken(losses: Any, leaves: Any) -> Any:
+        gradients = whole(losses, leaves)
+        frames.append(len(gradients[0]))
+        if len(frames) == 1:  # of the first frame alone
+            gradients[0][0] = torch.nan
+        return gradients
+
+    monkeypatch.setattr("drivesem.objective.torch.autograd.grad", broken)
+    words = ["attack", "--params", "rotate", "--steps", "1", "--limit", "2", "--workers", "1"]
+    assert main([*words, "--out", str(tmp_path / "ends")]) == 2
+    (line,) = [ln for ln in capsys.readouterr().err.splitlines() if ln.startswith("drivesem:")]
+    assert "gradient of objects[0].yaw: expected a finite value, found nan" in line
+    assert line.startswith("drivesem: frame ")
+    frames.clear()
+    told = attack([*words, "--json", "--keep-going", "--out", str(tmp_path / "goes")], capsys)
+    ((name, reason),) = told["frames_failed"].items()
+    assert told["frames"] == 1
+    assert reason.startswith(f"frame {name}: gradient of objects[0].yaw")

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import drivesem.feasibility_check
-from drivesem.feasibility_check import check_scene, overlap_area
+from drivesem.feasibility_check import _Car, _collisions, check_scene, overlap_area
 from drivesem.feasible import FeasibleSet, Limits, _Cars, _gap, _overlap, project, violations
 from drivesem.space import COMBOS, ParameterSpace
 from scene_ir import ffd
@@ -56,6 +56,33 @@ def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(st
     assert result.active == ()
     assert violations(space, scene, space.theta0) == ()
     assert check_scene(scene, space.apply(scene, space.theta0)) == []
+
+
+def test_a_start_that_violates_something_is_kept_and_named(street):
+    def named(**street_words):
+        space = ParameterSpace(street(**street_words), COMBOS[2])
+        feasible = FeasibleSet(space)
+        assert feasible.violations(space.theta0) == ()
+        assert torch.equal(feasible.project(space.theta0).theta, space.theta0)
+        return set(feasible.violated_at_start)
+
+    assert named() == set()
+    overlapping = {"positions_xz": ((0.0, 10.0), (1.0, 13.0), (6.0, 20.0)), "yaw": -math.pi / 2}
+    assert {"objects[0]: collision", "objects[1]: collision"} <= named(**overlapping)
+    assert not any(name.startswith("objects[2]") for name in named(**overlapping))
+    # Footprints 2 cm apart: less than the clearance.
+    assert named(positions_xz=((0.0, 10.0), (0.0, 14.22)), yaw=-math.pi / 2) >= {"objects[0]: collision"}
+    assert named(positions_xz=((0.0, 10.0), (6.0, 14.0)), road_edge_x_m=2.0) == {"objects[1]: road"}
+    assert "objects[0]: frame" in named(positions_xz=((9.5, 9.0),), yaw=0.0)
+    assert "objects[1]: visibility" in named(positions_xz=((0.0, 10.0), (0.5, 11.5)))
+
+
+def test_a_mesh_that_is_strained_at_the_start_is_named(street):
+    scene = street()
+    offsets = scene.objects.ffd.clone()
+    offsets[2] = 0.5 * _stretch(scene.objects)[2]
+    space = ParameterSpace(scene.with_objects(ffd=offsets), COMBOS[2])
+    assert FeasibleSet(space).violated_at_start == ("objects[2]: strain",)
 
 
 def test_a_feasible_theta_is_returned_to_the_bit(street):
@@ -199,7 +226,8 @@ def test_the_second_check_shares_no_code():
         for a in n.names
     }
     assert imported <= {
-        *("__future__", "collections.abc", "math", "cv2", "numpy", "numpy.typing", "scene_ir.types")
+        *("__future__", "collections.abc", "dataclasses", "math"),
+        *("cv2", "numpy", "numpy.typing", "scene_ir.types"),
     }
 
 
@@ -214,6 +242,8 @@ def test_the_second_check_shares_no_code():
         (lambda o: {"ffd": o.ffd + 0.3 * torch.randn(o.ffd.shape, generator=_generator())}, "strain in"),
         (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.05, 0.0])}, "lowest lattice layer"),
         (lambda o: {"ffd": -2 * _stretch(o)}, "mesh inverted"),
+        (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.0, 0.05])}, "mesh not symmetric"),
+        (lambda o: {"ffd": o.ffd + 0.6 * _stretch(o)}, "lattice bent by 0.300 unit boxes"),
     ],
 )
 def test_the_second_check_finds_what_is_wrong(street, change, said):
@@ -246,6 +276,29 @@ def test_the_second_check_finds_collisions_roads_and_hiding(street):
     pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
     hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
     assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
+
+
+def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):
+    scene = street(positions_xz=((0.0, 10.0), (1.8, 10.0)), yaw=0.0)
+    scene = scene.with_objects(yaw=torch.tensor([0.0, math.pi / 2]))
+    before, after = [_Car(scene, i) for i in range(2)], [_Car(scene, i) for i in range(2)]
+    shared = overlap_area(before[0].outline, before[1].outline)
+    assert overlap_area(before[0].footprint, before[1].footprint) > shared > 1
+    # The same rectangles, and a mesh that was a spindle in one of them.
+    before[1].vertices = _spindle(before[1])
+    less = overlap_area(before[0].outline, before[1].outline)
+    assert less < shared - 0.2
+    found = _collisions(dict(enumerate(before)), dict(enumerate(after)))
+    assert found == [f"objects[1]: mesh runs into that of objects[0], {shared:.2f} m2 ({less:.2f} before)"]
+    assert _collisions(dict(enumerate(after)), dict(enumerate(before))) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(after))) == []
+
+
+def _spindle(car):
+    """The vertices of a car's mesh, the narrower the further they are from its middle."""
+    local = (car.vertices - car.position) @ car.axes.T
+    local[:, 2] *= 1 - np.abs(local[:, 0]) / (car.high[0] - car.low[0]) * 1.8
+    return local @ car.axes + car.position
 
 
 def test_overlap_area_of_known_shapes():

@@ -45,6 +45,17 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     assert load_frame(path).feasible
 
 
+def test_results_from_before_the_start_was_judged_still_load(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    data = json.loads(dump_frame(frame_result()))
+    data["violated_at_start"] = ["objects[0]: collision"]
+    path.write_text(json.dumps(data))
+    assert load_frame(path).violated_at_start == ("objects[0]: collision",)
+    del data["violated_at_start"]
+    path.write_text(json.dumps(data))
+    assert load_frame(path) == frame_result()
+
+
 @pytest.mark.parametrize("spoil", ["missing", "schema", "text", "field"])
 def test_broken_file_is_named(tmp_path: Path, spoil: str) -> None:
     path = tmp_path / "result.json"

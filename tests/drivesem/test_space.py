@@ -93,11 +93,30 @@ def test_theta_by_name_speaks_metres_and_degrees(street):
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 2**31), names=st.sets(st.sampled_from(list(Parameter)), min_size=1))
-def test_flatten_is_the_inverse_of_unflatten(street, seed, names):
-    space = ParameterSpace(street(), tuple(names))
+@given(
+    seed=st.integers(0, 2**31),
+    names=st.sets(st.sampled_from(list(Parameter)), min_size=1),
+    count=st.integers(0, 5),
+)
+def test_flatten_is_the_inverse_of_unflatten(street, seed, names, count):
+    space = ParameterSpace(street(positions_xz=[(2.0 * i - 5, 8.0 + 5 * i) for i in range(count)]), tuple(names))
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(seed))
-    assert torch.equal(space.flatten(space.unflatten(theta)), theta)
+    parts = space.unflatten(theta)
+    assert torch.equal(space.flatten(parts), theta)
+    again = space.unflatten(space.flatten(parts))
+    for parameter in Parameter:
+        one, other = getattr(parts, parameter.value), getattr(again, parameter.value)
+        assert (one is None) == (other is None) == (parameter not in names)
+        assert one is None or (one.shape == other.shape and torch.equal(one, other))
+    # What a name says of a coordinate is where unflatten puts it.
+    for parameter, where in space.blocks.items():
+        block = getattr(parts, parameter.value).reshape(-1)
+        assert torch.equal(theta[where], block)
+        owners = [space.name(i).split(".")[0] for i in range(where.start, where.stop)]
+        size = len(block) // max(count, 1)
+        known = (Parameter.WEATHER, Parameter.FOLIAGE)
+        expected = [parameter.value if parameter in known else f"objects[{i // size}]" for i in range(len(block))]
+        assert owners == expected
 
 
 def test_flatten_rejects_what_does_not_fit(street):
