@@ -30,19 +30,20 @@ from drivesem.attacks.fgsm import FGSM
 from drivesem.attacks.placebo import Placebo
 from drivesem.attacks.restarts import Restarted
 from drivesem.attacks.sampling import Sampling
+from drivesem.attacks.scouted import Scouted
 from drivesem.attacks.scw import SCW
 from drivesem.attacks.sgd import SGD
 from drivesem.attacks.si_fgsm import SiFGSM
 from drivesem.attacks.subsets import Subsets
 from drivesem.budgets import budget_of, written
-from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError, command_line
+from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError
 from drivesem.devices import check_device
 from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
 from drivesem.objective import OF_DETECTIONS
 from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
 from drivesem.pool import outcomes
-from drivesem.report.html import render_report
+from drivesem.report_data import write_run
 from drivesem.results import FrameResult, RunSummary, load_frame
 from drivesem.run_folder import claim
 from drivesem.sources import NoVehicleError, SceneSource, open_source
@@ -52,8 +53,6 @@ from scene_ir.compositor import RenderSettings
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.types import SceneIR
 
-_NOT_TOLD = ("out", "json", "resume", "workers")
-"""Settings that change nothing in the result: left out of the report's command line."""
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -107,8 +106,7 @@ def _attacked(
     )
     files.write_json(out / "metrics.json", summary.to_json())
     files.write_json(out / "manifest.json", _manifest(config, out, done))
-    command = command_line("attack", config, _NOT_TOLD)
-    files.write_text(out / "report.html", render_report(summary, results, out, command))
+    write_run(out, config, summary, results)
     return summary
 
 
@@ -185,9 +183,10 @@ def aim_of(config: Attack) -> Aim:
 
 def attack_method(config: Attack) -> AttackMethod:
     """The algorithm that the settings ask for."""
+    attack = _from_theta0(config)
     if config.restarts:
-        return Restarted(_from_theta0(config), config.restarts, config.steps, config.early_stop)
-    return _from_theta0(config)
+        attack = Restarted(attack, config.restarts, config.steps, config.early_stop)
+    return Scouted(attack, config.scouts, early_stop=config.early_stop) if config.scouts else attack
 
 
 def _from_theta0(config: Attack) -> AttackMethod:

@@ -25,7 +25,9 @@ from drivesem.config import (
     Explain,
     Gradcheck,
     Plausibility,
+    Realism,
     Render,
+    Report,
     Retrain,
     Study,
     Synth,
@@ -139,10 +141,18 @@ def _run(config: Command) -> int:
         from drivesem import confirm_command
 
         return confirm_command.run(config)
+    if isinstance(config, Report):
+        from drivesem import report_command
+
+        return report_command.run(config)
     if isinstance(config, Plausibility):
         from drivesem import plausibility_command
 
         return plausibility_command.run(config)
+    if isinstance(config, Realism):
+        from drivesem import realism_command
+
+        return realism_command.run(config)
     if isinstance(config, Verify):
         from drivesem import verify_command
 

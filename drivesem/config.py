@@ -96,9 +96,9 @@ class Attack(Common):
     method: Literal[
         "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
     ] = "si-fgsm"
-    """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw (Carlini-Wagner) also keeps the change small; subsets finds the
-    fewest parameters that are enough; random (uniform), halton, sobol (scrambled sequences) and cma-es ask only
-    what the detector finds."""
+    """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
+    (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
+    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds."""
     steps: int = 10
     """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
     queries: int | None = None
@@ -113,6 +113,8 @@ class Attack(Common):
     """Of scw: the norm of the change that is kept small."""
     restarts: int = 0
     """Of si-fgsm, apgd, fgsm, sgd and scw: how often to begin again at random near the photograph."""
+    scouts: int = 0
+    """Of the same: how many samples of all the bounds are judged first; the attack begins at the best."""
     like: str | None = None
     """Of placebo, one random edit of each frame: the run whose counterexamples are as large."""
     budget: str = "paper"
@@ -156,10 +158,11 @@ class Study(Common):
     ]
     """single: the six parameters, each alone; multi: the combinations 1 to 4; samples: success against queries for
     each algorithm; steps: success against number and size of steps; labels: what labels that stay behind make of
-    an attack; transfer: counterexamples of combination 2 before other detectors; retrain: detectors trained on with
-    counterexamples, before benign frames, known and fresh counterexamples."""
+    an attack; transfer: counterexamples of combination 2 before other detectors; retrain: detectors trained on
+    with counterexamples, before benign frames, known and fresh counterexamples."""
     quick: Flag = False
-    """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder."""
+    """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
+    retrain, which trains on other frames, in another."""
     dataset: str = DEMO
     """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
@@ -184,6 +187,8 @@ class Study(Common):
     """What the detector computes gradients in; failures are always judged in float32."""
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
+    confirm: Flag = False
+    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only)."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
@@ -199,9 +204,9 @@ class Study(Common):
     train_steps: int | None = None
     """Retrain: steps of training; by default 1500, of the paper's protocol 6000; 40 with --quick."""
     mix: Literal["add", "replace"] = "add"
-    """Retrain: counterexamples beside benign frames, or in the place of some; of ours, not the paper's protocol."""
+    """Retrain: counterexamples beside benign frames, or in the place of some; not of the paper's protocol."""
     label_mode: Literal["moved", "paper"] = "moved"
-    """Retrain: labels of counterexamples in training; of ours, not the paper's protocol."""
+    """Retrain: labels of counterexamples in training; not of the paper's protocol."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     t_star: float | None = None
@@ -283,6 +288,18 @@ class Confirm(Common):
     """Folder of the run's data set, where it is no longer where the run found it."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")] = ()
+    """Folders of drivesem attack; a folder of drivesem study stands for its arms."""
+    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """HTML file to write; by default report.html in the one folder given, else where the command is called."""
+    frames: int | None = None
+    """Frames whose pictures are shown, worst first; by default as many as hold 200 pictures: 100 of one run."""
+
+
 @dataclass(frozen=True)
 class Plausibility(Command):
     """How common the vehicles of a run stand and are built, before and after the attack, by KITTI's labels."""
@@ -293,6 +310,31 @@ class Plausibility(Command):
     """Folder for the results; by default plausibility in the run's folder."""
     limit: int | None = None
     """Take the first N frames."""
+
+
+@dataclass(frozen=True)
+class Realism(Command):
+    """How far re-renders and counterexamples are from their photographs: PSNR, SSIM, LPIPS, FID and their kin."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")] = ()
+    """Folders of runs of drivesem attack; a table each."""
+    metrics: str = "available"
+    """With commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
+    frechet-inception, fid; or available: those whose weights are on disk (docs/realism.md)."""
+    weights: str | None = None
+    """A folder of weight files, looked at before torch's own cache."""
+    fetch: Flag = False
+    """Download missing weights into torch's cache, from where their publishers keep them."""
+    successes: Flag = False
+    """Only frames in which the attack succeeded."""
+    limit: int | None = None
+    """Take the first N frames of each run."""
+    bootstrap: int | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
+    seed: int = 0
+    """Seed of these draws."""
+    out: str | None = None
+    """Folder for the results; by default realism in the first run's folder."""
 
 
 @dataclass(frozen=True)
@@ -695,7 +737,9 @@ COMMANDS: dict[str, type[Command]] = {
     "study": Study,
     "explain": Explain,
     "confirm": Confirm,
+    "report": Report,
     "plausibility": Plausibility,
+    "realism": Realism,
     "verify": Verify,
     "derender": Derender,
     "render": Render,
@@ -724,6 +768,11 @@ def validate(config: Command) -> None:
             raise UsageError("--workers", "at least 1", config.workers)
         if config.limit is not None and config.limit < 1:
             raise UsageError("--limit", "at least 1", config.limit)
+    if isinstance(config, Report):
+        if not config.runs:
+            raise UsageError("RUN", "folders of drivesem attack", "none")
+        if config.frames is not None and config.frames < 1:
+            raise UsageError("--frames", "at least 1", config.frames)
     if isinstance(config, Attack | Study | Derender | Gradcheck | Bench):
         if config.dataset not in DATASETS:
             raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(config.dataset))
@@ -808,6 +857,15 @@ def validate(config: Command) -> None:
         raise UsageError("--run", "a folder of drivesem attack", "nothing")
     if isinstance(config, Plausibility) and config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)
+    if isinstance(config, Realism):
+        if not config.runs:
+            raise UsageError("RUN", "folders of drivesem attack", "nothing")
+        if config.limit is not None and config.limit < 1:
+            raise UsageError("--limit", "at least 1", config.limit)
+        if config.bootstrap is not None and config.bootstrap < 0:
+            raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+        if config.weights is not None and not Path(config.weights).is_dir():
+            raise UsageError("--weights", "a folder", config.weights)
     if isinstance(config, Synth):
         if config.frames < 1:
             raise UsageError("--frames", "at least 1", config.frames)
@@ -853,6 +911,7 @@ def _validate_method(config: Attack) -> None:
         "momentum": ("si-fgsm", "sgd"),
         "norm": ("scw",),
         "restarts": RESTARTED,
+        "scouts": RESTARTED,
         "like": ("placebo",),
     }
     for name, methods in own.items():
@@ -873,6 +932,8 @@ def _validate_method(config: Attack) -> None:
         raise UsageError("--like", "a run of drivesem attack", config.like)
     if config.restarts < 0:
         raise UsageError("--restarts", "at least 0", config.restarts)
+    if config.scouts < 0:
+        raise UsageError("--scouts", "at least 0", config.scouts)
     if config.method == "subsets" and config.queries is not None and config.queries < 2:
         raise UsageError("--queries", "at least 2 with subsets", config.queries)
 

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from detectors.augment import AugmentSettings
-from detectors.base import Detector, DetectorError
-from detectors.registry import load_detector, save_detector
-from detectors.squeezedet import SqueezeDet
-from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
+from detectors.base import Detector
+from detectors.registry import save_detector
+from detectors.training import CHECKPOINT, LOG, Sample
 from detectors.types import CLASSES, Detections
 from drivesem.attack_command import Worker, attack_frames
-from drivesem.config import Attack, Retrain, UsageError, size_hw
+from drivesem.config import Attack, Retrain, UsageError
 from drivesem.data.registry import open_dataset
 from drivesem.devices import check_device
 from drivesem.eval_report import percent
@@ -38,10 +34,11 @@ from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, fi
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore
 from drivesem.training.judging import judge
-from drivesem.training.mixture import Mixture, Shares
+from drivesem.training.mixture import Mixture
+from drivesem.training.retraining import WEIGHTS, broken, forget_other_weights, shares_of, startable, train_on
 from scene_ir import files
 
-WEIGHTS, FIGURES, CURVES = "retrained.safetensors", "retrain.json", "curves.png"
+FIGURES, CURVES = "retrain.json", "curves.png"
 TABLES = ("retrain.csv", "retrain.md")
 FRESH, CACHE = "fresh", "cache"
 """Folders: the new attack's run, decoded frames."""
@@ -78,11 +75,11 @@ def run(config: Retrain) -> int:
     frames = frames_of(Path(config.run))
     kept_out, learned = _divided(frames, config)
     start = config.start or attack.detector
-    before, after = _detector(start, config.device), _detector(start, config.device)
+    before, after = startable(start, config.device), startable(start, config.device)
     out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
     claim(out, config, _clear, _FREE)
     mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)
-    _train(config, after, mixture, out, console)
+    train_on(config, after, mixture, out, console)
     found = look(after, kept_out, "benign", config.device)
     after.t_star = _t_star(after, kept_out, found)
     save_detector(after, out / WEIGHTS, {"retrained_from": Path(start).name, "steps": str(config.steps)})
@@ -109,15 +106,6 @@ def run(config: Retrain) -> int:
     return 0
 
 
-def _detector(name: str, device: str) -> Detector:
-    try:
-        detector = load_detector(name, device)
-        JudgedClasses.of(detector)
-    except DetectorError as error:
-        raise UsageError("--start", "a detector that can be trained", error) from error
-    return detector
-
-
 def _divided(frames: Sequence[AttackedFrame], config: Retrain) -> tuple[list[AttackedFrame], list[AttackedFrame]]:
     """Frames that are never trained on, drawn at random, and the others."""
     order = np.random.default_rng([config.seed, 6]).permutation(len(frames))
@@ -138,10 +126,7 @@ def _mixture(
     after: Detector,
 ) -> Mixture:
     mode, classes = config.label_mode, after.classes
-    failed = [f for f in learned if (f.result.success_moved if mode == "moved" else f.result.success_paper)]
-    if not failed:
-        raise UsageError("--run", f"counterexamples that break the detector, by {mode} labels", "none")
-    counterexamples = AttackedSamples(failed, "counterexample", mode, classes)
+    counterexamples = AttackedSamples(broken(learned, mode), "counterexample", mode, classes)
     benign: Sequence[Sample]
     if config.dataset is None:
         benign = AttackedSamples(learned, "benign", "paper", classes)
@@ -153,38 +138,7 @@ def _mixture(
         if not names:
             raise UsageError("--root", "frames that are not held out", "none")
         benign = FrameStore(dataset, names, out / CACHE, classes)
-    shares = Shares(config.fraction, config.mix, round(config.ramp * config.steps), config.seed)
-    return Mixture(benign, counterexamples, shares)
-
-
-def _train(config: Retrain, detector: Detector, mixture: Mixture, out: Path, console: Console) -> None:
-    settings = TrainingSettings(
-        steps=config.steps,
-        minutes=config.minutes,
-        batch=config.batch,
-        rate=config.rate,
-        backbone_rate=1.0,  # nothing starts anew
-        warmup_steps=config.warmup,
-        precision=config.precision,
-        seed=config.seed,
-        checkpoint_every=config.checkpoint_every,
-        augment=AugmentSettings(window_hw=size_hw("--window", config.window)),
-    )
-    if isinstance(detector, SqueezeDet):
-        detector.trained_by = config.loss
-    detector.requires_grad_(True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("retraining", total=config.steps)
-
-        def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
-            bar.update(task, completed=done, description=f"loss {row['total']:.3f}")
-
-        try:
-            train(detector, mixture, settings, out, progress=progress)
-        except FloatingPointError as error:
-            raise UsageError("--rate", "one at which the loss stays finite", error) from error
-    detector.requires_grad_(False)
+    return Mixture(benign, counterexamples, shares_of(config))
 
 
 def _t_star(detector: Detector, frames: Sequence[AttackedFrame], found: Sequence[Detections]) -> float:
@@ -205,12 +159,12 @@ def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], devic
         found = look(detector, frames, stage, device)
         for mode in modes:
             scores = figures(detector, detector.t_star, frames, found, mode)
-            broken = None
+            share = None
             if stage == "counterexample" and name == "before":
                 won = [f.result.success_moved if mode == "moved" else f.result.success_paper for f in frames]
-                broken = sum(won) / len(won)
+                share = sum(won) / len(won)
             label = "benign" if stage == "benign" else "counterexamples of the run"
-            rows.append(Row(label, mode, name, len(frames), scores, broken))
+            rows.append(Row(label, mode, name, len(frames), scores, share))
     return rows
 
 
@@ -230,7 +184,7 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
         device=config.device,
         t_star=None,
     )
-    _forget_other_weights(out)
+    forget_other_weights(out / FRESH, out / WEIGHTS, out / _FRESH_OF)
     summary = attack_frames(Worker.of(again), names, out / FRESH)
     rows = []
     for mode, scores, won in (
@@ -240,15 +194,6 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
         share = won / summary.frames if summary.frames else None
         rows.append(Row("fresh counterexamples", mode, "after", summary.frames, scores.headline, share))
     return rows
-
-
-def _forget_other_weights(out: Path) -> None:
-    """Remove what was attacked with other weights than those that are there now."""
-    digest = hashlib.sha256(files.read_bytes(out / WEIGHTS)).hexdigest()
-    stamp = out / _FRESH_OF
-    if (out / FRESH).is_dir() and (not stamp.is_file() or files.read_text(stamp) != digest):
-        shutil.rmtree(out / FRESH)
-    files.write_text(stamp, digest)
 
 
 _COLUMNS = ("ap50", "ap70", "ap", "recall", "recall_at_t_star")
@@ -274,9 +219,9 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
 
 def _cells(row: Row) -> list[str]:
     facts = asdict(row.scores)
-    broken = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
+    share = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
     numbers = [percent(facts[name]) for name in _COLUMNS]
-    return [row.frames, row.labels, row.detector, *numbers, str(row.scores.objects), broken]
+    return [row.frames, row.labels, row.detector, *numbers, str(row.scores.objects), share]
 
 
 def _print(rows: Sequence[Row], console: Console) -> None:

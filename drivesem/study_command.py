@@ -5,27 +5,44 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
-from drivesem.config import Study, command_line
+from drivesem.config import Confirm, Study, command_line
+from drivesem.confirm.plans import open_plans
+from drivesem.confirm.report import Report as Confirmed
+from drivesem.confirm_command import confirm_run
 from drivesem.devices import check_device
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.run_folder import PRESENTATION, claim
+from drivesem.study import report, retrain, retrain_report, transfer
 from drivesem.study.arms import arms_of
 from drivesem.study.labels import label_sets
+from drivesem.study.largest import largest, write_largest
+from drivesem.study.lessons import CACHE, FRAMES, RETRAINED
 from drivesem.study.plots import write_plot
-from drivesem.study.report import Findings, print_findings, write_tables
+from drivesem.study.report import Findings, Told, print_told, write_tables
 from drivesem.study.rows import rows_of
 from drivesem.study.running import ARMS, Ran, run_arms, workers_of
 from drivesem.study.success import against, curve_of
+from drivesem.transfer.asking import DETECTIONS
+from drivesem.transfer.plot import write_heatmap
 from scene_ir import files
 
-_PICTURE, _FIGURES = "study.png", "study.json"
+_PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
 _TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
-_FREE = (*PRESENTATION, "quick", "controls", "bootstrap")
+_FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
+_FREE_IN_RETRAIN = (
+    *(name for name in PRESENTATION if name != "limit"),
+    *("bootstrap", "benign_frames", "fresh", "controls", "detectors", "sources"),
+)
+"""Of retrain: other frames to train on would make other detectors."""
 _NOT_TOLD = ("out", "json", "resume", "workers", "name")
 
 
@@ -33,21 +50,65 @@ def run(config: Study) -> int:
     """Run or continue a study; exit code 0. Raises UsageError or SceneError for bad input."""
     check_device(config.device)
     out = Path(config.out or f"runs/study-{config.name}-{config.dataset}-seed{config.seed}")
+    console = Console(stderr=True)
+    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, console)
+    files.write_json(out / _FIGURES, data)
+    command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
+    write_tables(out, told, _PICTURE, command)
+    draw(out / _PICTURE)
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    print_told(told, console if config.json else Console())
+    console.print(f"written to {out}", soft_wrap=True)
+    return 0
+
+
+_Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
+"""A study's figures for JSON, its text, and what draws its picture."""
+
+
+def _arms(config: Study, out: Path, console: Console) -> _Found:
+    """Attacks side by side."""
     arms = arms_of(config, out)
     workers = workers_of(arms)
     claim(out, config, _clear, _FREE)
-    console = Console(stderr=True)
-    found = _findings(config, run_arms(arms, workers, out, console))
-    data = found.to_json()
-    files.write_json(out / _FIGURES, data)
-    command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
-    write_tables(out, found, _PICTURE, command)
-    write_plot(out / _PICTURE, found)
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    print_findings(found, console if config.json else Console())
-    console.print(f"written to {out}", soft_wrap=True)
-    return 0
+    if config.confirm:  # before hours of attacks: whether the frames can be drawn again
+        open_plans(workers[0].config, None)
+    ran = run_arms(arms, workers, out, console)
+    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out, console))
+    write_largest(out / _LARGEST, largest(ran.runs, out))
+    return found.to_json(), report.told(found), partial(write_plot, found=found)
+
+
+def _confirmed(config: Study, ran: Ran, out: Path, console: Console) -> dict[str, Confirmed]:
+    """What the generator's pictures say of each arm that is no control, where that is asked."""
+    if not config.confirm:
+        return {}
+    shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
+    arms = [run.arm for run in ran.runs if run.arm.control is None]
+    return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)), console)[0] for arm in arms}
+
+
+def _transfer(config: Study, out: Path, console: Console) -> _Found:
+    """Counterexamples before other detectors."""
+    arms = arms_of(config, out)
+    workers = workers_of(arms)
+    asked = transfer.detectors_asked(config, out)
+    claim(out, config, _clear, (*_FREE, "detectors", "sources"))
+    found = transfer.run(config, arms, workers, asked, out, console)
+    return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
+
+
+def _retrain(config: Study, out: Path, console: Console) -> _Found:
+    """Detectors trained on with counterexamples."""
+    ready = retrain.prepare(config)
+    claim(out, config, _clear, _FREE_IN_RETRAIN)
+    found = retrain.run(config, ready, out, console)
+    return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
+
+
+_STUDIES = {"transfer": _transfer, "retrain": _retrain}
+"""Studies that are more than attacks side by side."""
 
 
 def _findings(config: Study, ran: Ran) -> Findings:
@@ -67,7 +128,8 @@ def _findings(config: Study, ran: Ran) -> Findings:
 
 def _clear(out: Path) -> None:
     """Remove what an earlier run wrote, and nothing else."""
-    for name in (_PICTURE, _FIGURES, *_TABLES):
+    for name in (_PICTURE, _FIGURES, _LARGEST, *_TABLES):
         (out / name).unlink(missing_ok=True)
-    if (out / ARMS).is_dir():
-        shutil.rmtree(out / ARMS)
+    for name in (ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)

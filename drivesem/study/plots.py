@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 
 _HEIGHT_IN = 4.6
 _LEAST_WIDTH_IN, _GROUP_IN = 6.4, 1.3
-_DPI = 150
+DPI = 150
+"""Of a study's picture."""
 _BLACK = "#000000"
+_GROUP_WIDTH = 0.8
+"""Of the bars of a group, in units of the distance from group to group."""
 
 
 def write_plot(path: Path, found: Findings) -> None:
@@ -44,7 +47,7 @@ def write_plot(path: Path, found: Findings) -> None:
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, fontsize=9)
     buffer = io.BytesIO()
     # no date and no version in the file: equal figures give equal bytes
-    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     files.write_bytes(path, buffer.getvalue())
 
 
@@ -58,7 +61,7 @@ def _falls(axes: Axes, rows: Sequence[Row]) -> None:
         series[f"{name}, moved labels"] = [
             row.controls[name].drops["moved"]["ap50"] if name in row.controls else None for row in rows
         ]
-    _bars(axes, series)
+    bars(axes, series)
     paper = [(i, r.run.arm.reference) for i, r in enumerate(rows) if r.run.arm.reference is not None]
     if paper:
         falls = [100 * (PAPER_BENIGN - reference) for _, reference in paper]
@@ -69,13 +72,19 @@ def _falls(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_title("What the attack takes from AP50; lines: 95 % of draws of frames", loc="left", fontsize=11)
 
 
-def _bars(axes: Axes, series: dict[str, list[Interval | None]]) -> None:
-    width = 0.8 / len(series)
+def place_of(group: int, series: int, count: int) -> float:
+    """Where the bar of a series stands in a group."""
+    return group + (series - (count - 1) / 2) * _GROUP_WIDTH / count
+
+
+def bars(axes: Axes, series: Mapping[str, Sequence[Interval | None]]) -> None:
+    """Bars, %, side by side in each group, with their bounds; series by name."""
+    width = _GROUP_WIDTH / len(series)
     for i, (name, values) in enumerate(series.items()):
         for group, one in enumerate(values):
             if one is None or one.value is None:
                 continue
-            place = group + (i - (len(series) - 1) / 2) * width
+            place = place_of(group, i, len(series))
             label = name if group == next(g for g, v in enumerate(values) if v and v.value is not None) else None
             axes.bar(place, 100 * one.value, width * 0.92, color=COLOURS[i], label=label)
             if one.low is not None and one.high is not None:
@@ -111,9 +120,9 @@ def _label_sets(axes: Axes, sets: Sequence[LabelSets]) -> None:
         *((f"benign only, {o:g}", [s.counted[o].only_unmoved for s in sets]) for o in OVERLAPS),
         *((f"moved labels, {o:g}", [s.counted[o].moved for s in sets]) for o in OVERLAPS),
     ]
-    width = 0.8 / len(series)
+    width = _GROUP_WIDTH / len(series)
     for i, (name, counts) in enumerate(series):
-        places = [g + (i - (len(series) - 1) / 2) * width for g in range(len(sets))]
+        places = [place_of(g, i, len(series)) for g in range(len(sets))]
         shares = [100 * count / max(one.frames, 1) for count, one in zip(counts, sets, strict=True)]
         axes.bar(places, shares, width * 0.92, color=COLOURS[i], label=name)
     axes.set_xticks(range(len(sets)), [one.name for one in sets])

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from drivesem.config import Study
+from drivesem.confirm.report import Report as Confirmed
 from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Difference, Interval
 from drivesem.judged import HEADLINE
@@ -30,9 +31,25 @@ _MARKS = (1, 2, 5, 10, 20, 64)
 
 
 @dataclass(frozen=True, slots=True)
+class Told:
+    """A study as text. short: the tables of `sheets` that a terminal shows; tables: rows of CSV files by name;
+    words: columns of words, the others hold numbers; unbroken: those that a terminal does not wrap.
+    """
+
+    study: str
+    sheets: Sequence[Sheet]
+    short: Sequence[Sheet]
+    notes: Sequence[str]
+    tables: Mapping[str, Sequence[Mapping[str, Any]]]
+    words: Collection[str]
+    unbroken: Collection[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
-    within `within` queries less what that arm does at its end. label_sets: of the study `labels`.
+    within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
+    the generator's pictures say, by arm.
     """
 
     study: Study
@@ -43,6 +60,7 @@ class Findings:
     beside: Mapping[str, Difference] | None = None
     within: int = 0
     label_sets: Sequence[LabelSets] = ()
+    confirmed: Mapping[str, Confirmed] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -55,13 +73,23 @@ class Findings:
             "frames_failed": self.ran.failed,
             "feasible_fraction": feasible_fraction(results),
             "bootstrap": self.draws,
-            "rows": [row.flat() for row in self.rows],
+            "rows": self.flat_rows(),
         }
         if self.curves:
             data["curves"] = [point for curve in self.curves for point in curve.to_json()]
         if self.label_sets:
             data["label_sets"] = [one.flat() for one in self.label_sets]
         return data
+
+    def flat_rows(self) -> list[dict[str, Any]]:
+        """Numbers of each row by name, with those of the second renderer where it was asked."""
+        rows = [row.flat() for row in self.rows]
+        for row in rows:
+            if row["name"] in self.confirmed:
+                share = self.confirmed[row["name"]].shares[0]
+                told = {"failures": share.failures, "share": share.share, "low": share.low, "high": share.high}
+                row |= {f"survive_{key}": value for key, value in told.items()}
+        return rows
 
 
 def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
@@ -74,6 +102,8 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     tables.append(_precision(found.rows))
     if any(row.controls for row in found.rows):
         tables.append(_controls(found.rows))
+    if found.confirmed:
+        tables.append(_confirmed(found.confirmed))
     return [*tables, *([_further(found.rows)] if whole else []), _frames(found.rows)]
 
 
@@ -112,6 +142,22 @@ def _controls(rows: Sequence[Row]) -> Sheet:
         f"size of {PLACEBO}",
     )
     return Sheet("Controls: AP50, moved labels, points", columns, tuple(lines))
+
+
+def _confirmed(confirmed: Mapping[str, Confirmed]) -> Sheet:
+    lines = []
+    for name, one in confirmed.items():
+        cells = [name, str(one.frames)]
+        for share in one.shares:
+            value = bounded(Interval(share.name, share.share, share.low, share.high))
+            cells.append(f"{value} of {share.failures}" if share.failures else "-")
+        lines.append(tuple(cells))
+    names = next(iter(confirmed.values())).shares
+    return Sheet(
+        "Failures that survive the generator's renderer, %",
+        (_ARM, "drawn", *(s.name for s in names)),
+        tuple(lines),
+    )
 
 
 def _further(rows: Sequence[Row]) -> Sheet:
@@ -205,6 +251,11 @@ def notes(found: Findings) -> list[str]:
             "attack's iterates the one that fails most by moved labels at IoU 0.5 is kept: chosen by the benign "
             "labels there would be more."
         )
+    if found.confirmed:
+        told.append(
+            "Survive: the same change, drawn by the generator and with exact labels, fails the detector too; in "
+            "brackets Wilson's 95 %. Generator only: of frames that did not fail before."
+        )
     share = feasible_fraction([result for run in found.ran.runs for result in run.results])
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
     if found.ran.without_vehicles:
@@ -213,29 +264,34 @@ def notes(found: Findings) -> list[str]:
     return told
 
 
-def print_findings(found: Findings, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in sheets(found, whole=False):
-        console.print(sheet.table(_WORDS, unbroken=_WORDS))
-    for note in notes(found):
-        console.print(note, soft_wrap=True)
-
-
-def write_tables(out: Path, found: Findings, picture: str, command: str) -> None:
-    """study.csv, further CSVs, and study.md. picture: its file's name; command: what repeats the study."""
-    tables = {"study": [row.flat() for row in found.rows]}
+def told(found: Findings) -> Told:
+    """The tables of all arms."""
+    tables = {"study": found.flat_rows()}
     if found.curves:
         tables["curves"] = [point for curve in found.curves for point in curve.to_json()]
     if found.label_sets:
         tables["label_sets"] = [one.flat() for one in found.label_sets]
-    for name, rows in tables.items():
+    return Told(found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS)
+
+
+def print_told(told: Told, console: Console) -> None:
+    """The tables, and what they mean."""
+    for sheet in told.short:
+        console.print(sheet.table(told.words, unbroken=told.unbroken))
+    for note in told.notes:
+        console.print(note, soft_wrap=True)
+
+
+def write_tables(out: Path, told: Told, picture: str, command: str) -> None:
+    """study.csv, further CSVs, and study.md. picture: its file's name; command: what repeats the study."""
+    for name, rows in told.tables.items():
         buffer = io.StringIO()
         writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         files.write_text(out / f"{name}.csv", buffer.getvalue())
-    lines = [f"# Study: {found.study.name}", "", f"    {command}", "", f"![]({picture})", ""]
-    for sheet in sheets(found):
-        lines += [*sheet.markdown(_WORDS), ""]
-    lines += [f"{note}\n" for note in notes(found)]
+    lines = [f"# Study: {told.study}", "", f"    {command}", "", f"![]({picture})", ""]
+    for sheet in told.sheets:
+        lines += [*sheet.markdown(told.words), ""]
+    lines += [f"{note}\n" for note in told.notes]
     files.write_text(out / "study.md", "\n".join(lines))

@@ -86,7 +86,7 @@ class Row:
 
 def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[Row]:
     """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
-    figures = {run.arm.name: _Figures.of(run) for run in runs}
+    figures = {run.arm.name: Figures.of(run) for run in runs}
     rows = []
     for run in runs:
         if run.arm.control is not None:
@@ -101,7 +101,7 @@ def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
     return sum(r.feasible for r in results) / len(results) if results else None
 
 
-def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, _Figures], draws: int, seed: int) -> Row:
+def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figures], draws: int, seed: int) -> Row:
     mine, summary = figures[run.arm.name], run.summary
     effects = {
         name: {mode: mine.falls(figures[other.arm.name], mode, draws, seed) for mode in MODES}
@@ -123,7 +123,7 @@ def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, _Figur
 
 
 @dataclass(frozen=True, slots=True)
-class _Figures:
+class Figures:
     """An arm's figures, to be weighed by frames: before the attack, and after it by label mode."""
 
     before: list[Figure]
@@ -131,7 +131,7 @@ class _Figures:
     frames: int
 
     @classmethod
-    def of(cls, run: ArmRun) -> _Figures:
+    def of(cls, run: ArmRun) -> Figures:
         names, label = run.judged.names, run.judged.names.index(HEADLINE)
         benign = [run.judged.targets(as_targets(r.targets_benign, CLASSES)) for r in run.results]
         moved = [run.judged.targets(as_targets(r.targets_moved, CLASSES)) for r in run.results]
@@ -152,7 +152,7 @@ class _Figures:
         fallen = differences(self.after[mode], self.before, self.frames, draws, rng)
         return {one.name: Interval(one.name, one.difference, one.low, one.high) for one in fallen}
 
-    def falls(self, control: _Figures, mode: str, draws: int, seed: int) -> Interval:
+    def falls(self, control: Figures, mode: str, draws: int, seed: int) -> Interval:
         """How far AP50 falls below the control's; paired over frames."""
         rng = np.random.default_rng(seed)
         (one,) = differences(self.after[mode][:1], control.after[mode][:1], self.frames, draws, rng)
@@ -177,12 +177,13 @@ def relative_size(control: Sequence[FrameResult], attack: Sequence[FrameResult])
     """
     ratios = []
     for one, other in zip(control, attack, strict=True):
-        size = _size(other)
+        size = size_of(other)
         if size > 0:
-            ratios.append(_size(one) / size)
+            ratios.append(size_of(one) / size)
     return float(np.mean(ratios)) if ratios else None
 
 
-def _size(result: FrameResult) -> float:
+def size_of(result: FrameResult) -> float:
+    """Norm of a frame's theta, each coordinate in units of its bounds."""
     values = [c.value / (c.upper - c.lower) for c in result.theta if c.upper > c.lower]
     return float(np.linalg.norm(values))

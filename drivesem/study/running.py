@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,13 +16,15 @@ from drivesem.judged import JudgedClasses
 from drivesem.pipeline import RESULT
 from drivesem.pool import outcomes
 from drivesem.results import FrameResult, RunSummary, load_frame
-from drivesem.run_folder import claim
-from drivesem.sources import NoVehicleError
+from drivesem.run_folder import PRESENTATION, claim
+from drivesem.sources import NoVehicleError, SceneSource
 from drivesem.study.arms import Arm
 from scene_ir.errors import SceneError
 
 ARMS = "arms"
 """Folder of the arms' runs."""
+_FREE = (*PRESENTATION, "like")
+"""Settings of an arm that may change on the way: the study's folder may have moved, and what lies in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console:
     names, without, failed = select_frames(first.source, first.config)
     folders = [out / ARMS / arm.folder for arm in arms]
     for worker, folder in zip(workers, folders, strict=True):
-        claim(folder, worker.config, shutil.rmtree)
+        claim(folder, worker.config, shutil.rmtree, _FREE)
     todo = [name for name in names if not all(_done(folder, name) for folder in folders)]
     empty: set[str] = set()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -73,21 +75,26 @@ def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console:
                 failed[name] = str(error)
             progress.advance(task)
     names = [name for name in names if name not in failed and name not in empty]
-    judged = JudgedClasses.of(first.detector)
     runs = []
     for arm, worker, folder in zip(arms, workers, folders, strict=True):
         summary = attack_frames(worker, names, folder)
         results = tuple(load_frame(folder / "frames" / name / RESULT) for name in names)
-        runs.append(ArmRun(arm, summary, results, judged))
+        runs.append(ArmRun(arm, summary, results, JudgedClasses.of(worker.detector)))
     return Ran(tuple(runs), without + len(empty), dict(sorted(failed.items())))
 
 
 def workers_of(arms: Sequence[Arm]) -> list[Worker]:
-    """One for each arm, with one source and one detector for all. The first arm needs of both what any
-    other needs. Raises UsageError or SceneError for settings that cannot be.
+    """One for each arm, with one source for all, and one detector for all that attack the same. The first arm of
+    each detector needs of it what any other needs. Raises UsageError or SceneError for settings that cannot be.
     """
-    first = Worker.of(arms[0].config)
-    return [first.beside(arm.config) for arm in arms]
+    first: dict[str, Worker] = {}
+    source: SceneSource | None = None
+    for config in (arm.config for arm in arms):
+        if config.detector not in first:
+            worker = Worker.of(config)
+            source = source or worker.source
+            first[config.detector] = replace(worker, source=source)
+    return [first[arm.config.detector].beside(arm.config) for arm in arms]
 
 
 def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> None:

@@ -24,7 +24,8 @@ from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-Stage = Literal["benign", "counterexample"]
+Stage = Literal["benign", "rerender", "counterexample"]
+"""The photograph, the same rendered again without any change, and what the attack made of it."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,16 @@ class AttackedFrame:
 
 
 class AttackedSamples(Sequence[Sample]):
-    """To train on: photographs with benign labels, or counterexamples with those of a mode; read each time."""
+    """To train on: photographs, as they are or rendered again, with benign labels, or counterexamples with those
+    of a mode; read each time.
+    """
 
     def __init__(
         self, frames: Sequence[AttackedFrame], stage: Stage, mode: LabelMode, classes: Sequence[str]
     ) -> None:
         self._frames = frames
         self._stage: Stage = stage
-        name = f"labels_{'paper' if stage == 'benign' else mode}.txt"
+        name = f"labels_{mode if stage == 'counterexample' else 'paper'}.txt"
         self._targets = [
             training_targets(kitti.read_labels(frame.folder / name), TRAINED, classes) for frame in frames
         ]
@@ -76,7 +79,7 @@ def frames_of(run: Path) -> list[AttackedFrame]:
 
 
 def look(detector: Predictor, frames: Sequence[AttackedFrame], stage: Stage, device: str) -> list[Detections]:
-    """What a detector finds in photographs or counterexamples: labels among the judged classes, on the CPU."""
+    """What a detector finds in pictures of a stage: labels among the judged classes, on the CPU."""
     judged = JudgedClasses.of(detector)
     found = []
     for frame in frames:

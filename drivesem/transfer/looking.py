@@ -53,16 +53,16 @@ class Memory:
 
     def has(self, picture: Path) -> bool:
         """Whether a picture was looked at."""
-        return self._path(picture).is_file()
+        return self.place(picture).is_file()
 
     def keep(self, picture: Path, found: Detections) -> None:
         """Remember detections whose labels are indices into the judged classes."""
         records = [asdict(record) for record in detection_records(found, self._judged.names)]
-        files.write_json(self._path(picture), {"schema": _SCHEMA, "detections": records})
+        files.write_json(self.place(picture), {"schema": _SCHEMA, "detections": records})
 
     def recall(self, picture: Path) -> Detections:
         """What was found in a picture. Raises FormatError where the file is damaged."""
-        path = self._path(picture)
+        path = self.place(picture)
         data = files.read_json(path)
         try:
             records = tuple(BoxRecord(**record) for record in data["detections"])
@@ -70,7 +70,8 @@ class Memory:
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(str(path), "detections as drivesem transfer writes them", error) from error
 
-    def _path(self, picture: Path) -> Path:
+    def place(self, picture: Path) -> Path:
+        """The file of a picture's detections: that of its bytes."""
         return self._folder / f"{hashlib.sha256(files.read_bytes(picture)).hexdigest()}.json"
 
 
@@ -80,9 +81,7 @@ def fingerprint(order: Order, predictor: Predictor) -> str:
     facts = [importlib.metadata.version("drivesem"), order.detector, order.tiles, order.device, *predictor.classes]
     known.update(json.dumps(facts).encode())
     if isinstance(predictor, nn.Module):
-        for name, tensor in predictor.state_dict().items():
-            known.update(name.encode())
-            known.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
+        known.update(weights_digest(predictor).encode())
     # The files that a name speaks of, such as an adapter's, and the settings that may lie beside one.
     for part in re.split("[,:]", order.detector):
         for path in (Path(part), Path(part).with_suffix(".yaml")) if part else ():
@@ -91,12 +90,24 @@ def fingerprint(order: Order, predictor: Predictor) -> str:
     return known.hexdigest()[:_FINGERPRINT]
 
 
+def weights_digest(module: nn.Module) -> str:
+    """Of all tensors and their names, hexadecimal."""
+    known = hashlib.sha256()
+    for name, tensor in module.state_dict().items():
+        known.update(name.encode())
+        known.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return known.hexdigest()
+
+
 def look(
     order: Order, predictor: Predictor, pictures: Sequence[Path], config: Transfer
 ) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Each picture that is not known yet, as it is done, with a call that raises what went wrong with it."""
+    """Each picture that is not known yet, as it is done, with a call that raises what went wrong with it. Of
+    pictures with the same bytes the first stands for all.
+    """
     memory = Memory(order, predictor)
-    todo = [picture for picture in pictures if not memory.has(picture)]
+    unknown = {memory.place(picture): picture for picture in reversed(pictures) if not memory.has(picture)}
+    todo = list(reversed(unknown.values()))
     work = partial(_look, predictor=predictor, memory=memory, device=order.device)
     yield from outcomes(work, partial(_in_process, order), todo, config)
 

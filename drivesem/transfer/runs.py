@@ -16,8 +16,9 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 MANIFEST, METRICS = "manifest.json", "metrics.json"
-PICTURES = {"benign": "benign.png", "attacked": "counterexample.png"}
-"""A frame's photograph, and the picture that was found: both lossless, as the source was judged on them."""
+PICTURES = {"benign": "benign.png", "rerendered": "rerender.png", "attacked": "counterexample.png"}
+"""A frame's photograph, the same rendered again without any change, and the picture that was found: all lossless,
+as the source was judged on them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from drivesem import study_command
 from drivesem.cli import main
 from drivesem.config import Study
 from drivesem.study.arms import Arm, arms_of
+from drivesem.synth.write import Order, synthesise
 
 WORDS = ["study", "multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
 ASKED = (
@@ -70,6 +71,27 @@ def test_files(finished: Path) -> None:
     assert min(cv2.imread(str(finished / "study.png")).shape[:2]) > 400
     settings = yaml.safe_load((finished / "config.yaml").read_text())
     assert (settings["name"], settings["steps"]) == ("multi", 1)
+
+
+def test_the_generator_draws_again_on_request(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "drawn"
+    shutil.copytree(finished, out)
+    (row,) = study([*WORDS, "--confirm", "--json", "--out", str(out)], capsys)["rows"]
+    drawn = json.loads((out / "arms" / "combo-1" / "confirm" / "confirm.json").read_text())
+    assert row["survive_share"] == drawn["survive"]
+    assert row["survive_failures"] == drawn["rows"][0]["failures"]
+    assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
+
+
+def test_photographs_cannot_be_drawn_again(tmp_path: Path, refused: Callable[..., str]) -> None:
+    for _ in synthesise(Order(tmp_path / "data", 1, seed=3, split="heldout")):
+        pass
+    (tmp_path / "data" / "manifest.json").unlink()  # now nobody knows that they were generated
+    words = ["study", "multi", "--confirm", "--dataset", "kitti", "--root", str(tmp_path / "data")]
+    assert "manifest.json" in refused(*words, "--out", str(tmp_path / "out"))
+    assert not (tmp_path / "out" / "arms").exists()
 
 
 def test_the_placebo_is_as_large_as_the_attack(finished: Path) -> None:

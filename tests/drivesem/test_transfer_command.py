@@ -14,10 +14,9 @@ import pytest
 import torch
 
 from detectors.types import Detections
-from drivesem import transfer_command
 from drivesem.cli import main
 from drivesem.results import load_frame
-from drivesem.transfer import looking
+from drivesem.transfer import asking, looking
 
 
 class Blind:
@@ -152,12 +151,12 @@ def test_a_matrix_of_two_runs(run: Path, tmp_path: Path, transfer: Callable[...,
     ],
 )
 def test_detectors_are_told_apart(text: str, names: list[str]) -> None:
-    assert transfer_command.detector_names(text) == names
+    assert asking.detector_names(text) == names
 
 
 def test_names_lose_their_folders_where_that_is_clear() -> None:
-    assert transfer_command.short_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
-    assert transfer_command.short_names(["onnx:a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
+    assert asking.short_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
+    assert asking.short_names(["onnx:a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,10 +12,12 @@ import pytest
 from rich.console import Console
 
 from drivesem.config import Study
+from drivesem.confirm.report import Report as Confirmed
+from drivesem.confirm.report import Share
 from drivesem.study.arms import PLACEBO, RANDOM
 from drivesem.study.labels import label_sets
 from drivesem.study.plots import write_plot
-from drivesem.study.report import Findings, notes, print_findings, sheets, write_tables
+from drivesem.study.report import Findings, notes, print_told, sheets, told, write_tables
 from drivesem.study.rows import rows_of
 from drivesem.study.running import Ran
 from drivesem.study.success import against, curve_of
@@ -85,6 +88,20 @@ def test_the_papers_figures_stand_beside(controlled: Findings) -> None:
     assert "check: 100.00 % of all" in text
 
 
+def test_what_survives_the_second_renderer_stands_beside(controlled: Findings) -> None:
+    shares = tuple(Share.of(name, outcomes) for name, outcomes in (("frames", [True, True, False]), ("lost", [])))
+    drawn = Confirmed(frames=4, left={}, shares=shares, scores={}, overlap=None)
+    found = replace(controlled, confirmed={"rotate": drawn, "mesh": drawn})
+    row = cells(found, "Failures that survive", "rotate")
+    assert (row["drawn"], row["lost"]) == ("4", "-")
+    assert row["frames"].startswith("66.7 [")
+    assert row["frames"].endswith("of 3")
+    first = found.to_json()["rows"][0]
+    assert (first["survive_failures"], first["survive_share"]) == (3, pytest.approx(2 / 3))
+    assert not any(sheet.title.startswith("Failures that survive") for sheet in sheets(controlled))
+    assert "survive_share" not in controlled.to_json()["rows"][0]
+
+
 def test_json_has_what_others_read(controlled: Findings) -> None:
     data = controlled.to_json()
     assert (data["frames"], data["feasible_fraction"]) == (4, 1.0)
@@ -116,7 +133,7 @@ def test_label_sets(labelled: Findings) -> None:
 @pytest.mark.parametrize("kind", ["controlled", "sampled", "labelled"])
 def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     found: Findings = request.getfixturevalue(kind)
-    write_tables(tmp_path, found, "study.png", "drivesem study any")
+    write_tables(tmp_path, told(found), "study.png", "drivesem study any")
     write_plot(tmp_path / "study.png", found)
     lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
     assert [line["name"] for line in lines] == [row.name for row in found.rows]
@@ -127,7 +144,7 @@ def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     picture = cv2.imread(str(tmp_path / "study.png"))
     assert min(picture.shape[:2]) > 400
     stream = io.StringIO()
-    print_findings(found, Console(file=stream, width=100))
+    print_told(told(found), Console(file=stream, width=100))
     assert found.rows[0].name in stream.getvalue()
 
 
@@ -138,5 +155,5 @@ def test_nothing_to_attack(frame, arm_run, arm, tmp_path: Path) -> None:
     found = Findings(Study(name="single"), DRAWS, Ran(tuple(runs), 5, {}), rows_of(runs, DRAWS, 0))
     assert found.to_json()["feasible_fraction"] is None
     assert cells(found, "Car AP50", "rotate")["benign"] == "-"
-    write_tables(tmp_path, found, "study.png", "drivesem study single")
+    write_tables(tmp_path, told(found), "study.png", "drivesem study single")
     write_plot(tmp_path / "study.png", found)
