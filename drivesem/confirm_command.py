@@ -13,8 +13,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from detectors.base import DetectorError, Predictor
-from detectors.registry import load_predictor
 from drivesem.config import Confirm, UsageError
 from drivesem.confirm.frame import Asked, confirm_frame, fingerprint
 from drivesem.confirm.plans import open_plans
@@ -24,7 +22,7 @@ from drivesem.devices import check_device
 from drivesem.judged import JudgedClasses
 from drivesem.pipeline import RESULT
 from drivesem.pool import outcomes
-from drivesem.run_folder import PRESENTATION, attack_of, claim
+from drivesem.run_folder import PRESENTATION, attack_of, claim, detector_of
 from drivesem.transfer.runs import METRICS, Frame, Run, load_runs
 from scene_ir import files
 from scene_ir.errors import SceneError
@@ -84,7 +82,7 @@ class _Worker:
         attack = attack_of(one.folder)
         self.config, self.one = config, one
         self.plans = open_plans(attack, config.root)
-        self.detector = _detector(attack.detector, config.device, attack.tiles)
+        self.detector = detector_of(attack, config.device)
         self.asked = Asked(config.device, float(files.read_json(one.folder / METRICS)["t_star"]))
 
     def confirm(self, frame: Frame, out: Path) -> Confirmed:
@@ -92,15 +90,6 @@ class _Worker:
         name = frame.result.identifier
         source = self.one.folder / _FRAMES / name
         return confirm_frame(frame, source, self.plans, self.detector, self.asked, out / _FRAMES / name)
-
-
-def _detector(name: str, device: str, tiles: str) -> Predictor:
-    try:
-        predictor = load_predictor(name, device, tiles)
-        JudgedClasses.of(predictor)
-    except DetectorError as error:
-        raise UsageError("--run", "a run whose detector is still there", error) from error
-    return predictor
 
 
 def _in_process(config: Confirm, one: Run, out: Path) -> Callable[[Frame], Confirmed]:

@@ -14,17 +14,14 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from detectors.base import DetectorError, Predictor
-from detectors.registry import load_predictor
 from drivesem.config import Attack, Explain, UsageError
 from drivesem.devices import check_device
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.explain.frame import Effort, digest, explain_frame
 from drivesem.explain.report import means, print_tables, write_report
 from drivesem.explain.results import EXPLANATION, Explanation, read_explanation
-from drivesem.judged import JudgedClasses
 from drivesem.pool import outcomes
-from drivesem.run_folder import PRESENTATION, attack_of, claim
+from drivesem.run_folder import PRESENTATION, attack_of, claim, detector_of
 from drivesem.space import Parameter, parse_params
 from drivesem.transfer.runs import Run, load_runs
 from scene_ir import files
@@ -85,7 +82,7 @@ class _Worker:
     params: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        self.detector = _detector(self.attack, self.config.device)
+        self.detector = detector_of(self.attack, self.config.device)
 
     def explain(self, name: str, out: Path) -> None:
         """One frame, from the run's folder to its own."""
@@ -93,16 +90,6 @@ class _Worker:
         folder = Path(config.run or "") / _FRAMES / name
         effort = Effort(config.points, config.permutations, config.seed, lost=config.least == "lost")
         explain_frame(folder, self.attack, self.params, self.detector, effort, out / _FRAMES / name)
-
-
-def _detector(attack: Attack, device: str) -> Predictor:
-    """The run's detector, in float32, in which a run judges too whatever it took its gradients in."""
-    try:
-        detector = load_predictor(attack.detector, device, attack.tiles)
-        JudgedClasses.of(detector)
-    except DetectorError as error:
-        raise UsageError("--run", "a run whose detector can be had", error) from error
-    return detector
 
 
 def _in_process(

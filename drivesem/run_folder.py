@@ -9,7 +9,10 @@ from typing import Any
 
 import yaml
 
+from detectors.base import DetectorError, Predictor
+from detectors.registry import load_predictor
 from drivesem.config import Attack, Common, UsageError, to_yaml
+from drivesem.judged import JudgedClasses
 from scene_ir import files
 
 CONFIG = "config.yaml"
@@ -48,6 +51,19 @@ def attack_of(run: Path) -> Attack:
     if not isinstance(loaded, dict) or not set(loaded) <= known:
         raise UsageError("--run", "a run of drivesem attack", run)
     return Attack(**loaded)
+
+
+def detector_of(attack: Attack, device: str) -> Predictor:
+    """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
+
+    Raises UsageError where it cannot be had, or knows no cars.
+    """
+    try:
+        detector = load_predictor(attack.detector, device, attack.tiles)
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--run", "a run whose detector can be had", error) from error
+    return detector
 
 
 def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:

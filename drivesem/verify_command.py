@@ -13,17 +13,15 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from detectors.base import DetectorError, Predictor
-from detectors.registry import load_predictor
 from drivesem.aims import Aim
 from drivesem.budgets import budget_of
-from drivesem.config import Attack, Common, UsageError, Verify
+from drivesem.config import Common, UsageError, Verify
 from drivesem.devices import check_device
 from drivesem.eval_report import Sheet
-from drivesem.judged import JudgedClasses, t_star_of
+from drivesem.judged import t_star_of
 from drivesem.pool import outcomes
 from drivesem.results import FrameResult
-from drivesem.run_folder import attack_of
+from drivesem.run_folder import attack_of, detector_of
 from drivesem.space import parse_params
 from drivesem.transfer.runs import MANIFEST, METRICS, Run, load_runs
 from drivesem.verify.differences import CHECKS, Difference, Tally
@@ -66,7 +64,7 @@ class _Worker:
 
     def __init__(self, config: Verify, one: Run) -> None:
         attack = attack_of(one.folder)
-        detector = _detector(attack, config.device)
+        detector = detector_of(attack, config.device)
         self.config, self.one = config, one
         self.given = Given(
             detector=detector,
@@ -82,16 +80,6 @@ class _Worker:
     def check(self, name: str) -> Checked:
         """One frame of the run."""
         return check_frame(name, self.one.folder / _FRAMES / name, self.given)
-
-
-def _detector(attack: Attack, device: str) -> Predictor:
-    """The run's detector, in float32, in which a run judges too whatever it took its gradients in."""
-    try:
-        detector = load_predictor(attack.detector, device, attack.tiles)
-        JudgedClasses.of(detector)
-    except DetectorError as error:
-        raise UsageError("--run", "a run whose detector can be had", error) from error
-    return detector
 
 
 def _hashes(one: Run) -> Mapping[str, Mapping[str, str]]:

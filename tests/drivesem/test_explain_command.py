@@ -17,7 +17,7 @@ import torch
 
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
-from drivesem import attack_command, explain_command
+from drivesem import attack_command, explain_command, run_folder
 from drivesem.cli import main
 from drivesem.explain import frame as explaining
 from drivesem.explain.results import read_explanation
@@ -104,7 +104,7 @@ def jumpy(monkeypatch: pytest.MonkeyPatch, scene: SceneIR) -> None:
 
 def _patch(patch: pytest.MonkeyPatch, scene: SceneIR) -> None:
     patch.setattr("drivesem.synth.demo.demo_scene", lambda *_: scene)
-    for module in (attack_command, explain_command):
+    for module in (attack_command, run_folder):
         patch.setattr(module, "load_predictor", lambda *_: Jumpy())
 
 
@@ -181,7 +181,7 @@ def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     assert [f.kind for f in least.failures] == ["phantom"]
     # judged anew from what was written
     frame = explained / "frames" / "demo-000"
-    result, attack = load_frame(frame / "result.json"), explain_command.attack_of(explained)
+    result, attack = load_frame(frame / "result.json"), run_folder.attack_of(explained)
     objective, theta = explaining.rebuild(result, frame, attack, ("translate", "rotate"), Jumpy())
     names = [objective.space.name(i) for i in range(objective.space.dim)]
     small = torch.zeros_like(theta)
@@ -230,7 +230,7 @@ def test_a_second_call_explains_nothing_twice(
 def test_without_gradient(
     run: Path, explain: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(explain_command, "load_predictor", lambda *_: Nameless())
+    monkeypatch.setattr(run_folder, "load_predictor", lambda *_: Nameless())
     data = explain("--run", run, "--out", run / "other", "--least", "lost")
     assert data["rows"][0]["gradient_share"] is None
     folder = run / "other" / "frames" / "demo-000"
@@ -275,7 +275,7 @@ def test_a_counterexample_that_does_not_fail_here_is_named(
 ) -> None:
     calm = Jumpy()
     monkeypatch.setattr(calm, "decode", lambda raw: [_nothing()] * len(raw))
-    monkeypatch.setattr(explain_command, "load_predictor", lambda *_: calm)
+    monkeypatch.setattr(run_folder, "load_predictor", lambda *_: calm)
     assert main(["explain", "--run", str(run), "--workers", "1"]) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "demo-000: expected a counterexample that fails, found one that the detector gets right here" in error

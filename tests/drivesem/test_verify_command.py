@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from detectors.types import CLASSES, Detections
-from drivesem import attack_command, verify_command
+from drivesem import attack_command, run_folder
 from drivesem.cli import main
 from drivesem.feasible import FeasibleSet
 from drivesem.results import load_frame
@@ -42,7 +42,7 @@ class Drifting:
 @pytest.fixture(scope="module", autouse=True)
 def drifting() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        for command in (attack_command, verify_command):
+        for command in (attack_command, run_folder):
             patch.setattr(command, "load_predictor", lambda *_: Drifting())
         yield
 
