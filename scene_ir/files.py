@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import io
 import json
 import os
@@ -36,6 +37,25 @@ def write_bytes(path: Path, data: bytes) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def share_alike(folder: Path, other: Path) -> None:
+    """Let files below `folder` that equal those of the same name below `other` take no room of their own: hard
+    links, where the file system has them. Files of this project are replaced and never written into, so that a
+    change of one stays away from the other.
+    """
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        twin = other / path.relative_to(folder)
+        if not twin.is_file() or path.samefile(twin) or not filecmp.cmp(path, twin, shallow=False):
+            continue
+        temporary = _sibling(path)
+        try:
+            os.link(twin, temporary)
+            os.replace(temporary, path)
+        except OSError:  # another file system, or one without links: two copies are as good
+            return
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

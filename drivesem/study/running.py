@@ -19,6 +19,7 @@ from drivesem.results import FrameResult, RunSummary, load_frame
 from drivesem.run_folder import PRESENTATION, claim
 from drivesem.sources import NoVehicleError, SceneSource
 from drivesem.study.arms import Arm
+from scene_ir import files
 from scene_ir.errors import SceneError
 
 ARMS = "arms"
@@ -103,6 +104,9 @@ def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> No
     scene = workers[0].source.scene(name)
     for worker, folder in todo:
         worker.attack_scene(name, scene, folder)
+        # Photograph, background and what else all arms have is most of a frame's folder.
+        if folder != folders[0] and _done(folders[0], name):
+            files.share_alike(folder / "frames" / name, folders[0] / "frames" / name)
 
 
 def _in_process(arms: Sequence[Arm], folders: Sequence[Path]) -> Callable[[str], None]:

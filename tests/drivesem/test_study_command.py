@@ -73,6 +73,14 @@ def test_files(finished: Path) -> None:
     assert (settings["name"], settings["steps"]) == ("multi", 1)
 
 
+def test_what_arms_have_in_common_takes_room_once(finished: Path) -> None:
+    arms = sorted((finished / "arms").iterdir())
+    frames = [arm / "frames" / "demo-000" for arm in arms]
+    for name in ("benign.png", "scene/background.png"):
+        assert all((frame / name).samefile(frames[0] / name) for frame in frames)
+    assert not (frames[1] / "result.json").samefile(frames[0] / "result.json")
+
+
 def test_the_generator_draws_again_on_request(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
