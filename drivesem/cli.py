@@ -30,11 +30,14 @@ from drivesem.config import (
     Report,
     Retrain,
     Study,
+    Survey,
+    SurveyResults,
     Synth,
     Train,
     Transfer,
     UsageError,
     Verify,
+    Worth,
     validate,
     yaml_arguments,
 )
@@ -153,6 +156,18 @@ def _run(config: Command) -> int:
         from drivesem import realism_command
 
         return realism_command.run(config)
+    if isinstance(config, Worth):
+        from drivesem import worth_command
+
+        return worth_command.run(config)
+    if isinstance(config, Survey):
+        from drivesem import survey_command
+
+        return survey_command.run(config)
+    if isinstance(config, SurveyResults):
+        from drivesem import survey_command
+
+        return survey_command.run_results(config)
     if isinstance(config, Verify):
         from drivesem import verify_command
 

@@ -338,6 +338,72 @@ class Realism(Command):
 
 
 @dataclass(frozen=True)
+class Worth(Command):
+    """Information worth of counterexamples, and what a second or retrained detector gained (section 3)."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")] = ()
+    """Folders of runs of drivesem attack against one detector; each object and as many empty places are points."""
+    second: str | None = None
+    """A second detector, or a folder of drivesem retrain: the gain is what its worth is less."""
+    table: str | None = None
+    """Instead of runs, a classifier's answers: a CSV file of label, a probability a class, and distance or realism
+    where known."""
+    after: str | None = None
+    """The same table of a second or retrained classifier."""
+    distance: str | None = None
+    """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
+    lpips-alex where its weights are on disk, else perceptual (docs/realism.md)."""
+    weights: str | None = None
+    """A folder of weight files of that distance, looked at before torch's own cache."""
+    base: str = "e"
+    """Base of the logarithm: e, 2, 10 or another number above 1."""
+    limit: int | None = None
+    """Take the first N frames of each run."""
+    bootstrap: int | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
+    seed: int = 0
+    """Seed of these draws."""
+    device: str = "cpu"
+    """torch device of the second detector: cpu, cuda, cuda:1, ..."""
+    tiles: Literal["auto", "off"] = "auto"
+    """Of a second detector in ONNX: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+    out: str | None = None
+    """Folder for the results; by default worth in the first run's folder, or beside the table."""
+
+
+@dataclass(frozen=True)
+class Survey(Command):
+    """A page that asks people what they see and how real it looks, as the paper did; it needs no network."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")] = ()
+    """Folders of runs of drivesem attack."""
+    items: int = 15
+    """Counterexamples that are shown, as in the paper; successes before others, drawn at random."""
+    controls: int = 0
+    """Beside them so many re-renders without any change: what people say of nothing."""
+    seed: int = 0
+    """Seed of the draw; the page itself asks everybody in an order of their own."""
+    out: str | None = None
+    """Folder for survey.html and its key; by default survey in the first run's folder."""
+
+
+@dataclass(frozen=True)
+class SurveyResults(Command):
+    """What people said: share that was named rightly, realism, agreement."""
+
+    answers: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="CSV...")] = ()
+    """Files that the page saved."""
+    survey: str | None = None
+    """The folder of drivesem survey, or its key."""
+    bootstrap: int | None = None
+    """Draws of people for intervals, by default 200; 0 leaves them out."""
+    seed: int = 0
+    """Seed of these draws."""
+    out: str | None = None
+    """Folder for the results; by default results beside the key."""
+
+
+@dataclass(frozen=True)
 class Verify(Command):
     """Is a finished run what it says it is? Every frame computed again from its files; exit code 1 where not."""
 
@@ -740,6 +806,9 @@ COMMANDS: dict[str, type[Command]] = {
     "report": Report,
     "plausibility": Plausibility,
     "realism": Realism,
+    "worth": Worth,
+    "survey": Survey,
+    "survey-results": SurveyResults,
     "verify": Verify,
     "derender": Derender,
     "render": Render,
@@ -857,9 +926,26 @@ def validate(config: Command) -> None:
         raise UsageError("--run", "a folder of drivesem attack", "nothing")
     if isinstance(config, Plausibility) and config.limit is not None and config.limit < 1:
         raise UsageError("--limit", "at least 1", config.limit)
-    if isinstance(config, Realism):
-        if not config.runs:
-            raise UsageError("RUN", "folders of drivesem attack", "nothing")
+    if isinstance(config, Worth):
+        if bool(config.runs) == (config.table is not None):
+            found = "both" if config.runs else "nothing"
+            raise UsageError("RUN", "folders of drivesem attack, or --table", found)
+        if config.after is not None and config.table is None:
+            raise UsageError("--after", "--table beside it", "none")
+        if config.second is not None and config.table is not None:
+            raise UsageError("--second", "runs (--after is a second table)", f"--table {config.table}")
+    if isinstance(config, Survey) and (config.items < 1 or config.controls < 0):
+        raise UsageError("--items, --controls", "at least 1, at least 0", f"{config.items}, {config.controls}")
+    if isinstance(config, SurveyResults):
+        if not config.answers:
+            raise UsageError("CSV", "files that the page of drivesem survey saved", "nothing")
+        if config.survey is None:
+            raise UsageError("--survey", "the folder of drivesem survey", "nothing")
+        if config.bootstrap is not None and config.bootstrap < 0:
+            raise UsageError("--bootstrap", "at least 0", config.bootstrap)
+    if isinstance(config, Realism | Survey) and not config.runs:
+        raise UsageError("RUN", "folders of drivesem attack", "nothing")
+    if isinstance(config, Realism | Worth):
         if config.limit is not None and config.limit < 1:
             raise UsageError("--limit", "at least 1", config.limit)
         if config.bootstrap is not None and config.bootstrap < 0:

@@ -65,14 +65,14 @@ class Perception:
         )
         share = torch.from_numpy(region[window].astype(np.float32))[None, None]
         total = 0.0
-        layers = list(zip(self._features(first[window]), self._features(second[window]), strict=True))
+        layers = list(zip(self.features(first[window]), self.features(second[window]), strict=True))
         for one, two in layers:
             apart = (F.normalize(one, dim=1) - F.normalize(two, dim=1)).square().sum(dim=1)[0]
             weight = F.adaptive_avg_pool2d(share, (apart.shape[0], apart.shape[1]))[0, 0]
             total += float((apart * weight).sum() / weight.sum())
         return total / len(layers)
 
-    def _features(self, picture: Picture) -> list[Tensor]:
+    def features(self, picture: Picture) -> list[Tensor]:
         """Of conv1, fire3 and fire5: (1, C, h, w) at a half, a quarter and an eighth of the picture's size."""
         image = torch.from_numpy(np.ascontiguousarray(picture[..., ::-1].transpose(2, 0, 1))).float()[None]
         net, found = self._net, []

