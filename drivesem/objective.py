@@ -144,8 +144,8 @@ class Objective:
         return self._scores[key]
 
     def preview(self, theta: Tensor) -> Score | None:
-        """What the gradient pass at theta (D,) saw, if there was one: of an image that is not rounded to 8 bits, and
-        in the precision of gradients.
+        """What the gradient pass at theta (D,) saw, if there was one: of an image that is not rounded to 8 bits,
+        and in the precision of gradients.
         """
         return self._previews.get(_key(theta))
 

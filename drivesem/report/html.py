@@ -1,105 +1,267 @@
-"""One self-contained HTML page from a run's results: no network, no server."""
+"""One self-contained HTML page from runs' results: no network, no server."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Sequence
+import os
+import shlex
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from itertools import islice, zip_longest
 from pathlib import Path
+from urllib.parse import quote
 
-import cv2
 import jinja2
+from markupsafe import Markup
 
-from drivesem.results import BoxRecord, FrameResult, RunSummary
+from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
+from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
+from drivesem.report.page import Page, ShownRun
+from drivesem.results import RunSummary
 
-JPEG_QUALITY = 88
-_SCORE_COLUMNS = (
-    ("AP50", "ap50"),
-    ("AP70", "ap70"),
-    ("AP50:95", "ap"),
-    ("recall", "recall"),
-    ("recall at t*", "recall_at_t_star"),
-)
+_COLUMNS = {
+    "AP50": "ap50",
+    "AP70": "ap70",
+    "AP50:95": "ap",
+    "recall": "recall",
+    "recall at t*": "recall_at_t_star",
+}
+_GLANCE = 4
+"""Failures at the head of the page."""
+_LARGEST_SIZE = 100
+_NONE = "–"
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
-    """A frame as the page shows it."""
-
-    result: FrameResult
-    width: int
-    height: int
-    before: str
-    after: str
-    true_boxes: tuple[BoxRecord, ...]
-    detected_boxes: tuple[BoxRecord, ...]
-    changes: tuple[tuple[str, str], ...]
+class _Row:
+    name: str
+    cells: tuple[str, ...]
+    words: tuple[str, ...] = ()
+    theirs: bool = False
 
 
-def render_report(summary: RunSummary, frames: Sequence[FrameResult], folder: Path, command: str) -> str:
-    """The page's text. `folder` holds `frames/<id>/benign.png` and `counterexample.png`; worst frames come first.
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    title: str
+    figure: str
+    more: str
 
-    command: what reproduces the run.
+
+def render_report(page: Page, at: Path) -> str:
+    """The page's text. at: the file it will be, from which its links lead to the runs' folders.
+
+    Raises FormatError where a picture of the gallery is missing.
     """
-    order = sorted(frames, key=lambda f: (not f.success_moved, -len(f.failures), f.identifier))
-    pictures = [_picture(result, folder / "frames" / result.identifier, summary.t_star) for result in order]
+    runs, several = page.runs, len(page.runs) > 1
+    cards = cards_of(runs, page.gallery)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(
-        resources.files("drivesem.report").joinpath("template.html").read_text(encoding="utf-8")
-    )
-    rows = [
-        ("benign", summary.benign),
-        ("benign re-rendered", summary.rerendered),
-        ("attacked, labels moved with the cars", summary.attacked_moved),
-        ("attacked, benign labels (as in the paper)", summary.attacked_paper),
-    ]
+    environment.filters |= {
+        "link_to": lambda folder, frame=None: _link(at, folder, frame),
+        "scene_of": lambda folder, frame: shlex.quote((folder / "frames" / frame / "scene").as_posix()),
+        "shown_folder": lambda folder: folder.as_posix(),
+    }
+    environment.globals |= {"told": told, "in_units": in_units, "trace": trace}
+    template = environment.from_string(_part("template.html"))
+    first = runs[0]
     return template.render(
-        summary=summary,
-        rows=[
-            (name, [_percent(getattr(scores.headline, key)) for _, key in _SCORE_COLUMNS]) for name, scores in rows
+        style=Markup(_part("style.css")),
+        script=Markup(_part("page.js")),
+        title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
+        runs=runs,
+        several=several,
+        gradient=first.summary.queries > 0,
+        headline=_comparison(runs) if several else _verdict(first.summary),
+        lead=_lead(runs),
+        tiles=[] if several else _tiles(first),
+        rows=[_run_row(run) for run in runs] if several else _figure_rows(first),
+        columns=tuple(_COLUMNS),
+        frames=len(cards),
+        left_out=page.left_out,
+        paper_before=next((f"{100 * run.paper.before:.1f}" for run in runs if run.paper), ""),
+        falls=_falls(runs),
+        charts=[
+            {
+                "title": chart.title,
+                "picture": curve_chart(chart),
+                "legend": [(key_of(place), line.name) for place, line in enumerate(chart.lines)],
+                "note": chart.note,
+            }
+            for chart in page.charts
         ],
-        columns=[title for title, _ in _SCORE_COLUMNS],
-        drop=_drop(summary.rerendered.headline.ap50, summary.attacked_moved.headline.ap50),
-        pictures=pictures,
-        command=command,
+        at_a_glance=list(islice(_glance(cards), _GLANCE)),
+        cards=cards,
+        gallery=[card for card in cards if card.layers],
+        params=sorted({param for card in cards for param in card.params}),
+        weathers=sorted({card.weather for card in cards if card.weather}),
+        largest=_LARGEST_SIZE,
     )
 
 
-def _drop(before: float | None, after: float | None) -> str:
-    return "-" if before is None or after is None else f"{100 * (before - after):.1f}"
+def _part(name: str) -> str:
+    return resources.files("drivesem.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _link(at: Path, folder: Path, frame: str | None) -> str:
+    """A relative URL that ends in a slash."""
+    target = folder if frame is None else folder / "frames" / frame
+    relative = os.path.relpath(target.resolve(), at.resolve().parent)
+    return quote(Path(relative).as_posix()) + "/"
 
 
 def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}"
+    return _NONE if value is None else f"{100 * value:.1f}"
 
 
-def _picture(result: FrameResult, folder: Path, threshold: float) -> _Picture:
-    before, height, width = _jpeg(folder / "benign.png")
-    after, _, _ = _jpeg(folder / "counterexample.png")
-    largest = sorted(result.theta, key=lambda c: -abs(c.value) / max(c.upper - c.lower, 1e-12))
-    shown = [c for c in largest if ".ffd[" not in c.name and c.value != 0]
-    bent = sum(1 for c in result.theta if ".ffd[" in c.name and c.value != 0)
-    changes = [(c.name, c.display) for c in shown]
-    if bent:
-        changes.append(("mesh", f"{bent} lattice offsets changed (theta.json lists them)"))
-    return _Picture(
-        result=result,
-        width=width,
-        height=height,
-        before=before,
-        after=after,
-        true_boxes=result.targets_moved,
-        detected_boxes=tuple(
-            box for box in result.detections_attacked if box.score is not None and box.score >= threshold
-        ),
-        changes=tuple(changes),
+def _points(before: float | None, after: float | None) -> str:
+    return _NONE if before is None or after is None else f"{100 * (before - after):.1f}"
+
+
+def _count(number: int, word: str, words: str | None = None) -> str:
+    return f"{number} {word if number == 1 else words or word + 's'}"
+
+
+def _totals(summary: RunSummary) -> tuple[int, int]:
+    return sum(summary.lost_objects.values()), sum(summary.phantoms.values())
+
+
+def _verdict(summary: RunSummary) -> str:
+    lost, phantoms = _totals(summary)
+    if not lost and not phantoms:
+        return f"{summary.detector} withstood in all of {_count(summary.frames, 'frame')}"
+    parts = [f"loses {_count(lost, 'object')}"] if lost else []
+    if phantoms:
+        parts.append(f"makes up {phantoms if lost else _count(phantoms, 'object')}")
+    frames = f"{summary.successes_moved} of {_count(summary.frames, 'frame')}"
+    return f"{summary.detector} {' and '.join(parts)}, in {frames}"
+
+
+def _comparison(runs: Sequence[ShownRun]) -> str:
+    most = max(runs, key=lambda run: run.summary.successes_moved)
+    broken, frames = most.summary.successes_moved, most.summary.frames
+    return f"{len(runs)} runs on {_count(frames, 'frame')}: {most.name} breaks most, {broken} of {frames}"
+
+
+def _lead(runs: Sequence[ShownRun]) -> str:
+    summary = runs[0].summary
+    data = f"{_count(summary.frames, 'frame')} of {summary.dataset} with {_count(summary.objects, 'vehicle')}"
+    if len(runs) > 1:
+        return f"The same {data}, each run beside the others."
+    changed = " + ".join(summary.params)
+    return (
+        f"{changed} changed by {runs[0].method} within what is feasible, on {data}. Everything lost or made up "
+        "was right before the change, and is judged by labels that moved with the cars."
     )
 
 
-def _jpeg(path: Path) -> tuple[str, int, int]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise FileNotFoundError(f"{path}: expected a picture of the run, found none")
-    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii"), *image.shape[:2]
+def _tiles(run: ShownRun) -> list[_Tile]:
+    summary = run.summary
+    before, moved, stay = (
+        s.headline.ap50 for s in (summary.benign, summary.attacked_moved, summary.attacked_paper)
+    )
+    lost, phantoms = _totals(summary)
+    paper = f"paper's mAP: {_percent(run.paper.before)} → {_percent(run.paper.after)}" if run.paper else ""
+    by_labels = f"by benign labels {_percent(stay)}"
+    share = f"{100 * summary.successes_moved / summary.frames:.0f} % of the frames" if summary.frames else ""
+    return [
+        _Tile(
+            f"AP50 of {summary.headline}, %",
+            f"{_percent(before)} → {_percent(moved)}",
+            f"{_points(before, moved)} points less; {by_labels}" + (f"; {paper}" if paper else ""),
+        ),
+        _Tile("frames broken", f"{summary.successes_moved} of {summary.frames}", share),
+        _Tile("lost and made up", f"{lost} + {phantoms}", _by_class(summary)),
+        _Tile(
+            "feasible, %",
+            _percent(summary.feasible_fraction),
+            f"by the independent check; {_count(summary.queries, 'query', 'queries')}",
+        ),
+    ]
+
+
+def _by_class(summary: RunSummary) -> str:
+    parts = []
+    for word, counts in (("lost", summary.lost_objects), ("made up", summary.phantoms)):
+        found = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
+        parts += [f"{word}: {found}"] if found else []
+    return "; ".join(parts) or "nothing"
+
+
+def _figure_rows(run: ShownRun) -> list[_Row]:
+    summary = run.summary
+    rows = [
+        ("before: photographs", summary.benign),
+        ("before: re-rendered", summary.rerendered),
+        ("after, moved labels", summary.attacked_moved),
+        ("after, benign labels (as in the paper)", summary.attacked_paper),
+    ]
+    found = [
+        _Row(name, tuple(_percent(getattr(scores.headline, key)) for key in _COLUMNS.values()))
+        for name, scores in rows
+    ]
+    if run.paper is not None:
+        empty = (_NONE,) * (len(_COLUMNS) - 1)
+        found += [
+            _Row("the paper's mAP, before", (_percent(run.paper.before), *empty), theirs=True),
+            _Row("the paper's mAP, after", (_percent(run.paper.after), *empty), theirs=True),
+        ]
+    return found
+
+
+def _run_row(run: ShownRun) -> _Row:
+    summary = run.summary
+    before, moved = summary.benign.headline, summary.attacked_moved.headline
+    lost, phantoms = _totals(summary)
+    return _Row(
+        run.name,
+        (
+            _percent(before.ap50),
+            _percent(moved.ap50),
+            _points(before.ap50, moved.ap50),
+            _percent(summary.attacked_paper.headline.ap50),
+            _percent(run.paper.after if run.paper else None),
+            _percent(moved.recall_at_t_star),
+            str(summary.successes_moved),
+            str(lost),
+            str(phantoms),
+            _percent(summary.feasible_fraction),
+            str(summary.queries),
+        ),
+        words=(run.name, f"{run.method} on {summary.detector}: {' + '.join(summary.params)}"),
+    )
+
+
+def _falls(runs: Sequence[ShownRun]) -> Markup | None:
+    """Rows from before to after; None without objects to find."""
+    found: list[Fall] = []
+    for run in runs:
+        summary, several = run.summary, len(runs) > 1
+        before, moved = summary.benign.headline.ap50, summary.attacked_moved.headline.ap50
+        stay = summary.attacked_paper.headline.ap50
+        if before is None or moved is None or stay is None:
+            continue
+        found.append(Fall(run.name if several else "moved labels", 100 * before, 100 * moved))
+        if not several:
+            found.append(Fall("benign labels, as in the paper", 100 * before, 100 * stay))
+    papers = dict.fromkeys((run.summary.params, run.paper) for run in runs if run.paper is not None)
+    found += [
+        Fall(f"the paper: {' + '.join(params)}", 100 * paper.before, 100 * paper.after, theirs=True)
+        for params, paper in papers
+        if paper is not None
+    ]
+    headline = runs[0].summary.headline
+    return fall_chart(found, f"AP50 of {headline}") if found else None
+
+
+def _glance(cards: Sequence[Card]) -> Iterator[tuple[Card, str, CloseUp]]:
+    """Close-ups of the worst frames: the first of each frame, then the second, and so on."""
+    shots = [
+        [
+            (card, one.run.name, shot)
+            for one, found in zip(card.outcomes, card.close_ups, strict=True)
+            for shot in found
+        ]
+        for card in cards
+        if card.layers
+    ]
+    for turn in zip_longest(*shots):
+        yield from (shot for shot in turn if shot is not None)

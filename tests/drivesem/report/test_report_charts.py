@@ -1,0 +1,84 @@
+"""Curves as SVG: places on the axes, dashes, texts that cannot break the markup."""
+
+from __future__ import annotations
+
+import re
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from drivesem.report.charts import SERIES, Fall, curve_chart, fall_chart, key_of, trace
+from drivesem.report.page import Chart, Line
+
+
+def chart(lines: list[Line], **of: object) -> ET.Element:
+    return ET.fromstring(curve_chart(Chart("A < B", "recall, %", "precision, %", lines, "", **of)))  # pyright: ignore
+
+
+def numbers(path: str) -> list[float]:
+    return [float(word) for word in re.findall(r"-?\d+\.?\d*", path)]
+
+
+def test_places() -> None:
+    svg = chart([Line("one", ((0.0, 100.0), (50.0, 50.0), (100.0, 0.0)), mark=(50.0, 50.0))])
+    (line,) = (e for e in svg.iter("path") if e.get("class") == "line s0")
+    x0, y0, x1, y1, x2, y2 = numbers(line.get("d", ""))
+    assert x1 == pytest.approx((x0 + x2) / 2, abs=0.06)
+    assert y1 == pytest.approx((y0 + y2) / 2, abs=0.06)
+    assert x0 < x2
+    assert y0 < y2
+    (mark,) = svg.iter("circle")
+    assert (float(mark.get("cx", "")), float(mark.get("cy", ""))) == (x1, y1)
+    words = [e.text for e in svg.iter("text")]
+    assert "recall, %" in words
+    assert "precision, %" in words
+    assert "A < B" in svg.get("aria-label", "")
+
+
+def test_steps_and_doubling() -> None:
+    line = Line(
+        "one", ((1.0, 10.0), (2.0, 40.0), (4.0, 40.0)), steps=True, band=((1.0, 5.0, 20.0), (4.0, 30.0, 50.0))
+    )
+    svg = chart([line], x_range=(1.0, 4.0), doubling=True)
+    (path,) = (e for e in svg.iter("path") if e.get("class") == "line s0")
+    places = numbers(path.get("d", ""))
+    xs, ys = places[0::2], places[1::2]
+    assert xs[1] == xs[2]  # goes up where the second query is, not before
+    assert ys[0] == ys[1]
+    assert xs[2] - xs[0] == pytest.approx(xs[4] - xs[2], abs=0.11)
+    assert [e.text for e in svg.iter("text")][6:9] == ["1", "2", "4"]
+    assert [e.get("class") for e in svg.iter("path")].count("band s0") == 1
+
+
+def test_lines_differ_in_colour_or_dash() -> None:
+    signs = [str(key_of(place)).split("<path")[1] for place in range(2 * SERIES)]
+    assert len(set(signs)) == 2 * SERIES
+
+
+def test_falls() -> None:
+    svg = ET.fromstring(
+        fall_chart([Fall("ours & <co>", 95.7, 89.9), Fall("theirs", 99.4, 65.9, theirs=True)], "AP50")
+    )
+    words = [e.text for e in svg.iter("text")]
+    assert {"ours & <co>", "95.7", "89.9", "99.4", "65.9", "AP50, %"} <= set(words)
+    before, after = (float(e.get("cx", "")) for e in list(svg.iter("circle"))[:2])
+    assert before > after
+    assert "ours & <co>: 95.7 to 89.9" in svg.get("aria-label", "")
+
+
+@pytest.mark.parametrize("fall", [Fall("all", 100.0, 0.0), Fall("up", 0.0, 100.0), Fall("none", 50.0, 50.0)])
+def test_every_fall_lies_in_the_picture(fall: Fall) -> None:
+    svg = ET.fromstring(fall_chart([fall], "AP50"))
+    width = float(svg.get("viewBox", "").split()[2])
+    assert all(0 <= float(e.get("cx", "")) <= width for e in svg.iter("circle"))
+    values = [e.text for e in svg.iter("text") if "value" in e.get("class", "")]
+    assert {f"{fall.before:.1f}", f"{fall.after:.1f}"} == set(values)
+
+
+def test_trace() -> None:
+    svg = ET.fromstring(trace([1.0, 3.0, 2.0]))
+    (line,) = svg.iter("polyline")
+    ys = numbers(line.get("points", ""))[1::2]
+    assert ys[1] < ys[2] < ys[0]
+    assert svg.get("aria-label") == "Loss by query: from 1 to 2, at most 3"
+    ET.fromstring(trace([1.0, 1.0]))

@@ -1,0 +1,240 @@
+"""`drivesem report` as a user types it: one run, several, a study, bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivesem.cli import main
+from drivesem.config import Attack
+from drivesem.evaluation.coco import ClassScores, Scores
+from drivesem.report.frames import cards_of
+from drivesem.report_data import load_shown, query_curves, write_run
+from scene_ir import files
+
+
+def report(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(["report", *words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_one_run(some_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = report([str(some_run)], capsys)
+    page = some_run / "report.html"
+    assert told["out"] == str(page)
+    assert told["bytes"] == page.stat().st_size
+    (run,) = told["runs"]
+    metrics = json.loads((some_run / "metrics.json").read_text())
+    assert {key: run[key] for key in metrics if key not in ("out", "seconds")} == {
+        key: value for key, value in metrics.items() if key not in ("out", "seconds")
+    }
+    assert run["paper"] == {"before": 0.994, "after": 0.659}
+    assert [one["frame"] for one in told["frames"]] == ["000001", "000002", "000003", "0001/rain/00004"]
+    assert told["frames"][3]["failures"] == {"some run": ["lost", "phantom"]}
+
+
+def test_the_same_run_gives_the_same_page(some_run: Path) -> None:
+    pages = []
+    for _ in range(2):
+        assert main(["report", str(some_run)]) == 0
+        pages.append((some_run / "report.html").read_bytes())
+    assert pages[0] == pages[1]
+
+
+def test_an_attack_writes_the_same_page(some_run: Path) -> None:
+    (shown,), _ = load_shown([str(some_run)])
+    write_run(some_run, Attack(), shown.summary, shown.frames)
+    written = (some_run / "report.html").read_bytes()
+    assert main(["report", str(some_run)]) == 0
+    assert (some_run / "report.html").read_bytes() == written
+
+
+def test_an_attack_without_any_frame(some_run: Path) -> None:
+    """Where none could be used, the page says which and why."""
+    (shown,), _ = load_shown([str(some_run)])
+    failed = {"000009": "labels: expected a number, found x"}
+    nothing = ClassScores(None, None, None, None, None, 0)
+    scores = Scores(nothing, nothing, dict.fromkeys(shown.summary.benign.per_class, nothing))
+    summary = replace(
+        shown.summary,
+        frames=0,
+        frames_failed=failed,
+        benign=scores,
+        rerendered=scores,
+        attacked_moved=scores,
+        attacked_paper=scores,
+        lost_objects={},
+        phantoms={},
+        feasible_fraction=None,
+        successes_moved=0,
+    )
+    write_run(some_run, Attack(), summary, [])
+    text = (some_run / "report.html").read_text(encoding="utf-8")
+    assert "000009 could not be used: labels: expected a number, found x" in text
+    assert "– → –" in text
+
+
+def test_runs_side_by_side(
+    tmp_path: Path,
+    frame: Callable[..., Any],
+    make_run: Callable[..., Path],
+    parse: Callable[[Path], Any],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Frames are matched by name; figures are of those that both have."""
+    a = make_run(tmp_path / "a", [frame("1", lost=True), frame("2", lost=True), frame("only a", phantom=True)])
+    b = make_run(tmp_path / "b", [frame("2"), frame("1", phantom=True)], Attack(method="placebo", like="x"))
+    out = tmp_path / "both.html"
+    told = report([str(a), str(b), "--out", str(out)], capsys)
+    assert told["frames_left_out"] == 1
+    assert [one["frame"] for one in told["frames"]] == ["1", "2"]
+    assert told["frames"][0]["failures"] == {"a": ["lost"], "b": ["phantom"]}
+    one, other = told["runs"]
+    assert (one["frames"], one["lost_objects"], one["phantoms"], one["successes_moved"]) == (2, 2, 0, 2)
+    assert (other["frames"], other["lost_objects"], other["phantoms"]) == (2, 0, 1)
+    assert one["attacked"]["moved"]["recall_at_t_star"] == pytest.approx(0.5)
+    assert other["attacked"]["moved"]["recall_at_t_star"] == pytest.approx(1.0)
+    assert one["paper"] is not None
+    assert other["paper"] is None  # the paper attacked by gradient
+    found = parse(out)
+    articles = found.having("article")
+    assert [(a["data-name"], a["data-lost"], a["data-phantoms"]) for a in articles] == [
+        ("1", "1", "1"),
+        ("2", "1", "0"),
+    ]
+    layers = [a for a in found.having("div") if a.get("class", "").split()[:1] == ["layer"]]
+    assert [layer["data-title"] for layer in layers] == ["before", "a", "b"] * 2
+    # the photograph's boxes are the same for both runs, and are there once
+    assert len([a for a in found.having("div") if a.get("data-runs") == "0 1"]) == 2
+    assert "a: 1 lost" in found.text
+    assert "b: withstood" in found.text
+    assert "1 that only some have are left out" in found.text
+
+
+def test_figures_of_all_frames_are_those_of_the_run(
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Counted again on the frames that are shared, they are as `drivesem attack` counts them."""
+    names = ("1", "2")
+    a = make_run(tmp_path / "a", [frame(name, lost=name == "1", phantom=True) for name in names])
+    b = make_run(tmp_path / "b", [frame(name) for name in (*names, "3")])
+    alone = report([str(a)], capsys)["runs"][0]
+    beside = report([str(a), str(b), "--out", str(tmp_path / "page.html")], capsys)["runs"][0]
+    assert alone == beside
+
+
+def test_a_study_stands_for_its_arms(
+    tmp_path: Path,
+    frame: Callable[..., Any],
+    make_run: Callable[..., Path],
+    parse: Callable[[Path], Any],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    study = tmp_path / "study"
+    for name in ("random", "apgd"):
+        make_run(study / "arms" / name, [frame("1", lost=name == "apgd")])
+    (study / "arms" / "unfinished").mkdir()
+    points = [
+        {"name": name, "queries": q, "share": 0.5 * q, "low": 0.1, "high": 1.0}
+        for name in ("random", "apgd")
+        for q in (1, 2)
+    ]
+    files.write_json(study / "study.json", {"curves": points})
+    told = report([str(study)], capsys)
+    assert [run["name"] for run in told["runs"]] == ["apgd", "random"]
+    found = parse(study / "report.html")
+    assert "Frames broken after so many queries" in found.text
+    (chart,) = query_curves(study)
+    assert [line.name for line in chart.lines] == ["apgd", "random"]
+    assert chart.lines[1].points == ((1.0, 50.0), (2.0, 100.0))
+    assert chart.lines[1].band == ((1.0, 10.0, 100.0), (2.0, 10.0, 100.0))
+
+
+def test_frames_without_failure(tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path]) -> None:
+    run = make_run(tmp_path / "run", [frame("1"), frame("2")])
+    assert main(["report", str(run)]) == 0
+    text = (run / "report.html").read_text(encoding="utf-8")
+    assert "withstood in all of 2 frames" in text
+    assert "What went wrong" not in text
+
+
+def test_large_pictures_are_made_smaller(
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivesem.report.frames.LARGEST_PX", 100)
+    run = make_run(tmp_path / "run", [frame("1", lost=True)])
+    shown, _ = load_shown([str(run)])
+    (card,) = cards_of(shown, 1)
+    assert (card.width, card.height) == (320, 96)  # boxes stay in the picture's own px
+    assert len(card.layers[0].source) < 2000
+
+
+def test_no_folder(refused: Callable[..., str]) -> None:
+    assert refused("report") == "drivesem: RUN: expected folders of drivesem attack, found none"
+
+
+def test_no_run(refused: Callable[..., str]) -> None:
+    assert "RUN: expected a folder of drivesem attack or drivesem study, found nowhere" in refused(
+        "report", "nowhere"
+    )
+
+
+def test_no_run_in_the_folder(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "plain").mkdir()
+    assert "expected a folder of drivesem attack" in refused("report", str(tmp_path / "plain"))
+
+
+def test_no_finished_arm(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "study" / "arms" / "a").mkdir(parents=True)
+    assert "expected a study with a finished arm" in refused("report", str(tmp_path / "study"))
+
+
+def test_unfinished(refused: Callable[..., str], some_run: Path) -> None:
+    (some_run / "metrics.json").unlink()
+    assert "expected a finished run" in refused("report", str(some_run))
+
+
+def test_damaged_figures(refused: Callable[..., str], some_run: Path) -> None:
+    files.write_json(some_run / "metrics.json", {"params": ["mesh"], "detector": "x"})
+    assert "metrics.json: expected the figures of a run" in refused("report", str(some_run))
+
+
+def test_no_shared_frame(
+    refused: Callable[..., str], tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path]
+) -> None:
+    a, b = (make_run(tmp_path / name, [frame(name)]) for name in ("a", "b"))
+    assert "expected runs that share frames" in refused("report", str(a), str(b))
+
+
+def test_other_photographs(
+    refused: Callable[..., str], tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path]
+) -> None:
+    a, b = (make_run(tmp_path / name, [frame("1")], tone=tone) for name, tone in (("a", 90), ("b", 91)))
+    assert "expected runs on the same photographs, found another picture of frame 1" in refused(
+        "report", str(a), str(b)
+    )
+
+
+def test_the_same_run_twice(refused: Callable[..., str], some_run: Path) -> None:
+    assert "each run once" in refused("report", str(some_run), str(some_run))
+
+
+def test_number_of_frames(refused: Callable[..., str], some_run: Path) -> None:
+    assert "--frames: expected at least 1" in refused("report", str(some_run), "--frames", "0")
+
+
+def test_out_is_a_folder(refused: Callable[..., str], some_run: Path) -> None:
+    assert "--out: expected an HTML file" in refused("report", str(some_run), "--out", str(some_run))
+
+
+def test_damaged_curves(refused: Callable[..., str], some_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(some_run, tmp_path / "study" / "arms" / "a")
+    files.write_json(tmp_path / "study" / "study.json", {"curves": [{"name": "a"}]})
+    assert "expected curves of a study" in refused("report", str(tmp_path / "study"))
