@@ -36,7 +36,7 @@ class Scouted(Attack):
         return self.inner._rank(problem, theta, score)
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        looks = Sampling(self.count, self.steps, self.early_stop, "halton")
+        looks: Attack = Sampling(self.count, self.steps, self.early_stop, "halton")
         seen = looks._propose(problem, theta0, generator)
         starts = [problem.project(theta0).theta, *seen.thetas]
         scores = [problem.score(start) for start in starts]
