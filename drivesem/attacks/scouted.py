@@ -36,18 +36,21 @@ class Scouted(Attack):
         return self.inner._rank(problem, theta, score)
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        looks: Attack = Sampling(self.count, self.steps, self.early_stop, "halton")
-        seen = looks._propose(problem, theta0, generator)
+        seen = self._run(Sampling(self.count, self.steps, self.early_stop, "halton"), problem, theta0, generator)
         starts = [problem.project(theta0).theta, *seen.thetas]
         scores = [problem.score(start) for start in starts]
         ranks = [self._rank(problem, start, score) for start, score in zip(starts, scores, strict=True)]
         best = max(range(len(starts)), key=lambda i: (*ranks[i], -i))
         if self.early_stop and scores[best].success:
             return seen
-        climb = self.inner._propose(problem, starts[best], generator)
+        climb = self._run(self.inner, problem, starts[best], generator)
         return Proposals(
             thetas=(*seen.thetas, *climb.thetas),
             losses=(*seen.losses, *climb.losses),
             queries=seen.queries + climb.queries,
             active_constraints=tuple(dict.fromkeys((*seen.active_constraints, *climb.active_constraints))),
         )
+
+    @staticmethod
+    def _run(attack: Attack, problem: Problem, start: Tensor, generator: torch.Generator) -> Proposals:
+        return attack._propose(problem, start, generator)
