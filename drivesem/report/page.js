@@ -67,7 +67,12 @@ function filter() {
 if (filters) {
   filters.addEventListener("input", filter);
   filters.addEventListener("submit", (event) => event.preventDefault());
-  filters.addEventListener("reset", () => setTimeout(() => { filter(); order("rank"); }));
+  filters.querySelector("button[type=reset]").addEventListener("click", (event) => {
+    event.preventDefault();  // the fields' own reset comes after the event, and so would be too late to filter by
+    filters.reset();
+    filter();
+    order("rank");
+  });
   one("#order").addEventListener("change", (event) => order(event.target.value));
 }
 function order(key) {

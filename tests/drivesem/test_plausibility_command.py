@@ -61,7 +61,7 @@ def run(tmp_path: Path) -> Path:
         write_labels(part / "labels_paper.txt", before)
         write_labels(part / "labels_moved.txt", after)
         files.write_text(part / "result.json", dump_frame(result(name)))
-        for picture in ("benign.png", "counterexample.png"):
+        for picture in ("benign.png", "rerender.png", "counterexample.png"):
             files.write_png(part / picture, np.zeros((4, 4, 3), np.uint8))
     return folder
 

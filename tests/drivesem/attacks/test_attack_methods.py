@@ -124,7 +124,10 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
     ("words", "message"),
     [
         (["--rate", "0"], "--rate: expected a number above 0, found 0"),
-        (["--method", "fgsm", "--rate", "2"], "--rate: expected --method si-fgsm, sgd, scw beside it, found fgsm"),
+        (
+            ["--method", "fgsm", "--rate", "2"],
+            "--rate: expected --method si-fgsm, apgd, sgd, scw beside it, found fgsm",
+        ),
         (["--step-form", "raw"], "--step-form: expected --method sgd beside it, found si-fgsm"),
         (
             ["--method", "scw", "--momentum", "1"],
@@ -135,7 +138,7 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
         (["--restarts", "-1"], "--restarts: expected at least 0, found -1"),
         (
             ["--method", "halton", "--restarts", "1"],
-            "--restarts: expected --method si-fgsm, fgsm, sgd, scw beside it",
+            "--restarts: expected --method si-fgsm, apgd, fgsm, sgd, scw beside it",
         ),
         (["--method", "sgd", "--queries", "9"], "--queries: expected --method random, halton, sobol, cma-es, scw"),
         (["--method", "subsets", "--queries", "1"], "--queries: expected at least 2 with subsets, found 1"),

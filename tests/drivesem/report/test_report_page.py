@@ -148,7 +148,7 @@ def test_a_hundred_frames_stay_small(
     if photographs:
         image = files.read_image(photographs[0])
     else:
-        coarse = np.random.default_rng(0).integers(0, 255, (94, 311, 3)).astype(np.uint8)
+        coarse = np.random.default_rng(0).integers(0, 255, (47, 156, 3)).astype(np.uint8)
         image = np.asarray(Image.fromarray(coarse).resize((1242, 375), Image.Resampling.BICUBIC))
     run = make_run(tmp_path / "run", [frame("one", lost=True, phantom=True)])
     for name in ("benign", "counterexample"):
