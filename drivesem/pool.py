@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any, TypeVar
 
 import torch
@@ -47,8 +48,19 @@ def outcomes(
 
 def _start(build: Callable[[], Callable[[Any], Any]], threads: int) -> None:
     global _work
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     _work = build()
+
+
+def _leave_with_parent() -> None:
+    """End this process when the one that started it is gone: killed, it can no longer say so itself, and its
+    workers would wait for ever, each with a detector in memory.
+    """
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _do(job: Any) -> Any:

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -58,3 +63,53 @@ def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> Non
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
     assert str(again) == str(error) == "file:3: expected a number, found [1, 2]"
+
+
+def linger(job: int, folder: str) -> None:
+    """Say who works, and never end."""
+    Path(folder, f"{job}-{os.getpid()}").touch()
+    time.sleep(600)
+
+
+def lingering(folder: str) -> Callable[[int], None]:
+    return partial(linger, folder=folder)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
+def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
+    script = (
+        "from drivesem.config import Common\n"
+        "from drivesem.pool import outcomes\n"
+        "from tests.drivesem.test_pool import lingering\n"
+        "from functools import partial\n"
+        "if __name__ == '__main__':\n"
+        f"    list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Common(workers=2)))\n"
+    )
+    file = tmp_path / "killed.py"
+    file.write_text(script)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    parent = subprocess.Popen([sys.executable, str(file)], env=environment)
+    _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
+    found = list(tmp_path.glob("[12]-*"))
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    assert len(found) == 2
+    workers = [int(path.name.partition("-")[2]) for path in found]
+    assert _soon(lambda: not any(_lives(pid) for pid in workers))
+
+
+def _soon(what: Callable[[], bool], seconds: float = 60) -> bool:
+    until = time.monotonic() + seconds
+    while not what():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def _lives(pid: int) -> bool:
+    """Whether a process runs: one that ended and that nobody has asked for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
