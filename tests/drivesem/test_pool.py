@@ -88,7 +88,7 @@ def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
     file = tmp_path / "killed.py"
     file.write_text(script)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    parent = subprocess.Popen([sys.executable, str(file)], env=environment)
+    parent = subprocess.Popen([sys.executable, str(file)], env=environment, stderr=subprocess.DEVNULL)
     _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
     found = list(tmp_path.glob("[12]-*"))
     parent.send_signal(signal.SIGKILL)
