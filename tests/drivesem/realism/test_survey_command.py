@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -147,40 +146,34 @@ def test_bad_input(survey: Path, tmp_path: Path, refused: Callable[..., str]) ->
 
 
 @pytest.mark.slow
-def test_the_page_in_a_browser(survey: Path, tmp_path: Path) -> None:
+def test_the_page_in_a_browser(survey: Path, tmp_path: Path, chromium: Any) -> None:
     """By keyboard alone: names, ratings, a file that survey-results takes; no error, no request."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs Debian's chromium")
     faults: list[str] = []
     asked: list[str] = []
-    with playwright.sync_playwright() as api:
-        browser = api.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 390, "height": 800})
-        page.on("console", lambda message: faults.append(message.text))
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto((survey / "survey.html").as_uri())
-        page.keyboard.press("Tab")
-        page.keyboard.type('Ann, "A"')
+    page = chromium.new_page(viewport={"width": 390, "height": 800})
+    page.on("console", lambda message: faults.append(message.text))
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto((survey / "survey.html").as_uri())
+    page.keyboard.press("Tab")
+    page.keyboard.type('Ann, "A"')
+    page.keyboard.press("Enter")
+    for _ in range(3):
+        assert page.locator("#naming").is_visible()
+        assert not page.locator("#rating").is_visible()
+        page.locator("input[name=named]").first.focus()
+        page.keyboard.press("Space")
         page.keyboard.press("Enter")
-        for _ in range(3):
-            assert page.locator("#naming").is_visible()
-            assert not page.locator("#rating").is_visible()
-            page.locator("input[name=named]").first.focus()
-            page.keyboard.press("Space")
-            page.keyboard.press("Enter")
-            assert page.locator("#rating").is_visible()
-            page.locator("input[name=realism]").first.focus()
-            for _ in range(4):
-                page.keyboard.press("ArrowRight")
-            page.keyboard.press("Enter")
-        with page.expect_download() as download:
-            page.locator("#save").click()
-        download.value.save_as(tmp_path / "answers.csv")
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        browser.close()
+        assert page.locator("#rating").is_visible()
+        page.locator("input[name=realism]").first.focus()
+        for _ in range(4):
+            page.keyboard.press("ArrowRight")
+        page.keyboard.press("Enter")
+    with page.expect_download() as download:
+        page.locator("#save").click()
+    download.value.save_as(tmp_path / "answers.csv")
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.close()
     assert not faults
     assert asked
     assert not [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]
