@@ -21,7 +21,6 @@ from rich.table import Table
 
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.registry import ONNX, load_detector, load_predictor
-from detectors.types import CLASSES
 from drivesem.aims import Aim
 from drivesem.attacks.apgd import APGD
 from drivesem.attacks.base import Attack as AttackMethod
@@ -38,16 +37,16 @@ from drivesem.attacks.subsets import Subsets
 from drivesem.budgets import budget_of, written
 from drivesem.config import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, UsageError
 from drivesem.devices import check_device
-from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
 from drivesem.objective import OF_DETECTIONS
-from drivesem.pipeline import RESULT, FrameSettings, as_detections, as_targets, attack_frame
+from drivesem.pipeline import RESULT, FrameSettings, attack_frame
 from drivesem.pool import outcomes
 from drivesem.report_data import write_run
 from drivesem.results import FrameResult, RunSummary, load_frame
 from drivesem.run_folder import claim
 from drivesem.sources import NoVehicleError, SceneSource, open_source
 from drivesem.space import Parameter, combo, parse_params
+from drivesem.tally import tally
 from scene_ir import files
 from scene_ir.compositor import RenderSettings
 from scene_ir.errors import RangeError, SceneError, ShapeError
@@ -316,21 +315,7 @@ def _summary(
     out: Path,
     start: float,
 ) -> RunSummary:
-    judged, t_star = JudgedClasses.of(detector), t_star_of(detector, config.t_star)
-    names = judged.names
-    benign = [judged.targets(as_targets(r.targets_benign, CLASSES)) for r in results]
-    moved = [judged.targets(as_targets(r.targets_moved, CLASSES)) for r in results]
-    attacked = [as_detections(r.detections_attacked, names) for r in results]
-
-    def scores(targets: list[Any], detections: list[Any]) -> coco.Scores:
-        return coco.evaluate(targets, detections, names, t_star, HEADLINE)
-
-    def count(kind: str) -> dict[str, int]:
-        counted = dict.fromkeys(names, 0)
-        for failure in (f for r in results for f in r.failures if f.kind == kind):
-            counted[failure.label] += 1
-        return counted
-
+    t_star = t_star_of(detector, config.t_star)
     return RunSummary(
         out=str(out),
         dataset=config.dataset,
@@ -338,21 +323,10 @@ def _summary(
         detector=config.detector,
         headline=HEADLINE,
         t_star=t_star,
-        frames=len(results),
         frames_without_vehicles=without_vehicles,
         frames_failed=dict(sorted(failed.items())),
-        objects=sum(r.objects for r in results),
-        benign=scores(benign, [as_detections(r.detections_benign, names) for r in results]),
-        rerendered=scores(benign, [as_detections(r.detections_rerendered, names) for r in results]),
-        attacked_paper=scores(benign, attacked),
-        attacked_moved=scores(moved, attacked),
-        lost_objects=count("lost"),
-        phantoms=count("phantom"),
-        successes_paper=sum(r.success_paper for r in results),
-        successes_moved=sum(r.success_moved for r in results),
-        feasible_fraction=sum(r.feasible for r in results) / len(results) if results else None,
-        queries=sum(r.queries for r in results),
         seconds=round(time.perf_counter() - start, 3),
+        **tally(results, JudgedClasses.of(detector), t_star, HEADLINE),
     )
 
 

@@ -9,21 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from detectors.types import CLASSES
 from drivesem.config import COMBO_NUMBERS, GRADIENT_FREE, Attack, UsageError, command_line
 from drivesem.data.label_table import WEATHERS
 from drivesem.eval_outcome import Outcome
-from drivesem.evaluation import coco
 from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.judged import JudgedClasses
-from drivesem.pipeline import as_detections, as_targets
 from drivesem.report.html import render_report
 from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
-from drivesem.results import BoxRecord, FrameResult, RunSummary
+from drivesem.results import FrameResult, RunSummary
 from drivesem.run_folder import attack_of
 from drivesem.space import combo
 from drivesem.study.arms import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
+from drivesem.tally import boxes_of, tally
 from drivesem.transfer.runs import METRICS, load_runs
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -189,7 +187,7 @@ def _curve(run: ShownRun, labels: str, seen: str, name: str) -> Line | None:
     judged = _judged(summary)
     if summary.headline not in judged.names or not run.frames:
         return None
-    targets, found = _sets(run.frames, judged, labels, seen)
+    targets, found = boxes_of(run.frames, judged, labels, seen)
     outcome = Outcome.of(targets, found, judged.names.index(summary.headline))
     samples = sampled_curve(outcome.candidates.tally(outcome.match, 0))
     if not samples:
@@ -205,44 +203,9 @@ def _judged(summary: RunSummary) -> JudgedClasses:
     return JudgedClasses(names, names)
 
 
-def _sets(
-    results: Sequence[FrameResult], judged: JudgedClasses, labels: str, seen: str
-) -> tuple[list[Any], list[Any]]:
-    def boxes(result: FrameResult, name: str) -> tuple[BoxRecord, ...]:
-        return getattr(result, name)
-
-    targets = [judged.targets(as_targets(boxes(r, f"targets_{labels}"), CLASSES)) for r in results]
-    return targets, [as_detections(boxes(r, f"detections_{seen}"), judged.names) for r in results]
-
-
 def _again(summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
     """The figures of some of a run's frames."""
-    judged = _judged(summary)
-
-    def scores(labels: str, seen: str) -> Scores:
-        return coco.evaluate(
-            *_sets(results, judged, labels, seen), judged.names, summary.t_star, headline=summary.headline
-        )
-
-    def count(kind: str) -> dict[str, int]:
-        labels = [failure.label for r in results for failure in r.failures if failure.kind == kind]
-        return {name: labels.count(name) for name in judged.names}
-
-    return replace(
-        summary,
-        frames=len(results),
-        objects=sum(r.objects for r in results),
-        benign=scores("benign", "benign"),
-        rerendered=scores("benign", "rerendered"),
-        attacked_paper=scores("benign", "attacked"),
-        attacked_moved=scores("moved", "attacked"),
-        lost_objects=count("lost"),
-        phantoms=count("phantom"),
-        successes_paper=sum(r.success_paper for r in results),
-        successes_moved=sum(r.success_moved for r in results),
-        feasible_fraction=sum(r.feasible for r in results) / len(results),
-        queries=sum(r.queries for r in results),
-    )
+    return replace(summary, **tally(results, _judged(summary), summary.t_star, summary.headline))
 
 
 def _summary(path: Path) -> RunSummary:
