@@ -278,6 +278,8 @@ def test_apgd_begins_with_the_papers_step_and_halves_it_on_rough_ground():
     wandering = SiFGSM(steps=20)._propose(hill.problem, torch.zeros(2), torch.Generator())
     assert max(loss for loss in wandering.losses if loss is not None) == pytest.approx(-0.06, abs=1e-6)
     assert max(loss for loss in proposals.losses if loss is not None) > -0.03
+    # In the end a step is at most an eighth of the first: halved at three of the checkpoints or more.
+    assert float((proposals.thetas[-1] - proposals.thetas[-2]).abs().max()) <= 0.1 / 8 + 1e-6
 
 
 def test_apgd_keeps_its_step_while_the_loss_rises():
