@@ -489,16 +489,16 @@ class Synth(Common):
 
 @dataclass(frozen=True)
 class Bench(Common):
-    """Measure: one attack step, the renderer, peak memory, the scene generator, de-rendering, or the detectors."""
+    """Measure: one attack step, the renderer, memory, the scene generator, de-rendering, detectors, evaluation."""
 
     what: tyro.conf.Positional[
-        Literal["step", "render", "memory", "synth", "derender", "found", "label-free", "detector"]
+        Literal["step", "render", "memory", "synth", "derender", "found", "label-free", "detector", "eval"]
     ] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
     memory above the detector's own; synth: the scene generator; derender: de-rendered generated frames beside the
     generator's truth; found: whether a detector finds removed cars again, and moved ones where they are;
     label-free: vehicles of photographs whose labels are hidden, beside those labels; detector: forward, backward
-    and decoding of each detector."""
+    and decoding of each detector; eval: drivesem eval of many frames beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
@@ -507,7 +507,8 @@ class Bench(Common):
     """Triangles a car, with commas."""
     frames: int | None = None
     """Frames that bench synth makes in each row, by default 200, with --quick 40; that bench derender takes apart,
-    by default 100, with --quick 12; or that bench label-free looks at, by default 60, with --quick 12."""
+    by default 100, with --quick 12; that bench label-free looks at, by default 60, with --quick 12; or that bench
+    eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Bench derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: int | None = None

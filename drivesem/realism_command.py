@@ -37,7 +37,7 @@ _NOTE = (
 
 def run(config: Realism) -> int:
     """Measure, report; exit code 0. Raises UsageError or SceneError for bad input."""
-    runs = load_runs(config.runs, config.limit)
+    runs = load_runs(config.runs, config.limit, "RUN")
     folder = None if config.weights is None else Path(config.weights)
     names, absent = chosen(config.metrics, folder, config.fetch)
     measures = load(names, folder, config.fetch)

@@ -65,7 +65,7 @@ def load_shown(folders: Sequence[str]) -> tuple[list[ShownRun], int]:
     Raises UsageError for folders that hold no finished run, runs that share no frame, and runs on different
     photographs; FormatError for a damaged file.
     """
-    loaded = load_runs(folders)
+    loaded = load_runs(folders, setting="RUN")
     names = [{frame.result.identifier for frame in run.frames} for run in loaded]
     shared, every = set.intersection(*names), set.union(*names)
     if not shared:

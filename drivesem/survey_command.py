@@ -47,7 +47,7 @@ _NOTE = (
 
 def run(config: Survey) -> int:
     """Make the page and its key; exit code 0. Raises UsageError or SceneError for bad input."""
-    runs = load_runs(config.runs)
+    runs = load_runs(config.runs, setting="RUN")
     out = Path(config.out) if config.out else runs[0].folder / "survey"
     if out.exists() and not out.is_dir():
         raise UsageError("--out", "a folder", f"the file {out}")

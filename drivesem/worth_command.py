@@ -81,7 +81,7 @@ def run(config: Worth) -> int:
         weighted = [False, True] if any((e.first.realism != 1).any() for e in entries) else [False]
         distance = None
     else:
-        runs = load_runs(config.runs, config.limit)
+        runs = load_runs(config.runs, config.limit, "RUN")
         distance = _distance(config)
         entries, names = _runs(runs, config, distance, out)
         weighted = [False] if distance is None else [False, True]

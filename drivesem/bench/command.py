@@ -15,7 +15,7 @@ from rich.console import Console
 
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector
-from drivesem.bench import derender, detector, found, label_free, memory, render, step, synth, tables
+from drivesem.bench import derender, detector, evaluation, found, label_free, memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
 from drivesem.config import Bench, UsageError, numbers, processes
@@ -49,6 +49,7 @@ def run(config: Bench) -> int:
         "found": _found,
         "label-free": _label_free,
         "detector": _detector,
+        "eval": _eval,
     }
     console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
     measured = measure[config.what](config, cars, triangles, console)
@@ -193,6 +194,14 @@ def _detector(config: Bench, cars: list[int], triangles: list[int], console: Con
     except DetectorError as error:
         raise UsageError("--detector", "a detector with gradients", error) from error
     return {"rows": [asdict(row) for row in rows], "method": detector.METHOD}
+
+
+def _eval(config: Bench, cars: list[int], triangles: list[int], console: Console) -> dict[str, Any]:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+    frames = config.frames or (evaluation.QUICK_FRAMES if config.quick else evaluation.FULL_FRAMES)
+    rows = list(_watched(evaluation.measure(frames, config.seed), 3, console))
+    return {"rows": [asdict(row) for row in rows], "method": evaluation.METHOD}
 
 
 def _watched(rows: Iterator[T], total: int, console: Console) -> Iterator[T]:

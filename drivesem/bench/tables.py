@@ -65,6 +65,11 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
         "decode_ms": ("decode, ms", "decode"), "decode_worst_ms": ("at worst", "at worst"),
         "peak_mb": ("peak, MB", "peak MB"), "rounds": ("rounds", None),
     },
+    "eval": {
+        "protocol": ("protocol", "protocol"), "engine": ("counted by", "counted by"),
+        "source": ("reads", "reads"), "frames": ("frames", "frames"),
+        "detections": ("detections", "detections"), "seconds": ("seconds", "seconds"), "ratio": ("ratio", "ratio"),
+    },
     "found": {
         "which": ("cars", "cars"), "measure": ("figure", "figure"), "cars": ("count", "count"),
         "found": ("found", "found"), "share": ("share", "share"), "low": ("from", "from"), "high": ("to", "to"),
@@ -82,6 +87,7 @@ TITLES = {
     "derender": "De-rendering beside the generator's truth",
     "label-free": "Photographs without labels, beside labels that were hidden",
     "detector": "The detectors",
+    "eval": "Evaluation of many frames",
     "found": "Cars that a detector finds, removed and moved",
 }
 

@@ -41,32 +41,33 @@ class Run:
     frames: tuple[Frame, ...]
 
 
-def load_runs(folders: Sequence[str], limit: int | None = None) -> list[Run]:
-    """Runs by folder; limit: the first frames of each. Raises UsageError for a folder that holds no finished run,
-    FormatError naming a file that is not as `drivesem attack` writes it.
+def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "--run") -> list[Run]:
+    """Runs by folder; limit: the first frames of each; setting: what names them on the command line. Raises
+    UsageError for a folder that holds no finished run, FormatError naming a file that is not as `drivesem attack`
+    writes it.
     """
     paths = [Path(folder) for folder in folders]
     doubled = sorted({str(path) for path in paths if sum(p.resolve() == path.resolve() for p in paths) > 1})
     if doubled:
-        raise UsageError("--run", "each run once", doubled[0])
+        raise UsageError(setting, "each run once", doubled[0])
     # Runs of the same name in different folders are told apart by their whole paths.
     plain = [path.resolve().name for path in paths]
     names = [name if plain.count(name) == 1 else str(path) for name, path in zip(plain, paths, strict=True)]
-    return [_load(path, name, limit) for path, name in zip(paths, names, strict=True)]
+    return [_load(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
 
 
-def _load(folder: Path, name: str, limit: int | None) -> Run:
+def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     if not (folder / CONFIG).is_file():
-        raise UsageError("--run", "a folder of drivesem attack", folder)
+        raise UsageError(setting, "a folder of drivesem attack", folder)
     try:
         settings = yaml.safe_load(files.read_text(folder / CONFIG))
     except yaml.YAMLError as error:
         raise FormatError(str(folder / CONFIG), "YAML", " ".join(str(error).split())) from error
     if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
-        raise UsageError("--run", "a folder of drivesem attack", f"{folder}, a run of another command")
+        raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
     if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
         raise UsageError(
-            "--run", "a finished run (the same command finishes it)", f"{folder}, which stopped early"
+            setting, "a finished run (the same command finishes it)", f"{folder}, which stopped early"
         )
     manifest, metrics = files.read_json(folder / MANIFEST), files.read_json(folder / METRICS)
     try:
@@ -74,7 +75,7 @@ def _load(folder: Path, name: str, limit: int | None) -> Run:
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
     if not identifiers:
-        raise UsageError("--run", "a run with frames", f"{folder}, which has none")
+        raise UsageError(setting, "a run with frames", f"{folder}, which has none")
     return Run(
         name=name,
         folder=folder,

@@ -131,7 +131,7 @@ def test_bad_input(
         return line
 
     assert "RUN: expected folders of drivesem attack, found nothing" in says()
-    assert "expected a folder of drivesem attack" in says(tmp_path)
+    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
     assert "each run once" in says(run, run)
     assert "--metrics: expected available, or psnr" in says(run, "--metrics", "psnr,beauty")
     assert "alexnet-owt-*.pth" in says(run, "--metrics", "lpips-alex")

@@ -14,6 +14,7 @@ import torch
 
 from detectors.types import Detections
 from drivesem.cli import main
+from drivesem.training.retraining import WEIGHTS
 from drivesem.transfer import looking
 from scene_ir import files
 
@@ -120,6 +121,26 @@ def test_gain_of_a_second_detector(
     assert row["value"] == pytest.approx(gain)
 
 
+def test_a_folder_of_retrain_is_a_second_detector(
+    write_run: Callable[..., Path],
+    tmp_path: Path,
+    worth: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights = tmp_path / "retrained" / WEIGHTS
+    weights.parent.mkdir()
+    weights.touch()
+    loaded: list[str] = []
+
+    def load(name: str, *_: object) -> Sees:
+        loaded.append(name)
+        return Sees(2)
+
+    monkeypatch.setattr(looking, "load_predictor", load)
+    data = worth(write_run(tmp_path / "run"), "--distance", "none", "--second", weights.parent)
+    assert set(loaded) == {str(weights)} == {data["detectors"][1]}
+
+
 TABLE = "label,bench,bus,distance\nbench,0.9,0.1,0\nbench,0.3,0.7,0.2\nbus,0.2,0.8,0.4\n"
 
 
@@ -183,7 +204,7 @@ def test_bad_input(write_run: Callable[..., Path], tmp_path: Path, refused: Call
     assert "--base" in says(run, "--base", "two")
     assert "--distance: expected none, perceptual" in says(run, "--distance", "psnr")
     assert "--second: expected a detector" in says(run, "--distance", "none", "--second", "nobody")
-    assert "a folder of drivesem attack" in says(tmp_path)
+    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
     (tmp_path / "table.csv").write_text(TABLE)
     (tmp_path / "other.csv").write_text(TABLE.replace("bus,0.2", "bench,0.2"))
     message = says("--table", tmp_path / "table.csv", "--after", tmp_path / "other.csv")

@@ -1,0 +1,48 @@
+"""`drivesem bench eval`: the same frames in both layouts, and the whole command timed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from drivesem.bench import evaluation, tables
+from drivesem.cli import main
+from drivesem.data.label_files import Reading, read
+from scene_ir.errors import FormatError
+
+_FRAMES = 5
+
+
+def test_both_layouts_hold_the_same_boxes(tmp_path: Path) -> None:
+    truth, found = evaluation._write(tmp_path, _FRAMES, 0)
+    assert len(truth["annotations"]) == 5 * _FRAMES
+    assert len(found) == 20 * _FRAMES
+    labels = read(tmp_path / "label_2", Reading("kitti"))
+    coco = read(tmp_path / "truth.json", Reading("coco"))
+    detected = read(tmp_path / "found", Reading("kitti", scores=True, truth=labels))
+    results = read(tmp_path / "found.json", Reading("coco", scores=True, truth=coco))
+    for first, second, count in ((labels, coco, 5), (detected, results, 20)):
+        assert len(first.boxes) == len(second.boxes) == count * _FRAMES
+        assert first.boxes == pytest.approx(second.in_edges(first.edges).boxes, abs=1e-6)
+
+
+def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["bench", "eval", "--frames", str(_FRAMES), "--json", "--markdown", str(tmp_path / "all.md")]
+    assert main(words) == 0
+    result = json.loads(capsys.readouterr().out)
+    alone, coco, kitti = result["rows"]
+    assert [row["protocol"] for row in result["rows"]] == ["coco", "coco", "kitti"]
+    assert (alone["engine"], alone["source"], alone["ratio"]) == ("pycocotools alone", "memory", 1.0)
+    for row in (coco, kitti):
+        assert (row["frames"], row["detections"], row["source"]) == (_FRAMES, 20 * _FRAMES, "files")
+        assert row["seconds"] > alone["seconds"]  # a process, which starts and reads
+    text = (tmp_path / "all.md").read_text()
+    assert f"### {tables.TITLES['eval']}" in text
+    assert f"`drivesem bench eval --frames {_FRAMES}`" in text
+
+
+def test_a_command_that_fails_is_told() -> None:
+    with pytest.raises(FormatError, match="exit code 2: drivesem: /nowhere: expected"):
+        evaluation._command(["--gt", "/nowhere", "--pred", "/nowhere"])
