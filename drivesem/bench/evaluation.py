@@ -22,11 +22,11 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 METHOD = (
-    "Random frames of 5 objects (Car, Pedestrian or Cyclist; a tenth of them DontCare) and 20 detections: three "
-    "around each object and five elsewhere. pycocotools alone: of results in memory, loadRes, evaluate, accumulate "
-    "and summarize, in this process. The other rows are whole commands, in processes of their own: start, reading "
-    "the files, figures by class and part, and for COCO the twelve numbers by the engine that is named. "
-    "--bootstrap 0. Wall time, once each. ratio: to that of pycocotools alone."
+    "Random frames of 5 objects (Car, Pedestrian or Cyclist; a tenth DontCare) and 20 detections: three around "
+    "each object and five elsewhere. pycocotools alone: of results in memory, loadRes, evaluate, accumulate "
+    "and summarize, in this process. The other rows are whole commands, in processes of their own: start, "
+    "reading the files, figures by class and part, and for COCO the twelve numbers by the engine that is "
+    "named. --bootstrap 0. Wall time, once each. ratio: to that of pycocotools alone."
 )
 FULL_FRAMES, QUICK_FRAMES = 20_000, 1_000
 _OBJECTS, _AROUND, _ELSEWHERE = 5, 3, 5
