@@ -391,6 +391,7 @@ def _cut_out(
     kept: list[int] = []
     held: list[bool] = []
     firsts: list[Cutout | None] = []
+    outlined: list[Mask] = []
     for row in order:
         options, by_laser = _options(frame, labels, row, settings)
         mine = unknown[row] | _union(masks, image.shape[:2])
@@ -416,18 +417,23 @@ def _cut_out(
         firsts.append(None if settings.fit or best != likeliest else first)
         masks.append(mask)
         hidden.append(mine)
+        outlined.append(outlines[best])
     if settings.fit:
         reliable, beside = _boxes(labels, kept, camera), silhouette.Evidence(bytes_image, held)
         fitting, backend = settings.fitting, settings.backend
-        chosen = silhouette.fit(chosen, masks, hidden, reliable, camera, fitting, backend, beside)
-    outlines = silhouette.silhouettes(chosen, camera, settings.backend)
+        fitted = silhouette.fit(chosen, masks, hidden, reliable, camera, fitting, backend, beside)
+        found = silhouette.silhouettes(fitted, camera, backend)
+        # The fit may lead a car of which only a corner shows out of sight: that one stays where its label says.
+        seen = [outline.any() for outline in found]
+        chosen = [after if s else before for before, after, s in zip(chosen, fitted, seen, strict=True)]
+        outlined = [after if s else before for before, after, s in zip(outlined, found, seen, strict=True)]
     cuts: list[_Cut] = []
     for index, row in enumerate(kept):
         mine = unknown[row] | _union([c.mask for c in cuts], image.shape[:2])
-        whole = outlines[index] if frame.masks is None else (frame.masks[row] > 0.5).numpy()
+        whole = outlined[index] if frame.masks is None else (frame.masks[row] > 0.5).numpy()
         if not (whole & ~mine).any():
             continue
-        cut = looks.cut(row, chosen[index], outlines[index], mine, told[row], firsts[index])
+        cut = looks.cut(row, chosen[index], outlined[index], mine, told[row], firsts[index])
         if cut.mask.any():
             cuts.append(cut)
     return sorted(cuts, key=lambda cut: cut.row)

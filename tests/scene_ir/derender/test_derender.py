@@ -11,7 +11,9 @@ import pytest
 import torch
 
 from scene_ir.compositor import Compositor
+from scene_ir.derender import silhouette
 from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Category, Frame, Labels, SceneIR
 
@@ -82,6 +84,18 @@ def test_same_input_same_scene(street, scene):
     assert torch.equal(again.background, scene.background)
     assert torch.equal(again.objects.translation, scene.objects.translation)
     assert torch.equal(again.objects.source[0].foreground.values, scene.objects.source[0].foreground.values)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_car_that_the_fit_leads_out_of_sight_stays_where_its_label_says(street, masked, monkeypatch):
+    def fit(placements: list[Placement], *_: object) -> list[Placement]:
+        return [replace(p, translation=p.translation + torch.tensor([80.0, 0.0, 0.0])) for p in placements]
+
+    monkeypatch.setattr(silhouette, "fit", fit)
+    masks = torch.from_numpy(street.mask)[None].float() if masked else None
+    scene = derender(replace(street.frame, masks=masks))
+    assert scene.objects.translation[0].tolist() == pytest.approx([0.6, 1.65, 11.0], abs=0.35)
+    assert psnr(render(scene), street.frame.photograph) > 60
 
 
 def test_a_given_mask_is_used(street):
