@@ -67,8 +67,8 @@ COLUMNS: dict[str, dict[str, tuple[str, str | None]]] = {
     },
     "eval": {
         "protocol": ("protocol", "protocol"), "engine": ("counted by", "counted by"),
-        "source": ("reads", "reads"), "frames": ("frames", "frames"),
-        "detections": ("detections", "detections"), "seconds": ("seconds", "seconds"), "ratio": ("ratio", "ratio"),
+        "frames": ("frames", "frames"), "detections": ("detections", "detections"),
+        "seconds": ("seconds", "seconds"), "ratio": ("ratio", "ratio"),
     },
     "found": {
         "which": ("cars", "cars"), "measure": ("figure", "figure"), "cars": ("count", "count"),
