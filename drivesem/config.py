@@ -73,7 +73,7 @@ class Common(Command):
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, ..."""
     keep_going: Flag = False
-    """List a frame that cannot be used in the results and go on with the rest."""
+    """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
     resume: bool = True
     """Keep the frames that are already there."""
 

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import os
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from multiprocessing import get_context, parent_process
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 
-from drivesem.config import Common, processes
+from detectors.base import DetectorError
+from drivesem.config import Common, UsageError, processes
+from scene_ir.errors import SceneError
 
 J = TypeVar("J")
 R = TypeVar("R")
 
 _work: Callable[[Any], Any] | None = None
+
+
+class UnforeseenError(SceneError):
+    """A defect of drivesem that one job brought to light, and with which a night's work need not end."""
 
 
 def outcomes(
@@ -25,17 +34,20 @@ def outcomes(
     """Each job with a call that gives its result or raises what went wrong, as they are done.
 
     work: does a job in this process, where one process is enough. build: makes the like of it in another process,
-    once for each, and can be pickled, as jobs and results can.
+    once for each, and can be pickled, as jobs and results can. With `keep_going` an error for which no input is to
+    blame is raised as UnforeseenError, which says where it arose.
     """
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     threads = max((os.cpu_count() or 1) // processes(config), 1)
     torch.set_num_threads(threads)
     count = min(processes(config), len(jobs))
     if count <= 1:
+        here = partial(_forgiving, work) if config.keep_going else work
         for job in jobs:
-            yield job, lambda job=job: work(job)
+            yield job, partial(here, job)
         return
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_start, initargs=(build, threads))
+    start = (build, threads, config.keep_going)
+    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_start, initargs=start)
     with pool:
         pending = {pool.submit(_do, job): job for job in jobs}
         try:
@@ -46,11 +58,23 @@ def outcomes(
             raise
 
 
-def _start(build: Callable[[], Callable[[Any], Any]], threads: int) -> None:
+def _start(build: Callable[[], Callable[[Any], Any]], threads: int, keep_going: bool) -> None:
     global _work
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
-    _work = build()
+    work = build()
+    _work = partial(_forgiving, work) if keep_going else work
+
+
+def _forgiving(work: Callable[[J], R], job: J) -> R:
+    try:
+        return work(job)
+    except (SceneError, UsageError, DetectorError):
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
+        raise UnforeseenError("drivesem", "no defect of its own", found) from error
 
 
 def _leave_with_parent() -> None:

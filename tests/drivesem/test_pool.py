@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -63,6 +64,45 @@ def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> Non
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
     assert str(again) == str(error) == "file:3: expected a number, found [1, 2]"
+
+
+def stumble(job: int) -> int:
+    return 12 // job
+
+
+def stumbling() -> Callable[[int], int]:
+    return stumble
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None:
+    def found(*, keep_going: bool) -> dict[int, int | str]:
+        results: dict[int, int | str] = {}
+        config = Common(workers=workers, keep_going=keep_going)
+        for job, outcome in outcomes(stumble, stumbling, [3, 0, 4], config):
+            try:
+                results[job] = outcome()
+            except SceneError as error:
+                results[job] = str(error)
+        return results
+
+    said = found(keep_going=True)
+    assert (said[3], said[4]) == (4, 3)
+    assert re.fullmatch(
+        r"drivesem: expected no defect of its own, found ZeroDivisionError at test_pool.py:\d+: .*", str(said[0])
+    )
+    with pytest.raises(ZeroDivisionError):
+        found(keep_going=False)
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_bad_settings_end_it_in_any_case(keep_going: bool) -> None:
+    def refuse(job: int) -> int:
+        raise UsageError("--detector", "another", job)
+
+    ((_, outcome),) = outcomes(refuse, stumbling, [1], Common(workers=1, keep_going=keep_going))
+    with pytest.raises(UsageError, match="--detector"):
+        outcome()
 
 
 def linger(job: int, folder: str) -> None:
