@@ -98,10 +98,11 @@ def _check_all(worker: _Worker, names: Sequence[str], console: Console) -> tuple
     checked: dict[str, Checked] = {}
     failed: dict[str, str] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    shared = Common(workers=worker.config.workers, keep_going=worker.config.keep_going)
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("checking frames", total=len(names))
         build = partial(_in_process, worker.config, worker.one)
-        for name, outcome in outcomes(worker.check, build, names, Common(workers=worker.config.workers)):
+        for name, outcome in outcomes(worker.check, build, names, shared):
             try:
                 checked[name] = outcome()
             except SceneError as error:
