@@ -29,9 +29,10 @@ _SIDES = {"benign": "photograph", "rerendered": "re-render", "attacked": "counte
 _REGION = {"frame": "frame", "boxes": "vehicles"}
 _NOTE = (
     "Mean over frames, and 95 % of the bootstrap over frames. Vehicles: the rectangle around each vehicle "
-    "before and after, at least 64 px a side; a frame's figure is their mean. PSNR is that of the mean squared "
-    "error; inf: equal pictures. A Frechet distance needs many more pictures than it has features to be compared "
-    "with others' figures; beside the same number of pictures it ranks."
+    "before and after, at least 64 px a side; a frame's figure is their mean. PSNR is that of the mean "
+    "squared error; inf: equal pictures. A Frechet distance needs many more pictures than it has features to "
+    "be compared with others' figures; beside the same number of pictures it ranks. It has no interval: draws "
+    "with repetitions lie farther apart than the sets themselves."
 )
 
 

@@ -53,8 +53,9 @@ class FrameParts:
 @dataclass(frozen=True, slots=True)
 class Row:
     """One figure of a run. value: mean over frames (of vehicles: of each frame's mean), for PSNR that of the mean
-    squared error, for a Fréchet distance that of all pictures; low, high: its interval; median: over frames. None
-    is an infinite PSNR, and what cannot be said. pictures: how many of each kind are compared.
+    squared error, for a Fréchet distance that of all pictures; low, high: its interval, which a Fréchet distance
+    does not have; median: over frames. None is an infinite PSNR, and what cannot be said. pictures: how many of
+    each kind are compared.
     """
 
     region: str
@@ -150,23 +151,6 @@ class _Mean:
         return float(np.average(self.values, weights=weights)) if len(self.values) else None
 
 
-@dataclass(frozen=True, slots=True)
-class _Apart:
-    """Fréchet distance of features (N, D) of N pictures; frame (N,): which frame each is from."""
-
-    first: Floats
-    second: Floats
-    frame: np.ndarray
-
-    def value(self, weights: Floats | None) -> float | None:
-        counts = None if weights is None else weights[self.frame]
-        if (len(self.frame) if counts is None else counts.sum()) < 2:
-            return None
-        if self.first is self.second:
-            return 0.0
-        return frechet(Gaussian.of(self.first, counts), Gaussian.of(self.second, counts))
-
-
 def rows(frames: Sequence[FrameParts], metrics: Sequence[str], draws: int, seed: int) -> list[Row]:
     """Every figure of a run, with intervals by drawing frames."""
     found: list[Row] = []
@@ -175,8 +159,10 @@ def rows(frames: Sequence[FrameParts], metrics: Sequence[str], draws: int, seed:
         known = [p for p in parts if p]
         for metric in metrics:
             for pair in PAIRS:
-                make = _pair_row if METRICS[metric].pairwise else _set_row
-                found.append(make(known, region, metric, pair, (draws, seed)))
+                if METRICS[metric].pairwise:
+                    found.append(_pair_row(known, region, metric, pair, (draws, seed)))
+                else:
+                    found.append(_set_row(known, region, metric, pair))
     return found
 
 
@@ -192,22 +178,18 @@ def _pair_row(
     return Row(region, metric, *pair, *ends, pictures=sum(map(len, parts)))
 
 
-def _set_row(
-    parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tuple[str, str], spread: tuple[int, int]
-) -> Row:
+def _set_row(parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tuple[str, str]) -> Row:
+    """Without an interval: draws with repetitions lie farther apart than the sets themselves."""
     everything = [part for frame in parts for part in frame]
-    if not everything:
-        return Row(region, metric, *pair, None, None, None, None, pictures=0)
     sides = [[part.features[metric][side] for part in everything] for side in pair]
-    stacked = [np.stack(side) for side in sides]
-    if all(a is b for a, b in zip(*sides, strict=True)):
-        stacked[1] = stacked[0]
-    frame = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-    one = _interval(_Apart(stacked[0], stacked[1], frame), len(parts), spread)
-    return Row(region, metric, *pair, one.value, one.low, one.high, None, pictures=len(everything))
+    value = None
+    if len(everything) > 1:
+        equal = all(a is b for a, b in zip(*sides, strict=True))
+        value = 0.0 if equal else frechet(*(Gaussian.of(np.stack(side)) for side in sides))
+    return Row(region, metric, *pair, value, None, None, None, pictures=len(everything))
 
 
-def _interval(part: _Mean | _Apart, frames: int, spread: tuple[int, int]) -> Interval:
+def _interval(part: _Mean, frames: int, spread: tuple[int, int]) -> Interval:
     draws, seed = spread
     figure = Figure("", (part,))  # pyright: ignore[reportArgumentType]
     (one,) = intervals([figure], frames, draws, np.random.default_rng(seed))

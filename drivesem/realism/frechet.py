@@ -24,21 +24,18 @@ class Gaussian:
     root: Floats
 
     @classmethod
-    def of(cls, features: Floats, weights: Floats | None = None) -> Gaussian:
-        """Of features (N, D), N >= 2, covariance over N - 1. weights (N,): how often each is there.
+    def of(cls, features: Floats) -> Gaussian:
+        """Of features (N, D), N >= 2, covariance over N - 1.
 
         Raises ShapeError for fewer than two, RangeError for a feature that is not finite.
         """
-        counts = np.ones(len(features)) if weights is None else weights
-        total = float(counts.sum())
-        if features.ndim != 2 or total < 2:
-            raise ShapeError("features of a Fréchet distance", "at least two pictures", f"{total:g}")
+        if features.ndim != 2 or len(features) < 2:
+            raise ShapeError("features of a Fréchet distance", "at least two pictures", len(features))
         if not np.isfinite(features).all():
             raise RangeError("features of a Fréchet distance", "finite numbers", "others")
-        there = counts > 0
-        features, counts = features[there].astype(np.float64), counts[there]
-        mean = counts @ features / total
-        root = np.sqrt(counts / (total - 1))[:, None] * (features - mean)
+        features = features.astype(np.float64)
+        mean = features.mean(axis=0)
+        root = (features - mean) / np.sqrt(len(features) - 1)
         if len(root) > root.shape[1]:
             root = np.asarray(np.linalg.qr(root, mode="r"))
         return cls(mean, root)

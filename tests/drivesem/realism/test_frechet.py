@@ -58,15 +58,6 @@ def test_sets_of_fewer_and_of_more_pictures_than_features(count: int) -> None:
         assert found == pytest.approx(frechet(*(Gaussian.of_moments(*m) for m in moments)), rel=1e-9)
 
 
-def test_weights_are_repetitions() -> None:
-    features = np.random.default_rng(3).normal(size=(4, 3))
-    times = np.array([2.0, 0.0, 1.0, 3.0])
-    weighted = Gaussian.of(features, times)
-    repeated = Gaussian.of(features.repeat(times.astype(int), axis=0))
-    np.testing.assert_allclose(weighted.mean, repeated.mean)
-    np.testing.assert_allclose(weighted.root.T @ weighted.root, repeated.root.T @ repeated.root, atol=1e-12)
-
-
 def test_bad_sets() -> None:
     with pytest.raises(ShapeError, match="at least two pictures"):
         Gaussian.of(np.zeros((1, 3)))

@@ -39,7 +39,9 @@ def test_identity(write_run: Callable[..., Path], tmp_path: Path, realism: Calla
     data = realism(run, "--metrics", "psnr,ssim,perceptual,frechet")
     for row in data["rows"]:
         expected = {"psnr": None, "ssim": pytest.approx(1), "perceptual": 0, "frechet": 0}[row["metric"]]
-        assert row["value"] == row["low"] == row["high"] == expected
+        assert row["value"] == expected
+        # draws of frames hold repetitions, and would lie farther apart than the sets
+        assert row["low"] == row["high"] == (None if row["metric"] == "frechet" else expected)
     assert len(data["rows"]) == 2 * 4 * 3
     assert {row["pictures"] for row in rows_of(data, region="boxes")} == {6}
 
