@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +55,19 @@ class Sheet:
         for row in self.rows:
             table.add_row(*row)
         return table
+
+
+def publish(
+    sheet: Sheet, path: Path, heading: str, words: Collection[str], note: str, data: Mapping[str, Any] | None
+) -> None:
+    """One table with a note: as a Markdown file, and on standard output; there as JSON where `data` is given."""
+    files.write_text(path, "\n".join([f"# {heading}", "", *sheet.markdown(words), "", note, ""]))
+    if data is not None:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+        return
+    people = Console()
+    people.print(sheet.table(words))
+    people.print(note, soft_wrap=True)
 
 
 def percent(value: float | None) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from drivesem.config import Realism, UsageError
-from drivesem.eval_report import Sheet
+from drivesem.eval_report import Sheet, publish
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.realism.comparison import PAIRS, FrameParts, Row, frame_parts, rows
 from drivesem.realism.measures import METRICS, load, missing, psnr_db
@@ -68,13 +66,7 @@ def run(config: Realism) -> int:
     files.write_json(out / "realism.json", data)
     files.write_text(out / "realism.csv", _csv(runs, frames, names))
     sheet = _sheet(table, len(runs) > 1)
-    files.write_text(out / "realism.md", "\n".join(["# Realism", "", *sheet.markdown(_WORDS), "", _NOTE, ""]))
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    else:
-        people = Console()
-        people.print(sheet.table(_WORDS))
-        people.print(_NOTE, soft_wrap=True)
+    publish(sheet, out / "realism.md", "Realism", _WORDS, _NOTE, data if config.json else None)
     for name, reason in absent.items():
         console.print(f"{name} left out: {reason}", soft_wrap=True, highlight=False)
     console.print(f"written to {out}", soft_wrap=True)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from rich.console import Console
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
 from drivesem.config import Transfer, UsageError, Worth
-from drivesem.eval_report import Sheet
+from drivesem.eval_report import Sheet, publish
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.judged import JudgedClasses, t_star_of
 from drivesem.pipeline import as_detections, as_targets
@@ -91,16 +89,7 @@ def run(config: Worth) -> int:
     data = {**facts, "rows": rows}
     files.write_json(out / "worth.json", data)
     files.write_text(out / "worth.csv", _csv(rows))
-    sheet = _sheet(rows)
-    files.write_text(
-        out / "worth.md", "\n".join(["# Information worth", "", *sheet.markdown(_WORDS), "", _NOTE, ""])
-    )
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    else:
-        people = Console()
-        people.print(sheet.table(_WORDS))
-        people.print(_NOTE, soft_wrap=True)
+    publish(_sheet(rows), out / "worth.md", "Information worth", _WORDS, _NOTE, data if config.json else None)
     Console(stderr=True).print(f"written to {out}", soft_wrap=True)
     return 0
 
