@@ -9,15 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from detectors.types import CLASSES
 from drivesem.config import Attack, to_yaml
-from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE
-from drivesem.pipeline import as_detections, as_targets
-from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame
+from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
+from tests.drivesem.counting import summary_of
 
-T_STAR = 0.5
 SIZE_WH = (320, 96)
 CAR, OTHER, NOTHING = (40.0, 40.0, 90.0, 70.0), (230.0, 40.0, 280.0, 70.0), (150.0, 30.0, 200.0, 62.0)
 Xyxy = tuple[float, float, float, float]
@@ -69,44 +66,6 @@ def _frame(
         success_paper=bool(failures),
         success_moved=bool(failures),
         identity_psnr_db=None,
-        seconds=0.0,
-    )
-
-
-def summary_of(config: Attack, results: Sequence[FrameResult]) -> RunSummary:
-    """As `drivesem attack` counts."""
-
-    def scores(labels: str, seen: str) -> coco.Scores:
-        targets = [as_targets(getattr(r, f"targets_{labels}"), CLASSES) for r in results]
-        found = [as_detections(getattr(r, f"detections_{seen}"), CLASSES) for r in results]
-        return coco.evaluate(targets, found, CLASSES, T_STAR, HEADLINE)
-
-    def count(kind: str) -> dict[str, int]:
-        return {
-            name: sum(f.kind == kind for r in results for f in r.failures) * (name == HEADLINE) for name in CLASSES
-        }
-
-    return RunSummary(
-        out="",
-        dataset=config.dataset,
-        params=("translate", "rotate", "mesh"),
-        detector=config.detector,
-        headline=HEADLINE,
-        t_star=T_STAR,
-        frames=len(results),
-        frames_without_vehicles=0,
-        frames_failed={},
-        objects=2 * len(results),
-        benign=scores("benign", "benign"),
-        rerendered=scores("benign", "rerendered"),
-        attacked_paper=scores("benign", "attacked"),
-        attacked_moved=scores("moved", "attacked"),
-        lost_objects=count("lost"),
-        phantoms=count("phantom"),
-        successes_paper=sum(r.success_paper for r in results),
-        successes_moved=sum(r.success_moved for r in results),
-        feasible_fraction=1.0,
-        queries=sum(r.queries for r in results),
         seconds=0.0,
     )
 

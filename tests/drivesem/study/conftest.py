@@ -9,14 +9,12 @@ import pytest
 
 from detectors.types import CLASSES
 from drivesem.config import Attack
-from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses
-from drivesem.pipeline import as_detections, as_targets
-from drivesem.results import BoxRecord, Coordinate, FrameResult, RunSummary
+from drivesem.results import BoxRecord, Coordinate, FrameResult
 from drivesem.study.arms import Arm
 from drivesem.study.running import ArmRun
+from tests.drivesem.counting import summary_of
 
-T_STAR = 0.5
 WIDTH_PX, HEIGHT_PX = 50.0, 30.0
 
 
@@ -62,36 +60,7 @@ def _frame(
 
 def _run(arm: Arm, results: Sequence[FrameResult]) -> ArmRun:
     judged = JudgedClasses(CLASSES, CLASSES)
-
-    def scores(labels: str, seen: str) -> coco.Scores:
-        targets = [as_targets(getattr(r, f"targets_{labels}"), CLASSES) for r in results]
-        found = [as_detections(getattr(r, f"detections_{seen}"), CLASSES) for r in results]
-        return coco.evaluate(targets, found, CLASSES, T_STAR, HEADLINE)
-
-    summary = RunSummary(
-        out="",
-        dataset="demo",
-        params=("rotate",),
-        detector="any",
-        headline=HEADLINE,
-        t_star=T_STAR,
-        frames=len(results),
-        frames_without_vehicles=0,
-        frames_failed={},
-        objects=2 * len(results),
-        benign=scores("benign", "benign"),
-        rerendered=scores("benign", "rerendered"),
-        attacked_paper=scores("benign", "attacked"),
-        attacked_moved=scores("moved", "attacked"),
-        lost_objects={},
-        phantoms={},
-        successes_paper=0,
-        successes_moved=0,
-        feasible_fraction=1.0,
-        queries=0,
-        seconds=0.0,
-    )
-    return ArmRun(arm, summary, tuple(results), judged)
+    return ArmRun(arm, summary_of(arm.config, results), tuple(results), judged)
 
 
 @pytest.fixture
