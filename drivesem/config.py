@@ -440,7 +440,7 @@ class Edit(Command):
     set: Repeated = ()
     """A change, as often as needed: 'objects[2].translate=0.5m,0m' (along the heading, to the left),
     'objects[2].rotate=10deg', 'objects[1].color=0.3,0,0,0,0', 'objects[all].rotate=2deg', weather=fog (or rain,
-    sunset, overcast, night), weather.rain=0.4, foliage.hue=0.5."""
+    sunset, overcast, twilight), weather.rain=0.4, foliage.hue=0.5."""
     remove: Repeated = ()
     """Rows of vehicles to take out, with their shadows; or all."""
     edits: str | None = None

@@ -39,7 +39,7 @@ WEATHERS: Mapping[str, Mapping[str, float]] = {
     "rain": {"rain": 0.8, "overcast": 0.6},
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
-    "night": {"time": 0.85},
+    "twilight": {"time": 1.0},
 }
 """Weather by name, as codes; those not named are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "remove")

@@ -29,8 +29,11 @@ _SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
 LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
-DARKENING = (2.0, 1.75, 1.25)
-"""Optical depth of red, green and blue at time code 1: night is blue and dark, not black."""
+TWILIGHT_DEPTH = (2.0, 1.75, 1.25)
+"""Optical depth of red, green and blue light at time code 1, as a camera shows the end of civil twilight: blue and
+dark, while what stands on the road can still be told apart without lamps."""
+DARKENING = tuple(depth / 2.2 for depth in TWILIGHT_DEPTH)
+"""The same of display values."""
 WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
 
@@ -46,7 +49,7 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 
 def shadow_softening(weather: Tensor) -> Tensor:
-    """The factor () by which overcast, fog, rain and night weaken cast shadows; 1 at code 0. weather (4,)."""
+    """The factor () by which overcast, fog, rain and twilight weaken cast shadows; 1 at code 0. weather (4,)."""
     fog, rain, time, overcast = weather.unbind(-1)
     return torch.exp(-(0.5 * fog + 0.4 * rain + 0.5 * time + 0.6 * overcast))
 
@@ -119,7 +122,7 @@ def apply_weather(
     image = image + 0.85 * overcast * (target - image)
     air = air + 0.85 * overcast * (0.9 * grey_air - air)
 
-    # Time of day: warm light at one half, then blue darkness.
+    # Time of day: warm light at one half, then blue twilight.
     gain = torch.expm1(-image.new_tensor(DARKENING) * time * time) + (
         image.new_tensor(WARMTH) * time * torch.exp(-3.5 * time * time)
     ) - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip

@@ -26,7 +26,7 @@ from drivesem.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
 from drivesem.synth.frames import Plan
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
-from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M
+from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, TWILIGHT_DEPTH, WARMTH
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
 from scene_ir.texture import apply_texture_code
@@ -107,16 +107,16 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
         return light
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
-    night = np.exp(-np.array([2.0, 1.75, 1.25]) * time * time)
-    warm = 1 + np.array([0.7, 0.12, -0.42]) * time * np.exp(-3.5 * time * time)
+    twilight = np.exp(-np.array(TWILIGHT_DEPTH) * time * time)
+    warm = 1 + np.array(WARMTH) * time * np.exp(-3.5 * time * time)
 
     def toward(value: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        return (value + cover * (target - value)) * night * warm
+        return (value + cover * (target - value)) * twilight * warm
 
     sun_lost = light.sun_colour * max(float(light.sun @ light.up), 0.0)
     return replace(
         light,
-        sun_colour=light.sun_colour * (1 - cover) * night * warm,
+        sun_colour=light.sun_colour * (1 - cover) * twilight * warm,
         zenith=toward(light.zenith, 0.8 * grey),
         horizon=toward(light.horizon, grey),
         ambient=toward(light.ambient, float(np.mean(light.ambient + 0.45 * sun_lost))),

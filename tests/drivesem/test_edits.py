@@ -106,7 +106,7 @@ def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
         ("objects[2].remove=yes", "remove: expected true or false, found 'yes'"),
         ("objects[-1].rotate=1deg", "objects: expected a number from 0, or all, found '-1'"),
         ("objects[two].rotate=1deg", "objects: expected a number from 0, or all, found 'two'"),
-        ("weather=snow", "weather: expected codes, or one of fog, rain, sunset, overcast, night, found 'snow'"),
+        ("weather=snow", "weather: expected codes, or one of fog, rain, sunset, overcast, twilight, found 'snow'"),
         ("weather.snow=1", "weather: snow: expected one of fog, rain, time, overcast"),
         ("weather.fog=2", r"weather.fog: expected a code in \[0, 1\], found 2.0"),
         ("foliage=autumn", "an unknown parameter"),
