@@ -21,12 +21,12 @@ from drivesem.config import Eval, UsageError
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.devices import check_device
 from drivesem.eval_outcome import Outcome, marked
-from drivesem.eval_report import percent
 from drivesem.evaluation import coco
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.judged import HEADLINE, JudgedClasses, t_star_of
 from drivesem.labels import Difficulty
 from drivesem.pipeline import to_uint8
+from drivesem.tables import percent
 from drivesem.training.targets import judged_targets, suited
 from scene_ir import files
 from scene_ir.errors import FormatError

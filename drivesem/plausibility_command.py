@@ -17,8 +17,8 @@ from rich.console import Console
 from drivesem.config import Plausibility as Config
 from drivesem.config import UsageError
 from drivesem.data.kitti import read_labels
-from drivesem.eval_report import Sheet
 from drivesem.plausibility import NAMES, UNUSUAL, Plausibility, plausibility
+from drivesem.tables import Sheet
 from drivesem.transfer.runs import Run, load_runs
 from scene_ir import files
 from scene_ir.errors import ShapeError

@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.progress import track
 
 from drivesem.config import Realism, UsageError
-from drivesem.eval_report import Sheet, publish
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.realism.comparison import PAIRS, FrameParts, Row, frame_parts, rows
 from drivesem.realism.measures import METRICS, load, missing, psnr_db
+from drivesem.tables import Sheet, publish
 from drivesem.transfer.runs import Run, load_runs
 from scene_ir import files
 

@@ -24,12 +24,12 @@ from drivesem.attack_command import Worker, attack_frames
 from drivesem.config import Attack, Retrain, UsageError
 from drivesem.data.registry import open_dataset
 from drivesem.devices import check_device
-from drivesem.eval_report import percent
 from drivesem.evaluation.coco import ClassScores
 from drivesem.judged import JudgedClasses
 from drivesem.labels import LabelMode
 from drivesem.pipeline import as_targets
 from drivesem.run_folder import attack_of, claim
+from drivesem.tables import percent
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore

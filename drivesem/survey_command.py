@@ -13,7 +13,6 @@ from typing import Any
 from rich.console import Console
 
 from drivesem.config import Survey, SurveyResults, UsageError
-from drivesem.eval_report import Sheet
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.realism.survey import (
     CHANGED,
@@ -27,6 +26,7 @@ from drivesem.realism.survey import (
     survey_name,
     write_key,
 )
+from drivesem.tables import Sheet
 from drivesem.transfer.runs import load_runs
 from scene_ir import files
 

@@ -17,12 +17,12 @@ from drivesem.aims import Aim
 from drivesem.budgets import budget_of
 from drivesem.config import Common, UsageError, Verify
 from drivesem.devices import check_device
-from drivesem.eval_report import Sheet
 from drivesem.judged import t_star_of
 from drivesem.pool import outcomes
 from drivesem.results import FrameResult
 from drivesem.run_folder import attack_of, detector_of
 from drivesem.space import parse_params
+from drivesem.tables import Sheet
 from drivesem.transfer.runs import MANIFEST, METRICS, Run, load_runs
 from drivesem.verify.differences import CHECKS, Difference, Tally
 from drivesem.verify.frame import BOX_PX, LABEL, LEVELS, SCORE, Checked, Given, check_frame

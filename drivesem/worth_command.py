@@ -17,7 +17,6 @@ from rich.console import Console
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
 from drivesem.config import Transfer, UsageError, Worth
-from drivesem.eval_report import Sheet, publish
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.judged import JudgedClasses, t_star_of
 from drivesem.pipeline import as_detections, as_targets
@@ -37,6 +36,7 @@ from drivesem.realism.worth import (
     worth_of,
 )
 from drivesem.results import BoxRecord
+from drivesem.tables import Sheet, publish
 from drivesem.training.retraining import WEIGHTS
 from drivesem.transfer.asking import DETECTIONS
 from drivesem.transfer.looking import Memory, Order, look

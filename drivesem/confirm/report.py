@@ -14,11 +14,11 @@ from rich.console import Console
 from detectors.types import CLASSES
 from drivesem.bench.found import wilson
 from drivesem.confirm.results import Confirmed
-from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation import coco
 from drivesem.judged import HEADLINE, JudgedClasses
 from drivesem.pipeline import as_detections, as_targets
 from drivesem.results import FrameResult
+from drivesem.tables import Sheet, percent
 from scene_ir import files
 
 SURVIVE, SAME, LOST, PHANTOMS, NEW = (

@@ -14,12 +14,12 @@ import numpy as np
 from rich import box
 from rich.console import Console
 
-from drivesem.eval_report import Sheet
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.resampling import Figure, Interval, Recalled, intervals
 from drivesem.explain.players import Size
 from drivesem.explain.plots import write_means
 from drivesem.explain.results import Contribution, Explanation, Outcome
+from drivesem.tables import Sheet
 from scene_ir import files
 
 _NEEDED = "needs"

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from drivesem.config import Study
 from drivesem.confirm.report import Report as Confirmed
-from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Difference, Interval
 from drivesem.judged import HEADLINE
 from drivesem.study.arms import PAPER_BENIGN, PLACEBO, RANDOM
@@ -21,6 +20,7 @@ from drivesem.study.labels import OVERLAPS, LabelSets
 from drivesem.study.rows import FIGURES, MODES, Row, feasible_fraction
 from drivesem.study.running import Ran
 from drivesem.study.success import Curve
+from drivesem.tables import Sheet, percent
 from drivesem.transfer.report import bounded
 from scene_ir import files
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drivesem.eval_plots import COLOURS, STYLE
-from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Interval
 from drivesem.judged import HEADLINE
 from drivesem.study.lessons import BENIGN
@@ -15,6 +14,7 @@ from drivesem.study.plots import DPI, bars, place_of
 from drivesem.study.report import Told
 from drivesem.study.retrain import Judged, Taught
 from drivesem.study.rows import FIGURES, MODES, feasible_fraction
+from drivesem.tables import Sheet, percent
 from drivesem.transfer.matrix import AP50, BROKEN, LOST
 from drivesem.transfer.report import bounded
 from scene_ir import files

@@ -15,13 +15,13 @@ from detectors.squeezedet import SqueezeDet
 from detectors.yolov3.yolov3 import YoloV3
 from drivesem.attack_command import Worker
 from drivesem.config import DEFAULT_COMBO, Study, Transfer
-from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import DRAWS, Interval, differences
 from drivesem.judged import HEADLINE
 from drivesem.study.arms import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER, Arm
 from drivesem.study.report import Told
 from drivesem.study.rows import MODES, feasible_fraction
 from drivesem.study.running import ARMS, Ran, run_arms
+from drivesem.tables import Sheet, percent
 from drivesem.transfer.asking import Asked, detector_names, detectors_of, rows_of
 from drivesem.transfer.matrix import AP50, BROKEN, FRAMES, LOST, TRANSFER, Row
 from drivesem.transfer.report import bounded

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from drivesem.eval_report import Sheet, percent
 from drivesem.evaluation.resampling import Interval
 from drivesem.judged import HEADLINE
+from drivesem.tables import Sheet, percent
 from drivesem.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, Row
 from drivesem.transfer.plot import write_heatmap
 from scene_ir import files

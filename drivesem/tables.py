@@ -1,0 +1,59 @@
+"""Tables for people, on a terminal and in Markdown."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from scene_ir import files
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """One table: its title, its columns, and rows of text."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def markdown(self, words: Collection[str]) -> list[str]:
+        """Lines: a heading, and the table. words: columns of words; the others hold numbers."""
+        sides = ("---" if name in words else "---:" for name in self.columns)
+        lines = (self.columns, sides, *self.rows)
+        cells = [[cell.replace("|", "\\|").replace("\n", ", ") for cell in line] for line in lines]
+        return [f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in cells)]
+
+    def table(self, words: Collection[str], unbroken: Collection[str] = (), **looks: Any) -> Table:
+        """The same for a terminal. unbroken: columns that are never wrapped; looks: of rich's Table."""
+        table = Table(title=self.title, title_justify="left", **looks)
+        for name in self.columns:
+            side = "left" if name in words else "right"
+            table.add_column(name, justify=side, no_wrap=name in unbroken, overflow="fold")
+        for row in self.rows:
+            table.add_row(*row)
+        return table
+
+
+def publish(
+    sheet: Sheet, path: Path, heading: str, words: Collection[str], note: str, data: Mapping[str, Any] | None
+) -> None:
+    """One table with a note: as a Markdown file, and on standard output; there as JSON where `data` is given."""
+    files.write_text(path, "\n".join([f"# {heading}", "", *sheet.markdown(words), "", note, ""]))
+    if data is not None:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+        return
+    people = Console()
+    people.print(sheet.table(words))
+    people.print(note, soft_wrap=True)
+
+
+def percent(value: float | None) -> str:
+    """A fraction as a percentage; a dash where there is none (COCO's -1 too)."""
+    return "-" if value is None or value < 0 else f"{100 * value:.2f}"
