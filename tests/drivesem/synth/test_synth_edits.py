@@ -11,6 +11,7 @@ import torch
 from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, read_edits
 from drivesem.synth.frames import SynthSettings, plan_frame, render_frame
 from drivesem.synth.layout import LayoutSettings, clearance, footprint
+from scene_ir.environment import apply_weather, sky_colour
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
 
@@ -108,6 +109,19 @@ def test_weather_and_foliage_codes_change_the_whole_street(plan):
     leaf = plain.environment.foliage_map.numpy() > 0.9
     redder = autumn.image[leaf].astype(float) - plain.image[leaf].astype(float)
     assert redder[:, 0].mean() > redder[:, 1].mean() + 3
+
+
+def test_twilight_is_as_dark_as_the_compositors(plan):
+    weather = (0.0, 0.0, 1.0, 0.0)
+    plain, drawn = render_frame(plan), render_frame(apply_edit(plan, FrameEdit(weather=weather)))
+    assert plain is not None
+    assert drawn is not None
+    picture = torch.from_numpy(plain.image).permute(2, 0, 1).double() / 255
+    inverse = torch.from_numpy(1.0 / np.maximum(plain.depth_m, 1.0)).double()
+    environment = replace(plain.environment, weather=torch.tensor(weather, dtype=torch.float64))
+    composed = apply_weather(picture, inverse, environment, sky_colour(picture, environment.sky.double()))
+    expected = drawn.image.reshape(-1, 3).mean(axis=0) / 255
+    assert composed.flatten(1).mean(dim=1).numpy() == pytest.approx(expected, rel=0.25)
 
 
 def test_bare_trees_have_fewer_leaves_and_dense_ones_no_fewer(plan):
