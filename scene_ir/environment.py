@@ -29,11 +29,9 @@ _SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
 LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
-TWILIGHT_DEPTH = (2.0, 1.75, 1.25)
-"""Optical depth of red, green and blue light at time code 1, as a camera shows the end of civil twilight: blue and
-dark, while what stands on the road can still be told apart without lamps."""
-DARKENING = tuple(depth / 2.2 for depth in TWILIGHT_DEPTH)
-"""The same of display values."""
+DARKENING = (2.0 / 2.2, 1.75 / 2.2, 1.25 / 2.2)
+"""Optical depth of red, green and blue at time code 1, the light's over the display's exponent: the end of civil
+twilight, blue and dark, while what stands on the road can still be told apart without lamps."""
 WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
 
@@ -52,6 +50,15 @@ def shadow_softening(weather: Tensor) -> Tensor:
     """The factor () by which overcast, fog, rain and twilight weaken cast shadows; 1 at code 0. weather (4,)."""
     fog, rain, time, overcast = weather.unbind(-1)
     return torch.exp(-(0.5 * fog + 0.4 * rain + 0.5 * time + 0.6 * overcast))
+
+
+def time_gain(time: Tensor) -> Tensor:
+    """What the time of day, a code () in [0, 1], adds to a display value of 1, (3,) RGB: warm light at one half,
+    then blue twilight; 0 at code 0."""
+    square = time * time
+    darkening, warmth = time.new_tensor(DARKENING), time.new_tensor(WARMTH)
+    warm = warmth * time * torch.exp(-3.5 * square) - 0.25 * time * torch.exp(-2.0 * square)
+    return torch.expm1(-darkening * square) + warm
 
 
 def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference") -> Tensor:
@@ -122,10 +129,7 @@ def apply_weather(
     image = image + 0.85 * overcast * (target - image)
     air = air + 0.85 * overcast * (0.9 * grey_air - air)
 
-    # Time of day: warm light at one half, then blue twilight.
-    gain = torch.expm1(-image.new_tensor(DARKENING) * time * time) + (
-        image.new_tensor(WARMTH) * time * torch.exp(-3.5 * time * time)
-    ) - 0.25 * time * torch.exp(-2.0 * time * time)  # fmt: skip
+    gain = time_gain(time)
     image = image + gain[:, None, None] * image
     air = air + gain * air
 

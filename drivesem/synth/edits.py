@@ -26,12 +26,15 @@ from drivesem.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
 from drivesem.synth.frames import Plan
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
-from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, TWILIGHT_DEPTH, WARMTH
+from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, time_gain
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
 from scene_ir.texture import apply_texture_code
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
+
+_GAMMA = 2.2
+"""Display values to linear light."""
 
 
 def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
@@ -92,11 +95,11 @@ def _painted(paint: tuple[float, float, float], code: tuple[float, ...]) -> tupl
     """Linear albedo of a paint under a texture code, as the compositor changes it in the picture."""
     if not any(code):
         return paint
-    shown = torch.tensor([paint], dtype=torch.float64).clamp(0, 1) ** (1 / 2.2)
+    shown = torch.tensor([paint], dtype=torch.float64).clamp(0, 1) ** (1 / _GAMMA)
     one = torch.ones(1, dtype=torch.float64)
     row = torch.tensor([code], dtype=torch.float64)
     changed = apply_texture_code(shown, one, row, one, 0.5 * one, 50.0 * one)[0]
-    red, green, blue = (changed.clamp(0.0, 1.0) ** 2.2).tolist()
+    red, green, blue = (changed.clamp(0.0, 1.0) ** _GAMMA).tolist()
     return red, green, blue
 
 
@@ -107,16 +110,15 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
         return light
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
-    twilight = np.exp(-np.array(TWILIGHT_DEPTH) * time * time)
-    warm = 1 + np.array(WARMTH) * time * np.exp(-3.5 * time * time)
+    daylight = (1 + time_gain(torch.tensor(time, dtype=torch.float64)).numpy()) ** _GAMMA
 
     def toward(value: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        return (value + cover * (target - value)) * twilight * warm
+        return (value + cover * (target - value)) * daylight
 
     sun_lost = light.sun_colour * max(float(light.sun @ light.up), 0.0)
     return replace(
         light,
-        sun_colour=light.sun_colour * (1 - cover) * twilight * warm,
+        sun_colour=light.sun_colour * (1 - cover) * daylight,
         zenith=toward(light.zenith, 0.8 * grey),
         horizon=toward(light.horizon, grey),
         ambient=toward(light.ambient, float(np.mean(light.ambient + 0.45 * sun_lost))),
