@@ -261,7 +261,8 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         # What stands behind the vehicles no classes tell.
         behind = segment.segment(background, ground, camera, settings.segmenter)
         seen = segment.of_frame(frame, behind).within((background != image).any(-1), behind)
-    environment, depth = _environment(seen, ground, sun, horizon, camera, vehicles)
+    flat = maps.with_footprints(seen.ground, labels, _posed_rows(labels), ground, camera)
+    environment, depth = _environment(seen, flat, ground, sun, horizon, camera, vehicles)
     if frame.depth is not None:
         # What stands behind the vehicles was never measured: there the estimate stays.
         depth = torch.where(torch.from_numpy(vehicles), depth, frame.depth.float())
@@ -622,14 +623,15 @@ def _not_copied(surroundings: _Surroundings, unknown: Mask) -> Mask:
 
 def _environment(
     seen: segment.Segmentation,
+    flat: Array,
     ground: torch.Tensor,
     sun: torch.Tensor,
     horizon: float,
     camera: Camera,
     vehicles: Mask,
 ) -> tuple[Environment, torch.Tensor]:
-    """Maps and depth of the background."""
-    depth = maps.depth_map(maps.plane_depth(ground, camera), seen.ground, seen.sky, horizon)
+    """Maps and depth of the background. flat (H, W): where there is ground."""
+    depth = maps.depth_map(maps.plane_depth(ground, camera), flat, seen.sky, horizon)
     # Weather changes the finished picture: a vehicle before the sky is none. Leaves change before it is drawn.
     sky = np.where(vehicles, 0, seen.sky)
     environment = Environment(

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scene_ir.geometry import box_corners, to_clip
 from scene_ir.types import Camera, Labels
 
 Array = NDArray[np.float32]
@@ -17,6 +18,12 @@ FAR = 80.0
 """m, where upright surfaces without a visible foot are put."""
 _SEAMLESS = 0.02
 """Of the image's width: over how much walls of other depths pass into each other."""
+_BESIDE = 0.03
+"""Of the image's width: how far the ground on which something stands goes on to its sides; more than walls of
+other depths need to pass into each other."""
+_NEAR_M = 0.5
+"""Boxes that come nearer to the camera say nothing."""
+_FAR_OUT_PX = 10_000
 DEFAULT_SUN = (-0.35, -0.85, -0.39)
 """Towards the sun where nothing is known: high, a little to the left and behind the camera."""
 
@@ -79,6 +86,23 @@ def horizon_row(ground: torch.Tensor, camera: Camera) -> float:
     inverse = np.linalg.inv(camera.intrinsics.double().numpy())
     across = ground[:3].double().numpy() @ inverse
     return float(-(across[0] * (camera.width - 1) / 2 + across[2]) / across[1])
+
+
+def with_footprints(flat: Array, labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
+    """`flat` (H, W) in [0, 1], and 1 where something labelled stands, and a little to its sides: whatever the
+    pixels look like, there is ground, and what is seen around it stands no nearer.
+    """
+    corners = box_corners(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows])[:, :4].double()
+    normal = ground.double()
+    y = -(corners[..., 0] * normal[0] + corners[..., 2] * normal[2] + normal[3]) / normal[1]
+    clip = to_clip(torch.stack([corners[..., 0], y, corners[..., 2]], dim=-1), camera.matrix.double())
+    in_view = (clip[..., 2] > _NEAR_M).all(dim=1)
+    stands = np.zeros(flat.shape, np.uint8)
+    for polygon in (clip[in_view, :, :2] / clip[in_view, :, 2:]).numpy():
+        # Far outside the picture pixels no longer fit OpenCV's integers.
+        cv2.fillConvexPoly(stands, np.rint(polygon.clip(-_FAR_OUT_PX, _FAR_OUT_PX)).astype(np.int32), 1)
+    beside = 2 * round(_BESIDE * flat.shape[1]) + 1
+    return np.where(cv2.dilate(stands, np.ones((1, beside), np.uint8)) > 0, np.float32(1), flat)
 
 
 def depth_map(ground_depth: Array, flat: Array, sky: Array, horizon: float) -> Array:

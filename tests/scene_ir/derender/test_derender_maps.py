@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -52,6 +54,23 @@ def test_depth_is_ground_below_a_wall_above_and_infinite_in_the_sky():
     assert depth[60, 200] == pytest.approx(ground[120, 200], rel=0.05)
     assert np.isinf(depth[:40]).all()
     assert depth[np.isfinite(depth)].max() <= maps.FAR
+
+
+def test_where_a_car_stands_there_is_ground_and_no_wall_before_it():
+    ground = maps.plane_depth(LEVEL, CAMERA)
+    road = np.zeros((200, 480), np.float32)
+    road[150:] = 1  # rails or a verge that nobody took for ground
+    labels = replace(
+        labels_at([[0.0, 1.65, 20.0], [0.0, 1.65, 0.2]]), size_lhw=torch.tensor([[4.0, 1.5, 1.8]] * 2)
+    )
+    flat = maps.with_footprints(road, labels, [0, 1], LEVEL, CAMERA)
+    nothing = np.zeros_like(road)
+    before, after = (maps.depth_map(ground, where, nothing, 88.0) for where in (road, flat))
+    car = slice(240 - 17, 240 + 17)
+    assert before[100, car].max() < 11
+    assert after[100, car].min() > 20
+    assert after[100, :100] == pytest.approx(before[100, :100], rel=0.01)
+    assert set(np.unique(flat)) == {0.0, 1.0}
 
 
 def test_sun_is_a_unit_vector_that_points_up():
