@@ -19,11 +19,12 @@ FAR = 80.0
 _SEAMLESS = 0.02
 """Of the image's width: over how much walls of other depths pass into each other."""
 _BESIDE = 0.03
-"""Of the image's width: how far the ground on which something stands goes on to its sides; more than walls of
+"""Of the image's width: how far the ground on which something stands goes on to its sides; most of what walls of
 other depths need to pass into each other."""
 _NEAR_M = 0.5
 """Boxes that come nearer to the camera say nothing."""
 _FAR_OUT_PX = 10_000
+"""Far outside of any picture, and within OpenCV's integers."""
 DEFAULT_SUN = (-0.35, -0.85, -0.39)
 """Towards the sun where nothing is known: high, a little to the left and behind the camera."""
 
@@ -99,7 +100,6 @@ def with_footprints(flat: Array, labels: Labels, rows: list[int], ground: torch.
     in_view = (clip[..., 2] > _NEAR_M).all(dim=1)
     stands = np.zeros(flat.shape, np.uint8)
     for polygon in (clip[in_view, :, :2] / clip[in_view, :, 2:]).numpy():
-        # Far outside the picture pixels no longer fit OpenCV's integers.
         cv2.fillConvexPoly(stands, np.rint(polygon.clip(-_FAR_OUT_PX, _FAR_OUT_PX)).astype(np.int32), 1)
     beside = 2 * round(_BESIDE * flat.shape[1]) + 1
     return np.where(cv2.dilate(stands, np.ones((1, beside), np.uint8)) > 0, np.float32(1), flat)

@@ -118,6 +118,19 @@ def test_a_given_depth_is_used_but_for_the_vehicles_own(street):
     assert (scene.depth == 33.0).float().mean() > 0.6
 
 
+def test_no_wall_stands_before_a_car_where_the_ground_was_not_recognised(street):
+    shares = np.zeros((3, *street.mask.shape), np.float32)
+    shares[0, :45], shares[1, 45:165], shares[2, 165:] = 1, 1, 1  # road up to 8 m only; the car stands at 11 m
+
+    def segmenter(_image: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        return shares, ("sky", "tree", "road")
+
+    depth = derender(street.frame, DerenderSettings(fit=False, segmenter=segmenter)).depth
+    left, top, right, _ = (int(v) for v in street.frame.labels.boxes_xyxy[0])
+    assert float(depth[top + 5, left:right].min()) > 10.5
+    assert float(depth[top + 5, :40].max()) < 10
+
+
 def test_no_labels_is_an_error(street):
     with pytest.raises(ShapeError, match="labels"):
         derender(replace(street.frame, labels=None))
