@@ -41,6 +41,7 @@ from drivesem.config import (
     validate,
     yaml_arguments,
 )
+from drivesem.folder_lock import let_go
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
 _EXIT_BAD_INPUT = 2
@@ -99,7 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
-        return _run(config)
+        with let_go():
+            return _run(config)
     except KeyboardInterrupt:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
         return _EXIT_INTERRUPTED

@@ -12,6 +12,7 @@ import yaml
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from drivesem.config import Attack, Common, UsageError, to_yaml
+from drivesem.folder_lock import LOCK, hold
 from drivesem.judged import JudgedClasses
 from scene_ir import files
 
@@ -24,20 +25,22 @@ PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
 def claim(
     out: Path, config: Common, clear: Callable[[Path], None], presentation: Collection[str] = PRESENTATION
 ) -> None:
-    """Make `out` this run's folder. clear: removes what an earlier run wrote, for --no-resume.
+    """Make `out` this run's folder, and hold it. clear: removes what an earlier run wrote, for --no-resume.
 
-    Raises UsageError where `out` is a file, holds other files, or a run whose settings were others.
+    Raises UsageError where `out` is a file, holds other files, a run whose settings were others, or what another
+    process is writing.
     """
     path = out / CONFIG
     if out.exists() and not out.is_dir():
         raise UsageError("--out", "a folder", f"the file {out}")
+    if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
+        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
+    hold(out)
     if path.exists():
         if config.resume:
             _check_settings(path, config, presentation)
         else:
             clear(out)
-    elif out.is_dir() and any(out.iterdir()):
-        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     files.write_text(path, to_yaml(config))
 
 

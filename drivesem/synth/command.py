@@ -18,6 +18,7 @@ from rich.progress import (
 )
 
 from drivesem.config import Synth, UsageError, processes
+from drivesem.folder_lock import hold
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, in_processes, synthesise
 
@@ -59,6 +60,7 @@ def run(config: Synth) -> int:
     start = time.perf_counter()
     order = order_of(config)
     total = len(order.places())
+    hold(order.out)
     columns = (
         *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
         *(TimeElapsedColumn(), TimeRemainingColumn()),
