@@ -34,6 +34,9 @@ _NEAR_M = 0.1
 _OCCLUSION_BOUNDS = np.array([0.0, 0.1, 0.5, 1.0])
 """Hidden share of a car at which KITTI's levels 0 (fully visible), 1 (partly), 2 (largely) begin; KITTI names no
 numbers, these are ours. Level 3 (unknown) never changes."""
+_SHOWED, _SHOWS = 0.25, 0.1
+"""Of a car that showed at least the first share of itself, at least the second must still show. Below, a car that
+is nearly hidden from the start would hold back all others by a few pixels."""
 _OPAQUE = 0.5
 """Opacity from which a pixel belongs to an object, as in `Render.object_id`."""
 
@@ -54,7 +57,8 @@ class MovedLabels:
     boxes_xyxy (N, 4) px; category (N,) int64; truncation (N,) in [0, 1]; occlusion (N,) int64, 0 to 3;
     ignore (N,) bool: too hard in the benign scene, or now. became_ignored (N,) bool: only now.
     became_counted (N,) bool: too hard in the benign scene, no longer now (still ignored, so that benign and
-    attacked figures are over the same objects). regions_xyxy (K, 4) px: no detection is judged there.
+    attacked figures are over the same objects). out_of_sight (N,) bool: showed in the benign scene, and is behind
+    others now. regions_xyxy (K, 4) px: no detection is judged there.
     """
 
     mode: LabelMode
@@ -65,6 +69,7 @@ class MovedLabels:
     ignore: Tensor
     became_ignored: Tensor
     became_counted: Tensor
+    out_of_sight: Tensor
     regions_xyxy: Tensor
 
     @property
@@ -117,6 +122,7 @@ class Labeller:
             ignore=ignore,
             became_ignored=torch.zeros_like(ignore),
             became_counted=torch.zeros_like(ignore),
+            out_of_sight=torch.zeros_like(ignore),
             regions_xyxy=base.ignore.detach(),
         )
 
@@ -136,10 +142,12 @@ class Labeller:
         truncation = np.minimum(np.maximum(self._truncation + change, 0), 1)
         truncation = np.where(change == 0, self._truncation, truncation)
         occlusion, gone = self._occlusion, np.zeros_like(self._ignore)
+        out_of_sight = gone
         if self._hidden is not None and render is not None:
             hidden = _hidden_shares(render)
             occlusion = _new_occlusion(self._occlusion, self._hidden, hidden)
             gone = (hidden >= 1) & (self._hidden < 1)
+            out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS)
         hard = self._too_hard(boxes, truncation, occlusion) | gone
         device = self._paper.boxes_xyxy.device
         return MovedLabels(
@@ -151,6 +159,7 @@ class Labeller:
             ignore=torch.from_numpy(self._ignore | hard).to(device),
             became_ignored=torch.from_numpy(hard & ~self._ignore).to(device),
             became_counted=torch.from_numpy(self._ignore & ~hard).to(device),
+            out_of_sight=torch.from_numpy(out_of_sight).to(device),
             regions_xyxy=self._paper.regions_xyxy,
         )
 

@@ -151,12 +151,15 @@ class Objective:
 
     def _score(self, loss: float, moved: MovedLabels, detections: Detections) -> Score:
         failed = self._failures(moved, detections)
+        # The projection takes cars for boxes, behind which another may lie from the start; a render knows.
+        hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(
             loss=loss,
             lost=len(failed.lost),
             phantoms=len(failed.phantoms),
-            success=failed.success,
-            success_paper=self._failures(self._labeller.paper(), detections).success,
+            success=failed.success and not hidden,
+            success_paper=self._failures(self._labeller.paper(), detections).success and not hidden,
+            violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
     def problem(self, feasible: FeasibleSet) -> Problem:

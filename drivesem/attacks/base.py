@@ -28,7 +28,8 @@ _TINY = 1e-30
 class Score:
     """What the detector makes of one theta. loss: the attack's objective, to be raised. lost: objects found in the
     benign re-render and missed now; phantoms: new false positives; success: any of the two, all under `moved`
-    labels. success_paper: the same under `paper` labels.
+    labels. success_paper: the same under `paper` labels. violations: what the render shows not to be feasible,
+    such as `objects[3]: visibility`; nothing is a success then.
     """
 
     loss: float
@@ -36,6 +37,7 @@ class Score:
     phantoms: int
     success: bool
     success_paper: bool
+    violations: tuple[str, ...] = ()
 
 
 def _unseen(theta: Tensor) -> Score | None:
@@ -153,7 +155,7 @@ class Attack(ABC):
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:
         """Run from theta0 (D,). Of theta0 and the proposals, projected and scored anew, the one that ranks highest
-        (`_rank`) wins; of equals the first.
+        (`_rank`) wins; of equals the first. What its render shows not to be feasible ranks below all others.
 
         Scored are all that no gradient pass saw, and of the others the LOOKED_AT that rank highest by what it saw:
         failures, and not the loss alone, which says only roughly what is lost. A score takes no gradient and
@@ -168,8 +170,9 @@ class Attack(ABC):
                 projected.append(feasible)
         projected = self._promising(problem, projected)
         scores = [problem.score(p.theta) for p in projected]
-        ranks = [self._rank(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
+        ranks = [self._order(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
         best = max(range(len(ranks)), key=lambda i: (*ranks[i], -i))
+        violations = [name for score in scores for name in score.violations]
         score = scores[best]
         trace = [loss for loss in proposals.losses if loss is not None]
         return AttackResult(
@@ -181,8 +184,13 @@ class Attack(ABC):
             success_moved=score.success,
             queries=proposals.queries,
             seed=seed,
-            active_constraints=tuple(dict.fromkeys((*proposals.active_constraints, *projected[best].active))),
+            active_constraints=tuple(
+                dict.fromkeys((*proposals.active_constraints, *projected[best].active, *violations))
+            ),
         )
+
+    def _order(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
+        return (float(not score.violations), *self._rank(problem, theta, score))
 
     def _promising(self, problem: Problem, projected: list[Projected]) -> list[Projected]:
         """What is worth a render, in its order; the first, where the attack began, always is."""
@@ -190,6 +198,6 @@ class Attack(ABC):
         for i, candidate in enumerate(projected[1:], start=1):
             preview = problem.preview(candidate.theta)
             if preview is not None:
-                seen[i] = self._rank(problem, candidate.theta, preview)
+                seen[i] = self._order(problem, candidate.theta, preview)
         best = sorted(seen, key=lambda i: (seen[i], -i), reverse=True)[:LOOKED_AT]
         return [candidate for i, candidate in enumerate(projected) if i not in seen or i in best]

@@ -139,6 +139,17 @@ def test_a_car_that_vanishes_is_ignored(street):
     assert labeller.moved(scene, _two_cars(scene, 20)).became_ignored.tolist() == [False, True]
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "out_of_sight"),
+    [(0, 18, False), (0, 19, True), (15, 19, True), (15, 18, False), (16, 20, False), (19, 20, False)],
+)
+def test_a_car_that_showed_may_not_go_out_of_sight(street, before: int, after: int, out_of_sight: bool):
+    scene = street(positions_xz=((0.0, 8.0), (2.0, 12.0)))
+    labeller = Labeller(scene, _two_cars(scene, before), EASY)  # of the car's 20 columns so many are hidden
+    assert labeller.moved(scene, _two_cars(scene, after)).out_of_sight.tolist() == [False, out_of_sight]
+    assert not labeller.paper().out_of_sight.any()
+
+
 def test_difficulty_and_regions(street):
     scene = street(positions_xz=((0.0, 8.0), (0.0, 70.0), (3.0, 9.0), (-3.0, 9.0)))
     scene = scene.with_objects(occlusion=torch.tensor([0, 0, 2, 0]), truncation=torch.tensor([0.0, 0.0, 0.0, 0.4]))

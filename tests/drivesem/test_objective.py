@@ -186,6 +186,20 @@ def test_a_detector_without_gradient_is_judged_by_its_detections(street):
     assert stayed.loss > objective.benign.loss
 
 
+def test_nothing_is_a_success_while_a_car_is_out_of_sight(street):
+    scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
+    compositor = Compositor(scene, RenderSettings(backend="reference"))
+    objective = Objective(compositor, ParameterSpace(scene, ("translate",)), Spotter(scene.objects.box2d))
+    beside = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
+    behind = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.25]))
+    assert beside.success
+    assert beside.violations == ()
+    assert behind.violations == ("objects[1]: visibility",)
+    assert behind.lost > 0
+    assert not behind.success
+    assert not behind.success_paper
+
+
 def test_a_threshold_of_choice(street):
     scene = street(positions_xz=NEAR)
     objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness", t_star=0.9)

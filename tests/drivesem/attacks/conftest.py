@@ -21,11 +21,14 @@ SLOPE = torch.tensor([1.0, 0.2, 0.3, -0.3, 0.1, 2.0])
 
 class Slope:
     """Loss SLOPE . theta / STEP; feasible is the box, and a sum of the first two coordinates of at most `fence`;
-    something is lost where the loss is above `need` and all groups named in `together` are moved.
+    something is lost where the loss is above `need` and all groups named in `together` are moved. Beyond a loss of
+    `sight` the render shows what may not be.
     """
 
-    def __init__(self, need: float = 6.0, fence: float = 10.0, together: tuple[str, ...] = ()) -> None:
-        self.need, self.fence, self.together = need, fence, together
+    def __init__(
+        self, need: float = 6.0, fence: float = 10.0, together: tuple[str, ...] = (), sight: float = 1e6
+    ) -> None:
+        self.need, self.fence, self.together, self.sight = need, fence, together, sight
         self.gradients: list[Tensor] = []
         self.scored: list[Tensor] = []
 
@@ -48,7 +51,8 @@ class Slope:
         self.scored.append(theta.clone())
         moved = {group.name for group in self.problem.moved(theta)}
         lost = int(float(self.loss(theta)) > self.need and moved.issuperset(self.together))
-        return Score(float(self.loss(theta)), lost, 0, bool(lost), False)
+        violations = ("objects[0]: visibility",) if float(self.loss(theta)) > self.sight else ()
+        return Score(float(self.loss(theta)), lost, 0, bool(lost) and not violations, False, violations)
 
     @property
     def problem(self) -> Problem:
