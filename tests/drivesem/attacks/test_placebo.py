@@ -1,5 +1,7 @@
 """The placebo: as large as another change, in a direction of its own, and never chosen against doing nothing."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -58,6 +60,31 @@ def test_what_is_not_feasible_is_projected_and_told() -> None:
     result = Placebo(LIKE)(problem(limit=0.2), START)
     assert float(result.theta.abs().max()) == pytest.approx(0.2)
     assert result.active_constraints == ("limit",)
+
+
+def test_an_edit_that_hides_a_car_is_drawn_again() -> None:
+    seen = []
+
+    def score(theta: torch.Tensor) -> Score:
+        hides = bool(theta[0] != 0) and len(seen) < 2
+        seen.append(theta)
+        return Score(0.0, 0, 0, False, False, ("objects[0]: visibility",) if hides else ())
+
+    result = Placebo(LIKE)(replace(problem(), score=score), START)
+    assert result.queries == 3
+    assert torch.equal(result.theta, seen[2])
+    assert not torch.equal(result.theta, seen[0])
+    assert sorted(result.theta.abs().tolist()) == pytest.approx(sorted(map(abs, LIKE)))
+
+
+def test_where_every_edit_hides_a_car_nothing_is_changed() -> None:
+    hidden = Score(0.0, 0, 0, False, False, ("objects[0]: visibility",))
+    plain = Score(0.0, 0, 0, False, False)
+    world = replace(problem(), score=lambda theta: hidden if bool(theta.any()) else plain)
+    result = Placebo(LIKE)(world, START)
+    assert not bool(result.theta.any())
+    assert result.queries == 8
+    assert result.active_constraints == ("objects[0]: visibility",)
 
 
 def test_another_scene_s_change_is_refused() -> None:
