@@ -39,7 +39,21 @@ def outcomes(
     """
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     threads = max((os.cpu_count() or 1) // processes(config), 1)
+    before = torch.get_num_threads()
     torch.set_num_threads(threads)
+    try:
+        yield from _outcomes(work, build, jobs, config, threads)
+    finally:
+        torch.set_num_threads(before)  # what follows, such as training, is alone again
+
+
+def _outcomes(
+    work: Callable[[J], R],
+    build: Callable[[], Callable[[J], R]],
+    jobs: Sequence[J],
+    config: Common,
+    threads: int,
+) -> Iterator[tuple[J, Callable[[], R]]]:
     count = min(processes(config), len(jobs))
     if count <= 1:
         here = partial(_forgiving, work) if config.keep_going else work

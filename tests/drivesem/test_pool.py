@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 from drivesem.config import Common, UsageError
 from drivesem.pool import outcomes
@@ -64,6 +65,19 @@ def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> Non
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
     assert str(again) == str(error) == "file:3: expected a number, found [1, 2]"
+
+
+@pytest.mark.parametrize("jobs", [[], [1], [1, 2]])
+def test_threads_are_shared_among_processes_only_while_they_work(jobs: list[int]) -> None:
+    before, shared = torch.get_num_threads(), max((os.cpu_count() or 1) // 2, 1)
+    try:
+        torch.set_num_threads(shared + 1)
+        for _, outcome in outcomes(square, partial(build, 0), jobs, Common(workers=2)):
+            outcome()
+            assert torch.get_num_threads() == shared
+        assert torch.get_num_threads() == shared + 1
+    finally:
+        torch.set_num_threads(before)
 
 
 def stumble(job: int) -> int:
