@@ -19,6 +19,7 @@ from drivesem.config import DATASETS, DEMO, Derender, Edit, Render
 from drivesem.data.registry import DATASETS as READERS
 from drivesem.data.registry import open_dataset
 from drivesem.edits import read_frame_edit
+from drivesem.folder_lock import LOCK
 from drivesem.scene_sheet import GAIN, PANEL_PX, scene_sheet
 from scene_ir import files
 from scene_ir.derender.silhouette import extent, placed, silhouettes
@@ -120,7 +121,7 @@ def test_derender_refuses(
 
 
 def test_a_folder_a_frame(taken: Path) -> None:
-    assert sorted(p.name for p in taken.iterdir()) == ["config.yaml", "demo-000", "demo-001"]
+    assert sorted(p.name for p in taken.iterdir()) == [LOCK, "config.yaml", "demo-000", "demo-001"]
     found = {p.name for p in (taken / "demo-000").iterdir()}
     assert found == {"scene.json", "arrays.npz", "photograph.png", "background.png", "meshes", "sheet.jpg"}
     assert load_scene(taken / "demo-000").provenance["frame"] == "demo-000"
