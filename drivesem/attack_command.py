@@ -48,8 +48,8 @@ from drivesem.sources import NoVehicleError, SceneSource, open_source
 from drivesem.space import Parameter, combo, parse_params
 from drivesem.tally import tally
 from scene_ir import files
-from scene_ir.compositor import RenderSettings
 from scene_ir.errors import RangeError, SceneError, ShapeError
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR
 
 _PACKAGES = (

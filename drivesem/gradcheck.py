@@ -47,10 +47,11 @@ from drivesem.pool import outcomes
 from drivesem.sources import SceneSource, open_source
 from drivesem.space import COMBOS, Parameter, ParameterSpace
 from scene_ir import files
-from scene_ir.compositor import Compositor, RenderSettings, scene_to
 from scene_ir.errors import RangeError, SceneError
 from scene_ir.raster.verbs import Backend
-from scene_ir.types import SceneIR
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import SceneIR, scene_to
 
 Array = NDArray[np.float64]
 

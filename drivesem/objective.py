@@ -19,8 +19,8 @@ from drivesem.feasible import FeasibleSet
 from drivesem.judged import JudgedClasses, t_star_of
 from drivesem.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.space import ParameterSpace
-from scene_ir.compositor import Compositor, render_batch
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.types import Render, SceneIR
 
 OF_DETECTIONS = ("objectness", *goals.GOALS)

@@ -25,8 +25,9 @@ from drivesem.report import pictures
 from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from drivesem.space import Budget, Parameter, ParameterSpace
 from scene_ir import files
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.io import load_scene, save_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR
 
 RESULT = "result.json"

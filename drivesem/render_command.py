@@ -14,8 +14,8 @@ from torch import Tensor
 
 from drivesem.config import Render, UsageError
 from scene_ir import files
-from scene_ir.compositor import render
 from scene_ir.io import load_scene
+from scene_ir.render.compositor import render
 from scene_ir.types import SceneIR
 
 

@@ -24,9 +24,9 @@ from drivesem.drawing import (
     write_text,
 )
 from drivesem.render_command import as_bytes
-from scene_ir.compositor import Compositor
 from scene_ir.raster import verbs
-from scene_ir.surfaces import rotate
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.surfaces import rotate
 from scene_ir.types import Crop, SceneIR
 
 PANEL_PX = 640

@@ -9,9 +9,10 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from scene_ir import blend, surfaces
-from scene_ir.compositor import Compositor, Layers, RenderSettings
 from scene_ir.errors import RangeError
+from scene_ir.render import blend, surfaces
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import Layers, RenderSettings
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _ROW = re.compile(r"objects\[(\d+)\](.*)", re.DOTALL)

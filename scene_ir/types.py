@@ -6,13 +6,16 @@ Axes, units, pixel centres and colour space are fixed in `conventions.md`, once 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import IntEnum
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
+
+T = TypeVar("T")
 
 LATTICE = (4, 4, 4)
 """Control points of the free-form deformation along length, height and width (3D-SDN)."""
@@ -404,3 +407,20 @@ class Render:
     depth: Tensor
     object_id: Tensor
     opacity: tuple[Crop, ...]
+
+
+def scene_to(value: T, dtype: torch.dtype, device: torch.device | str | None = None) -> T:
+    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`."""
+    converted: Any = value
+    if isinstance(value, Tensor):
+        converted = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+    elif isinstance(value, tuple):
+        converted = tuple(scene_to(v, dtype, device) for v in value)
+    elif is_dataclass(value) and not isinstance(value, type):
+        changes = {
+            f.name: scene_to(getattr(value, f.name), dtype, device)
+            for f in fields(value)
+            if not isinstance(getattr(value, f.name), (int, float, str, Mapping, type(None)))
+        }
+        converted = replace(value, **changes)
+    return converted

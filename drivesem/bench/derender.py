@@ -33,13 +33,14 @@ from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
 from drivesem.synth.layout import Actor, Road, clearance, footprint
 from drivesem.synth.view import blocks
-from scene_ir import blend, files, surfaces
-from scene_ir.compositor import Compositor
+from scene_ir import files
 from scene_ir.derender import silhouette
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
-from scene_ir.sources import solve_sources
+from scene_ir.render import blend, surfaces
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.sources import solve_sources
 from scene_ir.types import Crop, Frame, Labels, SceneIR
 
 Mask = NDArray[np.bool_]

@@ -30,10 +30,10 @@ from drivesem.pool import outcomes
 from drivesem.scene_edits import moved
 from drivesem.sources import SceneSource, open_source
 from scene_ir import files
-from scene_ir.compositor import Compositor, render
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import load_scene
 from scene_ir.removal import without_objects
+from scene_ir.render.compositor import Compositor, render
 from scene_ir.types import Category, SceneIR
 
 METHOD = (

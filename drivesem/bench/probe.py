@@ -85,8 +85,8 @@ def attack(order: Order) -> Found:
     from drivesem.feasible import FeasibleSet
     from drivesem.objective import Objective
     from drivesem.space import ParameterSpace, combo
-    from scene_ir.compositor import Compositor
     from scene_ir.io import load_scene
+    from scene_ir.render.compositor import Compositor
 
     torch.set_num_threads(order.threads)
     libraries = resident_kb()

@@ -18,8 +18,10 @@ from torch import Tensor
 from drivesem.bench import rivals
 from drivesem.bench.scenes import BenchScene, Placed, bench_scene
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
-from scene_ir.compositor import Compositor, RenderSettings, scene_to
 from scene_ir.raster import verbs
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import scene_to
 
 METHOD = (
     "Backends warp and reference re-render the whole picture (texture from the photograph, completion, halo, "

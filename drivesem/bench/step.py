@@ -17,7 +17,9 @@ from drivesem.feasible import FeasibleSet
 from drivesem.labels import Labeller
 from drivesem.objective import Objective
 from drivesem.space import Parameter, ParameterSpace, combo
-from scene_ir.compositor import Compositor, RenderSettings, scene_to
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import scene_to
 
 METHOD = (
     "A step is Objective.loss_and_grad at a feasible theta other than 0 (scene at theta, render, labels, "

@@ -40,9 +40,10 @@ from drivesem.report import pictures
 from drivesem.results import Coordinate, FrameResult, load_frame
 from drivesem.space import Parameter, ParameterSpace
 from scene_ir import files
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 
 KINDS: tuple[Kind, ...] = ("parameter", "object")
 

@@ -26,7 +26,7 @@ from drivesem.synth.soup import GROUND
 from drivesem.synth.view import blocks
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
-from scene_ir.sources import solve_sources
+from scene_ir.render.sources import solve_sources
 from scene_ir.types import LATTICE_POINTS, TEXTURE_DIM, Category, Crop, Mesh, Objects, SceneIR
 
 _KINDS = ("residential", "city", "junction", "arterial", "residential", "motorway", "city", "arterial")

@@ -26,10 +26,10 @@ from drivesem.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
 from drivesem.synth.frames import Plan
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
-from scene_ir.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, time_gain
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
-from scene_ir.texture import apply_texture_code
+from scene_ir.render.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, time_gain
+from scene_ir.render.texture import apply_texture_code
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
 

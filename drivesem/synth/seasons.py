@@ -1,4 +1,4 @@
-"""Foliage codes on a world's leaves and grass: the counterpart of `scene_ir.environment.apply_foliage` in
+"""Foliage codes on a world's leaves and grass: the counterpart of `scene_ir.render.environment.apply_foliage` in
 albedo."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from drivesem.synth.soup import Material, Soup
-from scene_ir.environment import apply_foliage
+from scene_ir.render.environment import apply_foliage
 from scene_ir.types import Environment
 
 _GROWTH = 0.35

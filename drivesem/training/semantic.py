@@ -17,9 +17,9 @@ from drivesem.space import Parameter, ParameterSpace
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
-from scene_ir.compositor import Compositor
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import SceneError
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame, Labels
 
 VARIANTS = 4

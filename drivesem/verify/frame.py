@@ -25,9 +25,10 @@ from drivesem.space import Budget, Parameter
 from drivesem.verify.change import check_change, check_feasibility
 from drivesem.verify.differences import Difference, Tally
 from scene_ir import files
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Labels, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"

@@ -20,7 +20,7 @@ from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import project_boxes, to_clip
 from scene_ir.raster import verbs
-from scene_ir.sources import SolveSettings, solve_sources
+from scene_ir.render.sources import SolveSettings, solve_sources
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,

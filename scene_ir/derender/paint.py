@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir import texture
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.raster import verbs
+from scene_ir.render import texture
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, SceneIR
 
 Array = NDArray[np.float64]

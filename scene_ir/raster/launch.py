@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch import Tensor
 
 _WORTH = 32768
 """Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to
@@ -129,3 +130,18 @@ def launch(
 
 def _run(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any, stream: Any) -> None:
     wp.launch(kernel, dim=count, inputs=[start, *inputs], device=device, stream=stream)
+
+
+def field(values: Tensor, dtype: Any = None) -> Any:
+    """A tensor as an array for a struct."""
+    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
+
+
+def array(values: Tensor, dtype: Any = None) -> Any:
+    """A tensor as an array for a kernel, in the form that is made fastest."""
+    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def vec3(values: Tensor) -> Any:
+    """Rows (R, 3) as an array for a kernel."""
+    return array(values, wp.vec3f)

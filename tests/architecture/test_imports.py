@@ -153,12 +153,12 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
         ("detectors/training.py", "from rich.progress import Progress"),
         ("drivesem/attacks/base.py", "from drivesem import objective"),
         ("drivesem/attacks/base.py", "from detectors import types"),
-        ("drivesem/feasible.py", "from scene_ir import compositor"),
+        ("drivesem/feasible.py", "from scene_ir.render import compositor"),
         ("drivesem/feasibility_check.py", "from drivesem.feasible import project"),
         ("drivesem/evaluation/coco.py", "from scene_ir.types import Labels"),
         ("drivesem/evaluation/coco.py", "import importlib\nimportlib.import_module('drivesem.attacks.base')"),
         ("drivesem/report/page.py", "import torch"),
-        ("drivesem/report/page.py", "from scene_ir import compositor"),
+        ("drivesem/report/page.py", "from scene_ir.render import compositor"),
     ],
 )
 def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
@@ -172,7 +172,7 @@ def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
         ("scene_ir/io.py", "import json\nimport torch\nfrom scene_ir.types import Mesh"),
         ("detectors/adapters/onnx.py", "import onnxruntime"),
         ("drivesem/attacks/si_fgsm.py", "from drivesem.attacks.base import Attack\nfrom scene_ir import ffd"),
-        ("drivesem/pipeline.py", "from scene_ir import compositor\nfrom detectors import registry"),
+        ("drivesem/pipeline.py", "from scene_ir.render import compositor\nfrom detectors import registry"),
         ("drivesem/report/page.py", "import jinja2\nfrom drivesem.results import RunSummary"),
     ],
 )

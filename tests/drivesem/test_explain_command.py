@@ -23,9 +23,9 @@ from drivesem.explain import frame as explaining
 from drivesem.explain.results import read_explanation
 from drivesem.feasibility_check import check_scene
 from drivesem.results import load_frame
-from scene_ir.compositor import Compositor
 from scene_ir.io import load_scene
-from scene_ir.sources import solve_sources
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
 
 EXPLAIN = ["explain", "--workers", "1", "--points", "4", "--json"]

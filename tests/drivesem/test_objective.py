@@ -13,8 +13,9 @@ from drivesem.feasible import FeasibleSet
 from drivesem.labels import Difficulty
 from drivesem.objective import BatchObjective, Objective
 from drivesem.space import ParameterSpace
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, Render
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0))

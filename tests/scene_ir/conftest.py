@@ -10,10 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from scene_ir import blend, surfaces
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.raster.verbs import Backend
-from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
+from scene_ir.render import blend, surfaces
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
 from scene_ir.types import Camera, Crop, Environment, Mesh, Objects, Part, SceneIR
 
 HEIGHT, WIDTH, FOCAL, EYE_M = 80, 144, 110.0, 1.65

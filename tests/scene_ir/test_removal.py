@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from scene_ir.compositor import render, scene_to
 from scene_ir.errors import RangeError
 from scene_ir.io import load_scene, save_scene
 from scene_ir.removal import without_objects
-from scene_ir.types import Objects, Render, SceneIR, Source
+from scene_ir.render.compositor import render
+from scene_ir.types import Objects, Render, SceneIR, Source, scene_to
 
 NEAR, FAR = 1, 2
 """Rows of two cars of which the first hides part of the second."""

@@ -10,8 +10,8 @@ import torch
 from drivesem.bench import command, memory, render, rivals, step
 from drivesem.bench.scenes import Placed, bench_scene
 from drivesem.cli import main
-from scene_ir.compositor import scene_to
 from scene_ir.raster import verbs
+from scene_ir.types import scene_to
 
 
 @pytest.fixture(autouse=True)

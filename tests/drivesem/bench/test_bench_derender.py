@@ -17,8 +17,8 @@ from drivesem.synth.frames import SynthFrame
 from drivesem.synth.layout import Strip as Kerb
 from drivesem.synth.soup import Material
 from scene_ir import files
-from scene_ir.compositor import Compositor
 from scene_ir.errors import RangeError
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 
 

@@ -6,9 +6,9 @@ import torch
 
 from drivesem.bench.remesh import with_triangles
 from drivesem.bench.scenes import HEIGHT, KITTI_BOX_PIXELS, WIDTH, Placed, bench_scene
-from scene_ir.compositor import Compositor
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import Mesh
 
 

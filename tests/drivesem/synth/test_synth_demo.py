@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from drivesem.synth.demo import demo_scene, demo_scenes
-from scene_ir.compositor import render
 from scene_ir.errors import RangeError
+from scene_ir.render.compositor import render
 from scene_ir.types import Category, SceneIR
 
 

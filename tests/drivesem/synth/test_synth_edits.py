@@ -11,9 +11,9 @@ import torch
 from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, read_edits
 from drivesem.synth.frames import SynthSettings, plan_frame, render_frame
 from drivesem.synth.layout import LayoutSettings, clearance, footprint
-from scene_ir.environment import apply_weather, sky_colour
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
+from scene_ir.render.environment import apply_weather, sky_colour
 
 SETTINGS = SynthSettings(LayoutSettings(people=False, vehicles=(6, 8)), sunny=True)
 

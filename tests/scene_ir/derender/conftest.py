@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.compositor import Compositor
 from scene_ir.meshes.templates import template
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import LATTICE_POINTS, Camera, Environment, Frame, Labels, Objects, SceneIR
 
 HEIGHT, WIDTH, FOCAL = 200, 480, 380.0

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.compositor import Compositor
 from scene_ir.derender import silhouette
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, Frame, Labels, SceneIR
 
 KITTI = Path(__file__).parents[4] / "shared" / "data" / "kitti" / "training"

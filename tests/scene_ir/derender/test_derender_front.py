@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.compositor import Compositor
 from scene_ir.derender import front, maps, silhouette
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.geometry import project_boxes
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import Camera, Frame, Labels
 
 CAMERA = Camera(torch.tensor([[300.0, 0, 119.5], [0, 300.0, 60.0], [0, 0, 1.0]]), 150, 240)

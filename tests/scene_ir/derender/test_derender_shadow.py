@@ -8,7 +8,7 @@ import torch
 
 from scene_ir.derender import shadow, silhouette
 from scene_ir.geometry import project
-from scene_ir.surfaces import shadow_density, sun_offset
+from scene_ir.render.surfaces import shadow_density, sun_offset
 from scene_ir.types import Camera
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)

@@ -13,7 +13,7 @@ from torch import Tensor
 from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import Layout
 from scene_ir.raster.verbs import Backend
-from scene_ir.texture import SATURATED
+from scene_ir.render.texture import SATURATED
 from scene_ir.types import Front
 
 _STANDING_M = 0.4
@@ -98,7 +98,7 @@ def composite(
     """
     factor, colour, opacity, z = what
     if backend == "warp":
-        from scene_ir.raster import blending
+        from scene_ir.render.kernels import blending
 
         rects = [(plan.layout, plan.order), (plan.shadow_layout, plan.shadows)]
         layers, shadows = (_stack(layout, order) for layout, order in rects)

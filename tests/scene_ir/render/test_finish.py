@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir import finish, texture
-from scene_ir.compositor import Compositor, RenderSettings
-from scene_ir.surfaces import Surface
+from scene_ir.render import finish, texture
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.surfaces import Surface
 from scene_ir.types import Part, SceneIR
 
 
@@ -86,7 +87,7 @@ def test_a_frames_vehicles_share_their_sunlight(photographed: SceneIR) -> None:
 
 def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a hidden car's completion would change once the others are there, and the picture with it."""
-    monkeypatch.setattr("scene_ir.compositor._MOST_SAMPLES", 150)
+    monkeypatch.setattr("scene_ir.render.prepare._MOST_SAMPLES", 150)
     names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
     names = (*names, "box2d", "truncation", "occlusion")
     objects, clear = photographed.objects, torch.zeros_like(photographed.depth)
@@ -120,7 +121,7 @@ def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
     assert 0.02 < float(turned.abs().max()) <= texture.RELIT_MOST
     # A side that turned to the sun is brighter.
     sun = photographed.environment.sun
-    normal = compositor._smooth
+    normal = compositor.smooth
     yaw = compositor.fleet.spread(objects.yaw)
     gained = (_turned(normal, yaw + 0.3) - _turned(normal, yaw)) @ sun
     lit = (_turned(normal, yaw) @ sun > 0.1) & (gained.abs() > 0.02)

@@ -1,7 +1,7 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
 """CIE L*a*b* and back, and the paint of vehicles, as NVIDIA Warp functions with gradients by hand; float32.
 
-What they compute is in `scene_ir.texture` (`lab`, `rgb_of`, `apply_texture_code`); a test holds both together.
+What they compute is in `texture` (`lab`, `rgb_of`, `apply_texture_code`); a test holds both together.
 A function's gradient is the function that ends in `_adjoint`: arguments, then the gradient to the result.
 """
 
@@ -15,9 +15,9 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir import texture as model
 from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, log_, store, store3
 from scene_ir.raster.launch import halves, launch, start_warp
+from scene_ir.render import texture as model
 
 start_warp()
 wp.set_module_options(OPTIONS)

@@ -1,7 +1,7 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
 """Weather over the whole picture as fused NVIDIA Warp kernels, with gradients written by hand; float32.
 
-The model, and what its numbers mean, is in `scene_ir.environment`. Only a wet road looks at other pixels than its
+The model is in `environment`, and what its numbers mean in `model`. Only a wet road looks at other pixels than its
 own: it mirrors the column above it. So the rows that hold some road (the wet rows) go through three kernels: what
 comes before the mirror, the mirror, the rest; all other rows go through one.
 """
@@ -17,8 +17,10 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir import environment as model
-from scene_ir.raster.colour import (
+from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, store, store3, total
+from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.render import environment as model
+from scene_ir.render.kernels.colour import (
     array,
     clamped,
     clamped_adjoint,
@@ -30,8 +32,6 @@ from scene_ir.raster.colour import (
     rgb_of,
     within,
 )
-from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, store, store3, total
-from scene_ir.raster.launch import halves, launch, start_warp, threads
 from scene_ir.types import Environment
 
 start_warp()

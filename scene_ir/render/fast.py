@@ -1,65 +1,19 @@
-"""The compositor's fast path: what the plain torch of `compositor` and `texture` does, in few passes.
+"""The fast path: what the plain torch of `reference` and `texture` does, in few passes.
 
-The kernels are in `raster.shading`, which is imported on first use. Shapes as in `compositor`.
+The kernels are in `kernels.shading`, which is imported on first use. Shapes as in `reference`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from scene_ir import surfaces, texture
 from scene_ir.raster import verbs
-from scene_ir.surfaces import Fleet
-
-if TYPE_CHECKING:
-    from scene_ir.compositor import Drawn
-
-
-@dataclass(frozen=True, slots=True)
-class Rig:
-    """What placing vertices takes besides the pose: normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4)
-    and centre (N, 3) m of the objects' cameras; edges: the objects' first vertices, and V."""
-
-    normal: Tensor
-    owner: Tensor
-    matrix: Tensor
-    centre: Tensor
-    edges: list[int]
-
-    @classmethod
-    def pack(cls, rigs: Sequence[Rig]) -> Rig:
-        """Several scenes' objects, one after the other."""
-        if len(rigs) == 1:
-            return rigs[0]
-        counts = [r.matrix.shape[0] for r in rigs]
-        shifts = [sum(counts[:i]) for i in range(len(counts))]
-        edges = [0]
-        for rig in rigs:
-            edges += [edges[-1] + e for e in rig.edges[1:]]
-        return cls(
-            torch.cat([r.normal for r in rigs]),
-            torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
-            torch.cat([r.matrix for r in rigs]),
-            torch.cat([r.centre for r in rigs]),
-            edges,
-        )
-
-    @classmethod
-    def of(cls, fleet: Fleet, normal: Tensor, matrix: Tensor, centre: Tensor) -> Rig:
-        """Of one scene's objects. matrix (3, 4), centre (3,)."""
-        count = fleet.vertex_ranges.shape[0]
-        return cls(
-            normal.contiguous(),
-            fleet.owner.to(torch.int32),
-            matrix.to(normal).expand(count, 3, 4).contiguous(),
-            centre.to(normal).expand(count, 3).contiguous(),
-            [0, *fleet.vertex_ranges[:, 1].tolist()],
-        )
+from scene_ir.render import texture
+from scene_ir.render.prepare import Drawn, Prepared
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +35,33 @@ class Fixed:
     frame_wh: Tensor
     sun: Tensor
     unproject: Tensor
+
+    @classmethod
+    def of(cls, prepared: Prepared) -> Fixed:
+        """Of one scene."""
+        fleet, base, count = prepared.fleet, prepared.base, len(prepared.scene.objects)
+        assert prepared.texels is not None
+        assert prepared.shadows is not None
+        own = (fleet.colours, prepared.sharp, fleet.paint[:, None], fleet.glass[:, None], prepared.height[:, None])
+        mirror = (prepared.mirror_clip, prepared.mirror_cos[:, None])
+        height, width = prepared.frame_hw
+        sun = prepared.scene.environment.sun.to(prepared.like)
+        return cls(
+            faces=fleet.faces.to(torch.int32).contiguous(),
+            base_clip=base.clip,
+            base=torch.stack([base.cos, fleet.paint, prepared.height], dim=1),
+            own=torch.cat([*own, *mirror, prepared.finish], dim=1),
+            texels=(
+                prepared.texels.values[: int(prepared.texels.offsets[count])],
+                prepared.texels.rects[:count],
+                prepared.texels.offsets[: count + 1],
+            ),
+            patches=patches(base.ground_clip),
+            dark=(prepared.shadows.values, prepared.shadows.rects, prepared.shadows.offsets),
+            frame_wh=prepared.like.new_tensor([width, height]).expand(count, 2).contiguous(),
+            sun=torch.cat([sun.expand(count, 3), prepared.sunlight[:, None]], dim=1),
+            unproject=prepared.unproject.expand(count, 3, 3).contiguous(),
+        )
 
     @classmethod
     def pack(cls, parts: Sequence[Fixed]) -> Fixed:
@@ -118,26 +99,6 @@ class Code:
     regions: texture.Regions
 
 
-def place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """Clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals to the camera."""
-    from scene_ir.raster import shading
-
-    clip, facing = shading.Place.apply(
-        local, yaw, translation, rig.normal, rig.owner, rig.matrix, rig.centre, rig.edges
-    )
-    return clip, facing
-
-
-def reference_place(rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """`place` in plain torch, any dtype."""
-    owner = rig.owner.long()
-    turn = yaw.index_select(0, owner)
-    points = surfaces.rotate(local, turn) + translation.index_select(0, owner)
-    matrix = rig.matrix.index_select(0, owner)
-    clip = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
-    return clip, surfaces.facing(points, surfaces.rotate(rig.normal, turn), rig.centre.index_select(0, owner))
-
-
 def photographed(
     fixed: Fixed,
     drawn: Drawn,
@@ -150,7 +111,7 @@ def photographed(
 
     reach_px: of each halo; code: texture codes, if there are any.
     """
-    from scene_ir.raster import shading
+    from scene_ir.render.kernels import shading
 
     def paint(
         mesh: Tensor, halo: Tensor, look: Tensor, fill: Tensor, values: Tensor, table: Tensor, nearest: Tensor

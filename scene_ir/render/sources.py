@@ -15,13 +15,14 @@ import scipy.ndimage
 import torch
 from torch import Tensor
 
-from scene_ir import blend, finish, surfaces, texture
-from scene_ir.compositor import Compositor, Drawn, RenderSettings
 from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
-from scene_ir.surfaces import nearest_true
+from scene_ir.render import blend, finish, surfaces, texture
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import Drawn, RenderSettings
+from scene_ir.render.surfaces import nearest_true
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _EXTENSION_PX = 4.5

@@ -224,6 +224,68 @@ class Fleet:
         return rotate(local, self.spread(yaw)) + self.spread(translation)
 
 
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """What placing vertices takes besides the pose: normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4)
+    and centre (N, 3) m of the objects' cameras; edges: the objects' first vertices, and V."""
+
+    normal: Tensor
+    owner: Tensor
+    matrix: Tensor
+    centre: Tensor
+    edges: list[int]
+
+    @classmethod
+    def pack(cls, rigs: Sequence[Rig]) -> Rig:
+        """Several scenes' objects, one after the other."""
+        if len(rigs) == 1:
+            return rigs[0]
+        counts = [r.matrix.shape[0] for r in rigs]
+        shifts = [sum(counts[:i]) for i in range(len(counts))]
+        edges = [0]
+        for rig in rigs:
+            edges += [edges[-1] + e for e in rig.edges[1:]]
+        return cls(
+            torch.cat([r.normal for r in rigs]),
+            torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
+            torch.cat([r.matrix for r in rigs]),
+            torch.cat([r.centre for r in rigs]),
+            edges,
+        )
+
+    @classmethod
+    def of(cls, fleet: Fleet, normal: Tensor, matrix: Tensor, centre: Tensor) -> Rig:
+        """Of one scene's objects. matrix (3, 4), centre (3,)."""
+        count = fleet.vertex_ranges.shape[0]
+        return cls(
+            normal.contiguous(),
+            fleet.owner.to(torch.int32),
+            matrix.to(normal).expand(count, 3, 4).contiguous(),
+            centre.to(normal).expand(count, 3).contiguous(),
+            [0, *fleet.vertex_ranges[:, 1].tolist()],
+        )
+
+
+def place(
+    rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor, backend: verbs.Backend
+) -> tuple[Tensor, Tensor]:
+    """Clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals to the camera.
+
+    yaw (N,) rad; translation (N, 3) m; backend `reference` takes any dtype.
+    """
+    if backend == "warp":
+        from scene_ir.render.kernels.placement import Place
+
+        clip, cos = Place.apply(local, yaw, translation, rig.normal, rig.owner, rig.matrix, rig.centre, rig.edges)
+        return clip, cos
+    owner = rig.owner.long()
+    turn = yaw.index_select(0, owner)
+    points = rotate(local, turn) + translation.index_select(0, owner)
+    matrix = rig.matrix.index_select(0, owner)
+    clip = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
+    return clip, facing(points, rotate(rig.normal, turn), rig.centre.index_select(0, owner))
+
+
 class _Bend(torch.autograd.Function):
     """weights (V, 64) @ offsets (64, 3), in the order of operands that is several times faster for three
     columns."""

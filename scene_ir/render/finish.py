@@ -21,8 +21,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_ir import texture
-from scene_ir.surfaces import Surface
+from scene_ir.render import texture
+from scene_ir.render.surfaces import Surface
 from scene_ir.types import Part
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from scene_ir import environment as env
-from scene_ir import texture
+from scene_ir.render import environment as env
+from scene_ir.render import texture
 from scene_ir.types import Environment
 
 VALUES = {"weather": 1e-6, "foliage": 2e-5, "paint": 8e-6}

@@ -7,14 +7,13 @@ differentiable there from both sides, though the weather code is bounded to [0, 
 from __future__ import annotations
 
 from functools import lru_cache
-from importlib import import_module
 
 import kornia
 import torch
 from torch import Tensor
 
 from scene_ir.raster.verbs import Backend
-from scene_ir.texture import lab, rgb_of, smoothstep
+from scene_ir.render.texture import lab, rgb_of, smoothstep
 from scene_ir.types import Environment
 
 FOG_EXTINCTION_PER_M = 0.03
@@ -70,7 +69,9 @@ def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend:
     """
     if backend == "warp":
         gaps = _leaf_gaps(*environment.foliage_map.shape).to(image)
-        return import_module("scene_ir.raster.effects").foliage(image, environment, air, gaps)
+        from scene_ir.render.kernels import effects
+
+        return effects.foliage(image, environment, air, gaps)
     amount = environment.foliage_map.to(image)
     index = (amount.flatten() > FEWEST_LEAVES).nonzero()[:, 0]
     if index.numel() == 0:
@@ -113,7 +114,9 @@ def apply_weather(
     """
     if backend == "warp":
         streaks = _streaks(*environment.sky.shape).to(image)
-        return import_module("scene_ir.raster.effects").weather(image, inverse_depth, environment, air, streaks)
+        from scene_ir.render.kernels import effects
+
+        return effects.weather(image, inverse_depth, environment, air, streaks)
     fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
     sky, road = environment.sky.to(image), environment.road.to(image)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / HAZE_CAP_M)

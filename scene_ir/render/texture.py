@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import cv2
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster import verbs
-from scene_ir.surfaces import nearest_true
+from scene_ir.render.surfaces import nearest_true
 from scene_ir.types import Crop, Source
 
 DEPTH_TOLERANCE_M = (0.25, 0.6)
@@ -278,8 +277,9 @@ def apply_texture_code(
     slope is not.
     """
     if backend == "warp":
-        fast = import_module("scene_ir.raster.colour").paint
-        return fast(colour, opacity, code, paint, height, base_lightness)
+        from scene_ir.render.kernels import colour as kernels
+
+        return kernels.paint(colour, opacity, code, paint, height, base_lightness)
     index = ((paint > 0.0) & (opacity > 0.0)).nonzero()[:, 0]
     if index.numel() == 0:
         return colour

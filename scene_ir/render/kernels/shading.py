@@ -19,10 +19,10 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir import surfaces, texture
 from scene_ir.raster.kernels import slopes, weights
-from scene_ir.raster.launch import between, halves, launch, load, share, start_warp
+from scene_ir.raster.launch import array, between, field, halves, launch, load, share, start_warp, vec3
 from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.render import surfaces, texture
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
@@ -89,134 +89,6 @@ def table_kernel(
             for x in range(width):
                 table[at] = wp.vec4i(draw, x0 + x, y0 + y, width)
                 at += 1
-
-
-# ------------------------------------------------------------------------------------------------------- placement
-
-
-@wp.kernel(enable_backward=False)
-def place_kernel(
-    start: int,
-    local: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    owner: wp.array(dtype=wp.int32),
-    turn: wp.array(dtype=wp.vec2f),
-    translation: wp.array(dtype=wp.vec3f),
-    matrix: wp.array2d(dtype=wp.vec4f),
-    centre: wp.array(dtype=wp.vec3f),
-    clip: wp.array(dtype=wp.vec3f),
-    facing: wp.array(dtype=wp.float32),
-):
-    i = start + wp.tid()
-    o = owner[i]
-    c = turn[o][0]
-    s = turn[o][1]
-    v = local[i]
-    p = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0]) + translation[o]
-    n = normal[i]
-    n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
-    q = wp.vec4f(p[0], p[1], p[2], 1.0)
-    clip[i] = wp.vec3f(wp.dot(matrix[o, 0], q), wp.dot(matrix[o, 1], q), wp.dot(matrix[o, 2], q))
-    way = centre[o] - p
-    facing[i] = wp.dot(way, n) / wp.max(wp.length(way), 1e-6)
-
-
-@wp.kernel(enable_backward=False)
-def place_backward_kernel(
-    start: int,
-    local: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    owner: wp.array(dtype=wp.int32),
-    turn: wp.array(dtype=wp.vec2f),
-    translation: wp.array(dtype=wp.vec3f),
-    matrix: wp.array2d(dtype=wp.vec4f),
-    centre: wp.array(dtype=wp.vec3f),
-    grad_clip: wp.array(dtype=wp.vec3f),
-    grad_facing: wp.array(dtype=wp.float32),
-    grad_local: wp.array(dtype=wp.vec3f),
-    grad_pose: wp.array(dtype=wp.vec4d),
-):
-    i = start + wp.tid()
-    g = grad_clip[i]
-    gf = grad_facing[i]
-    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or gf != 0.0:
-        o = owner[i]
-        c = turn[o][0]
-        s = turn[o][1]
-        v = local[i]
-        r = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
-        p = r + translation[o]
-        n = normal[i]
-        n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
-        way = centre[o] - p
-        length = wp.max(wp.length(way), 1e-6)
-        m = matrix[o, 0] * g[0] + matrix[o, 1] * g[1] + matrix[o, 2] * g[2]
-        to_way = (n - way * (wp.dot(way, n) / (length * length))) * (gf / length)
-        to_p = wp.vec3f(m[0], m[1], m[2]) - to_way
-        to_n = way * (gf / length)
-        grad_local[i] = wp.vec3f(c * to_p[0] - s * to_p[2], to_p[1], s * to_p[0] + c * to_p[2])
-        # d (turned vector) / d yaw is (z, 0, -x) of the turned vector
-        angle = to_p[0] * r[2] - to_p[2] * r[0] + to_n[0] * n[2] - to_n[2] * n[0]
-        wp.atomic_add(
-            grad_pose,
-            o,
-            wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle)),
-        )
-
-
-class Place(torch.autograd.Function):
-    """Local vertices (V, 3) m, yaw (N,), translation (N, 3) -> clip (V, 3), cosine towards the camera (V,).
-
-    normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4), centre (N, 3) of each object's camera; edges: the
-    objects' first vertices, and V.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, local, yaw, translation, normal, owner, matrix, centre, edges) -> tuple[Tensor, Tensor]:
-        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
-        clip, facing = torch.empty_like(local), local.new_empty(local.shape[0])
-        fixed = (
-            local.detach().contiguous(),
-            normal,
-            owner,
-            turn,
-            translation.detach().contiguous(),
-            matrix,
-            centre,
-        )
-        launch(
-            place_kernel,
-            halves(local.shape[0]),
-            [*_place_inputs(fixed), _vec3(clip), _array(facing)],
-            device=local.device,
-        )
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return clip, facing
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_clip: Tensor, grad_facing: Tensor):
-        fixed = ctx.saved_tensors
-        local, turn = fixed[0], fixed[3]
-        grad_clip, grad_facing = grad_clip.contiguous(), grad_facing.contiguous()
-        grad_local = torch.zeros_like(local)
-        grad_pose = torch.zeros(turn.shape[0], 4, dtype=torch.float64, device=local.device)
-        inputs = [
-            *(*_place_inputs(fixed), _vec3(grad_clip), _array(grad_facing)),
-            *(_vec3(grad_local), _array(grad_pose, wp.vec4d)),
-        ]
-        launch(place_backward_kernel, between(ctx.edges), inputs, device=local.device)
-        pose = grad_pose.to(local.dtype)
-        return grad_local, pose[:, 3], pose[:, :3], None, None, None, None, None
-
-
-def _place_inputs(fixed) -> list:
-    local, normal, owner, turn, translation, matrix, centre = fixed
-    return [
-        *(_vec3(local), _vec3(normal), _array(owner), _array(turn, wp.vec2f)),
-        *(_vec3(translation), _array(matrix, wp.vec4f), _vec3(centre)),
-    ]
 
 
 # ------------------------------------------------------------------------------------------- what a mesh pixel shows
@@ -383,8 +255,8 @@ def look_backward_kernel(
 def _look_inputs(fixed) -> list:
     table, face, clip, facing, brighter, base_clip, base, faces = fixed
     return [
-        *(_array(table, wp.vec4i), _array(face), _vec3(clip), _array(facing), _array(brighter)),
-        *(_vec3(base_clip), _vec3(base), _array(faces, wp.vec3i)),
+        *(array(table, wp.vec4i), array(face), vec3(clip), array(facing), array(brighter)),
+        *(vec3(base_clip), vec3(base), array(faces, wp.vec3i)),
     ]
 
 
@@ -1350,10 +1222,10 @@ def shadow_backward_kernel(
 def _shadow_inputs(s: Setting, table: Tensor, then: Tensor) -> list:
     ground = Ground()
     dark, rects, offsets = s.dark
-    ground.inside, ground.then = _field(s.inside, wp.mat33d), _field(then, wp.mat33d)
-    ground.dark, ground.rects, ground.offsets = _field(dark, wp.vec3f), _field(rects), _field(offsets)
-    ground.frame_wh = _field(s.frame_wh, wp.vec2f)
-    return [_array(table, wp.vec4i), ground]
+    ground.inside, ground.then = field(s.inside, wp.mat33d), field(then, wp.mat33d)
+    ground.dark, ground.rects, ground.offsets = field(dark, wp.vec3f), field(rects), field(offsets)
+    ground.frame_wh = field(s.frame_wh, wp.vec2f)
+    return [array(table, wp.vec4i), ground]
 
 
 # ----------------------------------------------------------------------------------------------- all stages as one
@@ -1426,36 +1298,36 @@ class Photographed(torch.autograd.Function):
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
         seen = _look_inputs((table, face, clip, facing, brighter, s.base_clip, s.base, s.faces))
-        filled = [*_outline(s, table, coverage), _array(found, vec9), _array(look, vec9)]
+        filled = [*_outline(s, table, coverage), array(found, vec9), array(look, vec9)]
         shades = _shade_inputs(s, table, nearest, coverage, look)
-        shaded = [*shades, _array(mesh, wp.vec4f), _array(halo, wp.vec4f), _array(fill)]
-        combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
-        combined += [_array(opacity), _array(depth)]
-        shadowed = [*_shadow_inputs(s, ground_table, then), _vec3(shadow)]
+        shaded = [*shades, array(mesh, wp.vec4f), array(halo, wp.vec4f), array(fill)]
+        combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), array(colour, wp.vec4f)]
+        combined += [array(opacity), array(depth)]
+        shadowed = [*_shadow_inputs(s, ground_table, then), vec3(shadow)]
         tables = [(s.fragments.layout, table), (s.ground, ground_table)]
         needs: dict[int, Tensor] = {}
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
             for layout, out in tables:
-                inputs = [_array(layout.rects), _array(layout.offsets), _array(out, wp.vec4i)]
+                inputs = [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
                 launch(table_kernel, [start, end], inputs, (), device)
             ranges = [parts.ground[start], parts.ground[end]]
             launch(shadow_kernel, ranges, shadowed, (), device)
             if last == first:
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
-            launch(look_kernel, [first, last], [*seen, _array(found, vec9)], (), device)
+            launch(look_kernel, [first, last], [*seen, array(found, vec9)], (), device)
             launch(fill_kernel, [first, last], filled, (), device)
             launch(shade_kernel, [first, last], shaded, (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
                 inputs = _complete_inputs(s, need, table, turn, clip, coverage, look, fill)
-                launch(complete_kernel, [0, need.shape[0]], [*inputs, _array(mesh, wp.vec4f)], (), device)
+                launch(complete_kernel, [0, need.shape[0]], [*inputs, array(mesh, wp.vec4f)], (), device)
             if s.painter is None:
                 launch(combine_kernel, [first, last], combined, (), device)
 
-        load(place_kernel)
+        load(look_kernel)
         share(work, parts.edges)
         ctx.painted = None
         if s.painter is not None:
@@ -1463,8 +1335,8 @@ class Photographed(torch.autograd.Function):
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
                 ctx.painted = leaves, s.painter(*leaves, table, nearest)
             mesh, halo = (t.detach().contiguous() for t in ctx.painted[1])
-            combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(colour, wp.vec4f)]
-            launch(combine_kernel, halves(size), [*combined, _array(opacity), _array(depth)], (), device)
+            combined = [*_combine_inputs(s, nearest, coverage, mesh, halo, look), array(colour, wp.vec4f)]
+            launch(combine_kernel, halves(size), [*combined, array(opacity), array(depth)], (), device)
         ctx.setting, ctx.parts, ctx.needs = s, parts, needs
         ctx.save_for_backward(
             clip,
@@ -1502,24 +1374,24 @@ class Photographed(torch.autograd.Function):
         grad_clip = torch.zeros(clip.shape, dtype=torch.float64, device=device)
         grad_then = torch.zeros_like(then)
         grad_turn = torch.zeros_like(turn, dtype=torch.float64)
-        to_clip, to_look = _array(grad_clip, wp.vec3d), _array(grad_look, vec9)
+        to_clip, to_look = array(grad_clip, wp.vec3d), array(grad_look, vec9)
         through = [
-            *(*_combine_inputs(s, nearest, coverage, mesh, halo, look), _array(grad_colour, wp.vec4f)),
-            *(_array(grad_opacity), _array(grad_mesh, wp.vec4f), _array(grad_halo, wp.vec4f)),
-            *(_array(grad_coverage), to_look),
+            *(*_combine_inputs(s, nearest, coverage, mesh, halo, look), array(grad_colour, wp.vec4f)),
+            *(array(grad_opacity), array(grad_mesh, wp.vec4f), array(grad_halo, wp.vec4f)),
+            *(array(grad_coverage), to_look),
         ]
         shades = _shade_inputs(s, table, nearest, coverage, look)
         spread = [
             *_outline(s, table, coverage),
-            _array(found, vec9),
-            _array(kept, vec9),
+            array(found, vec9),
+            array(kept, vec9),
             to_look,
-            _array(grad_coverage),
+            array(grad_coverage),
         ]
         looked = _look_inputs((table, s.fragments.face, clip, facing, brighter, s.base_clip, s.base, s.faces))
-        looked += [_array(found, vec9), to_look, to_clip, _array(grad_facing), _array(grad_brighter)]
-        shadowed = [*_shadow_inputs(s, ground_table, then), _vec3(grad_shadow)]
-        shadowed.append(_array(grad_then, wp.mat33d))
+        looked += [array(found, vec9), to_look, to_clip, array(grad_facing), array(grad_brighter)]
+        shadowed = [*_shadow_inputs(s, ground_table, then), vec3(grad_shadow)]
+        shadowed.append(array(grad_then, wp.mat33d))
 
         def combine(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -1539,19 +1411,19 @@ class Photographed(torch.autograd.Function):
             if need.numel():
                 inputs = [
                     *_complete_inputs(s, need, table, turn, clip, coverage, look, fill),
-                    *(_array(grad_mesh, wp.vec4f), to_look, _array(grad_fill), _array(grad_turn, wp.vec2d)),
-                    *(to_clip, _array(grad_coverage)),
+                    *(array(grad_mesh, wp.vec4f), to_look, array(grad_fill), array(grad_turn, wp.vec2d)),
+                    *(to_clip, array(grad_coverage)),
                 ]
                 launch(complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
             inputs = [
                 *shades,
-                _array(grad_mesh, wp.vec4f),
-                _array(grad_halo, wp.vec4f),
-                _array(grad_fill),
+                array(grad_mesh, wp.vec4f),
+                array(grad_halo, wp.vec4f),
+                array(grad_fill),
                 to_look,
             ]
             launch(shade_backward_kernel, [first, last], inputs, (), device)
-            inputs = [_array(s.fragments.face), _array(coverage), to_look, _array(kept, vec9)]
+            inputs = [array(s.fragments.face), array(coverage), to_look, array(kept, vec9)]
             launch(keep_kernel, [first, last], inputs, (), device)
             launch(fill_backward_kernel, [first, last], spread, (), device)
             launch(look_backward_kernel, [first, last], looked, (), device)
@@ -1578,14 +1450,14 @@ def _table_like(layout: Layout, device: torch.device) -> Tensor:
 
 def _outline(s: Setting, table: Tensor, coverage: Tensor) -> list:
     rects, face = s.fragments.layout.rects, s.fragments.face
-    return [_array(table, wp.vec4i), _array(rects), _array(face), _array(coverage)]
+    return [array(table, wp.vec4i), array(rects), array(face), array(coverage)]
 
 
 def _shade_inputs(s: Setting, table: Tensor, nearest: Tensor, coverage: Tensor, look: Tensor) -> list:
     texels, rects, offsets = s.texels
     return [
-        *(_array(table, wp.vec4i), _array(s.fragments.face), _array(coverage), _array(nearest)),
-        *(_array(texels, vec8), _array(rects), _array(offsets), _array(s.frame_wh, wp.vec2f), _array(look, vec9)),
+        *(array(table, wp.vec4i), array(s.fragments.face), array(coverage), array(nearest)),
+        *(array(texels, vec8), array(rects), array(offsets), array(s.frame_wh, wp.vec2f), array(look, vec9)),
     ]
 
 
@@ -1600,16 +1472,16 @@ def _complete_inputs(
     fill: Tensor,
 ) -> list:
     view, meshes = View(), Meshes()
-    view.turn, view.sun = _field(turn, wp.vec2f), _field(s.sun, wp.vec4f)
-    view.frame_wh, view.unproject = _field(s.frame_wh, wp.vec2f), _field(s.unproject, wp.mat33f)
-    meshes.table, meshes.rects = _field(table, wp.vec4i), _field(s.fragments.layout.rects)
-    meshes.face, meshes.coverage = _field(s.fragments.face), _field(coverage)
-    meshes.clip, meshes.faces = _field(clip, wp.vec3f), _field(s.faces, wp.vec3i)
-    meshes.attributes = _field(s.own, vec17)
+    view.turn, view.sun = field(turn, wp.vec2f), field(s.sun, wp.vec4f)
+    view.frame_wh, view.unproject = field(s.frame_wh, wp.vec2f), field(s.unproject, wp.mat33f)
+    meshes.table, meshes.rects = field(table, wp.vec4i), field(s.fragments.layout.rects)
+    meshes.face, meshes.coverage = field(s.fragments.face), field(coverage)
+    meshes.clip, meshes.faces = field(clip, wp.vec3f), field(s.faces, wp.vec3i)
+    meshes.attributes = field(s.own, vec17)
     texels, rects, offsets = s.texels
     return [
-        *(_array(need), _array(texels, vec8), _array(rects), _array(offsets), view, meshes),
-        *(_array(look, vec9), _array(fill)),
+        *(array(need), array(texels, vec8), array(rects), array(offsets), view, meshes),
+        *(array(look, vec9), array(fill)),
     ]
 
 
@@ -1617,8 +1489,8 @@ def _combine_inputs(
     s: Setting, nearest: Tensor, coverage: Tensor, mesh: Tensor, halo: Tensor, look: Tensor
 ) -> list:
     return [
-        *(_array(s.fragments.face), _array(nearest), _array(coverage), _array(mesh, wp.vec4f)),
-        *(_array(halo, wp.vec4f), _array(look, vec9)),
+        *(array(s.fragments.face), array(nearest), array(coverage), array(mesh, wp.vec4f)),
+        *(array(halo, wp.vec4f), array(look, vec9)),
     ]
 
 
@@ -1633,17 +1505,3 @@ def adjoints_kernel(out: wp.array(dtype=wp.float32)):
     b = vec9()
     out[0] = mesh_loss(b, a, xy, xy, g, 0.0) + halo_loss(b, a, xy, xy, g) + border_loss(xy, xy)
     out[1] = completed_loss(vec17(), 0.0, a, xy, c, g, xy, c) + mirror_loss(vec17(), xy)
-
-
-def _field(values: Tensor, dtype: Any = None) -> wp.array:
-    """An array for a struct."""
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
-
-
-def _array(values: Tensor, dtype: Any = None) -> Any:
-    """An array for a kernel, in the form that is made fastest."""
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-
-
-def _vec3(values: Tensor) -> Any:
-    return _array(values, wp.vec3f)

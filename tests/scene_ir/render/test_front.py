@@ -11,15 +11,16 @@ import torch
 from torch import Tensor
 
 from drivesem.labels import hidden_share
-from scene_ir import blend
-from scene_ir.compositor import Compositor, RenderSettings, scene_to
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene
 from scene_ir.raster.verbs import Backend
 from scene_ir.removal import without_objects
-from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
-from scene_ir.types import Crop, Front, SceneIR
+from scene_ir.render import blend
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
+from scene_ir.types import Crop, Front, SceneIR, scene_to
 
 POLE_M = 6.0
 """Nearer than all cars of the small street, the nearest of which stands at 9 m."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from scene_ir import environment as env
+from scene_ir.render import environment as env
 from scene_ir.types import Environment
 
 H, W = 40, 64

@@ -10,9 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from scene_ir.compositor import Compositor, RenderSettings, render_batch, scene_to
 from scene_ir.ffd import from_symmetric
-from scene_ir.types import Crop, SceneIR
+from scene_ir.render.compositor import Compositor, render_batch
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import Crop, SceneIR, scene_to
 
 PARAMETERS = ("translation", "yaw", "ffd", "texture_code", "weather", "foliage")
 VALUE, GRADIENT = 2e-4, 1e-4

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from scene_ir import texture
+from scene_ir.render import texture
 from scene_ir.types import Crop
 
 ROWS = 64

@@ -15,8 +15,8 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import between, launch, start_warp
-from scene_ir.texture import SATURATED as _SATURATED
+from scene_ir.raster.launch import array, between, field, launch, start_warp
+from scene_ir.render.texture import SATURATED as _SATURATED
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": False})
@@ -221,9 +221,9 @@ class Blend(torch.autograd.Function):
         over = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
         under_shadow, under_layer = torch.empty_like(factor), torch.empty_like(colour)
         inputs = [
-            *(_stack(*shadows), _stack(*layers), _array(factor, wp.vec3f), _array(colour, wp.vec4f)),
-            *(_array(opacity), _array(depth), clamped, _array(image), _array(nearest), _array(number)),
-            *(_array(under_shadow, wp.vec3f), _array(under_layer, wp.vec4f), _array(over)),
+            *(_stack(*shadows), _stack(*layers), array(factor, wp.vec3f), array(colour, wp.vec4f)),
+            *(array(opacity), array(depth), clamped, array(image), array(nearest), array(number)),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over)),
         ]
         launch(blend_kernel, edges, inputs, device=canvas.device)
         ctx.save_for_backward(factor, opacity, under_shadow, under_layer, over)
@@ -245,9 +245,9 @@ class Blend(torch.autograd.Function):
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)
         inputs = [
-            *(_stack(*shadows), _stack(*layers), _array(factor, wp.vec3f), _array(opacity)),
-            *(_array(under_shadow, wp.vec3f), _array(under_layer, wp.vec4f), _array(over), _array(grad_image)),
-            *(_array(grad), _array(grad_factor, wp.vec3f), _array(grad_colour, wp.vec4f), _array(grad_opacity)),
+            *(_stack(*shadows), _stack(*layers), array(factor, wp.vec3f), array(opacity)),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over), array(grad_image)),
+            *(array(grad), array(grad_factor, wp.vec3f), array(grad_colour, wp.vec4f), array(grad_opacity)),
         ]
         launch(blend_backward_kernel, edges, inputs, device=factor.device)
         return (grad if with_canvas else None), grad_factor, grad_colour, grad_opacity, None, None, None, None
@@ -268,13 +268,5 @@ def row_edges(height: int, rects: np.ndarray) -> list[int]:
 
 def _stack(order: Tensor, rects: Tensor, offsets: Tensor) -> Any:
     stack = Stack()
-    stack.order, stack.rects, stack.offsets = _field(order), _field(rects), _field(offsets)
+    stack.order, stack.rects, stack.offsets = field(order), field(rects), field(offsets)
     return stack
-
-
-def _field(values: Tensor) -> wp.array:
-    return wp.from_torch(values.detach(), requires_grad=False)
-
-
-def _array(values: Tensor, dtype: Any = None) -> Any:
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)

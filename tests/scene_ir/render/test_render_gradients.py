@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.ffd import from_symmetric
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import FOLIAGE_DIM, LATTICE, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
 FUNCTIONALS = 3

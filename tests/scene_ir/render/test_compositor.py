@@ -15,13 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from scene_ir import blend, surfaces
-from scene_ir.compositor import Compositor, RenderSettings, render, scene_to
 from scene_ir.errors import ShapeError
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
-from scene_ir.sources import SolveSettings, analytic_shadows, solve_sources
-from scene_ir.types import Crop, Objects, Render, SceneIR
+from scene_ir.render import blend, surfaces
+from scene_ir.render.compositor import Compositor, render
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
+from scene_ir.types import Crop, Objects, Render, SceneIR, scene_to
 
 REFERENCE = RenderSettings(backend="reference")
 IDENTITY = 1e-5

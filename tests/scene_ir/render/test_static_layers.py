@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesem.synth.demo import demo_scene
-from scene_ir.compositor import Compositor, RenderSettings, scene_to
-from scene_ir.types import Camera, Crop, Render, SceneIR, Source
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import Camera, Crop, Render, SceneIR, Source, scene_to
 
 NAMES = ("translation", "yaw", "ffd", "texture_code", "weather", "foliage")
 SPREAD = {"translation": 0.6, "yaw": 0.3, "ffd": 0.03, "texture_code": 0.5, "weather": 0.7, "foliage": 0.7}

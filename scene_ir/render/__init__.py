@@ -1,0 +1,1 @@
+"""The differentiable renderer: `prepare`, then `reference` or `fast`, then `compositor`."""

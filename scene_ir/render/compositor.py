@@ -1,0 +1,150 @@
+"""Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all six kinds of parameter.
+
+In the order of work: `prepare`, then `reference` (plain torch, says what is right) or `fast` (kernels), here for
+several scenes in one go, then `blend` and `environment`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+
+from scene_ir.errors import ShapeError
+from scene_ir.raster.layout import Layout
+from scene_ir.render import blend, fast, reference
+from scene_ir.render.environment import apply_foliage, apply_weather, shadow_softening
+from scene_ir.render.prepare import Layers, Pack, Prepared, RenderSettings, active, joined
+from scene_ir.render.texture import Regions
+from scene_ir.types import Crop, Objects, Render, SceneIR
+
+
+def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
+    """Render scenes as they stand. To render many perturbations of one scene, keep its `Compositor`."""
+    return [Compositor(scene, settings).render(scene) for scene in scenes]
+
+
+class Compositor(Prepared):
+    """Draws perturbations of one scene; keeps what no parameter touches."""
+
+    _fixed: fast.Fixed | None = None
+
+    @property
+    def fixed(self) -> fast.Fixed | None:
+        """What the fast kernels read, gathered on first use; None where they are not used."""
+        if self._fixed is None and self.texels is not None and self.settings.backend == "warp":
+            with torch.no_grad():
+                self._fixed = fast.Fixed.of(self)
+        return self._fixed
+
+    def layers(self, objects: Objects) -> Layers:
+        """The objects drawn one by one, not yet blended."""
+        fixed = self.fixed
+        if fixed is None:
+            return reference.layers(self, objects, self.draw(objects))
+        return _layers([self], self.pack, fixed, [objects])[0]
+
+    def render(self, perturbed: SceneIR) -> Render:
+        """The picture of a perturbed scene; with nothing perturbed, the photograph."""
+        objects = self.moved(perturbed)
+        return self.compose(perturbed, objects, self.layers(objects) if len(objects) else None)
+
+    def moved(self, perturbed: SceneIR) -> Objects:
+        """The objects of a perturbed scene in this one's dtype. Raises ShapeError where it has other objects."""
+        objects = perturbed.objects
+        if len(objects) != len(self.scene.objects):
+            raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
+        moving = {n: getattr(objects, n).to(self.like) for n in ("translation", "yaw", "ffd", "texture_code")}
+        return replace(self.scene.objects, **moving)
+
+    def compose(self, perturbed: SceneIR, objects: Objects, layers: Layers | None) -> Render:
+        """The picture of drawn objects. perturbed: for its environment; layers: None where there are no
+        objects."""
+        environment, backend = perturbed.environment, self.settings.backend
+        weather, foliage = active(environment.weather), active(environment.foliage)
+        canvas = self.canvas if weather else self.canvas[:3]
+        if foliage:
+            changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
+            canvas = torch.cat([apply_foliage(canvas[:3], changed, self.air, backend), canvas[3:]])
+        if self.standing is not None:
+            layers = self.standing.before(layers, canvas[:3] - self.canvas[:3] if foliage else None)
+        if layers is None:
+            with torch.no_grad():
+                depth = self.scene.depth.clone()
+                number = torch.zeros(self.frame_hw, dtype=torch.int64, device=depth.device)
+            opacity: tuple[Crop, ...] = ()
+        else:
+            factors = layers.shadow
+            if weather:
+                factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self.like))
+            order = blend.paint_order(
+                objects.size_lhw, objects.yaw, objects.translation, self.centre, self.footprints
+            )
+            plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
+            what = (factors, layers.colour, layers.opacity, layers.depth)
+            canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
+            number = number if self.standing is None else number.masked_fill(number > len(objects), 0)
+            opacity = tuple(
+                Crop(crop.reshape(1, *size), window[1].start, window[0].start)
+                for crop, (_, window, size) in zip(
+                    layers.opacity.clamp(0.0, 1.0).split(plan.sizes), plan.spans, strict=True
+                )
+            )[: len(objects)]
+        image = canvas
+        if weather:
+            changed = replace(self.scene.environment, weather=environment.weather.to(self.like))
+            image = apply_weather(canvas[:3], canvas[3], changed, self.air, backend)
+        if weather or layers is None:
+            image = blend.clamp_colour(image[:3])
+        return Render(image, depth, number, opacity)
+
+
+def _layers(
+    members: Sequence[Compositor], pack: Pack, fixed: fast.Fixed, objects: Sequence[Objects]
+) -> list[Layers]:
+    """The layers of each member by the fast kernels, all of them in one go."""
+    drawn = pack.draw(objects, with_ground=False)
+    code = None
+    if any(active(o.texture_code) for o in objects):
+        regions = [m.regions for m in members]
+        code = fast.Code(
+            joined([o.texture_code for o in objects]),
+            joined([m.paint_lightness for m in members]),
+            Regions.joined([r for r in regions if r is not None]),
+        )
+    yaw = joined([o.yaw for o in objects])
+    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, code)
+    if len(members) == 1:
+        return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
+    layouts, grounds = (
+        [Layout.of(rects) for rects in whole_layout.rects.split(pack.counts)]
+        for whole_layout in (drawn.mesh.layout, drawn.ground_layout)
+    )
+    sizes, ground_sizes = [part.size for part in layouts], [part.size for part in grounds]
+    parts = zip(
+        layouts, colour.split(sizes), opacity.split(sizes), depth.split(sizes), grounds,
+        shadow.split(ground_sizes), strict=True,
+    )  # fmt: skip
+    return [Layers(*part) for part in parts]
+
+
+@lru_cache(maxsize=2)
+def _together(members: tuple[Compositor, ...]) -> tuple[Pack, fast.Fixed]:
+    """Compositors, all of them with fast kernels, as one."""
+    return Pack(members), fast.Fixed.pack([m.fixed for m in members if m.fixed is not None])
+
+
+def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
+    """The picture of each perturbed scene by its compositor, their objects drawn in one go where they can be.
+
+    A compositor may occur several times. The pictures are those that `Compositor.render` gives, one by one.
+    """
+    members = tuple(c for c, _ in pairs)
+    together = len(pairs) > 1 and all(c.fixed is not None for c in members)
+    if not together:
+        return [c.render(scene) for c, scene in pairs]
+    objects = [c.moved(scene) for c, scene in pairs]
+    layers = _layers(members, *_together(members), objects)
+    return [c.compose(p, o, part) for (c, p), o, part in zip(pairs, objects, layers, strict=True)]

@@ -1,0 +1,566 @@
+"""What no parameter touches, made ready once: placed meshes, the ground that takes their shadows, and what the
+photograph knows of each vehicle; and the z-buffers, which find what the pixels of a perturbation see.
+
+A vehicle's *mesh* shows the photograph where the photograph saw that point, and completes what it did not see. Its
+*halo*, the pixels around the mesh, carries what of the matte lies beyond the mesh, and moves as the nearest piece
+of outline does. A pixel's lookup is `pixel + displacement`, the displacement interpolated from the difference of
+the clip coordinates then and now: with nothing perturbed it is exactly zero, every lookup falls on a pixel centre,
+and the picture is the photograph.
+
+Shapes: N objects, V vertices, T packed pixels of all objects' crops.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir.meshes.lod import detail
+from scene_ir.raster import verbs
+from scene_ir.render import blend, finish, surfaces, texture
+from scene_ir.render.environment import sky_colour
+from scene_ir.render.surfaces import Fleet, Rig, Surface
+from scene_ir.render.texture import Regions, Texels, smoothstep
+from scene_ir.types import Crop, Objects, SceneIR, scene_to
+
+HALO_MAX_PX = 64.0
+"""However near a vehicle is, its halo reaches no farther: of a car that fills the picture's height this is a
+sixth."""
+
+
+_MOST_SAMPLES, _GOLDEN = 5000, 0.6180339887
+"""Pixels of one object that its finish is read off, some for each vertex; steps by the golden section spread
+them."""
+_PATCH_MARGIN_PX = 4
+"""Ground kept around a photographed shadow: the reach of the lookups' kernel, and two pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class RenderSettings:
+    """backend: `warp` (float32, fast) or `reference` (plain torch, the scene's dtype, for gradient checks).
+    shadows: whether vehicles darken the ground. lod: whether meshes are drawn as coarsely as their size in pixels
+    allows; a scene is rendered as it was taken apart where both were done alike.
+    """
+
+    backend: verbs.Backend = "warp"
+    shadows: bool = True
+    lod: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The objects of one scene, drawn but not yet blended.
+
+    layout: crops of the objects; colour (T, 4): premultiplied RGB and opacity / depth; opacity (T,); depth (T,) m.
+    shadow_layout, shadow (Ts, 3): the shadows' crops and factors.
+    """
+
+    layout: verbs.Layout
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    shadow_layout: verbs.Layout
+    shadow: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What stands in front of vehicles, as layers after theirs. footprints (K, 4, 2) m, see `blend`; layout,
+    colour (T, 4), opacity (T,), depth (T,) m as in `Layers`; pixel (T,) int64: of the frame, for each of theirs.
+    """
+
+    footprints: np.ndarray
+    layout: verbs.Layout
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    pixel: Tensor
+
+    @classmethod
+    def of(cls, scene: SceneIR, like: Tensor) -> Standing:
+        """Of a scene's `front`. `like`: a tensor of the dtype and device to work in."""
+        texels = Texels.pack([f.foreground for f in scene.front], like)
+        layout = verbs.Layout.of(texels.rects)
+        rgba, draw = texels.values, layout.draw()
+        depth = like.new_tensor([f.depth_m for f in scene.front])[draw]
+        colour = torch.cat([rgba[:, :3], rgba[:, 3:] / depth[:, None]], dim=1)
+        x, y = layout.pixels().unbind(1)
+        footprints = blend.standing_footprints(scene.front, scene.camera.matrix)
+        return cls(footprints, layout, colour, rgba[:, 3], depth, y * scene.camera.width + x)
+
+    def before(self, layers: Layers | None, change: Tensor | None) -> Layers:
+        """Layers of objects, if there are any, and these after them. change: (3, H, W), what the season does to
+        the background, and so to these."""
+        colour = self.colour
+        if change is not None:
+            moved = change.flatten(1)[:, self.pixel].T * self.opacity[:, None]
+            colour = torch.cat([colour[:, :3] + moved, colour[:, 3:]], dim=1)
+        if layers is None:
+            nothing = verbs.Layout.of(self.layout.rects[:0])
+            return Layers(self.layout, colour, self.opacity, self.depth, nothing, colour[:0, :3])
+        return Layers(
+            verbs.Layout.of(torch.cat([layers.layout.rects, self.layout.rects])),
+            torch.cat([layers.colour, colour]),
+            torch.cat([layers.opacity, self.opacity]),
+            torch.cat([layers.depth, self.depth]),
+            layers.shadow_layout,
+            layers.shadow,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
+    camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.brightened`, by what the
+    objects turned since the photograph."""
+
+    clip: Tensor
+    cos: Tensor
+    ground_clip: Tensor
+    brighter: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo;
+    ground_layout: of the patches; ground: what was found there, None where the fast kernels find out themselves.
+    """
+
+    geometry: Geometry
+    mesh: verbs.Fragments
+    coverage: Tensor
+    reach_px: tuple[float, ...]
+    ground_layout: verbs.Layout
+    ground: verbs.Fragments | None
+
+    def nearest(self) -> Tensor:
+        """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo
+        reaches."""
+        return surfaces.nearest_hits(self.mesh, self.reach_px)
+
+
+class Prepared:
+    """One scene, made ready to draw its perturbations: all that no parameter touches.
+
+    A perturbed scene may differ from `scene` in objects.translation, yaw, ffd, texture_code and in
+    environment.weather, foliage. With backend `warp` the scene is worked on in float32.
+    """
+
+    def __init__(
+        self,
+        scene: SceneIR,
+        settings: RenderSettings | None = None,
+        hidden: Sequence[Tensor] | None = None,
+        whole_patches: bool = False,
+    ) -> None:
+        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given.
+        whole_patches: keep all of the ground that a vehicle may darken, not only what its source's shadow does."""
+        self.settings = settings or RenderSettings()
+        if self.settings.backend == "warp" and scene.photograph.dtype != torch.float32:
+            scene = scene_to(scene, torch.float32)
+        self.scene = scene
+        self._whole_patches = whole_patches
+        self.like = scene.photograph
+        self.frame_hw = (scene.camera.height, scene.camera.width)
+        self.centre = surfaces.camera_centre(scene.camera.matrix).to(self.like)
+        self.unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self.like)
+        self.air = sky_colour(scene.photograph, scene.environment.sky)
+        inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
+        self.canvas = torch.cat([scene.background, inverse.to(self.like)[None]])
+        self.standing = Standing.of(scene, self.like) if scene.front else None
+        self.footprints = None if self.standing is None else self.standing.footprints
+        with torch.no_grad():
+            self._prepare(scene.objects, hidden)
+
+    def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
+        """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
+        base = photographed(objects)
+        meshes = [self.scene.meshes[int(i)] for i in objects.mesh_index]
+        if self.settings.lod:
+            heights = self._height_px(base)
+            meshes = [detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
+        picked = [Surface.of(mesh, self.like.dtype) for mesh in meshes]
+        self.fleet = Fleet.of(picked, self.like)
+        local = self.fleet.local(base.ffd, base.size_lhw)
+        self.sharp, self.smooth = self.fleet.normals(local)
+        self.rig = Rig.of(self.fleet, self.smooth, self.scene.camera.matrix, self.centre)
+        inflation = self.like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
+        self.halo = inflation * self.scene.camera.matrix[0, 0].to(self.like)
+        self.sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
+        self.corners = surfaces.shadow_corners(base.size_lhw, self.sun_offset)
+        if objects.source and not self._whole_patches:
+            self.corners = self._trimmed_corners(objects, base)
+        self.outwards = surfaces.outwards(self.corners, base.size_lhw, self.sun_offset)
+        self._lit: Tensor | None = None
+        self.base_yaw = base.yaw
+        self.sunlight = self.like.new_tensor(
+            [s.sunlight for s in objects.source] or [texture.SUNLIGHT] * len(base)
+        )
+        self.size = base.size_lhw
+        self._base_ffd, self._base_local = base.ffd, local
+        # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
+        self.pack = Pack([weakref.proxy(self)])
+        self.base = self._place(base)
+        self.height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self.like.new_zeros(0)
+        self.texels, self.shadows, self.regions = None, None, None
+        self._finish: Tensor | None = None
+        self._drawn: Drawn | None = None  # until the finish is found
+        self.paint_lightness = self._base_lightness(objects)
+        if objects.source:
+            self._prepare_sources(objects, base, hidden)
+
+    def _trimmed_corners(self, objects: Objects, base: Objects) -> Tensor:
+        """The patches (N, 4, 2) m, cut down to what the photographed shadows darken."""
+        height, width = self.frame_hw
+        corners = self.corners.clone()
+        for i, source in enumerate(objects.source):
+            if source.shadow is None or source.shadow.values.numel() == 0:
+                continue
+            rows, columns = (source.shadow.values < 1.0).any(dim=0).nonzero().unbind(dim=1)
+            x, y = columns + source.shadow.x0, rows + source.shadow.y0
+            margin = _PATCH_MARGIN_PX
+            if not len(x) or int(x.min()) < margin or int(y.min()) < margin:
+                continue  # a shadow that the border cuts goes on beyond it
+            if int(x.max()) >= width - margin or int(y.max()) >= height - margin:
+                continue
+            steps = torch.tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
+            pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self.like)
+            found = surfaces.on_ground(
+                pixels,
+                self.unproject,
+                self.centre,
+                base.translation[i],
+                base.yaw[i],
+                self.scene.environment.ground,
+            )
+            if found is None:
+                continue
+            low = torch.maximum(found.amin(dim=0), corners[i].amin(dim=0))
+            high = torch.minimum(found.amax(dim=0), corners[i].amax(dim=0))
+            if bool((high > low).all()):
+                corners[i] = surfaces.rectangle(low, high)
+        return corners
+
+    def _height_px(self, objects: Objects) -> list[float]:
+        """How high the objects are in the image at their nearest point, at least."""
+        middle = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2]
+        nearest = (middle - 0.5 * objects.size_lhw[:, [0, 2]].norm(dim=1)).clamp(min=1.0)
+        return (self.scene.camera.matrix[1, 1].to(nearest) * objects.size_lhw[:, 1] / nearest).tolist()
+
+    def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
+        drawn = self.draw(base)
+        self._drawn = drawn
+        mirrored = self.fleet.place(
+            self.fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
+        )
+        self.mirror_clip = surfaces.project_vertices(mirrored, self.scene.camera)
+        flipped = surfaces.rotate(self.smooth * self.like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.fleet.owner])
+        self.mirror_cos = surfaces.facing(mirrored, flipped, self.centre)
+        order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self.centre, self.footprints)
+        nearer = [thing.foreground for thing in (*objects.source, *self.scene.front)]
+        mattes = [replace(crop, values=crop.values[3:]) for crop in nearer]
+        crops = []
+        rects = drawn.mesh.layout.rects.tolist()
+        for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
+            before = [mattes[j] for j in order[order.index(i) + 1 :]]
+            unseen = hidden[i] if hidden else texture.hidden_behind(before, self.frame_hw, self.like)
+            x0, y0, x1, y1 = rects[i]
+            if x1 <= x0:
+                crops.append(Crop(self.like.new_zeros(texture.CHANNELS, 0, 0), 0, 0))
+                continue
+            depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
+            crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self.frame_hw))
+        self.texels = Texels.pack(crops + crops, self.like)
+        self.shadows = Texels.pack([_darkness(s.shadow, self.frame_hw) for s in objects.source], self.like)
+        blank = Crop(self.like.new_zeros(1, 0, 0), 0, 0)
+        self.regions = Regions(
+            Texels.pack([s.region or blank for s in objects.source], self.like),
+            torch.tensor([s.region is not None for s in objects.source], device=self.like.device),
+        )
+
+    @property
+    def finish(self) -> Tensor:
+        """(V, 4): gains (3) and lift that make the templates' colours the vehicles'; found on first use."""
+        if self._finish is None:
+            parts = zip(self.fleet.surfaces, self.samples(), strict=True)
+            found = [torch.from_numpy(finish.fitted(surface, samples)) for surface, samples in parts]
+            self._finish = torch.cat(found).to(self.like)
+            self._drawn = None
+        return self._finish
+
+    def _base_lightness(self, objects: Objects) -> Tensor:
+        """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
+        if objects.source:
+            paint = torch.stack([s.paint for s in objects.source]).to(self.like)
+        else:
+            paint = self._template_paint()
+        return texture.lab(paint.clamp(0.0, 1.0))[:, 0]
+
+    def _template_paint(self) -> Tensor:
+        """The mean colour (N, 3) of the templates' paint."""
+        fleet = self.fleet
+        total = self.size.new_zeros(len(self.size), 3)
+        total = total.index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
+        count = total.new_zeros(len(total)).index_add(0, fleet.owner, fleet.paint)
+        return total / count.clamp(min=1e-3)[:, None]
+
+    def base_paint(self, samples: Sequence[finish.Samples]) -> Tensor:
+        """The paint (N, 3) of the objects as the photograph shows it, by their `samples`; the templates' where it
+        shows none."""
+        paint = self._template_paint()
+        for i, (surface, own) in enumerate(zip(self.fleet.surfaces, samples, strict=True)):
+            found = finish.base_paint(surface, own)
+            if found is not None:
+                paint[i] = found.to(paint)
+        return paint
+
+    def _place(self, objects: Objects) -> Geometry:
+        return self.pack.place([objects])
+
+    def draw(self, objects: Objects) -> Drawn:
+        """Find which surfaces the pixels see."""
+        return self.pack.draw([objects])
+
+    def local(self, objects: Objects) -> Tensor:
+        """Vertices (V, 3) m in their objects' frames."""
+        bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
+        return self.fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
+
+    def brighter(self, objects: Objects) -> Tensor:
+        """By how much (V,) the surfaces are brighter than in the photograph, since they turned: see
+        `texture.brightened`."""
+        turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
+        if not objects.source or not turned:
+            return self.like.new_zeros(self.fleet.owner.shape[0])
+        if self._lit is None:
+            self._lit = self._sun_on(self.base_yaw)
+        sunlight = self.fleet.spread(self.sunlight)
+        then = texture.AMBIENT[0] + texture.AMBIENT[1] * (0.5 - 0.5 * self.smooth[:, 1]) + sunlight * self._lit
+        return texture.brightened(sunlight * (self._sun_on(objects.yaw) - self._lit) / then, self.fleet.paint)
+
+    def _sun_on(self, yaw: Tensor) -> Tensor:
+        """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
+        sun = self.scene.environment.sun.to(self.like).expand(len(yaw), 3)
+        x, y, z = self.fleet.spread(surfaces.rotate(sun, -yaw)).unbind(-1)
+        # Written out: sums along an axis may differ in their last bit with the number of rows.
+        soft = self.smooth[:, 0] * x + self.smooth[:, 1] * y + self.smooth[:, 2] * z
+        return texture.sunward(soft)
+
+    def ground(self, objects: Objects) -> Tensor:
+        """Clip coordinates (4N, 3) of the corners of the shadows' patches.
+
+        A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
+        sun: the patch is sheared the more, the farther out.
+        """
+        ground = self.scene.environment.ground
+        offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self.size[:, 1])
+        corners = self.corners + self.outwards[..., None] * (offset - self.sun_offset)[:, None]
+        corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
+        return surfaces.project_vertices(corners, self.scene.camera)
+
+    def shadowless(self) -> list[bool]:
+        """Which objects darken no ground."""
+        source = self.scene.objects.source
+        count = len(self.scene.objects)
+        return [not self.settings.shadows or (bool(source) and source[i].shadow is None) for i in range(count)]
+
+    def reach_px(self, objects: Objects) -> list[float]:
+        """How far the halo of each object reaches beyond its mesh."""
+        if not objects.source:
+            return [0.0] * len(objects)
+        distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
+        return (self.halo / distance).clamp(max=HALO_MAX_PX).tolist()
+
+    def own_attributes(self, objects: Objects, geometry: Geometry) -> Tensor:
+        """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
+        fleet = self.fleet
+        normals = surfaces.rotate(self.sharp, fleet.spread(objects.yaw))
+        parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self.height)
+        return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
+
+    def own_colour(self, xy: Tensor, owner: Tensor, own: Tensor) -> Tensor:
+        """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
+        `_own_attributes` (K, 10)."""
+        sunlight = self.sunlight.index_select(0, owner)
+        albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
+        ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self.unproject.T
+        normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
+        to_eye = -torch.nn.functional.normalize(ray, dim=-1)
+        sun = self.scene.environment.sun.to(self.like)
+        return texture.shade(normal, to_eye, albedo, sheen, height, sun, sunlight)
+
+    @torch.no_grad()
+    def photographed_paint(self) -> list[Crop]:
+        """For each object, where its foreground is: Crop (1, h, w), 1 where the mesh at its place in the
+        photograph is paint, 0 where not; beyond the mesh as at its nearest pixel."""
+        objects = photographed(self.scene.objects)
+        drawn = self.draw(objects)
+        dense = verbs.interpolate(
+            drawn.mesh, drawn.geometry.clip, self.fleet.faces, self.fleet.paint[:, None], self.settings.backend
+        )
+        out = []
+        for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
+            place = objects.source[i].foreground
+            h, w = place.values.shape[1:]
+            x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
+            known = (drawn.mesh.face[packed] >= 0).reshape(size)
+            if not h or not w or not bool(known.any()):
+                out.append(Crop(self.like.new_zeros(1, h, w), place.x0, place.y0))
+                continue
+            values = texture.continued(dense[packed].T.reshape(1, *size), known)
+            rows = (torch.arange(h) + place.y0 - y0).clamp(0, size[0] - 1)
+            columns = (torch.arange(w) + place.x0 - x0).clamp(0, size[1] - 1)
+            out.append(Crop(values[:, rows][:, :, columns], place.x0, place.y0))
+        return out
+
+    @torch.no_grad()
+    def samples(self) -> list[finish.Samples]:
+        """What the photograph shows of each object, beside its template in daylight: a row a pixel, of large
+        objects about `_MOST_SAMPLES` pixels, spread evenly."""
+        objects, drawn = photographed(self.scene.objects), self._drawn
+        if drawn is None:
+            drawn = self.draw(objects)
+        layout, count = drawn.mesh.layout, len(objects)
+        pixel = (drawn.mesh.face >= 0).nonzero()[:, 0]
+        owner, xy = layout.draw()[pixel], layout.pixels()[pixel].to(self.like)
+        assert self.texels is not None
+        counts = torch.bincount(owner, minlength=2 * count)
+        seen = self.texels.sample(xy, counts, self.settings.backend, "clamp")
+        weight = smoothstep(seen[:, 3], 0.9, 0.99) * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
+        weight = weight * (1.0 - smoothstep(seen[:, 5], 0.0, 1.0))
+        plain = (weight > 0.0).nonzero()[:, 0]
+        # By their places within the object, so that others beside it change nothing.
+        size = torch.bincount(owner[plain], minlength=count)
+        place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
+        chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MOST_SAMPLES / size.clamp(min=1))[owner[plain]]]
+        pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
+        corner = self.fleet.faces[drawn.mesh.face[pixel].long()]
+        share = surfaces.weights_at(drawn.geometry.clip[corner], xy).to(self.like)
+        own = torch.cat([self.own_attributes(objects, drawn.geometry), drawn.geometry.cos[:, None]], dim=1)
+        own = (own[corner] * share[..., None]).sum(dim=1)
+        weight = weight * smoothstep(own[:, 10], *texture.SQUARE)
+        template = self.own_colour(xy, owner, own[:, :10])
+        normal = torch.nn.functional.normalize(own[:, 3:6], dim=-1, eps=1e-6)
+        sun = self.scene.environment.sun.to(self.like)
+        sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
+        columns = (corner, share, template, seen[:, :3], sky, lit - sky, weight)
+        out = []
+        for i, (start, _) in enumerate(self.fleet.vertex_ranges.tolist()):
+            mine = (owner == i) & (weight > 0.0)
+            vertex, *values = (c[mine].cpu().numpy() for c in columns)
+            out.append(finish.Samples(vertex - start, *(v.astype(np.float64) for v in values)))
+        return out
+
+    def ground_density(self, drawn: Drawn) -> Tensor:
+        """How much the objects' boxes darken the pixels (Ts,) of their patches, in [0, 1]."""
+        clip = drawn.geometry.ground_clip
+        assert drawn.ground is not None
+        faces, _, _ = patch_faces(self.corners.shape[0], clip.device)
+        corners = self.corners.reshape(-1, 2).contiguous()
+        local = verbs.interpolate(drawn.ground, clip, faces, corners, self.settings.backend)
+        owner = drawn.ground_layout.draw()
+        density = surfaces.shadow_density(local, self.size[owner], self.sun_offset[owner])
+        return density * (drawn.ground.face >= 0)
+
+
+class Pack:
+    """Prepared scenes whose objects are drawn in one go: each stage passes once over all pixels, of however many
+    scenes.
+
+    A scene may occur more than once, for several perturbations of one scene.
+    """
+
+    def __init__(self, members: Sequence[Prepared]) -> None:
+        self._members = tuple(members)
+        self._backend: verbs.Backend = members[0].settings.backend
+        self._rig = Rig.pack([m.rig for m in members])
+        self._faces, self._vertex_ranges, self._face_ranges = Fleet.joined([m.fleet for m in members])
+        self._ranges = torch.tensor(self._face_ranges, dtype=torch.int64, device=self._faces.device).reshape(-1, 2)
+        closed = [s.closed for m in members for s in m.fleet.surfaces]
+        self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
+        self.counts = [len(m.scene.objects) for m in members]
+        cameras = [m.scene.camera for m in members]
+        self._frames_hw = [
+            (c.height, c.width) for c, n in zip(cameras, self.counts, strict=True) for _ in range(n)
+        ]
+        self._patches = patch_faces(sum(self.counts), self._faces.device)
+        self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self.counts))]
+        self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self.counts))]
+        self._shadowless = [s for m in members for s in m.shadowless()]
+
+    def place(self, objects: Sequence[Objects]) -> Geometry:
+        """Where the vertices of perturbed objects, of each member, come to lie."""
+        local = joined([m.local(o) for m, o in zip(self._members, objects, strict=True)])
+        yaw, translation = joined([o.yaw for o in objects]), joined([o.translation for o in objects])
+        ground = joined([m.ground(o) for m, o in zip(self._members, objects, strict=True)])
+        clip, cos = surfaces.place(self._rig, local, yaw, translation, self._backend if len(yaw) else "reference")
+        brighter = joined([m.brighter(o) for m, o in zip(self._members, objects, strict=True)])
+        return Geometry(clip, cos, ground, brighter)
+
+    def reach_px(self, objects: Sequence[Objects]) -> list[float]:
+        """How far the halo of each object reaches beyond its mesh."""
+        return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
+
+    def draw(self, objects: Sequence[Objects], with_ground: bool = True) -> Drawn:
+        """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
+        geometry, backend, reach = self.place(objects), self._backend, self.reach_px(objects)
+        rects = surfaces.crop_rects(
+            geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
+            [2.0 + r for r in reach],
+        )  # fmt: skip
+        layout = verbs.Layout.of(rects)
+        mesh = verbs.rasterize(geometry.clip, self._faces, self._ranges, layout, backend, cull=self._cull)
+        coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
+        faces, _, face_ranges = self._patches
+        patch_rects = surfaces.crop_rects(
+            geometry.ground_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
+        )
+        patch_rects[torch.tensor(self._shadowless, dtype=torch.bool)] = 0
+        ground_layout = verbs.Layout.of(patch_rects)
+        ground = None
+        if with_ground:
+            ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
+        return Drawn(geometry, mesh, coverage, tuple(reach), ground_layout, ground)
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """Several scenes' rows, one after the other."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+
+
+def photographed(objects: Objects) -> Objects:
+    """The objects at the geometry of their sources."""
+    if not objects.source:
+        return objects
+    names = ("translation", "yaw", "size_lhw", "ffd")
+    return replace(
+        objects, **{n: torch.stack([getattr(s, n) for s in objects.source]).to(objects.yaw) for n in names}
+    )
+
+
+def _darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
+    """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches
+    there."""
+    if shadow is None or shadow.values.numel() == 0:
+        return Crop(torch.zeros(3, 0, 0), 0, 0)
+    h, w = shadow.values.shape[1:]
+    dark = replace(shadow, values=1.0 - shadow.values)
+    rect = (shadow.x0 - 4, shadow.y0 - 4, shadow.x0 + w + 4, shadow.y0 + h + 4)
+    return Crop(texture.crop_of(dark, rect, frame_hw), rect[0], rect[1])
+
+
+def patch_faces(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Faces (2N, 3), vertex and face ranges (N, 2) of the shadows' patches, four corners each."""
+    start = torch.arange(count, device=device)[:, None]
+    faces = (4 * start + torch.tensor([0, 1, 2, 0, 2, 3], device=device)).reshape(-1, 3)
+    return faces, torch.cat([4 * start, 4 * start + 4], dim=1), torch.cat([2 * start, 2 * start + 2], dim=1)
+
+
+def active(code: Tensor) -> bool:
+    """Whether a code has to be applied: it is not 0, or somebody wants its gradient."""
+    return code.requires_grad or bool((code.detach() != 0).any())

@@ -1,0 +1,287 @@
+"""Drawing objects in plain torch, in any dtype: what the fast path has to agree with.
+
+Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its halo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene_ir.raster import verbs
+from scene_ir.render import texture
+from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
+from scene_ir.render.texture import smoothstep
+from scene_ir.types import Objects
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Pixels to be coloured, mesh rows first, each part grouped by object.
+
+    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this
+    row fills; counts (2N,) int64 rows of each mesh, then of each halo; fringe: see `_Fringe`; anchor (R - Rm,)
+    int64: the mesh row that each row of a halo moves with.
+    """
+
+    pixel: Tensor
+    owner: Tensor
+    xy: Tensor
+    share: Tensor
+    counts: Tensor
+    mesh_rows: int
+    fringe: _Fringe
+    anchor: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Shaded:
+    """Rows with their looks: premultiplied colour (R, 3), opacity (R,), depth (R,) m, paint and height (R,)."""
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    paint: Tensor
+    height: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Fringe:
+    """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses
+    have nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing
+    jumps when the outline passes over a pixel's centre.
+
+    hit (Rm,) 1 or 0; row (K,) int64: rows at the outline; own (K,) in [0, 1]: how much they keep of their own
+    values; neighbour (K, 4) int64 rows; weight (K, 4), of sum 1, or 0 where no neighbour is hit.
+    """
+
+    hit: Tensor
+    row: Tensor
+    own: Tensor
+    neighbour: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, layout: verbs.Layout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor) -> _Fringe:
+        """hit, coverage, owner (T,): of all packed pixels; mesh_pixel (Rm,) int64: those that have a row."""
+        row = (coverage.detach()[mesh_pixel] < 1).nonzero()[:, 0]
+        pixel = mesh_pixel[row]
+        draw = owner[pixel]
+        x0, y0, x1, y1 = layout.rects[draw].unbind(-1)
+        width, within = x1 - x0, pixel - layout.offsets[draw]
+        column, line = within % width, within // width
+        steps = torch.stack([torch.full_like(width, -1), torch.ones_like(width), -width, width], dim=1)
+        exists = torch.stack([column > 0, column < width - 1, line > 0, line < y1 - y0 - 1], dim=1)
+        neighbour = torch.where(exists, pixel[:, None] + steps, pixel[:, None])
+        known = exists & hit[neighbour]
+        weight = ((2.0 * coverage[neighbour] - 1.0).clamp(min=0.0) + 1e-3) * known
+        weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-3)
+        own = smoothstep(coverage[pixel], 0.5, 1.0) * hit[pixel]
+        own = torch.where(known.any(dim=1), own, torch.ones_like(own))
+        rank = torch.zeros_like(hit, dtype=torch.int64)
+        rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=hit.device)
+        return cls(hit[mesh_pixel].to(coverage), row, own, rank[neighbour], weight)
+
+    def fill(self, values: Tensor) -> Tensor:
+        """Values (Rm, Q), read at the hits, continued over the outline."""
+        known = values * self.hit[:, None]
+        if self.row.numel() == 0:
+            return known
+        mean = (known[self.neighbour] * self.weight[..., None]).sum(dim=1)
+        return known.index_add(0, self.row, (1.0 - self.own)[:, None] * (mean - known[self.row]))
+
+
+def layers(prepared: Prepared, objects: Objects, drawn: Drawn) -> Layers:
+    """`layers` in plain torch."""
+    rows = _rows(prepared, drawn, bool(objects.source))
+    size = drawn.mesh.layout.size
+    if objects.source:
+        shaded = _photographed_rows(prepared, objects, drawn, rows)
+    else:
+        own = _mesh_attributes(prepared, drawn, rows, prepared.own_attributes(objects, drawn.geometry))
+        colour = prepared.own_colour(rows.xy, rows.owner, own).clamp(0.0, 1.0)
+        shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
+    colour, depth = shaded.colour, shaded.depth
+    if active(objects.texture_code):
+        code, base = objects.texture_code.index_select(0, rows.owner), prepared.paint_lightness[rows.owner]
+        colour = texture.apply_texture_code(colour, shaded.opacity, code, shaded.paint, shaded.height, base)
+    opacity = shaded.opacity * rows.share
+    inverse = (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]
+    packed = torch.cat([colour * rows.share[:, None], inverse], dim=1)
+    z = torch.full_like(drawn.mesh.depth, torch.inf).scatter_reduce(
+        0, rows.pixel, depth.detach(), "amin", include_self=True
+    )
+    return Layers(
+        drawn.mesh.layout,
+        packed.new_zeros(size, 4).index_add(0, rows.pixel, packed),
+        opacity.new_zeros(size).index_add(0, rows.pixel, opacity),
+        z,
+        drawn.ground_layout,
+        _shadow_factors(prepared, objects, drawn),
+    )
+
+
+def _rows(prepared: Prepared, drawn: Drawn, with_halo: bool) -> _Rows:
+    layout = drawn.mesh.layout
+    count = layout.rects.shape[0]
+    covered = drawn.coverage.detach()
+    hit = drawn.mesh.face >= 0
+    mesh_pixel = (hit | (covered > 0)).nonzero()[:, 0]
+    owner = layout.draw()
+    pixel, share = mesh_pixel, drawn.coverage.index_select(0, mesh_pixel)
+    counts = torch.bincount(owner[mesh_pixel], minlength=count)
+    anchor = mesh_pixel[:0]
+    if with_halo:
+        nearest = drawn.nearest()
+        halo_pixel = ((nearest >= 0) & (covered < 1)).nonzero()[:, 0]
+        pixel = torch.cat([mesh_pixel, halo_pixel])
+        share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, halo_pixel)])
+        counts = torch.cat([counts, torch.bincount(owner[halo_pixel], minlength=count)])
+        rank = torch.zeros_like(owner)
+        rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=rank.device)
+        anchor = rank[nearest[halo_pixel]]
+    rows_owner = owner[pixel]
+    x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
+    within, width = pixel - layout.offsets[rows_owner], x1 - x0
+    xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
+    fringe = _Fringe.of(layout, hit, drawn.coverage, mesh_pixel, owner)
+    return _Rows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], fringe, anchor)
+
+
+def _mesh_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+    """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
+    dense = verbs.interpolate(
+        drawn.mesh, drawn.geometry.clip, prepared.fleet.faces, attributes, prepared.settings.backend
+    )
+    return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
+
+
+def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows) -> _Shaded:
+    """All rows, coloured by the photograph, and completed where it did not see the mesh."""
+    geometry, base, fleet, m = drawn.geometry, prepared.base, prepared.fleet, rows.mesh_rows
+    turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, prepared.height, geometry.brighter], dim=1)
+
+    attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
+    dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, prepared.settings.backend)
+    mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
+    move, rest = torch.cat([mesh, mesh.index_select(0, rows.anchor)]).split([2, 7], dim=1)
+    z_then, z_now, turned, cos_then, paint, up, brighter = rest.unbind(1)
+
+    assert prepared.texels is not None
+    uv = rows.xy + move
+    seen = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
+    rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
+    alpha, hidden, outline, z_seen, support = rest.unbind(1)
+    rgb = texture.relit(rgb, brighter)
+    clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
+    inside = texture.inside_weight(uv, *prepared.frame_hw)
+    visible = inside * clear
+    facing = texture.facing_weight(turned, cos_then, paint)
+    weight = facing * visible
+    if bool((inside.detach() < 1.0).any()):
+        near = texture.inside_weight(uv, *prepared.frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
+        weight = weight + facing * (1.0 - inside) * near * clear
+    weight = weight * (1.0 - smoothstep(z_then - z_seen, *texture.DEPTH_TOLERANCE_M))
+    kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
+    weight = torch.cat([weight[:m], weight[m:] * kept])
+    rim = 1.0 - smoothstep(cos_then[:m], *texture.RIM)
+    opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
+    # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
+    empty = visible[:m] * (1.0 - smoothstep(support[:m], 0.1, 0.9))
+    # What opens up is as opaque as the inside, in its own colour, where there is enough of it to tell.
+    closed = weight[:m] * opened * (1.0 - empty) * smoothstep(alpha[:m], *texture.OPEN_ALPHA)
+    gain = torch.cat([closed / alpha[:m].clamp(min=texture.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
+    fill = (1.0 - weight[:m]) * (1.0 - empty)
+    colour, opacity = (weight + gain)[:, None] * rgb, (weight + gain) * alpha
+    need = (fill != 0.0).nonzero()[:, 0]
+    if need.numel():
+        filled = fill.index_select(0, need)
+        completed = _completion(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m])
+        colour = colour.index_add(0, need, filled[:, None] * completed)
+        opacity = opacity.index_add(0, need, filled)
+    assert prepared.regions is not None
+    if active(objects.texture_code) and bool(prepared.regions.known.any()):
+        unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
+        found = prepared.regions.texels.sample_parts(uv, rows.counts, prepared.settings.backend)[:, 0]
+        paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
+    return _Shaded(colour, opacity, z_now, paint, up)
+
+
+def _completion(
+    prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows, need: Tensor, cos_now: Tensor
+) -> Tensor:
+    """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
+    template in the car's own finish.
+
+    cos_now: (Rm,) towards the camera.
+    """
+    own = prepared.own_attributes(objects, drawn.geometry)
+    mirror = torch.cat([prepared.mirror_clip, prepared.mirror_cos[:, None]], dim=1)
+    both = _mesh_attributes(prepared, drawn, rows, torch.cat([own, mirror, prepared.finish], dim=1))[need]
+    gain, lift = both[:, 14:17], both[:, 17:]
+    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], both[:, :10]), gain, lift)
+    clip, cos_then = both[:, 10:13], both[:, 13]
+    z = clip[:, 2]
+    safe = z.clamp(min=0.1)
+    uv = clip[:, :2] / safe[:, None]
+    counts = torch.bincount(rows.owner[need], minlength=rows.counts.shape[0])
+    assert prepared.texels is not None
+    seen = prepared.texels.sample(uv, counts, prepared.settings.backend, "clamp")
+    height, width = prepared.frame_hw
+    weight = (
+        texture.inside_weight(uv, height, width)
+        * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
+        * smoothstep(seen[:, 3], 0.5, 0.95)
+        * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
+        * texture.facing_weight(cos_now[need] - cos_then, cos_then, both[:, 6])
+        * smoothstep(cos_then, 0.05, 0.2)
+        * (1.0 - smoothstep(seen[:, 5], *texture.MIRRORED_RIM))
+    )
+    straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
+    return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
+
+
+def _shadow_factors(prepared: Prepared, objects: Objects, drawn: Drawn) -> Tensor:
+    """Factors (Ts, 3) on the ground, of all patches."""
+    clip, layout = drawn.geometry.ground_clip, drawn.ground_layout
+    assert drawn.ground is not None
+    if layout.size == 0:
+        return clip.new_zeros(0, 3)
+    faces, _, _ = patch_faces(len(objects), clip.device)
+    if not objects.source:
+        return (1.0 - prepared.ground_density(drawn))[:, None].expand(-1, 3)
+    base = prepared.base.ground_clip
+    fixed = torch.cat([base - clip, base[:, 2:]], dim=1)
+    dense = verbs.interpolate(drawn.ground, clip, faces, fixed, prepared.settings.backend)
+    hit = (drawn.ground.face >= 0).nonzero()[:, 0]
+    xy = layout.pixels()[hit].to(prepared.like)
+    wanted = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
+    height, width = prepared.frame_hw
+    # Constant from the border on, where `_darkness` repeats it: clamping two pixels beyond leaves no kink.
+    uv = wanted.clamp(min=-2.0).minimum(wanted.new_tensor([width + 1.0, height + 1.0]))
+    assert prepared.shadows is not None
+    owner = layout.draw()[hit]
+    rect = prepared.shadows.rects[owner]
+    reached = ((uv > rect[:, :2] - 2) & (uv < rect[:, 2:] + 1)).all(dim=1).nonzero()[:, 0]
+    hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)
+    counts = torch.bincount(owner[reached], minlength=len(objects))
+    dark = prepared.shadows.sample(uv, counts, prepared.settings.backend, "zero")
+    dark = dark * texture.inside_weight(wanted, height, width, texture.SHADOW_EXTENDED_PX)[:, None]
+    return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
+
+
+def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
+    """From interpolated clip differences to where the photograph shows this point.
+
+    attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px
+    -> (R, 4 + K): displacement in px (2), w then, w now, and the K more. A point that was behind the camera is
+    looked up far outside the photograph.
+    """
+    delta, then = attributes[:, :3], attributes[:, 3:4]
+    before = then > verbs.NEAR_M
+    safe = torch.where(before, then, torch.ones_like(then))
+    moved = (delta[:, :2] - xy * delta[:, 2:]) / safe
+    moved = torch.where(before, moved, torch.full_like(moved, 1e5))
+    return torch.cat([moved, then, then - delta[:, 2:], attributes[:, 4:]], dim=1)
