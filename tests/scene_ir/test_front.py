@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.labels import hidden_share
+from drivesem.attack.labels import hidden_share
 from scene_ir import blend
 from scene_ir.compositor import Compositor, RenderSettings, scene_to
 from scene_ir.errors import FormatError, RangeError
