@@ -174,7 +174,7 @@ class Detector(nn.Module, ABC):
         """One Detections for each image, best first, boxes inside the image; carries no gradient."""
 
     def candidates(self, raw: Any) -> Candidates:
-        """What `decode` chooses from, of a batch of one image, for the objectives of drivesem/goals.py.
+        """What `decode` chooses from, of a batch of one image, for the objectives of drivesem/attack/goals.py.
 
         Raises DetectorError where a detector does not tell.
         """

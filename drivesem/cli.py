@@ -3,47 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import tyro
 
-from drivesem.config import (
-    COMMANDS,
-    Anchors,
-    Attack,
-    Bench,
-    Check,
-    Command,
-    Confirm,
-    Convert,
-    Derender,
-    Edit,
-    Eval,
-    Explain,
-    Gradcheck,
-    Plausibility,
-    Realism,
-    Render,
-    Report,
-    Retrain,
-    Study,
-    Survey,
-    SurveyResults,
-    Synth,
-    Train,
-    Transfer,
-    UsageError,
-    Verify,
-    Worth,
-    validate,
-    yaml_arguments,
-)
-from drivesem.folder_lock import let_go
+from drivesem.run.lock import let_go
+from drivesem.settings.checks import validate
+from drivesem.settings.commands import COMMANDS, Command
+from drivesem.settings.errors import UsageError
+from drivesem.settings.text import yaml_arguments
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
+_MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
 
@@ -126,103 +101,9 @@ def _is_bad_input(error: Exception) -> bool:
 
 
 def _run(config: Command) -> int:
-    if isinstance(config, Attack):
-        from drivesem import attack_command
-
-        return attack_command.run(config)
-    if isinstance(config, Transfer):
-        from drivesem import transfer_command
-
-        return transfer_command.run(config)
-    if isinstance(config, Explain):
-        from drivesem import explain_command
-
-        return explain_command.run(config)
-    if isinstance(config, Study):
-        from drivesem import study_command
-
-        return study_command.run(config)
-    if isinstance(config, Confirm):
-        from drivesem import confirm_command
-
-        return confirm_command.run(config)
-    if isinstance(config, Report):
-        from drivesem import report_command
-
-        return report_command.run(config)
-    if isinstance(config, Plausibility):
-        from drivesem import plausibility_command
-
-        return plausibility_command.run(config)
-    if isinstance(config, Realism):
-        from drivesem import realism_command
-
-        return realism_command.run(config)
-    if isinstance(config, Worth):
-        from drivesem import worth_command
-
-        return worth_command.run(config)
-    if isinstance(config, Survey):
-        from drivesem import survey_command
-
-        return survey_command.run(config)
-    if isinstance(config, SurveyResults):
-        from drivesem import survey_command
-
-        return survey_command.run_results(config)
-    if isinstance(config, Verify):
-        from drivesem import verify_command
-
-        return verify_command.run(config)
-    if isinstance(config, Derender):
-        from drivesem import derender_command
-
-        return derender_command.run(config)
-    if isinstance(config, Render):
-        from drivesem import render_command
-
-        return render_command.run(config)
-    if isinstance(config, Edit):
-        from drivesem import edit_command
-
-        return edit_command.run(config)
-    if isinstance(config, Synth):
-        from drivesem.synth import command
-
-        return command.run(config)
-    if isinstance(config, Bench):
-        from drivesem.bench import command as bench_command
-
-        return bench_command.run(config)
-    if isinstance(config, Gradcheck):
-        from drivesem import gradcheck
-
-        return gradcheck.run(config)
-    if isinstance(config, Eval):
-        from drivesem import eval_command
-
-        return eval_command.run(config)
-    if isinstance(config, Check):
-        from drivesem import check_command
-
-        return check_command.run(config)
-    if isinstance(config, Convert):
-        from drivesem import convert_command
-
-        return convert_command.run(config)
-    if isinstance(config, Train):
-        from drivesem import train_command
-
-        return train_command.run(config)
-    if isinstance(config, Anchors):
-        from drivesem import anchors_command
-
-        return anchors_command.run(config)
-    if isinstance(config, Retrain):
-        from drivesem import retrain_command
-
-        return retrain_command.run(config)
-    raise UsageError("command", ", ".join(COMMANDS), type(config).__name__)
+    name = next(name for name, kind in COMMANDS.items() if type(config) is kind)
+    run: Callable[[Command], int] = importlib.import_module(_MODULES.format(name.replace("-", "_"))).run
+    return run(config)
 
 
 if __name__ == "__main__":

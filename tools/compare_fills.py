@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.bench.closeness import Perception, Picture, psnr
 from drivesem.bench.derender import changed_region, make_case, share_of, without
+from drivesem.questions.realism.closeness import Perception, Picture, psnr
 from drivesem.synth.layout import footprint
 from scene_ir.derender import background, maps, segment, street, upright
 from scene_ir.derender.derender import VEHICLES

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from drivesem.report import pictures
-from drivesem.results import load_frame
+from drivesem.run.results import load_frame
 from scene_ir import files
 
 JPEG_QUALITY = 88

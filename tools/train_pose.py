@@ -28,7 +28,7 @@ from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.data.classes import VEHICLES
 from drivesem.data.kitti import KittiDataset
-from drivesem.label_free import DETECTOR_LOOKS
+from drivesem.scenes.label_free import DETECTOR_LOOKS
 from scene_ir import files
 from scene_ir.derender import pose
 from scene_ir.derender.pose import KINDS, PoseNet, Said

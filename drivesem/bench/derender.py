@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.bench.closeness import EXACT_DB, PERCEPTUAL, Perception, Picture, Strip, psnr, sheet
+from drivesem.questions.realism.closeness import EXACT_DB, PERCEPTUAL, Perception, Picture, Strip, psnr, sheet
 from drivesem.synth.demo import take_apart
 from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame

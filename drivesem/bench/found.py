@@ -20,17 +20,18 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.registry import load_predictor
+from drivesem.attack.edits import FrameEdit, ObjectEdit
+from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.labels import Labeller, MovedLabels
+from drivesem.attack.scene_edits import moved
 from drivesem.bench.found_sheet import failure_sheet
 from drivesem.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
-from drivesem.config import Bench, Derender
-from drivesem.edits import FrameEdit, ObjectEdit
-from drivesem.feasibility_check import check_places
-from drivesem.labels import Labeller, MovedLabels
-from drivesem.pool import outcomes
-from drivesem.scene_edits import moved
-from drivesem.sources import SceneSource, open_source
+from drivesem.evaluation.resampling import wilson
+from drivesem.run.workers import outcomes
+from drivesem.scenes.sources import SceneSource, open_source
+from drivesem.settings.commands import Bench, Derender
 from scene_ir import files
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
 from scene_ir.removal import without_objects
 from scene_ir.render.compositor import Compositor, render
@@ -53,8 +54,6 @@ MOVE_M, TURN_RAD = 0.5, math.radians(10.0)
 LEAST_HEIGHT_PX, MOST_OCCLUSION = 25.0, 1
 _MORE_CUT = 0.05
 """Share of a car by which a move may carry it farther out of the picture."""
-_Z_95 = 1.959964
-"""Of the normal distribution, two-sided 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,16 +288,6 @@ class _Moves:
         image, labels = self._drawn(changed)
         self.in_crowd = [row for row in places if self._as_visible(labels, row)]
         return image, labels.boxes_xyxy
-
-
-def wilson(found: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share, after Wilson (1927). RangeError unless 0 <= found <= count and count >= 1."""
-    if count < 1 or not 0 <= found <= count:
-        raise RangeError("share", "0 to all of at least one", f"{found} of {count}")
-    share, z2 = found / count, _Z_95 * _Z_95
-    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = _Z_95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 def summary(cars: Sequence[CarRow]) -> list[dict[str, Any]]:

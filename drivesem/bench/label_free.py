@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from detectors.boxes import iou_matrix
-from drivesem.config import DEMO, Bench
-from drivesem.pool import outcomes
+from drivesem.run.workers import outcomes
+from drivesem.settings.commands import DEMO, Bench
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
 from scene_ir.types import Camera, Frame, Labels
 
@@ -110,7 +110,7 @@ class _Judge:
 
 def judge(frame: Frame, labels: Labels) -> FrameRows:
     """Hold what is found of a frame's photograph against labels that were hidden from it."""
-    from drivesem.label_free import detect, label_free, settings_for
+    from drivesem.scenes.label_free import detect, label_free, settings_for
 
     bare = Frame(frame.identifier, frame.photograph, frame.camera)
     found = label_free(bare, detect(bare))

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from drivesem.attack.objective import Objective
 from drivesem.bench.probe import Found, Order
 from drivesem.bench.scenes import bench_scene
-from drivesem.objective import Objective
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import save_scene

@@ -82,9 +82,9 @@ def attack(order: Order) -> Found:
     import torch
 
     from detectors.registry import load_detector
-    from drivesem.feasible import FeasibleSet
-    from drivesem.objective import Objective
-    from drivesem.space import ParameterSpace, combo
+    from drivesem.attack.feasible import FeasibleSet
+    from drivesem.attack.objective import Objective
+    from drivesem.attack.space import ParameterSpace, combo
     from scene_ir.io import load_scene
     from scene_ir.render.compositor import Compositor
 

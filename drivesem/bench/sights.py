@@ -13,7 +13,7 @@ from torch import Tensor
 from detectors.base import Predictor, predict
 from detectors.boxes import ioa_matrix, iou_matrix
 from detectors.types import CLASSES, Detections
-from drivesem.render_command import as_bytes
+from drivesem.commands.render import as_bytes
 from scene_ir.types import Category
 
 Picture = NDArray[np.uint8]

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from detectors.base import Detector
 from detectors.types import Targets
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.labels import Labeller
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import Parameter, ParameterSpace, combo
 from drivesem.bench.scenes import BenchScene, bench_scene
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
-from drivesem.feasible import FeasibleSet
-from drivesem.labels import Labeller
-from drivesem.objective import Objective
-from drivesem.space import Parameter, ParameterSpace, combo
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import scene_to

@@ -22,7 +22,7 @@ from drivesem.data.truth import TrackedObject
 from drivesem.data.vkitti1 import SIZE_HW, Vkitti1Dataset
 from drivesem.data.vkitti2 import Vkitti2Dataset
 from drivesem.data.yolo import YoloDataset, parse_line, size_of_image
-from drivesem.results import BoxRecord, load_frame
+from drivesem.run.results import BoxRecord, load_frame
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 

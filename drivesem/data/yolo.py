@@ -18,13 +18,7 @@ import torch
 import yaml
 
 from drivesem.data.coco import CATEGORIES, CATEGORY_IDS, from_coco, pinhole, to_coco
-from drivesem.data.kitti import (
-    IMAGE_SUFFIXES,
-    PNG_COMPRESSION,
-    UNKNOWN_OCCLUSION,
-    format_calib,
-    read_calib,
-)
+from drivesem.data.kitti import IMAGE_SUFFIXES, PNG_COMPRESSION, UNKNOWN_OCCLUSION, format_calib, read_calib
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError

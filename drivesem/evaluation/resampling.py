@@ -7,6 +7,7 @@ matter; p is the share of swaps whose difference is at least the observed one, t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,8 @@ LEVEL = 0.95
 """Share of draws inside an interval."""
 DRAWS = 200
 """Bootstrap draws by default."""
+_Z_95 = 1.959964
+"""Of the normal distribution, two-sided 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,3 +195,13 @@ def _bounds(values: Sequence[float | None]) -> tuple[float | None, float | None]
         return None, None
     low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
+
+
+def wilson(found: int, count: int) -> tuple[float, float]:
+    """The 95 % interval of a share, after Wilson (1927). ValueError unless 0 <= found <= count and count >= 1."""
+    if count < 1 or not 0 <= found <= count:
+        raise ValueError(f"share: expected 0 to all of at least one, found {found} of {count}")
+    share, z2 = found / count, _Z_95 * _Z_95
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = _Z_95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
+    return max(middle - half, 0.0), min(middle + half, 1.0)

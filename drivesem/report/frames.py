@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivesem.report.page import ShownRun
-from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult
+from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
 from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:

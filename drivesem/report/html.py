@@ -17,7 +17,7 @@ from markupsafe import Markup
 from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
 from drivesem.report.page import Page, ShownRun
-from drivesem.results import RunSummary
+from drivesem.run.results import RunSummary
 
 _COLUMNS = {
     "AP50": "ap50",

@@ -16,25 +16,9 @@ import torch
 from drivesem.synth import kernels
 from drivesem.synth.light import develop, sky_radiance
 from drivesem.synth.noise import white_noise
-from drivesem.synth.shading import (
-    LEAF_DEPTH_M,
-    SHADOW_OFFSET_M,
-    SHADOW_OFFSET_TEXELS,
-    Samples,
-    shade,
-    unit,
-)
+from drivesem.synth.shading import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS, Samples, shade, unit
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.view import (
-    SHADOW_VIEWS_M,
-    SUPERSAMPLING,
-    Setting,
-    Shadow,
-    Sight,
-    SunMaps,
-    View,
-    blocks,
-)
+from drivesem.synth.view import SHADOW_VIEWS_M, SUPERSAMPLING, Setting, Shadow, Sight, SunMaps, View, blocks
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
 

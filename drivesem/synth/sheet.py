@@ -15,7 +15,7 @@ import numpy as np
 from drivesem.data.registry import Dataset
 from drivesem.data.truth import SKY_CM, Exposure, Place
 from drivesem.data.vkitti2 import COLOURS
-from drivesem.drawing import (
+from drivesem.report.drawing import (
     FAR_M,
     INK,
     MARGIN_PX,

@@ -9,18 +9,7 @@ import numpy as np
 
 from drivesem.synth import buildings, flora, furniture, people, vehicles
 from drivesem.synth.layout import Actor, Road
-from drivesem.synth.soup import (
-    Material,
-    Semantic,
-    Soup,
-    box,
-    join,
-    make,
-    placed,
-    quad,
-    stick,
-    tagged,
-)
+from drivesem.synth.soup import Material, Semantic, Soup, box, join, make, placed, quad, stick, tagged
 
 _STATIONS_M = np.array([-14, -8, -4, 0, 4, 8, 12, 18, 24, 32, 40, 50, 62, 76, 92, 110, 135, 165, 200.0])
 """Where ribbons of ground are cut along s; gentle bends need no more."""

@@ -14,12 +14,12 @@ import torch
 from detectors.base import Predictor, predict
 from detectors.training import Sample
 from detectors.types import CLASSES, Detections
+from drivesem.attack.judging import HEADLINE, JudgedClasses
+from drivesem.attack.labels import LabelMode
 from drivesem.data import kitti
 from drivesem.evaluation.coco import ClassScores, evaluate
-from drivesem.judged import HEADLINE, JudgedClasses
-from drivesem.labels import LabelMode
-from drivesem.pipeline import RESULT, as_targets
-from drivesem.results import FrameResult, load_frame
+from drivesem.run.frame import RESULT, as_targets
+from drivesem.run.results import FrameResult, load_frame
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
 from scene_ir.errors import FormatError

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from detectors.base import Detector
+from drivesem.attack.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores
-from drivesem.labels import Difficulty
 from drivesem.training.judging import Marks
 from drivesem.training.targets import TRAINED
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivesem.eval_plots import COLOURS, LINES, STYLE
+from drivesem.report.plots import COLOURS, LINES, STYLE
 from scene_ir import files
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from detectors.anchors import fit_anchors, target_sizes
 from detectors.squeezedet import ANCHOR_SIZES_WH
 from detectors.training import Sample
 from detectors.types import Targets
+from drivesem.attack.labels import Difficulty
 from drivesem.data.registry import Dataset
-from drivesem.labels import Difficulty
-from drivesem.pipeline import to_uint8
+from drivesem.run.frame import to_uint8
 from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
 from scene_ir import files
 from scene_ir.errors import FormatError

@@ -15,9 +15,11 @@ from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.training import Sample, TrainingSettings, train
-from drivesem.config import Retrain, UsageError, interval, size_hw
-from drivesem.judged import JudgedClasses
-from drivesem.labels import LabelMode
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.labels import LabelMode
+from drivesem.settings.commands import Retrain
+from drivesem.settings.errors import UsageError
+from drivesem.settings.values import interval, size_hw
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.mixture import Shares
 from scene_ir import files

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from detectors.training import Sample
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.labels import Labeller, to_kitti_labels
+from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.data import kitti
-from drivesem.feasible import FeasibleSet
-from drivesem.labels import Labeller, to_kitti_labels
-from drivesem.pipeline import to_uint8
-from drivesem.space import Parameter, ParameterSpace
+from drivesem.run.frame import to_uint8
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 
 from detectors.types import CLASSES, Targets
+from drivesem.attack.labels import Difficulty
 from drivesem.data.classes import KITTI, ClassMap
 from drivesem.data.coco import COCO_ROAD_USERS
-from drivesem.labels import Difficulty
 from scene_ir.types import Labels
 
 ROAD_USERS = ClassMap(

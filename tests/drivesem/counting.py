@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from detectors.types import CLASSES
-from drivesem.config import Attack
+from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation import coco
-from drivesem.judged import HEADLINE
-from drivesem.pipeline import as_detections, as_targets
-from drivesem.results import FrameResult, RunSummary
+from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.results import FrameResult, RunSummary
+from drivesem.settings.commands import Attack
 
 T_STAR = 0.5
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.bench import command, detector, detector_probe, memory, tables
+from drivesem.bench import detector, detector_probe, memory, tables
 from drivesem.bench.timing import Clock
 from drivesem.cli import main
+from drivesem.commands import bench
 
 
 @pytest.fixture(autouse=True)
@@ -54,8 +55,8 @@ def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch
 
 
 def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(command._SECONDS, "detector", (0.0, 0.0))
-    monkeypatch.setattr(command, "SHIPPED", {"squeezedet": Path()})
+    monkeypatch.setitem(bench._SECONDS, "detector", (0.0, 0.0))
+    monkeypatch.setattr(bench, "SHIPPED", {"squeezedet": Path()})
     monkeypatch.setattr(detector, "SIZES_HW", ((64, 96),))
     words = ["bench", "detector", "--quick", "--threads", "1", "--json"]
     assert main([*words, "--markdown", str(tmp_path / "all.md")]) == 0

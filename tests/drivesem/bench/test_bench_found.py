@@ -14,11 +14,11 @@ from scipy.stats import binomtest
 from torch import Tensor
 
 from detectors.types import Detections
+from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.labels import Labeller
 from drivesem.bench import found
 from drivesem.bench.sights import SCORE, Sight, View, assign
 from drivesem.cli import main
-from drivesem.feasibility_check import check_places
-from drivesem.labels import Labeller
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import save_scene
 from scene_ir.types import SceneIR

@@ -12,7 +12,7 @@ import torch
 from drivesem.bench import label_free as bench
 from drivesem.bench.label_free import Error, FrameRows, VehicleRow
 from drivesem.cli import main
-from drivesem.config import Bench
+from drivesem.settings.commands import Bench
 from scene_ir.types import Camera, Labels
 
 CAMERA = Camera(torch.tensor([[720.0, 0, 620.0], [0, 720.0, 180.0], [0, 0, 1.0]]), 375, 1242)

@@ -367,7 +367,7 @@ def test_yolo_text_files(run: Run, tmp_path: Path, kitti: tuple[Path, Path]):
 
 
 def test_a_run_of_the_attack(run: Run, tmp_path: Path):
-    from drivesem.results import BoxRecord, FrameResult, dump_frame
+    from drivesem.run.results import BoxRecord, FrameResult, dump_frame
 
     truth = (BoxRecord(BOXES[0], "Car"), BoxRecord(BOXES[1], "Car"), BoxRecord(BOXES[2], "Car", ignore=True))
     found = tuple(BoxRecord(box, "Car", score=0.9) for box in BOXES)

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.config import Attack, to_yaml
-from drivesem.judged import HEADLINE
-from drivesem.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.attack.judging import HEADLINE
+from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.settings.commands import Attack
+from drivesem.settings.text import to_yaml
 from scene_ir import files
 from tests.drivesem.counting import summary_of
 

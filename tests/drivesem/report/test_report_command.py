@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
-from drivesem.config import Attack
 from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.report.frames import cards_of
-from drivesem.report_data import load_shown, query_curves, write_run
+from drivesem.run.page import load_shown, query_curves, write_run
+from drivesem.settings.commands import Attack
 from scene_ir import files
 
 

@@ -16,10 +16,10 @@ import pytest
 from PIL import Image
 
 from drivesem.cli import main
-from drivesem.eval_plots import COLOURS
 from drivesem.report.frames import cards_of
-from drivesem.report_data import load_shown
-from drivesem.results import load_frame
+from drivesem.report.plots import COLOURS
+from drivesem.run.page import load_shown
+from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.synth.compare import (
-    QUANTITIES,
-    VEHICLES,
-    Comparison,
-    Histograms,
-    compare,
-    histograms,
-    reference,
-)
+from drivesem.synth.compare import QUANTITIES, VEHICLES, Comparison, Histograms, compare, histograms, reference
 from drivesem.synth.layout import statistics
 from scene_ir.types import Labels
 

@@ -45,7 +45,7 @@ def test_translate_is_along_the_length_and_across_to_the_left(plan):
 
 
 def test_it_moves_as_the_compositor_moves_it(plan):
-    from drivesem.space import ground_axes
+    from drivesem.attack.space import ground_axes
 
     actor = plan.actors[1]
     view = plan.setting.view

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.synth.frames import (
-    SynthFrame,
-    SynthSettings,
-    actor_soups,
-    generate_frame,
-    plan_frame,
-    render_frame,
-)
+from drivesem.synth.frames import SynthFrame, SynthSettings, actor_soups, generate_frame, plan_frame, render_frame
 from drivesem.synth.view import View, blocks
 from drivesem.synth.world import POOLS, surroundings
 from scene_ir.errors import RangeError

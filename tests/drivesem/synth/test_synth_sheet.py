@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drivesem import drawing
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
+from drivesem.report import drawing
 from drivesem.synth import sheet as sheets
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import generate_frame

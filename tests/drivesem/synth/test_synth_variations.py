@@ -7,14 +7,7 @@ import pytest
 import torch
 
 from drivesem.synth.exposure import CLASS_NAMES, expose, paint_name
-from drivesem.synth.frames import (
-    BASELINE_M,
-    SynthSettings,
-    plan_frame,
-    render_frame,
-    second_camera,
-    variation_of,
-)
+from drivesem.synth.frames import BASELINE_M, SynthSettings, plan_frame, render_frame, second_camera, variation_of
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.variations import VARIATIONS, parse_variations
 from scene_ir.errors import RangeError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from detectors.types import CLASSES
+from drivesem.attack.labels import Difficulty
 from drivesem.data.kitti import KittiDataset
-from drivesem.labels import Difficulty
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
 from scene_ir.errors import FormatError

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.labels import hidden_share
+from drivesem.attack.labels import hidden_share
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene

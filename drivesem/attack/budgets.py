@@ -1,0 +1,98 @@
+"""How far an attack may go, as people write it: a preset, a YAML file, or `translate=0.5m,rotate=5deg`.
+
+A YAML file names parameters, as far as they are to be held more tightly than the paper's budget does:
+
+    translate: 0.5m     # at most, along and across; a bare number is in own lengths
+    rotate: 5deg        # a bare number is in rad
+    mesh: 0.1           # unit boxes
+    color: 0.5          # codes, like weather and foliage
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from drivesem.attack.edits import ANGLE_UNITS, LENGTH_UNITS, finite_number, load_yaml, mapping_of, measure
+from drivesem.attack.space import Budget, Parameter
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import FormatError
+
+PAPER, PARKING = "paper", "parking"
+PRESETS: Mapping[str, Budget] = {
+    PAPER: Budget(),
+    # What a parked car's place may well differ by, and no driver would notice.
+    PARKING: Budget(translate_m=0.5, rotate=math.radians(5)),
+}
+_WIDEST = PRESETS[PAPER]
+"""What the second check of feasibility allows, so a budget can only be narrower."""
+_UNITS: Mapping[Parameter, Mapping[str, float]] = {
+    Parameter.TRANSLATE: LENGTH_UNITS,
+    Parameter.ROTATE: ANGLE_UNITS,
+}
+
+
+def budget_of(text: str) -> Budget:
+    """The budget that a preset's name, a YAML file or NAME=VALUE with commas says.
+
+    Raises UsageError where it is none of them, FormatError naming file or setting, and the parameter.
+    """
+    if text in PRESETS:
+        return PRESETS[text]
+    if Path(text).suffix in (".yaml", ".yml") or Path(text).is_file():
+        loaded = load_yaml(Path(text))
+        return _budget(text, {} if loaded is None else loaded)
+    if "=" not in text:
+        expected = f"{', '.join(PRESETS)}, a YAML file, or NAME=VALUE with commas"
+        raise UsageError("--budget", expected, repr(text))
+    pairs = [part.partition("=") for part in text.split(",")]
+    names = [name.strip() for name, _, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise FormatError(f"--budget: {name}", "each parameter once", text)
+    return _budget("--budget", {name.strip(): _value(value) for name, _, value in pairs})
+
+
+def written(budget: Budget) -> str:
+    """The text that gives this budget without any file: a preset's name, or NAME=VALUE with commas."""
+    for name, preset in PRESETS.items():
+        if budget == preset:
+            return name
+    parts = {str(p): repr(getattr(budget, p.value)) for p in Parameter if _narrowed(budget, p.value)}
+    if math.isfinite(budget.translate_m):
+        parts[Parameter.TRANSLATE.value] = f"{budget.translate_m!r}m"
+    return ",".join(f"{name}={value}" for name, value in parts.items())
+
+
+def _narrowed(budget: Budget, name: str) -> bool:
+    return getattr(budget, name) != getattr(_WIDEST, name)
+
+
+def _value(text: str) -> float | str:
+    """A number, or text with a unit."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
+
+
+def _budget(where: str, content: Any) -> Budget:
+    entry = mapping_of(where, content, [p.value for p in Parameter])
+    limits: dict[str, float] = {}
+    for name, value in entry.items():
+        parameter = Parameter(name)
+        units = _UNITS.get(parameter)
+        if units is not None and isinstance(value, str):
+            limit = measure(f"{where}: {name}", value, units)
+            key = "translate_m" if parameter is Parameter.TRANSLATE else name
+        else:
+            limit, key = finite_number(f"{where}: {name}", value), name
+        widest = getattr(_WIDEST, key)
+        if not 0 < limit <= widest:
+            most = "" if widest == math.inf else f" of at most {widest:g}"
+            raise FormatError(f"{where}: {name}", f"a positive number{most}", value)
+        limits[key] = limit
+    return replace(_WIDEST, **limits)

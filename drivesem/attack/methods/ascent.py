@@ -1,0 +1,76 @@
+"""What attacks that climb the loss step by step have in common."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from drivesem.attack.methods.base import Attack, Problem, Proposals
+from scene_ir.errors import RangeError
+
+
+@dataclass(frozen=True, slots=True)
+class Ascent(Attack):
+    """theta <- project(theta + rate * move(gradient)), `steps` times; a subclass writes `_move`.
+
+    early_stop: end at the first iterate that fails the detector under `moved` labels (one more render a step).
+    momentum: what is left after a step of the gradients before it, which are added up (Dong et al. 2018, MI-FGSM,
+    where it is 1); 0 forgets them. RangeError for fewer than 1 step, a momentum outside [0, 1], or a rate that is
+    not positive.
+    """
+
+    steps: int = 10
+    early_stop: bool = False
+    momentum: float = 0.0
+    rate: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise RangeError("steps", "at least 1", self.steps)
+        if not 0 <= self.momentum <= 1:
+            raise RangeError("momentum", "a number in [0, 1]", self.momentum)
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise RangeError("rate", "a positive number", self.rate)
+
+    @abstractmethod
+    def _move(self, problem: Problem, gradient: Tensor) -> Tensor:
+        """How far to go (D,) at rate 1, by a gradient (D,) or what momentum made of several."""
+
+    def _weighed(self, problem: Problem, gradient: Tensor) -> Tensor:
+        """A gradient (D,) as momentum adds it up: in each group divided by its L1 norm, so that early and late
+        gradients weigh the same, however steep the loss is there.
+        """
+        weighed = gradient.clone()
+        for group in problem.groups:
+            block = weighed[group.where]
+            if bool(block.any()):
+                block /= block.abs().sum()
+        return weighed
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        start = problem.project(theta0.detach())
+        theta, active = start.theta, list(start.active)
+        thetas: list[Tensor] = [theta]
+        losses: list[float | None] = []
+        kept = torch.zeros_like(theta)
+        for _ in range(self.steps):
+            loss, gradient = problem.loss_and_grad(theta)
+            losses.append(loss)
+            if self.momentum:
+                gradient = kept = self.momentum * kept + self._weighed(problem, gradient)
+            step = problem.project(theta + self.rate * self._move(problem, gradient))
+            theta = step.theta
+            thetas.append(theta)
+            active.extend(step.active)
+            if self.early_stop and problem.score(theta).success:
+                break
+        return Proposals(
+            thetas=tuple(thetas),
+            losses=(*losses, None),
+            queries=len(losses),
+            active_constraints=tuple(dict.fromkeys(active)),
+        )

@@ -1,0 +1,299 @@
+"""theta -> loss: the one place where scene, renderer, labels and detector meet."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from detectors.base import Detector, Predictor, RawPredictions, predict
+from detectors.types import Detections, Targets
+from drivesem.attack import detection_loss, goals
+from drivesem.attack.aims import EVERYTHING, Aim
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.judging import JudgedClasses, t_star_of
+from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
+from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.space import ParameterSpace
+from drivesem.evaluation import failures
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.render.compositor import Compositor, render_batch
+from scene_ir.types import Render, SceneIR
+
+OF_DETECTIONS = ("objectness", *goals.GOALS)
+"""Terms that need no more than detections."""
+_REMEMBERED = 3
+"""Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """One theta, rendered, detected and labelled; carries no gradient. detections: labels are indices into the
+    judged classes. loss: the objective, by its own labels.
+    """
+
+    scene: SceneIR
+    render: Render
+    detections: Detections
+    paper: MovedLabels
+    moved: MovedLabels
+    loss: float
+
+
+class Objective:
+    """What an attack raises, as a function of theta (D,).
+
+    label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
+    away from the label. They are constant in the gradient. term: one of `goals.GOALS`, or a key of
+    `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. t_star: score from which a detection
+    counts; by default the detector's own. aim: what counts as a failure, and is raised; by default everything.
+    Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
+    RangeError where it has no such term.
+    """
+
+    def __init__(
+        self,
+        compositor: Compositor,
+        space: ParameterSpace,
+        detector: Predictor,
+        label_mode: LabelMode = "moved",
+        term: str = "objectness",
+        difficulty: Difficulty | None = None,
+        t_star: float | None = None,
+        aim: Aim = EVERYTHING,
+    ) -> None:
+        self.compositor = compositor
+        self.space = space
+        self.detector = detector
+        self.label_mode: LabelMode = label_mode
+        self.term = term
+        self.t_star = t_star_of(detector, t_star)
+        self.judged = JudgedClasses.of(detector)
+        self.aim = aim
+        with torch.no_grad():
+            base_render = compositor.render(space.apply(space.scene, space.theta0))
+        self._labeller = Labeller(space.scene, base_render, difficulty)
+        self._benign = self._judged(space.scene, base_render)
+        self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
+        self._scores: dict[bytes, Score] = {}
+        self._previews: dict[bytes, Score] = {}
+
+    @property
+    def benign(self) -> Rendered:
+        """The scene at theta = 0, re-rendered."""
+        return self._benign
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
+        return _losses([self], [theta])[0]
+
+    def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
+        """Loss and its gradient (D,). Raises RangeError naming the coordinate where either is not finite."""
+        losses, gradients = self.loss_and_grad_many(theta[None])
+        return float(losses[0]), gradients[0]
+
+    def loss_and_grad_many(self, thetas: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses (B,) and gradients (B, D) at thetas (B, D), such as restarts: one step for all. Raises as
+        `loss_and_grad` does.
+        """
+        if thetas.ndim != 2 or len(thetas) == 0 or thetas.shape[1] != self.space.dim:
+            raise ShapeError("thetas", f"(B, {self.space.dim})", tuple(thetas.shape))
+        outcome = _losses_and_gradients([self] * len(thetas), thetas.unbind())
+        return torch.stack([loss for loss, _ in outcome]), torch.stack([gradient for _, gradient in outcome])
+
+    @torch.no_grad()
+    def evaluate(self, theta: Tensor) -> Rendered:
+        """Render, detect and label at theta (D,), without gradients."""
+        if torch.equal(theta, self.space.theta0):
+            return self._benign
+        for known, rendered in self._recent:
+            if torch.equal(theta, known):
+                return rendered
+        scene = self.space.apply(self.space.scene, theta)
+        rendered = self._judged(scene, self.compositor.render(scene))
+        self._recent.append((theta.clone(), rendered))
+        return rendered
+
+    def failures(self, rendered: Rendered, mode: LabelMode) -> failures.Failures:
+        """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""
+        labels = rendered.moved if mode == "moved" else rendered.paper
+        return self._failures(labels, rendered.detections)
+
+    def _failures(self, labels: MovedLabels, detections: Detections) -> failures.Failures:
+        found = failures.find(
+            self.judged.targets(self._benign.paper.targets),
+            self._benign.detections,
+            self.judged.targets(labels.targets),
+            detections,
+            self.t_star,
+        )
+        return self.aim.failures(found, labels.targets, detections, self.judged.names)
+
+    def score(self, theta: Tensor) -> Score:
+        """What the detector makes of theta (D,): a render of its own, judged under both label modes.
+
+        Scores are kept, which are small, so that a search without gradient pays for each theta once.
+        """
+        key = _key(theta)
+        if key not in self._scores:
+            rendered = self.evaluate(theta)
+            self._scores[key] = self._score(rendered.loss, rendered.moved, rendered.detections)
+        return self._scores[key]
+
+    def preview(self, theta: Tensor) -> Score | None:
+        """What the gradient pass at theta (D,) saw, if there was one: of an image that is not rounded to 8 bits,
+        and in the precision of gradients.
+        """
+        return self._previews.get(_key(theta))
+
+    def _score(self, loss: float, moved: MovedLabels, detections: Detections) -> Score:
+        failed = self._failures(moved, detections)
+        # The projection takes cars for boxes, behind which another may lie from the start; a render knows.
+        hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
+        return Score(
+            loss=loss,
+            lost=len(failed.lost),
+            phantoms=len(failed.phantoms),
+            success=failed.success and not hidden,
+            success_paper=self._failures(self._labeller.paper(), detections).success and not hidden,
+            violations=tuple(f"objects[{i}]: visibility" for i in hidden),
+        )
+
+    def problem(self, feasible: FeasibleSet) -> Problem:
+        """This objective as attacks see it."""
+        return Problem(
+            loss_and_grad=self.loss_and_grad,
+            project=feasible.project,
+            score=self.score,
+            step=self.space.step,
+            lower=self.space.lower,
+            upper=self.space.upper,
+            groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
+            preview=self.preview,
+        )
+
+    @property
+    def differentiable(self) -> Detector:
+        """The detector. Raises RangeError where it has no gradient."""
+        if not isinstance(self.detector, Detector):
+            raise RangeError("detector", "one with a gradient", self.detector.name)
+        return self.detector
+
+    @torch.no_grad()
+    def detect(self, image: Tensor) -> Detections:
+        """What the detector finds in an image (3, H, W), as far as it is judged."""
+        return self.judged.detections(predict(self.detector, image[None])[0])
+
+    def loss_of(self, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
+        """The loss () of one image's predictions, by the labels of its scene and render."""
+        labels = self._labeller.labels(self.label_mode, scene, render)
+        return self._loss(self.differentiable, raw, labels.targets)
+
+    def loss_at(self, theta: Tensor, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
+        """The same at theta (D,); what is seen there is kept for `preview`."""
+        moved = self._labeller.moved(scene, render)
+        aimed = moved if self.label_mode == "moved" else self._labeller.paper()
+        loss = self._loss(self.differentiable, raw, aimed.targets)
+        with torch.no_grad():
+            found = self.judged.detections(self.differentiable.decode(raw)[0])
+        self._previews[_key(theta)] = self._score(float(loss.detach()), moved, found)
+        return loss
+
+    @torch.no_grad()
+    def _judged(self, scene: SceneIR, render: Render) -> Rendered:
+        # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
+        render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
+        paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
+        labels = (moved if self.label_mode == "moved" else paper).targets
+        if isinstance(self.detector, Detector):
+            raw = self.detector(render.image[None])
+            loss = float(self._loss(self.detector, raw, labels))
+            found = self.judged.detections(self.detector.decode(raw)[0])
+        else:
+            found = self.detect(render.image)
+            loss = self._loss_of_detections(found, labels)
+        return Rendered(scene, render, found, paper, moved, loss)
+
+    def _loss(self, detector: Detector, raw: RawPredictions, labels: Targets) -> Tensor:
+        targets = self.judged.own_targets(self.judged.targets(self.aim.targets(labels)))
+        if self.term in goals.GOALS:
+            known = [detector.classes.index(name) for name in self.aim.classes_of(self.judged.names)]
+            loss = goals.goal(self.term, detector.candidates(raw), targets, self.t_star, known)
+        else:
+            terms = detector.loss(raw, [targets])
+            self._check_term((*terms, *goals.GOALS))
+            loss = terms[self.term]
+        if not bool(torch.isfinite(loss)):
+            raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
+        return loss
+
+    def _loss_of_detections(self, found: Detections, labels: Targets) -> float:
+        """The same where there is no gradient, of judged detections."""
+        self._check_term(OF_DETECTIONS)
+        names, targets = self.judged.names, self.judged.targets(self.aim.targets(labels))
+        if self.term not in goals.GOALS:
+            return detection_loss.objectness(targets, found)
+        known = [names.index(name) for name in self.aim.classes_of(names)]
+        return float(goals.goal(self.term, goals.of_detections(found, len(names)), targets, self.t_star, known))
+
+    def _check_term(self, terms: Collection[str]) -> None:
+        if self.term not in terms:
+            raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
+
+
+class BatchObjective:
+    """Objectives of several scenes before one detector, which sees all images of a size at once.
+
+    Raises RangeError where there is no objective, or they have several detectors.
+    """
+
+    def __init__(self, objectives: Sequence[Objective]) -> None:
+        detectors = {id(objective.detector) for objective in objectives}
+        if len(detectors) != 1:
+            raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
+        self.objectives = tuple(objectives)
+
+    def loss_and_grad(self, thetas: Sequence[Tensor]) -> list[tuple[float, Tensor]]:
+        """Loss and gradient (D,) of each scene at its own theta (D,). Raises as `Objective.loss_and_grad` does."""
+        if len(thetas) != len(self.objectives):
+            raise ShapeError("thetas", f"{len(self.objectives)}, one for each scene", len(thetas))
+        outcome = _losses_and_gradients(self.objectives, thetas)
+        return [(float(loss), gradient) for loss, gradient in outcome]
+
+
+def _key(theta: Tensor) -> bytes:
+    return theta.detach().cpu().numpy().tobytes()
+
+
+def _losses_and_gradients(
+    objectives: Sequence[Objective], thetas: Sequence[Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
+    losses = _losses(objectives, leaves)
+    gradients = torch.autograd.grad(losses, leaves)
+    for objective, gradient in zip(objectives, gradients, strict=True):
+        bad = (~torch.isfinite(gradient)).nonzero()
+        if len(bad):
+            i = int(bad[0])
+            raise RangeError(f"gradient of {objective.space.name(i)}", "a finite value", float(gradient[i]))
+    return [(loss.detach(), gradient) for loss, gradient in zip(losses, gradients, strict=True)]
+
+
+def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
+    """The loss () of each objective at its theta (D,), differentiable; all of them have one detector."""
+    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
+    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
+    of_size: dict[torch.Size, list[int]] = {}
+    for i, render in enumerate(renders):
+        of_size.setdefault(render.image.shape, []).append(i)
+    losses: dict[int, Tensor] = {}
+    for members in of_size.values():
+        images = [renders[i].image for i in members]
+        raw = objectives[members[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
+        for row, i in enumerate(members):
+            # Each by itself: the loss of a batch is a mean over its images, and weighs them by their objects.
+            losses[i] = objectives[i].loss_at(thetas[i], raw.one(row), scenes[i], renders[i])
+    return [losses[i] for i in range(len(renders))]

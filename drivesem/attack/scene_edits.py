@@ -1,0 +1,69 @@
+"""Edits applied to a scene: vehicles moved, turned, bent, painted, removed; other weather and foliage.
+
+The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.attack.edits`.
+Objects are numbered by their row.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from drivesem.attack.edits import ALL, FrameEdit, ObjectEdit
+from drivesem.attack.space import Budget, ground_axes
+from scene_ir import ffd
+from scene_ir.errors import RangeError
+from scene_ir.types import SceneIR
+
+
+def removed_rows(scene: SceneIR, edit: FrameEdit) -> list[int]:
+    """The rows that an edit removes. RangeError where it names a row that the scene does not have."""
+    return [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
+
+
+def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
+    """The scene after an edit, with the vehicles that it removes still there (`scene_ir.removal` takes them out).
+
+    What is said of all objects and of one adds up, and all of it adds to what the scene has: moves on the ground
+    plane, along and across the heading that the vehicle has in `scene`; codes end at the bounds that theta's do.
+    Raises RangeError where the edit names a row that the scene does not have.
+    """
+    changes = _by_row(scene, edit)
+    objects, environment = scene.objects, scene.environment
+    like = objects.translation
+
+    def summed(values: list[list[tuple[float, ...]]]) -> Tensor:
+        return like.new_tensor([[sum(parts) for parts in zip(*row, strict=True)] for row in values])
+
+    limits = Budget()
+    touched: dict[str, Tensor] = {}
+    if any(changes):
+        length_m = objects.size_lhw[:, 0]
+        own = summed([[(0.0, 0.0), *(c.translate for c in row)] for row in changes])
+        metres = summed([[(0.0, 0.0), *(c.translate_m for c in row)] for row in changes])
+        axes = ground_axes(objects.yaw, length_m, scene.environment.ground)
+        shift = (own + metres / length_m[:, None])[:, :, None] * axes
+        turn = summed([[(0.0,), *((c.rotate,) for c in row)] for row in changes])[:, 0]
+        none = (0.0,) * ffd.SYMMETRIC_DIM
+        bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
+        paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
+        touched = {
+            "translation": objects.translation + shift.sum(dim=1),
+            "yaw": objects.yaw + turn,
+            "ffd": objects.ffd + ffd.from_symmetric(bend),
+            "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
+        }
+    weather = environment.weather + environment.weather.new_tensor(edit.weather)
+    foliage = environment.foliage + environment.foliage.new_tensor(edit.foliage)
+    return scene.with_objects(**touched).with_environment(
+        weather=weather.clamp(0.0, limits.weather), foliage=foliage.clamp(-limits.foliage, limits.foliage)
+    )
+
+
+def _by_row(scene: SceneIR, edit: FrameEdit) -> list[list[ObjectEdit]]:
+    """What happens to each object: what is said of all, then of it."""
+    count = len(scene.objects)
+    for key in edit.objects:
+        if isinstance(key, int) and key >= count:
+            known = f"a row from 0 to {count - 1}" if count else "no row: the scene has no objects"
+            raise RangeError(f"objects[{key}]", known, key)
+    return [[edit.objects[key] for key in (ALL, row) if key in edit.objects] for row in range(count)]

@@ -1,0 +1,365 @@
+"""What an attack may move: the six parameters, their units and bounds, and theta, the flat vector of all of them.
+
+theta is flat for the attack and readable for people: every coordinate has a name, a unit and bounds. The scene as
+photographed is theta = 0. What is *feasible* inside the bounds is decided by `drivesem.attack.feasible`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+from scene_ir import ffd
+from scene_ir.errors import FormatError, RangeError, ShapeError
+from scene_ir.geometry import yaw_matrix
+from scene_ir.types import FOLIAGE_DIM, LATTICE, TEXTURE_DIM, WEATHER_DIM, SceneIR, check_finite
+
+
+class Parameter(StrEnum):
+    """What can be moved, in the order in which theta holds it."""
+
+    COLOR = "color"
+    WEATHER = "weather"
+    FOLIAGE = "foliage"
+    TRANSLATE = "translate"
+    ROTATE = "rotate"
+    MESH = "mesh"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSpec:
+    """Facts of one parameter. size: coordinates a car (`per_object`) or a scene; unit: of theta, for people;
+    names: of the coordinates, after `objects[i].` where it belongs to a car.
+    """
+
+    size: int
+    per_object: bool
+    unit: str
+    names: tuple[str, ...]
+
+
+def _lattice_names() -> tuple[str, ...]:
+    half = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
+    points = [(i, j, k) for i in range(half[0]) for j in range(half[1]) for k in range(half[2])]
+    return tuple(f"ffd[{i},{j},{k}].{axis}" for i, j, k in points for axis in "xyz")
+
+
+SPECS: dict[Parameter, ParameterSpec] = {
+    Parameter.COLOR: ParameterSpec(
+        TEXTURE_DIM, True, "code", tuple(f"paint.{n}" for n in ("lightness", "a", "b", "gloss", "dirt"))
+    ),
+    Parameter.WEATHER: ParameterSpec(
+        WEATHER_DIM, False, "code", tuple(f"weather.{n}" for n in ("fog", "rain", "time_of_day", "overcast"))
+    ),
+    Parameter.FOLIAGE: ParameterSpec(
+        FOLIAGE_DIM, False, "code", tuple(f"foliage.{n}" for n in ("hue", "lightness", "density"))
+    ),
+    Parameter.TRANSLATE: ParameterSpec(2, True, "own lengths", ("translate.along", "translate.across")),
+    Parameter.ROTATE: ParameterSpec(1, True, "rad", ("yaw",)),
+    Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", _lattice_names()),
+}
+
+COMBOS: dict[int, tuple[Parameter, ...]] = {
+    1: (Parameter.TRANSLATE, Parameter.ROTATE),
+    2: (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.MESH),
+    3: (Parameter.TRANSLATE, Parameter.MESH),
+    4: (Parameter.ROTATE, Parameter.MESH),
+}
+"""The paper's combinations for detection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """How far each parameter may go from the photograph, at most. Codes end at these values whatever they start
+    from; the others are distances from the photographed scene. translate: own lengths; translate_m: metres, the
+    same for long and short cars, and the nearer of both binds; rotate: rad; mesh: unit boxes (the bound on strain
+    in `drivesem.attack.feasible` is the one that binds).
+    """
+
+    color: float = 1.0
+    weather: float = 1.0
+    foliage: float = 1.0
+    translate: float = 0.25
+    rotate: float = 0.35
+    mesh: float = 0.25
+    translate_m: float = math.inf
+
+    def __post_init__(self) -> None:
+        _check_positive("budget", self, unbounded=("translate_m",))
+
+
+@dataclass(frozen=True, slots=True)
+class StepSizes:
+    """The paper's step alpha for each parameter, in theta's units."""
+
+    color: float = 0.05
+    weather: float = 0.25
+    foliage: float = 0.10
+    translate: float = 0.01
+    rotate: float = 0.01
+    mesh: float = 0.025
+
+    def __post_init__(self) -> None:
+        _check_positive("steps", self)
+
+
+def _check_positive(what: str, values: Budget | StepSizes, unbounded: Collection[str] = ()) -> None:
+    for entry in fields(values):
+        value = getattr(values, entry.name)
+        if not (value > 0 and (math.isfinite(value) or entry.name in unbounded)):
+            raise RangeError(f"{what}.{entry.name}", "a positive number", value)
+
+
+@dataclass(frozen=True, slots=True)
+class Perturbation:
+    """theta by parameter; None where a parameter is held. color (N, 5), weather (4,), foliage (3,),
+    translate (N, 2), rotate (N, 1), mesh (N, 96): changes from the photographed scene.
+    """
+
+    color: Tensor | None = None
+    weather: Tensor | None = None
+    foliage: Tensor | None = None
+    translate: Tensor | None = None
+    rotate: Tensor | None = None
+    mesh: Tensor | None = None
+
+
+def normalise_params(params: Iterable[str]) -> tuple[Parameter, ...]:
+    """Parameters by name, in theta's order. Raises FormatError on an unknown, a repeated or no parameter."""
+    known = [str(p) for p in Parameter]
+    names = [str(p).strip() for p in params]
+    for name in names:
+        if name not in known:
+            raise FormatError("params", f"names among {', '.join(known)}", repr(name))
+    if not names:
+        raise FormatError("params", f"at least one of {', '.join(known)}", "none")
+    if len(set(names)) != len(names):
+        raise FormatError("params", "each parameter once", ",".join(names))
+    return tuple(p for p in Parameter if p.value in names)
+
+
+def parse_params(text: str) -> tuple[Parameter, ...]:
+    """Parameters from "translate,rotate,mesh". Raises FormatError naming the unknown one and the known ones."""
+    return normalise_params(part for part in text.split(",") if part.strip())
+
+
+def combo(number: int) -> tuple[Parameter, ...]:
+    """The paper's combination by number. Raises RangeError on an unknown one."""
+    if number not in COMBOS:
+        raise RangeError("combo", f"one of {', '.join(map(str, COMBOS))}", number)
+    return COMBOS[number]
+
+
+class ParameterSpace:
+    """The vector theta (D,) of one scene: names, bounds, steps, and the way from theta to a perturbed scene.
+
+    Blocks follow each other in the order of `Parameter`; a block of a parameter of cars is (N, size), row-major.
+    dtype and device are those of the scene.
+    """
+
+    def __init__(
+        self,
+        scene: SceneIR,
+        params: Sequence[str],
+        budget: Budget | None = None,
+        steps: StepSizes | None = None,
+    ) -> None:
+        self.scene = scene
+        self.params = normalise_params(params)
+        self.budget = budget or Budget()
+        self.steps = steps or StepSizes()
+        self.count = len(scene.objects)
+        self._slices: dict[Parameter, slice] = {}
+        start = 0
+        for parameter in self.params:
+            spec = SPECS[parameter]
+            end = start + spec.size * (self.count if spec.per_object else 1)
+            self._slices[parameter] = slice(start, end)
+            start = end
+        self.dim = start
+        # Constant, as nobody asks for a gradient to the photographed scene.
+        self._axes = _ground_axes_of(scene).detach()
+        reference = scene.objects.translation
+        self.theta0 = reference.new_zeros(self.dim)
+        self.lower = reference.new_zeros(self.dim)
+        self.upper = reference.new_zeros(self.dim)
+        self.step = reference.new_zeros(self.dim)
+        for parameter, where in self._slices.items():
+            low, high = self._bounds(parameter)
+            self.lower[where] = low
+            self.upper[where] = high
+            self.step[where] = getattr(self.steps, parameter.value)
+
+    @property
+    def blocks(self) -> Mapping[Parameter, slice]:
+        """Where theta holds each of its parameters, in its order."""
+        return self._slices
+
+    def slice_of(self, parameter: Parameter) -> slice | None:
+        """Where theta holds `parameter`, or None where it is held."""
+        return self._slices.get(parameter)
+
+    def name(self, i: int) -> str:
+        """The name of coordinate `i`, for instance `objects[3].yaw`."""
+        parameter, owner, k = self._locate(i)
+        spec = SPECS[parameter]
+        return f"objects[{owner}].{spec.names[k]}" if spec.per_object else spec.names[k]
+
+    def describe(self, i: int) -> str:
+        """Name, unit and bounds of coordinate `i`: `objects[3].yaw, rad, [-0.35, 0.35]`."""
+        parameter, _, _ = self._locate(i)
+        return f"{self.name(i)}, {SPECS[parameter].unit}, [{float(self.lower[i]):g}, {float(self.upper[i]):g}]"
+
+    def unflatten(self, theta: Tensor) -> Perturbation:
+        """theta (D,) as named tensors (views of it). Raises ShapeError."""
+        if tuple(theta.shape) != (self.dim,):
+            raise ShapeError("theta", f"shape ({self.dim},)", tuple(theta.shape))
+        parts = {}
+        for parameter, where in self._slices.items():
+            spec = SPECS[parameter]
+            shape = (self.count, spec.size) if spec.per_object else (spec.size,)
+            parts[parameter.value] = theta[where].reshape(shape)
+        return Perturbation(**parts)
+
+    def flatten(self, perturbation: Perturbation) -> Tensor:
+        """The inverse of `unflatten`. Raises ShapeError where a parameter is missing, unexpected or misshaped."""
+        parts = []
+        for parameter in Parameter:
+            value = getattr(perturbation, parameter.value)
+            where = self._slices.get(parameter)
+            if where is None:
+                if value is not None:
+                    raise ShapeError(f"perturbation.{parameter.value}", "None (it is held)", tuple(value.shape))
+                continue
+            spec = SPECS[parameter]
+            shape = (self.count, spec.size) if spec.per_object else (spec.size,)
+            if value is None or tuple(value.shape) != shape:
+                raise ShapeError(
+                    f"perturbation.{parameter.value}",
+                    f"shape {shape}",
+                    None if value is None else tuple(value.shape),
+                )
+            parts.append(value.reshape(-1))
+        return torch.cat(parts) if parts else self.theta0
+
+    def apply(self, scene: SceneIR, theta: Tensor) -> SceneIR:
+        """The scene at theta (D,); differentiable to theta. At theta = 0 all tensors equal the originals exactly.
+
+        A translation is a fraction of the car's own length, along and across its photographed heading; the car
+        keeps its height above the ground plane. Mesh offsets are symmetric left to right, added to the source's.
+        Raises ShapeError, and RangeError naming a coordinate that is not finite.
+        """
+        finite = torch.isfinite(theta)
+        if not bool(finite.all()):
+            i = int((~finite).nonzero()[0])
+            raise RangeError(f"theta: {self.name(i)}", "a finite value", float(theta[i]))
+        part = self.unflatten(theta)
+        objects, environment = scene.objects, scene.environment
+        changes: dict[str, Tensor] = {}
+        if part.translate is not None:
+            axes = self._axes if scene is self.scene else _ground_axes_of(scene)
+            changes["translation"] = objects.translation + (part.translate[:, None] @ axes)[:, 0]
+        if part.rotate is not None:
+            changes["yaw"] = objects.yaw + part.rotate[:, 0]
+        if part.mesh is not None:
+            changes["ffd"] = objects.ffd + ffd.from_symmetric(part.mesh)
+        if part.color is not None:
+            changes["texture_code"] = _within(
+                objects.texture_code, part.color, -self.budget.color, self.budget.color
+            )
+        if changes:
+            scene = scene.with_objects(**changes)
+        codes: dict[str, Tensor] = {}
+        if part.weather is not None:
+            codes["weather"] = _within(environment.weather, part.weather, 0.0, self.budget.weather)
+        if part.foliage is not None:
+            limit = self.budget.foliage
+            codes["foliage"] = _within(environment.foliage, part.foliage, -limit, limit)
+        return scene.with_environment(**codes) if codes else scene
+
+    def physical(self, i: int, value: float) -> tuple[float, str] | None:
+        """`value` of coordinate `i` in metres ("m") or degrees ("deg"), or None where it is a bare code."""
+        parameter, owner, k = self._locate(i)
+        size_lhw = self.scene.objects.size_lhw
+        if parameter is Parameter.TRANSLATE:
+            return value * float(size_lhw[owner, 0]), "m"
+        if parameter is Parameter.ROTATE:
+            return math.degrees(value), "deg"
+        if parameter is Parameter.MESH:
+            return value * float(size_lhw[owner, k % 3]), "m"
+        return None
+
+    def display(self, i: int, value: float) -> str:
+        """`value` of coordinate `i` as people write it: `0.21 m`, `5.7 deg`, `0.25`."""
+        physical = self.physical(i, value)
+        return f"{value:.3g}" if physical is None else f"{physical[0]:.3g} {physical[1]}"
+
+    def theta_by_name(self, theta: Tensor) -> dict[str, dict[str, float | str]]:
+        """theta (D,) for people: name -> value, unit, lower, upper, and display in metres or degrees."""
+        check_finite("theta", theta)
+        self.unflatten(theta)
+        lower, upper = self.lower.tolist(), self.upper.tolist()
+        return {
+            self.name(i): {
+                "value": value,
+                "unit": SPECS[self._locate(i)[0]].unit,
+                "lower": lower[i],
+                "upper": upper[i],
+                "display": self.display(i, value),
+            }
+            for i, value in enumerate(theta.detach().cpu().tolist())
+        }
+
+    def _locate(self, i: int) -> tuple[Parameter, int, int]:
+        """Parameter, object (0 for a scene's parameter) and place within them of coordinate `i`."""
+        if not 0 <= i < self.dim:
+            raise RangeError("theta coordinate", f"an index in [0, {self.dim})", i)
+        for parameter, where in self._slices.items():
+            if i < where.stop:
+                owner, k = divmod(i - where.start, SPECS[parameter].size)
+                return parameter, owner, k
+        raise AssertionError("the slices cover theta")
+
+    def _bounds(self, parameter: Parameter) -> tuple[Tensor | float, Tensor | float]:
+        """Bounds of theta's block of `parameter`; they always hold 0."""
+        limit = getattr(self.budget, parameter.value)
+        if parameter is Parameter.COLOR:
+            start, low = self.scene.objects.texture_code.reshape(-1), -limit
+        elif parameter is Parameter.WEATHER:
+            start, low = self.scene.environment.weather, 0.0
+        elif parameter is Parameter.FOLIAGE:
+            start, low = self.scene.environment.foliage, -limit
+        elif parameter is Parameter.TRANSLATE:
+            length_m = self.scene.objects.size_lhw[:, :1].detach()
+            reach = (self.budget.translate_m / length_m).clamp(max=limit).expand(-1, 2).reshape(-1)
+            return -reach, reach
+        else:
+            return -limit, limit
+        start = start.detach()
+        return (low - start).clamp(max=0), (limit - start).clamp(min=0)
+
+
+def ground_axes(yaw: Tensor, length_m: Tensor, ground: Tensor) -> Tensor:
+    """Shifts (N, 2, 3) m of cars on the ground plane: by one own length along the heading, and by one across it
+    (towards +z of their own frame). yaw (N,) rad; length_m (N,); ground (4,): n.x + d = 0.
+
+    The horizontal part follows heading; y follows the plane, so the height above it is kept.
+    """
+    flat = yaw_matrix(yaw).transpose(-1, -2)[:, ::2]
+    y = -(ground[0] * flat[..., 0] + ground[2] * flat[..., 2]) / ground[1]
+    return torch.stack([flat[..., 0], y, flat[..., 2]], dim=-1) * length_m[:, None, None]
+
+
+def _ground_axes_of(scene: SceneIR) -> Tensor:
+    objects = scene.objects
+    return ground_axes(objects.yaw, objects.size_lhw[:, 0], scene.environment.ground)
+
+
+def _within(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
+    """start + change within [low, high], or up to `start` where that lies outside: 0 changes nothing."""
+    return torch.clamp(start + change, min=start.clamp(max=low), max=start.clamp(min=high))

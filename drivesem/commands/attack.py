@@ -1,0 +1,55 @@
+"""`drivesem attack`: a run of attacks, resumable, and what came of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from drivesem.run.attack import attack_run
+from drivesem.run.results import RunSummary
+from drivesem.settings.commands import Attack
+
+
+def run(config: Attack) -> int:
+    """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
+    summary = attack_run(config)
+    if config.json:
+        sys.stdout.write(json.dumps(summary.to_json()) + "\n")
+    else:
+        _print(summary, Console())
+    return 0
+
+
+def _print(summary: RunSummary, console: Console) -> None:
+    table = Table(
+        title=f"{summary.detector} on {summary.dataset}: {' + '.join(summary.params)}", title_justify="left"
+    )
+    table.add_column(f"{summary.headline}, %")
+    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*"):
+        table.add_column(title, justify="right")
+    rows = {
+        "benign": summary.benign,
+        "benign re-rendered": summary.rerendered,
+        "attacked, moved labels": summary.attacked_moved,
+        "attacked, benign labels (paper)": summary.attacked_paper,
+    }
+    for name, scores in rows.items():
+        one = scores.headline
+        cells = (one.ap50, one.ap70, one.ap, one.recall, one.recall_at_t_star)
+        table.add_row(name, *("-" if cell is None else f"{100 * cell:.1f}" for cell in cells))
+    console.print(table)
+    feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
+    console.print(
+        f"{summary.frames} frames, {summary.objects} vehicles: {sum(summary.lost_objects.values())} lost, "
+        f"{sum(summary.phantoms.values())} phantoms, {summary.successes_moved} frames broken; "
+        f"feasible {feasible}; {summary.queries} queries in {summary.seconds:.0f} s"
+    )
+    if summary.frames_without_vehicles:
+        console.print(f"{summary.frames_without_vehicles} frames without vehicles passed over")
+    for name, reason in summary.frames_failed.items():
+        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
+    console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)

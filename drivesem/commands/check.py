@@ -1,0 +1,60 @@
+"""`drivesem check`: whether a detector keeps the contract of `detectors.base`."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import asdict
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from detectors.base import DetectorError
+from detectors.check import Report, check_detector
+from detectors.registry import load_predictor
+from drivesem.settings.commands import Check
+from drivesem.settings.devices import check_device
+from drivesem.settings.errors import UsageError
+
+LEAST_SIDE = 64
+"""Of a picture, px: its blocks must be larger than a network's stride."""
+_STYLES = {"ok": "green", "failed": "bold red", "not tried": "dim"}
+
+
+def run(config: Check) -> int:
+    """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input."""
+    width, height = _size(config.size)
+    check_device(config.device)
+    try:
+        detector = load_predictor(config.detector, config.device, config.tiles)
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    report = check_detector(detector, (height, width), seed=config.seed, device=config.device)
+    if config.json:
+        sys.stdout.write(json.dumps({"detector_setting": config.detector, **asdict(report)}) + "\n")
+    else:
+        _print(report, config, Console())
+    return 1 if report.failed else 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height px."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if found is None or min(int(found[1]), int(found[2])) < LEAST_SIDE:
+        raise UsageError("--size", f"WIDTHxHEIGHT, each at least {LEAST_SIDE} px", repr(text))
+    return int(found[1]), int(found[2])
+
+
+def _print(report: Report, config: Check, console: Console) -> None:
+    kind = "with gradients" if report.gradients else "predicts only"
+    table = Table(title=f"{config.detector} ({kind})", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("promise", "", "found"):
+        table.add_column(heading)
+    for finding in report.findings:
+        style = _STYLES[finding.verdict]
+        table.add_row(finding.name, f"[{style}]{finding.verdict}[/]", finding.said.replace("[", r"\["))
+    console.print(table)
+    tried = sum(finding.verdict != "not tried" for finding in report.findings)
+    console.print(f"{tried - len(report.failed)} of {tried} kept, {len(report.failed)} broken", soft_wrap=True)

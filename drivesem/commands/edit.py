@@ -1,0 +1,77 @@
+"""`drivesem edit`: a scene folder, changed by physical units, as a picture and as a scene folder again."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from drivesem.attack.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
+from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.scene_edits import moved, removed_rows
+from drivesem.commands.render import picture, picture_path
+from drivesem.settings.commands import Edit
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.io import load_scene, save_scene
+from scene_ir.removal import without_objects
+
+
+def run(config: Edit) -> int:
+    """Edit a scene folder; exit code 0. Raises UsageError or SceneError for bad input."""
+    start = time.perf_counter()
+    folder = Path(config.scene)
+    out = None
+    if config.out is not None or config.save is None:
+        out = picture_path(config.out, folder / "edit.png")
+    save = None if config.save is None else _save_path(Path(config.save), folder)
+    edit = frame_edit("edit", _changes(config))
+    scene = load_scene(folder)
+    gone = removed_rows(scene, edit)
+    changed = moved(scene, edit)
+    notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in gone))
+    for note in notes:
+        sys.stderr.write(f"drivesem: {note}\n")
+    changed = without_objects(changed, gone)
+    if save is not None:
+        save_scene(changed, save)
+    if out is not None:
+        files.write_png(out, picture(changed))
+    seconds = round(time.perf_counter() - start, 3)
+    written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
+    if config.json:
+        found = {"scene": config.scene, **written, "objects": len(changed.objects), "notes": notes}
+        sys.stdout.write(json.dumps({**found, "seconds": seconds}) + "\n")
+    else:
+        what = f"{len(changed.objects)} vehicles, {len(gone)} removed ({seconds:.1f} s)"
+        Console().print(f"{' and '.join(written.values())}: {what}", soft_wrap=True)
+    return 0
+
+
+def _changes(config: Edit) -> dict[Any, Any]:
+    """The edits of file and command line as one mapping. FormatError or UsageError for what cannot be."""
+    changes: dict[Any, Any] = {} if config.edits is None else read_frame_edit(Path(config.edits))
+    for text in config.set:
+        changes = merged(changes, parse_setting(text))
+    for text in config.remove:
+        for part in text.split(","):
+            row = part.strip()
+            if row != ALL and not (row.isascii() and row.isdigit()):
+                raise UsageError("--remove", "rows from 0, or all", repr(text))
+            changes = merged(changes, {"objects": {ALL if row == ALL else int(row): {"remove": True}}})
+    if not changes:
+        raise UsageError("edit", "a change: --set, --remove or --edits", "none")
+    return changes
+
+
+def _save_path(path: Path, scene: Path) -> Path:
+    """Where the changed scene goes. UsageError where that would destroy something else than a scene."""
+    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not (path / "scene.json").is_file()):
+        raise UsageError("--save", "a new folder, or one of a scene", path)
+    if path.resolve() in scene.resolve().parents:
+        raise UsageError("--save", "a folder that does not hold the scene", path)
+    return path

@@ -1,0 +1,136 @@
+"""`drivesem study`: the paper's experiments on frames of one's own, its figures beside ours."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from drivesem.commands.confirm import confirm_run
+from drivesem.evaluation.resampling import DRAWS
+from drivesem.questions.confirm.plans import open_plans
+from drivesem.questions.confirm.report import Report as Confirmed
+from drivesem.questions.study import report, retrain, retrain_report, transfer
+from drivesem.questions.study.arms import arms_of
+from drivesem.questions.study.labels import label_sets
+from drivesem.questions.study.largest import largest, write_largest
+from drivesem.questions.study.lessons import CACHE, FRAMES, RETRAINED
+from drivesem.questions.study.plots import write_plot
+from drivesem.questions.study.report import Findings, Told, print_told, write_tables
+from drivesem.questions.study.rows import rows_of
+from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
+from drivesem.questions.study.success import against, curve_of
+from drivesem.questions.transfer.asking import DETECTIONS
+from drivesem.questions.transfer.plot import write_heatmap
+from drivesem.run.folder import PRESENTATION, claim
+from drivesem.settings.commands import Confirm, Study
+from drivesem.settings.devices import check_device
+from drivesem.settings.text import command_line
+from scene_ir import files
+
+_PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
+_TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
+_FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
+"""Settings that may change on the way: they add frames, arms or draws, and alter none."""
+_FREE_IN_RETRAIN = (
+    *(name for name in PRESENTATION if name != "limit"),
+    *("bootstrap", "benign_frames", "fresh", "controls", "detectors", "sources"),
+)
+"""Of retrain: other frames to train on would make other detectors."""
+_NOT_TOLD = ("out", "json", "resume", "workers", "name")
+
+
+def run(config: Study) -> int:
+    """Run or continue a study; exit code 0. Raises UsageError or SceneError for bad input."""
+    check_device(config.device)
+    out = Path(config.out or f"runs/study-{config.name}-{config.dataset}-seed{config.seed}")
+    console = Console(stderr=True)
+    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, console)
+    files.write_json(out / _FIGURES, data)
+    command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
+    write_tables(out, told, _PICTURE, command)
+    draw(out / _PICTURE)
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    print_told(told, console if config.json else Console())
+    console.print(f"written to {out}", soft_wrap=True)
+    return 0
+
+
+_Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
+"""A study's figures for JSON, its text, and what draws its picture."""
+
+
+def _arms(config: Study, out: Path, console: Console) -> _Found:
+    """Attacks side by side."""
+    arms = arms_of(config, out)
+    workers = workers_of(arms)
+    claim(out, config, _clear, _FREE)
+    if config.confirm:  # before hours of attacks: whether the frames can be drawn again
+        open_plans(workers[0].config, None)
+    ran = run_arms(arms, workers, out, console)
+    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out, console))
+    write_largest(out / _LARGEST, largest(ran.runs, out))
+    return found.to_json(), report.told(found), partial(write_plot, found=found)
+
+
+def _confirmed(config: Study, ran: Ran, out: Path, console: Console) -> dict[str, Confirmed]:
+    """What the generator's pictures say of each arm that is no control, where that is asked."""
+    if not config.confirm:
+        return {}
+    shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
+    arms = [run.arm for run in ran.runs if run.arm.control is None]
+    return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)), console)[0] for arm in arms}
+
+
+def _transfer(config: Study, out: Path, console: Console) -> _Found:
+    """Counterexamples before other detectors."""
+    arms = arms_of(config, out)
+    workers = workers_of(arms)
+    asked = transfer.detectors_asked(config, out)
+    claim(out, config, _clear, (*_FREE, "detectors", "sources"))
+    found = transfer.run(config, arms, workers, asked, out, console)
+    return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
+
+
+def _retrain(config: Study, out: Path, console: Console) -> _Found:
+    """Detectors trained on with counterexamples."""
+    ready = retrain.prepare(config)
+    claim(out, config, _clear, _FREE_IN_RETRAIN)
+    found = retrain.run(config, ready, out, console)
+    return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
+
+
+_STUDIES = {"transfer": _transfer, "retrain": _retrain}
+"""Studies that are more than attacks side by side."""
+
+
+def _findings(config: Study, ran: Ran) -> Findings:
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    rows = rows_of(ran.runs, draws, config.seed)
+    if config.name == "labels":
+        return Findings(config, draws, ran, rows, label_sets=[label_sets(one) for one in ran.runs])
+    if config.name not in ("samples", "steps"):
+        return Findings(config, draws, ran, rows)
+    curves = [curve_of(one, draws, config.seed) for one in ran.runs]
+    if config.name == "steps":
+        return Findings(config, draws, ran, rows, curves)
+    first = ran.runs[0]
+    beside = {one.arm.name: against(first, config.steps, one, draws, config.seed) for one in ran.runs}
+    return Findings(config, draws, ran, rows, curves, beside, config.steps)
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run wrote, and nothing else."""
+    for name in (_PICTURE, _FIGURES, _LARGEST, *_TABLES):
+        (out / name).unlink(missing_ok=True)
+    for name in (ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)

@@ -1,0 +1,47 @@
+"""`drivesem survey` makes the page that asks people."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from drivesem.questions.survey.page import (
+    CHANGED,
+    UNCHANGED,
+    items_of,
+    render_page,
+    survey_name,
+    write_key,
+)
+from drivesem.run.finished import load_runs
+from drivesem.settings.commands import Survey
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+
+PAGE, KEY = "survey.html", "survey-key.json"
+
+
+def run(config: Survey) -> int:
+    """Make the page and its key; exit code 0. Raises UsageError or SceneError for bad input."""
+    runs = load_runs(config.runs, setting="RUN")
+    out = Path(config.out) if config.out else runs[0].folder / "survey"
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    chosen = items_of(runs, config.items, config.controls, config.seed)
+    items = [item for item, _ in chosen]
+    page = render_page(chosen)
+    files.write_text(out / PAGE, page)
+    write_key(out / KEY, items, {"runs": [str(one.folder) for one in runs], "seed": config.seed})
+    counts = {kind: sum(item.kind == kind for item in items) for kind in (CHANGED, UNCHANGED)}
+    data = {"survey": survey_name(items), "page": str(out / PAGE), "key": str(out / KEY), **counts}
+    data["megabytes"] = round(len(page) / 1e6, 2)
+    console = Console(stderr=True)
+    if config.json:
+        sys.stdout.write(json.dumps(data) + "\n")
+    if counts[CHANGED] < config.items:
+        console.print(f"only {counts[CHANGED]} of {config.items} pictures: the runs have no more", soft_wrap=True)
+    console.print(f"give people {out / PAGE}, keep {out / KEY}", soft_wrap=True, highlight=False)
+    return 0

@@ -1,0 +1,109 @@
+"""`drivesem synth`: generated frames in a data set's layout."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from drivesem.run.lock import hold
+from drivesem.settings.commands import Synth, processes
+from drivesem.settings.errors import UsageError
+from drivesem.synth.variations import MIXED, parse_variations
+from drivesem.synth.write import Order, in_processes, synthesise
+
+_DRIVE_FRAMES = 10
+"""Frames of one drive in the layouts of Virtual KITTI, unless --sequence says otherwise."""
+_SHEET_FRAMES = 8
+
+
+def order_of(config: Synth) -> Order:
+    """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
+    out = Path(config.out or f"data/synth-{config.layout}-{config.split}-seed{config.seed}")
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    virtual = config.layout.startswith("vkitti")
+    for name in ("meshes", "assets"):
+        folder = getattr(config, name)
+        if folder is not None and not Path(folder).is_dir():
+            raise UsageError(f"--{name}", "a folder", folder)
+    return Order(
+        out=out,
+        frames=config.frames if config.limit is None else min(config.frames, config.limit),
+        seed=config.seed,
+        layout=config.layout,
+        split=config.split,
+        variations=parse_variations(config.variations or ("clone" if virtual else MIXED)),
+        sequence=config.sequence or (_DRIVE_FRAMES if virtual else 1),
+        people=not virtual if config.people is None else config.people,
+        cameras=config.cameras,
+        validation=config.validation,
+        edits=None if config.edits is None else Path(config.edits),
+        meshes=None if config.meshes is None else Path(config.meshes),
+        assets=None if config.assets is None else Path(config.assets),
+        resume=config.resume,
+    )
+
+
+def run(config: Synth) -> int:
+    """Write the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
+    start = time.perf_counter()
+    order = order_of(config)
+    total = len(order.places())
+    hold(order.out)
+    columns = (
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
+        *(TimeElapsedColumn(), TimeRemainingColumn()),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        done = synthesise(order, in_processes(min(processes(config), total)))
+        for _ in progress.track(done, total=total, description="making frames"):
+            pass
+    found: dict[str, object] = {"out": str(order.out), "frames": total}
+    if config.sheet:
+        found["sheet"] = str(_sheet(order))
+    if config.compare:
+        found["distances"] = _compare(order)
+    found["seconds"] = round(time.perf_counter() - start, 3)
+    if config.json:
+        sys.stdout.write(json.dumps(found) + "\n")
+    else:
+        Console().print(f"{total} frames in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True)
+    return 0
+
+
+def _sheet(order: Order) -> Path:
+    """A contact sheet of what was written, read back by the layout's reader."""
+    from drivesem.data.registry import open_dataset
+    from drivesem.report.drawing import write_picture
+    from drivesem.synth.sheet import sheet_of
+
+    dataset = open_dataset(order.layout, order.out)
+    names = dataset.identifiers
+    step = max(len(names) // _SHEET_FRAMES, 1)
+    path = order.out / "sheet.jpg"
+    write_picture(path, sheet_of(dataset, names[::step][:_SHEET_FRAMES]))
+    return path
+
+
+def _compare(order: Order) -> dict[str, object]:
+    """Distributions beside KITTI's own: a plot and a table in the folder."""
+    from drivesem.data.registry import open_dataset
+    from drivesem.synth.compare import compare
+    from scene_ir import files
+
+    found = compare(open_dataset(order.layout, order.out))
+    found.plot(order.out / "distributions.png")
+    files.write_text(order.out / "distributions.md", found.table())
+    return found.summary()["distances"]

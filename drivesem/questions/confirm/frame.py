@@ -1,0 +1,116 @@
+"""One frame: the change drawn by the generator, the detector asked before and after, its folder on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from detectors.base import Predictor, predict
+from detectors.types import CLASSES, Detections
+from drivesem.attack.judging import JudgedClasses
+from drivesem.questions.confirm.carry import carried
+from drivesem.questions.confirm.judge import exact_labels, findings, stands
+from drivesem.questions.confirm.plans import Plans
+from drivesem.questions.confirm.results import Confirmed, dump
+from drivesem.questions.confirm.sheet import sheet_of
+from drivesem.run.finished import Frame
+from drivesem.run.frame import RESULT, detection_records, target_records
+from drivesem.run.results import BoxRecord
+from drivesem.synth.edits import apply_edit
+from drivesem.synth.frames import Plan, SynthFrame, render_frame
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
+
+PICTURE, SHEET = "generator.png", "sheet.png"
+_ROUNDING = 1
+"""Levels of 255 by which the same picture may differ from one processor to another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """How the detector is asked. t_star: score from which a detection counts."""
+
+    device: str
+    t_star: float
+
+    @torch.no_grad()
+    def detect(self, detector: Predictor, image: np.ndarray) -> Detections:
+        """What it finds in a picture (H, W, 3) uint8, of judged classes, on the CPU."""
+        picture = torch.from_numpy(image).permute(2, 0, 1).to(self.device) / 255
+        found = JudgedClasses.of(detector).detections(predict(detector, picture[None])[0])
+        return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
+
+
+def confirm_frame(
+    frame: Frame, source: Path, plans: Plans, detector: Predictor, ask: Asked, folder: Path
+) -> Confirmed:
+    """Draw one frame of a run again and write `folder`, whole or not at all. source: the frame's folder in the
+    run.
+
+    Raises FormatError where the plan is not that of the frame, as its picture without the change tells.
+    """
+    start = time.perf_counter()
+    changed = load_scene(source / "scene")
+    still = changed.as_photographed()
+    identifier = frame.result.identifier
+    planned = plans.planned(identifier, changed)
+    before = _rendered(planned.plan)
+    _check_same(frame.pictures["benign"], before.image)
+    change = carried(still, changed, planned)
+    after = _rendered(apply_edit(planned.plan, change.edit, f"frame {identifier}"))
+    exact = exact_labels(before, after)
+    seen = [ask.detect(detector, image) for image in (before.image, after.image)]
+    found = findings(frame.result, planned.tracks, exact, seen, JudgedClasses.of(detector), ask.t_star)
+    targets = [target_records(t, CLASSES, len(exact.tracks)) for t in (exact.benign, exact.changed)]
+    names = JudgedClasses.of(detector).names
+    result = Confirmed(
+        identifier=identifier,
+        source=fingerprint(source),
+        compositor=found[0],
+        generator=found[1],
+        stands=stands(frame.result, planned.tracks, exact, before, after),
+        targets_benign=_by_track(targets[0], exact.tracks),
+        targets_changed=_by_track(targets[1], exact.tracks),
+        detections_benign=detection_records(seen[0], names),
+        detections_changed=detection_records(seen[1], names),
+        not_carried=change.missing,
+        seconds=round(time.perf_counter() - start, 3),
+    )
+    with files.whole_folder(folder) as part:
+        files.write_png(part / PICTURE, after.image)
+        files.write_png(part / SHEET, sheet_of(frame, result, after.image, ask.t_star))
+        files.write_text(part / RESULT, dump(result))
+    return result
+
+
+def fingerprint(source: Path) -> str:
+    """Of a frame's result in the run: another result is another frame."""
+    return hashlib.sha256(files.read_bytes(source / RESULT)).hexdigest()
+
+
+def _rendered(plan: Plan) -> SynthFrame:
+    frame = render_frame(plan)
+    assert frame is not None
+    return frame
+
+
+def _check_same(path: Path, image: np.ndarray) -> None:
+    """Raises FormatError where the run's photograph is not the picture that the generator makes."""
+    given = files.read_image(path, image.shape[:2])
+    apart = int(np.abs(given.astype(np.int16) - image).max(initial=0))
+    if apart > _ROUNDING:
+        raise FormatError(
+            str(path), "the picture that the generator makes of this frame", f"one {apart} levels off"
+        )
+
+
+def _by_track(records: Sequence[BoxRecord], tracks: Sequence[int]) -> tuple[BoxRecord, ...]:
+    return tuple(r if r.index is None else dataclasses.replace(r, index=tracks[r.index]) for r in records)

@@ -1,0 +1,181 @@
+"""What counts as a failure in either renderer's picture, by labels that the generator's geometry gives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from detectors import boxes
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.labels import Difficulty
+from drivesem.data.classes import VEHICLES
+from drivesem.evaluation import failures
+from drivesem.run.results import FrameResult
+from drivesem.synth.frames import SynthFrame, Truth, table
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A failure in one of the two pictures. track: of the lost vehicle in the generator's plan; None for a
+    phantom, and where the plan has no counterpart. survives: whether it is a failure in the other picture too: the
+    same vehicle lost, or a phantom of the same class at an IoU of at least 0.5.
+    """
+
+    kind: str
+    label: str
+    xyxy: tuple[float, float, float, float]
+    track: int | None
+    score: float | None
+    survives: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """One of the scene's objects in both pictures. iou: of its moved label with the generator's box; iou_benign:
+    of the boxes before the change; None where it cannot be seen. judged: whether its exact label counts, now.
+    """
+
+    index: int
+    track: int
+    judged: bool
+    iou_benign: float | None
+    iou: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Exact:
+    """The generator's labels before and after the change; row i of both is the same object. tracks: of the first
+    rows; the others are regions in which no detection counts."""
+
+    benign: Targets
+    changed: Targets
+    tracks: tuple[int, ...]
+
+
+def exact_labels(before: SynthFrame, after: SynthFrame, difficulty: Difficulty | None = None) -> Exact:
+    """Labels of the vehicles that are labelled before the change, by geometry.
+
+    Ignored are those too hard before or after it. Regions, of both pictures: what the generator ignores, people,
+    and vehicles that only the change brought into view.
+    """
+    difficulty = difficulty or Difficulty()
+    first = {t.actor.track: t for t in before.truths if t.labelled and t.actor.label in VEHICLES}
+    then = {t.actor.track: t for t in after.truths if t.actor.label in VEHICLES}
+    regions = torch.cat(
+        [
+            *(_regions(frame) for frame in (before, after)),
+            _boxes([t for track, t in then.items() if track not in first and t.labelled]),
+        ]
+    )
+    ignore = [_too_hard(t, difficulty) or _too_hard(then.get(track), difficulty) for track, t in first.items()]
+    count = len(CLASSES)
+    labels = torch.cat(
+        [
+            torch.tensor([int(VEHICLES[t.actor.label]) for t in first.values()], dtype=torch.int64),
+            torch.arange(count).repeat(len(regions)),
+        ]
+    )
+    ignored = torch.tensor([*ignore, *[True] * (count * len(regions))], dtype=torch.bool)
+    around = regions.repeat_interleave(count, dim=0)
+    # What left the picture has no box, and is ignored.
+    moved = [then[track].box_xyxy if track in then else np.zeros(4) for track in first]
+    return Exact(
+        Targets(torch.cat([_boxes(list(first.values())), around]), labels, ignored),
+        Targets(torch.cat([table(moved, 4), around]), labels, ignored),
+        tuple(first),
+    )
+
+
+def _boxes(truths: Sequence[Truth]) -> Tensor:
+    return table([t.box_xyxy for t in truths], 4)
+
+
+def _regions(frame: SynthFrame) -> Tensor:
+    people = [t for t in frame.truths if t.labelled and t.actor.label not in VEHICLES]
+    return torch.cat([frame.labels.ignore_xyxy, _boxes(people)])
+
+
+def _too_hard(truth: Truth | None, difficulty: Difficulty) -> bool:
+    if truth is None or not truth.labelled:
+        return True
+    height = truth.box_xyxy[3] - truth.box_xyxy[1]
+    return bool(
+        height < difficulty.min_height_px
+        or truth.occlusion > difficulty.max_occlusion
+        or truth.truncation > difficulty.max_truncation
+    )
+
+
+def findings(
+    result: FrameResult,
+    tracks: Sequence[int | None],
+    exact: Exact,
+    seen: Sequence[Detections],
+    judged: JudgedClasses,
+    t_star: float,
+) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+    """Failures in the compositor's picture, as the run has them, and in the generator's. seen: detections before
+    and after the change; tracks: of the scene's objects."""
+    benign, changed = judged.targets(exact.benign), judged.targets(exact.changed)
+    found = failures.find(benign, seen[0], changed, seen[1], t_star)
+    after = seen[1]
+    theirs = []
+    for i in found.lost:
+        label = CLASSES[int(exact.changed.labels[i])]
+        theirs.append(Finding("lost", label, _xyxy(changed.boxes_xyxy[i]), exact.tracks[i], None, False))
+    for i in found.phantoms:
+        label, score = judged.names[int(after.labels[i])], float(after.scores[i])
+        theirs.append(Finding("phantom", label, _xyxy(after.boxes_xyxy[i]), None, score, False))
+    ours = [
+        Finding(f.kind, f.label, f.xyxy, None if f.index is None else tracks[f.index], f.score, False)
+        for f in result.failures
+    ]
+    return _with_survival(ours, theirs), _with_survival(theirs, ours)
+
+
+def _with_survival(these: Sequence[Finding], others: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(dataclasses.replace(one, survives=any(_same(one, other) for other in others)) for one in these)
+
+
+def _same(one: Finding, other: Finding) -> bool:
+    if one.kind != other.kind:
+        return False
+    if one.kind == "lost":
+        return one.track is not None and one.track == other.track
+    return one.label == other.label and _iou(one.xyxy, other.xyxy) >= failures.IOU
+
+
+def stands(
+    result: FrameResult, tracks: Sequence[int | None], exact: Exact, before: SynthFrame, after: SynthFrame
+) -> tuple[Stand, ...]:
+    """Where the scene's objects stand in both pictures, those that have a counterpart."""
+    first, then = ({t.actor.track: _xyxy(t.box_xyxy) for t in frame.truths} for frame in (before, after))
+    ignored = dict(zip(exact.tracks, exact.changed.ignore.tolist(), strict=False))
+    ours = {t.index: t.xyxy for t in result.targets_benign if t.index is not None}
+    moved = {t.index: t.xyxy for t in result.targets_moved if t.index is not None}
+    return tuple(
+        Stand(
+            index=i,
+            track=track,
+            judged=not ignored.get(track, True),
+            iou_benign=_iou(ours[i], first[track]) if track in first else None,
+            iou=_iou(moved[i], then[track]) if track in then else None,
+        )
+        for i, track in enumerate(tracks)
+        if track is not None
+    )
+
+
+def _iou(one: Sequence[float], two: Sequence[float]) -> float:
+    return float(boxes.iou_matrix(torch.tensor([one]), torch.tensor([two]))[0, 0])
+
+
+def _xyxy(box: Tensor | np.ndarray) -> tuple[float, float, float, float]:
+    x0, y0, x1, y1 = box.tolist()
+    return x0, y0, x1, y1

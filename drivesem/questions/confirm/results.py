@@ -1,0 +1,61 @@
+"""What came of one frame before both renderers, and its file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivesem.questions.confirm.judge import Finding, Stand
+from drivesem.run.results import BoxRecord
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmed:
+    """What came of one frame. source: fingerprint of the run's result. compositor, generator: failures in either
+    picture; targets, detections: in the generator's pictures, boxes with their track as index; not_carried: what
+    of the change the plan has no counterpart for. `seconds` alone may differ between two calls.
+    """
+
+    identifier: str
+    source: str
+    compositor: tuple[Finding, ...]
+    generator: tuple[Finding, ...]
+    stands: tuple[Stand, ...]
+    targets_benign: tuple[BoxRecord, ...]
+    targets_changed: tuple[BoxRecord, ...]
+    detections_benign: tuple[BoxRecord, ...]
+    detections_changed: tuple[BoxRecord, ...]
+    not_carried: tuple[str, ...]
+    seconds: float
+
+
+def dump(result: Confirmed) -> str:
+    """JSON text of one frame's result."""
+    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
+
+
+def load(path: Path) -> Confirmed:
+    """Read what `dump` wrote. Raises FormatError naming the file."""
+    data = files.read_json(path)
+    try:
+        if data.pop("schema") != SCHEMA:
+            raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
+        kinds: dict[str, Callable[..., Any]] = {"compositor": Finding, "generator": Finding, "stands": Stand}
+        kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
+        for name, kind in kinds.items():
+            data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])
+        return Confirmed(**{**data, "not_carried": tuple(data["not_carried"])})
+    except (AttributeError, KeyError, TypeError) as error:
+        raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
+
+
+def _box_of(entry: dict[str, Any]) -> dict[str, Any]:
+    return {"xyxy": tuple(entry["xyxy"])} if "xyxy" in entry else {}

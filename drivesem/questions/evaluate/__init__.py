@@ -1,0 +1,1 @@
+"""Detections against labels: where both come from, and what is written of them."""

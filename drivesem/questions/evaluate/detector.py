@@ -1,0 +1,161 @@
+"""`drivesem eval --detector`: a detector's precision and recall on a data set's photographs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from detectors.base import DetectorError, Predictor, predict
+from detectors.registry import load_predictor
+from detectors.types import Detections, Targets
+from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
+from drivesem.attack.labels import Difficulty
+from drivesem.data.registry import Dataset, open_dataset
+from drivesem.evaluation import coco
+from drivesem.evaluation.outcome import Outcome
+from drivesem.evaluation.resampling import DRAWS, Interval
+from drivesem.report.mistakes import marked
+from drivesem.report.tables import percent
+from drivesem.run.frame import to_uint8
+from drivesem.settings.commands import Eval
+from drivesem.settings.devices import check_device
+from drivesem.settings.errors import UsageError
+from drivesem.training.targets import judged_targets, suited
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.types import Labels
+
+
+def run(config: Eval) -> int:
+    """Run the detector over the frames, count, report; exit code 0. UsageError or SceneError for bad input."""
+    check_device(config.device)
+    dataset = open_dataset(config.dataset, Path(config.root or ""))
+    detector = _detector(config)
+    names = dataset.identifiers[: config.limit]
+    found, targets = _look(config, dataset, detector, names)
+    t_star = t_star_of(detector)
+    judged = JudgedClasses.of(detector).names
+    scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
+    outcome = Outcome.of(targets, found, judged.index(HEADLINE))
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    spread = outcome.intervals(draws, config.seed) if draws else []
+    data: dict[str, Any] = {
+        "detector": config.detector,
+        "dataset": config.dataset,
+        "frames": len(names),
+        "headline": HEADLINE,
+        "t_star": t_star,
+        "min_height": config.min_height,
+        "max_occlusion": config.max_occlusion,
+        "max_truncation": config.max_truncation,
+        "tiles": config.tiles,
+        **scores.to_json(),
+        "bootstrap": draws,
+        "intervals": [asdict(one) for one in spread],
+    }
+    if config.out is not None:
+        _write(Path(config.out), data, names, found, judged)
+        _draw(config, dataset, names, outcome, t_star)
+    if config.json:
+        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+    _print(scores.per_class, data, spread, Console(stderr=True))
+    return 0
+
+
+def _draw(config: Eval, dataset: Dataset, names: Sequence[str], outcome: Outcome, t_star: float) -> None:
+    """The frames with most mistakes, worst first."""
+    marks = [outcome.marks(frame, t_star) for frame in range(len(names))]
+    worst = sorted(range(len(names)), key=lambda i: (-marks[i].mistakes, i))
+    for rank, frame in enumerate(worst[: config.pictures], start=1):
+        picture = marked(to_uint8(dataset.frame(names[frame]).photograph), marks[frame])
+        name = names[frame].replace("/", "_")
+        files.write_png(Path(config.out or "") / "pictures" / f"{rank:03d}-{name}.png", picture)
+
+
+def _detector(config: Eval) -> Predictor:
+    try:
+        detector = load_predictor(config.detector or "", config.device, config.tiles)
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    return detector
+
+
+def _look(
+    config: Eval, dataset: Dataset, detector: Predictor, names: Sequence[str]
+) -> tuple[list[Detections], list[Targets]]:
+    judged = JudgedClasses.of(detector)
+    found: list[Detections] = []
+    labels: list[Labels] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        for name in progress.track(names, description="frames"):
+            frame = dataset.frame(name)
+            if frame.labels is None:
+                raise FormatError(f"frame {name}", "labels", "none")
+            seen = judged.detections(predict(detector, frame.photograph[None].to(config.device))[0])
+            found.append(Detections(seen.boxes_xyxy.cpu(), seen.labels.cpu(), seen.scores.cpu()))
+            labels.append(frame.labels)
+    limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
+    return found, [judged_targets(one, limits, judged.names) for one in labels]
+
+
+def _write(
+    out: Path, data: Mapping[str, Any], names: Sequence[str], found: Sequence[Detections], judged: Sequence[str]
+) -> None:
+    """metrics.json, and the detections as KITTI's results, which drivesem eval --pred reads."""
+    from drivesem.data.kitti import write_labels
+
+    files.write_json(out / "metrics.json", data)
+    for name, one in zip(names, found, strict=True):
+        # KITTI's lines cannot hold a box without an area
+        kept = ((one.boxes_xyxy[:, 2:] - one.boxes_xyxy[:, :2]) >= 0.01).all(dim=1)
+        n = int(kept.sum())
+        unknown = torch.full((n, 3), torch.nan)
+        labels = Labels(
+            kind=tuple(judged[int(k)] for k in one.labels[kept]),
+            boxes_xyxy=one.boxes_xyxy[kept],
+            truncation=unknown[:, 0],
+            occlusion=torch.full((n,), 3, dtype=torch.int64),
+            translation=unknown,
+            yaw=unknown[:, 0],
+            size_lhw=unknown,
+            ignore_xyxy=torch.zeros(0, 4),
+        )
+        path = out / "detections" / f"{name.replace('/', '_')}.txt"
+        write_labels(path, labels, one.scores[kept])
+
+
+def _print(
+    per_class: Mapping[str, coco.ClassScores],
+    data: Mapping[str, Any],
+    spread: Sequence[Interval],
+    console: Console,
+) -> None:
+    table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
+    table.add_column("class")
+    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*", "objects"):
+        table.add_column(title, justify="right")
+    for name, scores in per_class.items():
+        row = asdict(scores)
+        cells = [percent(row[key]) for key in ("ap50", "ap70", "ap", "recall", "recall_at_t_star")]
+        table.add_row(name, *cells, str(scores.objects))
+    console.print(table)
+    for one in spread:
+        if one.low is not None and one.high is not None:
+            bounds = f"{percent(one.low)} to {percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
+            console.print(f"{HEADLINE} {one.name} {percent(one.value)}, {bounds}", soft_wrap=True)
+    console.print(
+        f"{data['frames']} frames; judged: at least {data['min_height']:g} px high, occlusion at most "
+        f"{data['max_occlusion']}, truncation at most {data['max_truncation']:g}; t* {data['t_star']:.3f}",
+        soft_wrap=True,
+    )

@@ -1,0 +1,205 @@
+"""What an evaluation prints and writes: a table for people, JSON, CSV, Markdown, PNG."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from drivesem.evaluation.coco import STATS
+from drivesem.evaluation.results import Result
+from drivesem.report.plots import write_bars, write_curves
+from drivesem.report.tables import Sheet, percent
+from scene_ir import files
+
+_COCO_WORDS = (
+    *("AP, IoU 0.50:0.95", "AP, IoU 0.50", "AP, IoU 0.75", "AP, small", "AP, medium", "AP, large"),
+    *("AR, 1 detection", "AR, 10 detections", "AR, 100 detections", "AR, small", "AR, medium", "AR, large"),
+)
+_WORDS = ("class", "figure", "what", "difficulty", "by", "part")
+"""Columns of words; the others hold numbers."""
+_AXES = {"distance": "distance", "size": "height", "occlusion": "occlusion as labelled", "weather": "weather"}
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:+.2f}"
+
+
+def sheets(result: Result, wide: bool = False) -> list[Sheet]:
+    """The tables of an evaluation, the protocol's own figures first. wide: parts by class beside one another."""
+    found: list[Sheet] = []
+    if result.stats is not None:
+        rows = zip(STATS, _COCO_WORDS, map(percent, result.stats), strict=True)
+        found.append(Sheet("COCO, all classes, %", ("figure", "what", "%"), tuple(rows)))
+    if result.rows:
+        kit = result.facts["small_detections"]
+        found.append(
+            Sheet(
+                f"KITTI 2D, %; small detections: {kit}",
+                ("class", "difficulty", "R40", "R11", "objects"),
+                tuple(
+                    (r.name, r.difficulty, percent(r.r40), percent(r.r11), str(r.ground_truth))
+                    for r in result.rows
+                ),
+            )
+        )
+    further = list(dict.fromkeys(key for row in result.classes for key in row.further))
+    found.append(
+        Sheet(
+            "Classes, %; t*: score of best F1",
+            (
+                "class",
+                "IoU",
+                "AP",
+                *(key.upper() for key in further),
+                "recall",
+                "t*",
+                "F1",
+                "precision at t*",
+                "recall at t*",
+                "objects",
+            ),
+            tuple(
+                (
+                    *(c.name, f"{c.overlap:g}", percent(c.ap), *(percent(c.further.get(k)) for k in further)),
+                    *(percent(c.recall), "-" if c.t_star is None else f"{c.t_star:.3f}", percent(c.f1)),
+                    *(percent(c.precision_at_t_star), percent(c.recall_at_t_star), str(c.objects)),
+                )
+                for c in result.classes
+            ),
+        )
+    )
+    if result.parts:
+        found.append(_wide_parts(result) if wide else _parts(result))
+    if result.intervals:
+        draws, frames = result.facts["bootstrap"], result.facts["frames"]
+        found.append(
+            Sheet(
+                f"95 % intervals, %; {draws} bootstrap draws of {frames} frames",
+                ("figure", "value", "low", "high"),
+                tuple((i.name, percent(i.value), percent(i.low), percent(i.high)) for i in result.intervals),
+            )
+        )
+    if result.comparison:
+        found.append(
+            Sheet(
+                "Second minus first, percentage points; paired over frames",
+                ("figure", "first", "second", "difference", "low", "high", "p"),
+                tuple(
+                    (
+                        *(d.name, percent(d.first), percent(d.second), _signed(d.difference)),
+                        *(_signed(d.low), _signed(d.high), "-" if d.p is None else f"{d.p:.4f}"),
+                    )
+                    for d in result.comparison
+                ),
+            )
+        )
+    return found
+
+
+def _parts(result: Result) -> Sheet:
+    rows = ((p.name, p.by, p.part, percent(p.ap), percent(p.recall), str(p.objects)) for p in result.parts)
+    title = "Parts, %; objects elsewhere are ignored, false positives count everywhere"
+    return Sheet(title, ("class", "by", "part", "AP", "recall", "objects"), tuple(rows))
+
+
+def _wide_parts(result: Result) -> Sheet:
+    names = tuple(row.name for row in result.classes if any(p.name == row.name for p in result.parts))
+    cells = {(p.by, p.part, p.name): f"{percent(p.recall)} of {p.objects}" for p in result.parts}
+    places = dict.fromkeys((p.by, p.part) for p in result.parts)
+    rows = ((*place, *(cells.get((*place, name), "-") for name in names)) for place in places)
+    return Sheet("Recall by part, %, and objects", ("by", "part", *names), tuple(rows))
+
+
+def print_result(result: Result, console: Console) -> None:
+    """The tables, and what a reader must know."""
+    for sheet in sheets(result, wide=True):
+        console.print(sheet.table(_WORDS, min_width=min(len(sheet.title) + 4, console.width)))
+    facts = result.facts
+    counted = f", counted by {facts['engine']}" if "engine" in facts else ""
+    console.print(
+        f"{facts['frames']} frames, {facts['objects']} objects, {facts['detections']} detections{counted}"
+    )
+    for note in result.notes:
+        console.print(note, soft_wrap=True)
+
+
+def write_report(out: Path, result: Result) -> None:
+    """metrics.json, one CSV a table, curves.csv, report.md and PNGs in `out`."""
+    files.write_json(out / "metrics.json", result.to_json())
+    for sheet in sheets(result):
+        files.write_text(out / f"{_file_name(sheet.title)}.csv", _csv(sheet.columns, sheet.rows))
+    rows = [(name, *(f"{value:.6f}" for value in row)) for name, curve in result.curves.items() for row in curve]
+    files.write_text(out / "curves.csv", _csv(("class", "recall", "precision", "score"), rows))
+    pictures = _pictures(out, result)
+    files.write_text(out / "report.md", _markdown(result, pictures))
+
+
+def _file_name(title: str) -> str:
+    """The first words of a title: "KITTI 2D, %" is kitti-2d."""
+    return re.sub(r"[^a-z0-9]+", "-", re.split(r"[,;]", title)[0].lower()).strip("-")
+
+
+def _csv(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([["" if cell == "-" else cell for cell in row] for row in rows])
+    return buffer.getvalue()
+
+
+def _pictures(out: Path, result: Result) -> dict[str, str]:
+    """File name -> what it shows."""
+    found: dict[str, str] = {}
+    overlaps = {row.name: row.overlap for row in result.classes}
+    curves = {
+        f"{name}, IoU {overlaps[name]:g}": ([r[0] for r in rows], [r[1] for r in rows])
+        for name, rows in result.curves.items()
+        if rows
+    }
+    if curves:
+        found["precision-recall.png"] = "Precision over recall, best at each recall or a higher one"
+        write_curves(out / "precision-recall.png", "Precision over recall", curves)
+    for name in dict.fromkeys(row.name for row in result.rows if row.r40 is not None):
+        official = {
+            f"{row.difficulty}, R40 {percent(row.r40)} %": _reached(row.precision)
+            for row in result.rows
+            if row.name == name and row.r40 is not None
+        }
+        file = f"kitti-{name.lower()}.png"
+        found[file] = f"KITTI's 41 samples of precision: {name}"
+        write_curves(out / file, f"{name}, KITTI 2D", official)
+    for by in dict.fromkeys(part.by for part in result.parts):
+        groups = list(dict.fromkeys(part.part for part in result.parts if part.by == by))
+        recall = {(part.name, part.part): part.recall for part in result.parts if part.by == by}
+        series: Mapping[str, list[float | None]] = {
+            row.name: [recall.get((row.name, group)) for group in groups]
+            for row in result.classes
+            if any((row.name, group) in recall for group in groups)
+        }
+        file = f"recall-by-{by}.png"
+        found[file] = f"Recall by {_AXES[by]}"
+        write_bars(out / file, f"Recall by {_AXES[by]}", groups, series, _AXES[by])
+    return found
+
+
+def _reached(precision: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Recall and precision of KITTI's samples, as far as there are thresholds."""
+    count = max((k + 1 for k, value in enumerate(precision) if value > 0), default=1)
+    return [k / (len(precision) - 1) for k in range(count)], list(precision[:count])
+
+
+def _markdown(result: Result, pictures: Mapping[str, str]) -> str:
+    facts = result.facts
+    lines = [f"# Evaluation, protocol {result.protocol}", ""]
+    lines += [f"- {key}: {value}" for key, value in facts.items()]
+    lines += [f"- {note}" for note in result.notes]
+    for sheet in sheets(result):
+        lines += ["", *sheet.markdown(_WORDS)]
+    for file, text in pictures.items():
+        lines += ["", f"![{text}]({file})"]
+    return "\n".join(lines) + "\n"

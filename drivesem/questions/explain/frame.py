@@ -1,0 +1,312 @@
+"""One counterexample, from the folder of its run to the folder of its explanation."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from detectors.base import Detector, Predictor
+from detectors.types import CLASSES
+from drivesem.attack.aims import Aim
+from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.methods.base import Problem, Score
+from drivesem.attack.objective import Objective, Rendered
+from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.questions.explain import players, sensitivity
+from drivesem.questions.explain.minimal import Block, Minimal, Search, minimal
+from drivesem.questions.explain.players import Kind, Player
+from drivesem.questions.explain.plots import write_waterfalls
+from drivesem.questions.explain.results import (
+    EXPLANATION,
+    Contribution,
+    Explanation,
+    Least,
+    Outcome,
+    Sensitivity,
+    write_explanation,
+)
+from drivesem.questions.explain.shapley import MOST_EXACT, Flags, Floats, shapley
+from drivesem.report import pictures
+from drivesem.run.frame import RESULT, detection_records, failure_records, target_records, to_uint8
+from drivesem.run.results import Coordinate, FrameResult, load_frame
+from drivesem.settings.commands import Attack
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+
+KINDS: tuple[Kind, ...] = ("parameter", "object")
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How closely to look. points: of the grid of scales; permutations: walks through more than MOST_EXACT cars,
+    drawn from `seed`; lost: the least change of a counterexample that loses objects must lose one too.
+    """
+
+    points: int
+    permutations: int
+    seed: int
+    lost: bool = False
+
+
+class Judge:
+    """What the detector makes of parts of a change. renders: thetas that were judged, each once."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._seen: set[bytes] = set()
+
+    @property
+    def renders(self) -> int:
+        return len(self._seen)
+
+    def outcome(self, theta: Tensor, mask: Tensor) -> Outcome:
+        """Of theta (D,) with the coordinates outside of `mask` (D,) bool as photographed, projected."""
+        wanted = torch.where(mask, theta, 0)
+        part = self.project(wanted)
+        score = self._score(part)
+        return Outcome(score.loss, score.lost, score.phantoms, score.success, not torch.equal(part, wanted))
+
+    def project(self, theta: Tensor) -> Tensor:
+        """theta (D,), feasible."""
+        return self._problem.project(theta).theta
+
+    def size(self, theta: Tensor) -> float:
+        """Of theta (D,) in steps, by group (`Problem.size`)."""
+        return float(self._problem.size(theta))
+
+    def search(self, points: int, lost: bool) -> Search:
+        """For the least change that fails, or that loses an object."""
+
+        def fails(theta: Tensor) -> bool:
+            score = self._score(theta)
+            return score.lost > 0 if lost else score.success
+
+        return Search(self.project, fails, self.size, points)
+
+    def _score(self, theta: Tensor) -> Score:
+        self._seen.add(theta.cpu().numpy().tobytes())
+        return self._problem.score(theta)
+
+
+def digest(folder: Path) -> str:
+    """Of the result in a frame's folder of a run: differs where the run was made anew."""
+    return hashlib.sha256(files.read_bytes(folder / RESULT)).hexdigest()
+
+
+def explain_frame(
+    folder: Path,
+    attack: Attack,
+    params: Sequence[Parameter],
+    detector: Predictor,
+    effort: Effort,
+    out: Path,
+) -> Explanation:
+    """Explain the counterexample in a run's folder of one frame, and write the folder `out`, whole or not at all.
+
+    attack, params: the run's. Raises FormatError where the scene is not there or is damaged, or the detector does
+    not fail on it on this machine; RangeError for a gradient that is not finite.
+    """
+    start = time.perf_counter()
+    result = load_frame(folder / RESULT)
+    objective, theta = rebuild(result, folder, attack, params, detector)
+    space = objective.space
+    judge = Judge(objective.problem(FeasibleSet(space)))
+    everything = torch.ones_like(theta, dtype=torch.bool)
+    found = judge.outcome(theta, everything)
+    if not found.success:
+        raise FormatError(str(folder), "a counterexample that fails", "one that the detector gets right here")
+    teams = {"parameter": players.parameters(space, theta), "object": players.objects(space, theta)}
+    slope = objective.loss_and_grad(space.theta0)[1] * theta if isinstance(detector, Detector) else None
+    generator = np.random.default_rng([effort.seed, zlib.crc32(result.identifier.encode())])
+    contributions = [
+        one for team in teams.values() for one in weigh(team, theta, judge, slope, effort.permutations, generator)
+    ]
+    blocks = _blocks(space, theta, teams, contributions, judge)
+    shortened = minimal(theta, blocks, judge.search(effort.points, effort.lost and found.lost > 0))
+    least = objective.evaluate(shortened.theta)
+    views = _views(objective, theta)
+    explanation = Explanation(
+        identifier=result.identifier,
+        source=digest(folder),
+        objects=result.objects,
+        benign=judge.outcome(theta, ~everything),
+        found=found,
+        contributions=tuple(contributions),
+        exact=tuple(kind for kind in KINDS if len(teams[kind]) <= MOST_EXACT),
+        sizes=tuple(players.sizes(space, theta)),
+        least=_least(objective, judge, theta, shortened, least),
+        sensitivity={name: _shares(*view) for name, view in views.items()},
+        renders=judge.renders,
+        seconds=round(time.perf_counter() - start, 3),
+    )
+    with files.whole_folder(out) as part:
+        _write(part, explanation, objective, least, views)
+    return explanation
+
+
+def rebuild(
+    result: FrameResult, folder: Path, attack: Attack, params: Sequence[Parameter], detector: Predictor
+) -> tuple[Objective, Tensor]:
+    """The objective of a frame of a run, and the theta (D,) that was found, from the scene that was saved.
+
+    The saved scene carries the one it was made from, so that neither the data set nor its de-rendering is needed.
+    A budget is not needed either: all that is asked for lies between theta0 and theta. Raises FormatError.
+    """
+    scene = load_scene(folder / "scene").as_photographed()
+    space = ParameterSpace(scene, params)
+    if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
+        raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
+    theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
+    compositor = Compositor(scene, RenderSettings(backend=attack.backend))
+    labels, term = attack.objective_labels, attack.objective
+    aim = Aim.of(attack.target_objects, attack.target_classes)
+    return Objective(compositor, space, detector, labels, term, t_star=attack.t_star, aim=aim), theta
+
+
+def weigh(
+    team: Sequence[Player],
+    theta: Tensor,
+    judge: Judge,
+    slope: Tensor | None,
+    permutations: int,
+    generator: np.random.Generator,
+) -> list[Contribution]:
+    """What each player of a team, which covers theta (D,), adds. slope (D,): gradient at theta0 times theta."""
+    masks = torch.stack([player.mask for player in team])
+    known: dict[bytes, Outcome] = {}
+
+    def outcome(members: Flags) -> Outcome:
+        key = members.tobytes()
+        if key not in known:
+            known[key] = judge.outcome(theta, masks[torch.from_numpy(members)].any(dim=0))
+        return known[key]
+
+    def game(members: Flags) -> Floats:
+        one = outcome(members)
+        return np.array([one.loss, one.success], dtype=np.float64)
+
+    shares = shapley(game, len(team), permutations, generator)
+    steepness = None if slope is None else float(slope.abs().sum())
+    contributions: list[Contribution] = []
+    for i, player in enumerate(team):
+        alone = np.arange(len(team)) == i
+        errors = (None, None) if shares.errors is None else tuple(shares.errors[i].tolist())
+        part = None if slope is None else slope[player.mask]
+        contributions.append(
+            Contribution(
+                kind=player.kind,
+                name=player.name,
+                loss=float(shares.contributions[i, 0]),
+                loss_error=errors[0],
+                fails=float(shares.contributions[i, 1]),
+                fails_error=errors[1],
+                gradient=None if part is None else float(part.sum()),
+                gradient_share=float(part.abs().sum()) / steepness if part is not None and steepness else None,
+                alone=outcome(alone),
+                without=outcome(~alone),
+            )
+        )
+    return contributions
+
+
+def _blocks(
+    space: ParameterSpace,
+    theta: Tensor,
+    teams: Mapping[str, Sequence[Player]],
+    contributions: Sequence[Contribution],
+    judge: Judge,
+) -> list[Block]:
+    """What to try to leave out: parameters and cars, those first that add least to the loss; then single
+    parameters of single cars, the smallest first.
+    """
+    added = {c.name: c.loss for c in contributions}
+    whole = sorted((p for team in teams.values() for p in team), key=lambda player: added[player.name])
+    blocks = [Block(player.name, player.mask) for player in whole]
+    parts: list[tuple[float, Block]] = []
+    for cell in players.cells(space):
+        mask = torch.zeros_like(theta, dtype=torch.bool)
+        mask[cell.where] = True
+        parts.append((judge.size(torch.where(mask, theta, 0)), Block(cell.name, mask)))
+    return blocks + [block for size, block in sorted(parts, key=lambda part: part[0]) if size > 0]
+
+
+def _least(objective: Objective, judge: Judge, theta: Tensor, shortened: Minimal, rendered: Rendered) -> Least:
+    space, small = objective.space, shortened.theta
+    return Least(
+        scan=shortened.scan,
+        sign_changes=shortened.sign_changes,
+        scale_whole=shortened.shortened_scale,
+        scale=shortened.scale,
+        dropped=shortened.dropped,
+        norm_found=judge.size(theta),
+        norm_whole=judge.size(shortened.shortened),
+        norm=judge.size(small),
+        outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
+        violations=tuple(check_scene(space.scene, rendered.scene)),
+        sizes=tuple(players.sizes(space, small)),
+        failures=failure_records(objective, rendered),
+        theta=tuple(
+            Coordinate(name=name, **facts)  # pyright: ignore[reportArgumentType]
+            for name, facts in space.theta_by_name(small).items()
+            if facts["value"] != 0
+        ),
+    )
+
+
+def _views(objective: Objective, theta: Tensor) -> dict[str, tuple[Rendered, sensitivity.Floats]]:
+    """The benign re-render and the counterexample with the loss's gradient (H, W) to their pixels; empty where the
+    detector has none.
+    """
+    if not isinstance(objective.detector, Detector):
+        return {}
+    pair = {"benign": objective.benign, "counterexample": objective.evaluate(theta)}
+    return {name: (one, sensitivity.pixel_gradient(objective, one)) for name, one in pair.items()}
+
+
+def _shares(rendered: Rendered, gradient: sensitivity.Floats) -> Sensitivity:
+    ids = rendered.render.object_id.cpu().numpy()
+    *objects, background = sensitivity.shares(gradient, ids, len(rendered.scene.objects))
+    return Sensitivity(tuple(objects), background)
+
+
+def _write(
+    part: Path,
+    explanation: Explanation,
+    objective: Objective,
+    least: Rendered,
+    views: Mapping[str, tuple[Rendered, sensitivity.Floats]],
+) -> None:
+    image = to_uint8(least.render.image)
+    files.write_png(part / "minimal.png", image)
+    marked = pictures.overlay(
+        image,
+        target_records(least.moved.targets, CLASSES, explanation.objects),
+        detection_records(least.detections, objective.judged.names),
+        explanation.least.failures,
+        objective.t_star,
+    )
+    files.write_png(part / "minimal_overlay.png", sensitivity.numbered(marked, _boxes(least)))
+    if views:
+        rows = [
+            (name, to_uint8(one.render.image), _boxes(one), gradient) for name, (one, gradient) in views.items()
+        ]
+        files.write_png(part / "sensitivity.png", sensitivity.sheet(rows))
+    write_waterfalls(part / "shapley.png", explanation)
+    write_explanation(part / EXPLANATION, explanation)
+
+
+def _boxes(rendered: Rendered) -> sensitivity.Floats:
+    """Of the objects (N, 4) px, where they are."""
+    return rendered.moved.boxes_xyxy.cpu().numpy()

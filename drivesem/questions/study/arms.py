@@ -1,0 +1,152 @@
+"""What each study compares: arms, their controls, and the paper's figures."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from drivesem.attack.space import Parameter
+from drivesem.questions.transfer.asking import detector_names, short_names
+from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
+from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
+
+QUICK_FRAMES, FRAMES = 6, 200
+"""Frames of a study with --quick, and without."""
+RANDOM, PLACEBO = "random", "placebo"
+"""Controls: the best of as many random samples as the attack takes steps, of the box that those steps reach; and
+one random edit as large as the attack's own."""
+_LONGER = 4
+"""Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
+_FAR = 2
+"""Steps of the study `steps`, in multiples of --steps: far enough to see where more are of no use."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One attack on all frames. folder: of its run; reference: the paper's mAP after it, a fraction; control:
+    RANDOM or PLACEBO where it stands beside the arm named `of`.
+    """
+
+    name: str
+    folder: str
+    config: Attack
+    reference: float | None = None
+    control: str | None = None
+    of: str | None = None
+
+
+def attack_of(study: Study) -> Attack:
+    """The attack that a study's arms vary."""
+    return Attack(
+        limit=study.limit or (QUICK_FRAMES if study.quick else FRAMES),
+        seed=study.seed,
+        workers=study.workers,
+        device=study.device,
+        keep_going=study.keep_going,
+        dataset=study.dataset,
+        root=study.root,
+        detector=study.detector,
+        method=study.method,
+        steps=study.steps,
+        budget=study.budget,
+        objective_labels=study.objective_labels,
+        objective=study.objective,
+        precision=study.precision,
+        fit=study.fit,
+        t_star=study.t_star,
+    )
+
+
+def arms_of(study: Study, out: Path) -> list[Arm]:
+    """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
+    base = attack_of(study)
+    if study.name == "single":
+        single = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in Parameter]
+        return _controlled(single, out) if study.controls else single
+    if study.name == "multi":
+        multi = [_combo(base, number) for number in COMBO_NUMBERS]
+        if study.method == "si-fgsm":
+            longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
+            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer, PAPER_COMBOS[DEFAULT_COMBO]))
+        return _controlled(multi, out) if study.controls else multi
+    if study.name == "samples":
+        return _samples(replace(base, combo=DEFAULT_COMBO), study)
+    if study.name == "transfer":
+        sources = _sources(base, study)
+        return _controlled(sources, out, (PLACEBO,)) if study.controls else sources
+    if study.name == "steps":
+        steps = _FAR * study.steps
+        far = replace(base, combo=DEFAULT_COMBO, method="si-fgsm", steps=steps, early_stop=True)
+        rates = (0.5, 1.0, 2.0) if study.quick else (0.25, 0.5, 1.0, 2.0, 4.0)
+        return [_arm(f"rate {rate:g}", replace(far, rate=rate)) for rate in rates]
+    return _labels(base, study.quick)
+
+
+def _arm(name: str, config: Attack, reference: float | None = None) -> Arm:
+    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference)
+
+
+def _combo(base: Attack, number: int) -> Arm:
+    return _arm(f"combo {number}", replace(base, combo=number), PAPER_COMBOS[number])
+
+
+def _controlled(arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO)) -> list[Arm]:
+    """Each arm, followed by its controls."""
+    found: list[Arm] = []
+    for arm in arms:
+        # As the run's own settings say it: relative to where the command is called.
+        size_of = os.path.join(out, "arms", arm.folder)
+        configs = {
+            RANDOM: replace(arm.config, method="random", range="steps", queries=arm.config.steps),
+            PLACEBO: replace(arm.config, method="placebo", like=size_of),
+        }
+        found.append(arm)
+        for kind in kinds:
+            name, folder = f"{arm.name} {kind}", f"{arm.folder}-{kind}"
+            found.append(Arm(name, folder, configs[kind], control=kind, of=arm.name))
+    return found
+
+
+def _sources(base: Attack, study: Study) -> list[Arm]:
+    """The default combination against each source: the arm of the first has the name that `multi` gives it."""
+    sources = detector_names(study.sources or study.detector, "--sources")
+    arms = []
+    for place, (source, short) in enumerate(zip(sources, short_names(sources), strict=True)):
+        arm = _combo(replace(base, detector=source), DEFAULT_COMBO)
+        folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
+        arms.append(replace(arm, name=short, folder=folder))
+    return arms
+
+
+def _samples(base: Attack, study: Study) -> list[Arm]:
+    """Each method until its first success. Without gradient it looks where the steps of si-FGSM may lead; the full
+    study also lets it look in all of the bounds.
+    """
+    arms = [
+        _arm("si-fgsm", replace(base, method="si-fgsm", early_stop=True)),
+        _arm("apgd", replace(base, method="apgd", early_stop=True)),
+        _arm("fgsm", replace(base, method="fgsm")),
+    ]
+    searches = ("random", "halton", "sobol", "cma-es")
+    for method in searches:
+        search = replace(base, method=method, queries=study.queries, early_stop=True)
+        arms.append(_arm(method, replace(search, range="steps")))
+        if not study.quick:
+            arms.append(_arm(f"{method}, bounds", search))
+    if not study.quick:
+        arms.append(_arm("sgd", replace(base, method="sgd", early_stop=True)))
+    return arms
+
+
+def _labels(base: Attack, quick: bool) -> list[Arm]:
+    """Attacks that aim at the benign labels, as the paper's do, and one that aims at labels that move."""
+    stay = replace(base, objective_labels="paper")
+    arms = [_arm("translate", replace(stay, params="translate"))]
+    if not quick:
+        arms.append(_arm("rotate", replace(stay, params="rotate")))
+    arms += [_combo(stay, number) for number in ((DEFAULT_COMBO,) if quick else COMBO_NUMBERS)]
+    aimed = _arm(f"combo {DEFAULT_COMBO}, moved", replace(base, combo=DEFAULT_COMBO, objective_labels="moved"))
+    return [replace(arm, reference=None) for arm in arms] + [aimed]

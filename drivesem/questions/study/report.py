@@ -1,0 +1,298 @@
+"""A study for people: tables on the terminal and in Markdown, with what they mean."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from drivesem.attack.judging import HEADLINE
+from drivesem.evaluation.resampling import Difference, Interval
+from drivesem.questions.confirm.report import Report as Confirmed
+from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.labels import OVERLAPS, LabelSets
+from drivesem.questions.study.rows import FIGURES, MODES, Row, feasible_fraction
+from drivesem.questions.study.running import Ran
+from drivesem.questions.study.success import Curve
+from drivesem.questions.transfer.report import bounded
+from drivesem.report.paper import PAPER_BENIGN
+from drivesem.report.tables import Sheet, percent
+from drivesem.settings.commands import Study
+from scene_ir import files
+
+_ARM, _MEASURE = "arm", "figure"
+_WORDS = (_ARM, _MEASURE)
+_MARKS = (1, 2, 5, 10, 20, 64)
+"""Queries at which a curve is told in a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A study as text. short: the tables of `sheets` that a terminal shows; tables: rows of CSV files by name;
+    words: columns of words, the others hold numbers; unbroken: those that a terminal does not wrap.
+    """
+
+    study: str
+    sheets: Sequence[Sheet]
+    short: Sequence[Sheet]
+    notes: Sequence[str]
+    tables: Mapping[str, Sequence[Mapping[str, Any]]]
+    words: Collection[str]
+    unbroken: Collection[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
+    within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
+    the generator's pictures say, by arm.
+    """
+
+    study: Study
+    draws: int
+    ran: Ran
+    rows: Sequence[Row]
+    curves: Sequence[Curve] = ()
+    beside: Mapping[str, Difference] | None = None
+    within: int = 0
+    label_sets: Sequence[LabelSets] = ()
+    confirmed: Mapping[str, Confirmed] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        results = [result for run in self.ran.runs for result in run.results]
+        data: dict[str, Any] = {
+            "study": self.study.name,
+            "headline": HEADLINE,
+            "frames": len(self.ran.runs[0].results),
+            "frames_without_vehicles": self.ran.without_vehicles,
+            "frames_failed": self.ran.failed,
+            "feasible_fraction": feasible_fraction(results),
+            "bootstrap": self.draws,
+            "rows": self.flat_rows(),
+        }
+        if self.curves:
+            data["curves"] = [point for curve in self.curves for point in curve.to_json()]
+        if self.label_sets:
+            data["label_sets"] = [one.flat() for one in self.label_sets]
+        return data
+
+    def flat_rows(self) -> list[dict[str, Any]]:
+        """Numbers of each row by name, with those of the second renderer where it was asked."""
+        rows = [row.flat() for row in self.rows]
+        for row in rows:
+            if row["name"] in self.confirmed:
+                share = self.confirmed[row["name"]].shares[0]
+                told = {"failures": share.failures, "share": share.share, "low": share.low, "high": share.high}
+                row |= {f"survive_{key}": value for key, value in told.items()}
+        return rows
+
+
+def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
+    """The study's own question first. whole: with the figures that only some ask for."""
+    tables: list[Sheet] = []
+    if found.curves:
+        tables.append(_success(found))
+    if found.label_sets:
+        tables += [_label_sets(found.label_sets), _counterexamples(found.label_sets)]
+    tables.append(_precision(found.rows))
+    if any(row.controls for row in found.rows):
+        tables.append(_controls(found.rows))
+    if found.confirmed:
+        tables.append(_confirmed(found.confirmed))
+    return [*tables, *([_further(found.rows)] if whole else []), _frames(found.rows)]
+
+
+def _precision(rows: Sequence[Row]) -> Sheet:
+    told = any(row.run.arm.reference is not None for row in rows)
+    columns = [_ARM, "benign", *(f"{mode} labels" for mode in MODES), *(f"falls, {mode}" for mode in MODES)]
+    lines = []
+    for row in rows:
+        reference = row.run.arm.reference
+        cells = [row.name, *(percent(scores.ap50) for scores in (row.benign, row.paper, row.moved))]
+        cells += [bounded(row.drops[mode]["ap50"]) for mode in MODES]
+        if told:
+            cells += [percent(reference), "-" if reference is None else f"{100 * (PAPER_BENIGN - reference):.1f}"]
+        lines.append(tuple(cells))
+    columns += ["mAP there", "falls there"] if told else []
+    return Sheet(f"{HEADLINE} AP50, %", tuple(columns), tuple(lines))
+
+
+def _controls(rows: Sequence[Row]) -> Sheet:
+    lines = []
+    for row in rows:
+        cells = [row.name]
+        for name in (RANDOM, PLACEBO):
+            control = row.controls[name]
+            falls = control.drops["moved"]["ap50"].value
+            cells += ["-" if falls is None else f"{100 * falls:.1f}", bounded(row.effects[name]["moved"])]
+        size = row.controls[PLACEBO].size
+        cells.append("-" if size is None else f"{size:.2f}")
+        lines.append(tuple(cells))
+    columns = (
+        _ARM,
+        f"{RANDOM} falls",
+        f"attack less {RANDOM}",
+        f"{PLACEBO} falls",
+        f"attack less {PLACEBO}",
+        f"size of {PLACEBO}",
+    )
+    return Sheet("Controls: AP50, moved labels, points", columns, tuple(lines))
+
+
+def _confirmed(confirmed: Mapping[str, Confirmed]) -> Sheet:
+    lines = []
+    for name, one in confirmed.items():
+        cells = [name, str(one.frames)]
+        for share in one.shares:
+            value = bounded(Interval(share.name, share.share, share.low, share.high))
+            cells.append(f"{value} of {share.failures}" if share.failures else "-")
+        lines.append(tuple(cells))
+    names = next(iter(confirmed.values())).shares
+    return Sheet(
+        "Failures that survive the generator's renderer, %",
+        (_ARM, "drawn", *(s.name for s in names)),
+        tuple(lines),
+    )
+
+
+def _further(rows: Sequence[Row]) -> Sheet:
+    lines = []
+    for row in rows:
+        for key, name in FIGURES.items():
+            if key == "ap50":
+                continue
+            scores = (getattr(one, key) for one in (row.benign, row.paper, row.moved))
+            falls = (bounded(row.drops[mode][key]) for mode in MODES)
+            lines.append((row.name, name, *map(percent, scores), *falls))
+    columns = (_ARM, _MEASURE, "benign", *MODES, *(f"falls, {mode}" for mode in MODES))
+    return Sheet(f"{HEADLINE}, further figures, %", columns, tuple(lines))
+
+
+def _frames(rows: Sequence[Row]) -> Sheet:
+    controls = [name for name in (RANDOM, PLACEBO) if any(name in row.controls for row in rows)]
+    lines = []
+    for row in rows:
+        flat = row.flat()
+        keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
+        lines.append((row.name, *(str(flat[key]) for key in ("frames", *keys, "queries"))))
+    columns = (_ARM, "frames", *MODES, *controls, "queries")
+    return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
+
+
+def _success(found: Findings) -> Sheet:
+    most = max(curve.most for curve in found.curves)
+    marks = [mark for mark in _MARKS if mark <= most]
+    lines = []
+    for curve in found.curves:
+        shares = [bounded(curve.at(mark)) if mark <= curve.most else "-" for mark in marks]
+        last = bounded(curve.at(curve.most))
+        mean = "-" if curve.mean is None else f"{curve.mean:.1f}"
+        cells = [curve.name, *shares, f"{last} of {curve.most}", mean]
+        if found.beside is not None:
+            one = found.beside[curve.name]
+            cells.append(bounded(Interval(one.name, one.difference, one.low, one.high)))
+        lines.append(tuple(cells))
+    columns = [_ARM, *(f"{mark}" for mark in marks), "at the end", "mean queries"]
+    if found.beside is not None:
+        columns.append(f"{found.curves[0].name} in {found.within}, less this at the end")
+    return Sheet("Frames broken after so many queries, %", tuple(columns), tuple(lines))
+
+
+def _label_sets(sets: Sequence[LabelSets]) -> Sheet:
+    lines = []
+    for one in sets:
+        iou = ("-" if value is None else f"{value:.3f}" for value in one.iou.values())
+        lines.append((one.name, str(one.objects), *iou, *(percent(one.below[o]) for o in OVERLAPS)))
+    columns = (_ARM, "objects", *sets[0].iou, *(f"below {o:g}, %" for o in OVERLAPS))
+    return Sheet("IoU of benign and moved labels", columns, tuple(lines))
+
+
+def _counterexamples(sets: Sequence[LabelSets]) -> Sheet:
+    lines = [
+        (one.name, f"{overlap:g}", *(str(count) for count in (one.frames, *astuple(at))))
+        for one in sets
+        for overlap, at in one.counted.items()
+    ]
+    columns = (_ARM, "IoU", "frames", "paper", "moved", "paper only", "lost, paper", "lost, paper only")
+    return Sheet("Counterexamples by benign (paper) and by moved labels", columns, tuple(lines))
+
+
+def notes(found: Findings) -> list[str]:
+    """What the columns mean."""
+    spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
+    told = [
+        f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
+    ]
+    if any(row.run.arm.reference is not None for row in found.rows):
+        told.append(
+            f"There: in the paper, with its own detector on Virtual KITTI; mAP {100 * PAPER_BENIGN:.1f} before."
+        )
+    if any(row.controls for row in found.rows):
+        told.append(
+            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead. "
+            "Placebo: one random edit as large as the attack's, through the same pipeline; its size beside the "
+            "attack's, which projection onto what is feasible may lessen. The attack's effect is what it lowers "
+            "AP50 by more than the placebo."
+        )
+    if found.curves:
+        told.append(
+            "Each frame ends at its first success by moved labels. A query is one gradient, or one judged render; "
+            "methods without gradient look where si-FGSM's steps may lead, or in all of the bounds."
+        )
+    if found.label_sets:
+        told.append(
+            "Attacks aim at the benign labels where the arm says nothing else. Paper only: counterexamples by the "
+            "benign labels which are none by moved ones, where a detection meets a label from that IoU on. Of an "
+            "attack's iterates the one that fails most by moved labels at IoU 0.5 is kept: chosen by the benign "
+            "labels there would be more."
+        )
+    if found.confirmed:
+        told.append(
+            "Survive: the same change, drawn by the generator and with exact labels, fails the detector too; in "
+            "brackets Wilson's 95 %. Generator only: of frames that did not fail before."
+        )
+    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
+    told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
+    if found.ran.without_vehicles:
+        told.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
+    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.ran.failed.items()]
+    return told
+
+
+def told(found: Findings) -> Told:
+    """The tables of all arms."""
+    tables = {"study": found.flat_rows()}
+    if found.curves:
+        tables["curves"] = [point for curve in found.curves for point in curve.to_json()]
+    if found.label_sets:
+        tables["label_sets"] = [one.flat() for one in found.label_sets]
+    return Told(found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS)
+
+
+def print_told(told: Told, console: Console) -> None:
+    """The tables, and what they mean."""
+    for sheet in told.short:
+        console.print(sheet.table(told.words, unbroken=told.unbroken))
+    for note in told.notes:
+        console.print(note, soft_wrap=True)
+
+
+def write_tables(out: Path, told: Told, picture: str, command: str) -> None:
+    """study.csv, further CSVs, and study.md. picture: its file's name; command: what repeats the study."""
+    for name, rows in told.tables.items():
+        buffer = io.StringIO()
+        writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        files.write_text(out / f"{name}.csv", buffer.getvalue())
+    lines = [f"# Study: {told.study}", "", f"    {command}", "", f"![]({picture})", ""]
+    for sheet in told.sheets:
+        lines += [*sheet.markdown(told.words), ""]
+    lines += [f"{note}\n" for note in told.notes]
+    files.write_text(out / "study.md", "\n".join(lines))

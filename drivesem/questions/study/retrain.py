@@ -1,0 +1,324 @@
+"""Detectors trained on with counterexamples, before benign frames, known and fresh counterexamples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from detectors.base import Detector
+from detectors.registry import load_detector, read_weights, save_detector
+from detectors.types import Detections, Targets
+from drivesem.attack.judging import HEADLINE, t_star_of
+from drivesem.attack.labels import Difficulty
+from drivesem.evaluation.coco import ClassScores, evaluate
+from drivesem.evaluation.resampling import DRAWS, Figure, Interval, differences, intervals
+from drivesem.questions.study import lessons as plan
+from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.lessons import BENIGN, RETRAINED, Lesson, Parts
+from drivesem.questions.study.rows import MODES, Figures, Row, feasible_fraction, rows_of
+from drivesem.questions.study.running import ARMS, ArmRun, Ran, run_arms, workers_of
+from drivesem.questions.transfer.asking import detectors_of
+from drivesem.questions.transfer.asking import rows_of as transfer_rows
+from drivesem.questions.transfer.matrix import AP50, BROKEN, figures_of
+from drivesem.questions.transfer.matrix import Row as Known
+from drivesem.run.attack import Worker, select_frames
+from drivesem.run.finished import load_runs
+from drivesem.run.frame import as_detections, detection_records
+from drivesem.run.looking import weights_digest
+from drivesem.run.results import BoxRecord
+from drivesem.settings.commands import Study, Transfer
+from drivesem.settings.errors import UsageError
+from drivesem.training.attacked import AttackedFrame
+from drivesem.training.frames import FrameStore
+from drivesem.training.judging import detect, judge
+from drivesem.training.retraining import broken, forget_other_weights
+from scene_ir import files
+
+_STAMP = "attacked.txt"
+"""Beside weights: which of them the fresh counterexamples are against."""
+_SEEN = "benign.json"
+"""Beside weights: what was found in benign frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One detector. benign: HEADLINE's figures on held-out benign frames; spread: their AP50 with bounds; known:
+    the counterexamples against the detector as it was; fresh: those against this one. drops: of AP50 and recall on
+    benign frames, from the detector as it was; gains: of AP50 by label mode, on known and on fresh ones, over what
+    the detector as it was has on its own. All paired over frames.
+    """
+
+    name: str
+    reference: tuple[float, float]
+    t_star: float
+    benign_frames: int
+    benign: ClassScores
+    spread: dict[str, Interval]
+    known: Known
+    fresh: Row
+    drops: dict[str, Interval]
+    gains: dict[str, dict[str, Interval]]
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
+        counterexamples, benign = self.reference
+        theirs, fresh = self.known.flat(), self.fresh.flat()
+        found: dict[str, Any] = {
+            "name": self.name,
+            "benign_ap50": self.benign.ap50,
+            "paper_ap50": theirs["paper_ap50"],
+            "moved_ap50": theirs["moved_ap50"],
+            "drop_paper": theirs["drop_paper"],
+            "drop_moved": theirs["drop_moved"],
+            "recall_paper": theirs["paper_recall"],
+            "recall_moved": theirs["moved_recall"],
+            "reference": counterexamples,
+            "reference_benign": benign,
+            "t_star": self.t_star,
+            "benign_frames": self.benign_frames,
+            "benign_objects": self.benign.objects,
+            "benign_recall": self.benign.recall,
+            "frames": self.known.frames,
+            "photographs_ap50": theirs["benign_ap50"],
+            "broken_rate": theirs[BROKEN],
+            "fresh_paper_ap50": fresh["paper_ap50"],
+            "fresh_moved_ap50": fresh["moved_ap50"],
+            "fresh_recall_moved": fresh["recall_moved"],
+            "fresh_broken_rate": fresh["successes_moved"] / fresh["frames"] if fresh["frames"] else None,
+            "feasible_fraction": fresh["feasible_fraction"],
+        }
+        bounded = {f"benign_{'' if key == AP50 else 'recall_'}drop": one for key, one in self.drops.items()}
+        for name, gains in self.gains.items():
+            prefix = "" if name == "known" else f"{name}_"
+            bounded |= {f"{prefix}gain_{mode}": one for mode, one in gains.items()}
+        for key, one in bounded.items():
+            found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """All that the study found. learned, judged: attacks on frames to train on, and on held-out ones; lessons with
+    how many different counterexamples were shown in each; benign: frames to train on beside them.
+    """
+
+    study: Study
+    draws: int
+    learned: Ran
+    judged: Ran
+    lessons: Mapping[str, tuple[Lesson, int]]
+    benign: int
+    rows: Sequence[Judged]
+
+    def to_json(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        results = [result for ran in (self.learned, self.judged) for run in ran.runs for result in run.results]
+        return {
+            "study": self.study.name,
+            "headline": HEADLINE,
+            "frames": self.rows[0].known.frames,
+            "benign_frames": self.rows[0].benign_frames,
+            "frames_without_vehicles": self.learned.without_vehicles + self.judged.without_vehicles,
+            "frames_failed": {**self.learned.failed, **self.judged.failed},
+            "feasible_fraction": feasible_fraction(results),
+            "bootstrap": self.draws,
+            "attacked_to_train_on": len(self.learned.runs[0].results),
+            "benign_to_train_on": self.benign,
+            "training": {
+                name: {"counterexamples": count, **_training(lesson)}
+                for name, (lesson, count) in self.lessons.items()
+            },
+            "rows": [row.flat() for row in self.rows],
+        }
+
+
+def _training(lesson: Lesson) -> dict[str, Any]:
+    told = ("steps", "batch", "window", "scale", "rate", "fraction", "mix", "loss", "precision")
+    return {"pictures": lesson.pictures, "labels": lesson.labels} | {
+        key: getattr(lesson.config, key) for key in told
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """What is checked before anything is written. arm, workers: of the attack on frames to train on."""
+
+    arm: Arm
+    workers: Sequence[Worker]
+    lessons: Sequence[Lesson]
+    parts: Parts
+
+
+def prepare(study: Study) -> Ready:
+    """Raises UsageError or SceneError for bad settings."""
+    arm = plan.learning_arm(study)
+    plan.startable(study.detector, study.device, "--detector")
+    parts = plan.parts_of(study)
+    workers = plan.among(workers_of([arm]), parts.learned)
+    judging = plan.judging_arms(study, (), Path())
+    held_out = plan.among(workers_of(judging), parts.judged)
+    for one, setting in ((workers[0], "--root"), (held_out[0], "--held-out")):
+        if not select_frames(one.source, one.config)[0]:
+            raise UsageError(setting, "frames with vehicles", "none")
+    return Ready(arm, workers, plan.lessons_of(study), parts)
+
+
+def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
+    """Attack, train, attack again, judge: what is there already stays. Raises UsageError or SceneError."""
+    learned = run_arms([ready.arm], ready.workers, out, console)
+    folder = out / ARMS / ready.arm.folder / "frames"
+    frames = [AttackedFrame(folder / result.identifier) for result in learned.runs[0].results]
+    benign = partial(plan.benign_samples, ready.parts, frames, out=out)
+    for lesson in ready.lessons:
+        plan.learn(study, lesson, frames, benign, plan.weights_of(out, lesson), console)
+    names = {BENIGN: study.detector}
+    names |= {lesson.name: str(plan.weights_of(out, lesson)) for lesson in ready.lessons}
+    seen = _on_benign_frames(study, ready, names, out, console)
+    for lesson in ready.lessons:
+        weights = plan.weights_of(out, lesson)
+        forget_other_weights(out / ARMS / lesson.run, weights, weights.parent / _STAMP)
+    arms = plan.judging_arms(study, ready.lessons, out)
+    judged = run_arms(arms, plan.among(workers_of(arms), ready.parts.judged), out, console)
+    if not judged.runs[0].results:
+        raise UsageError("--held-out", "frames with vehicles that can be taken apart", "none")
+    known = _known(study, names, out / ARMS / arms[0].folder, out, console)
+    draws = DRAWS if study.bootstrap is None else study.bootstrap
+    rows = rows_for(study, ready.lessons, seen, known, judged.runs, draws)
+    shown = {
+        lesson.name: (lesson, len(broken(frames, lesson.config.label_mode, "--limit"))) for lesson in ready.lessons
+    }
+    trained_on = len(frames) if ready.parts.benign is None else len(ready.parts.benign[1])
+    return Taught(study, draws, learned, judged, shown, trained_on, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A detector on benign frames."""
+
+    scores: ClassScores
+    figures: list[Figure]
+    frames: int
+    t_star: float
+
+
+def _on_benign_frames(
+    study: Study, ready: Ready, names: Mapping[str, str], out: Path, console: Console
+) -> dict[str, Seen]:
+    """Each detector on the held-out benign frames. A retrained one's t* is the score of best F1 there."""
+    first = load_detector(study.detector, study.device)
+    store = plan.held_out_frames(study, ready.parts, first.classes, out, console)
+    wanted = store.judged(Difficulty())
+    found: dict[str, Seen] = {}
+    for name, spec in names.items():
+        detector = load_detector(spec, study.device)
+        folder = out / RETRAINED / ("benign" if name == BENIGN else Path(spec).parent.name)
+        seen = look_at(detector, store, folder / _SEEN, study.device)
+        if name != BENIGN:
+            set_threshold(detector, Path(spec), judge(seen, wanted, detector.classes).t_star)
+        found[name] = seen_by(detector, seen, wanted, t_star_of(detector, study.t_star))
+    return found
+
+
+def seen_by(detector: Detector, found: Sequence[Detections], wanted: Sequence[Targets], t_star: float) -> Seen:
+    """The figures of what a detector found in benign frames."""
+    scores = evaluate(wanted, found, detector.classes, t_star, HEADLINE).headline
+    figures = figures_of(wanted, found, detector.classes.index(HEADLINE))
+    return Seen(scores, figures, len(wanted), t_star)
+
+
+def look_at(detector: Detector, store: FrameStore, path: Path, device: str) -> list[Detections]:
+    """What is found in the frames of a store, remembered with the weights that found it."""
+    key = {"weights": weights_digest(detector), "frames": list(store.names)}
+    if path.is_file():
+        kept = files.read_json(path)
+        if all(kept[name] == value for name, value in key.items()):
+            records = [tuple(BoxRecord(**record) for record in rows) for rows in kept["detections"]]
+            return [as_detections(rows, detector.classes) for rows in records]
+    found = detect(detector, store, range(len(store)), device)
+    rows = [[asdict(record) for record in detection_records(one, detector.classes)] for one in found]
+    files.write_json(path, key | {"detections": rows})
+    return found
+
+
+def set_threshold(detector: Detector, weights: Path, t_star: float) -> None:
+    """Write it beside the weights, unless it is there."""
+    facts, _ = read_weights(weights)
+    if facts["t_star"] != f"{t_star:.6g}":
+        detector.t_star = t_star
+        kept = {name: facts[name] for name in ("retrained_from", "steps")}
+        save_detector(detector, weights, kept)
+    detector.t_star = float(f"{t_star:.6g}")
+
+
+def _known(study: Study, names: Mapping[str, str], run: Path, out: Path, console: Console) -> list[Known]:
+    """The held-out counterexamples against the detector as it was, before all detectors."""
+    settings = Transfer(
+        seed=study.seed,
+        workers=study.workers,
+        device=study.device,
+        keep_going=study.keep_going,
+        bootstrap=study.bootstrap,
+    )
+    asked = detectors_of(list(names.values()), settings, out, study.t_star)
+    named = [replace(one, name=name) for one, name in zip(asked, names, strict=True)]
+    return transfer_rows(load_runs([str(run)]), named, settings, console)[0]
+
+
+def rows_for(
+    study: Study,
+    lessons: Sequence[Lesson],
+    seen: Mapping[str, Seen],
+    known: Sequence[Known],
+    runs: Sequence[ArmRun],
+    draws: int,
+) -> list[Judged]:
+    fresh = rows_of(runs, draws, study.seed)
+    figures = [Figures.of(run).after for run in runs]
+    before = seen[BENIGN]
+    found = []
+    for i, (name, one) in enumerate(seen.items()):
+        gains = {
+            "known": {
+                m: _gain(known[0].figures[m], known[i].figures[m], known[i].frames, draws, study) for m in MODES
+            },
+            "fresh": {m: _gain(figures[0][m], figures[i][m], len(runs[i].results), draws, study) for m in MODES},
+        }
+        rng = np.random.default_rng(study.seed)
+        fallen = differences(one.figures, before.figures, one.frames, draws, rng)
+        spread = {
+            "benign": _spread(one.figures, one.frames, draws, study),
+            "known": _spread(known[i].figures["moved"], known[i].frames, draws, study),
+            "fresh": _spread(figures[i]["moved"], len(runs[i].results), draws, study),
+        }
+        found.append(
+            Judged(
+                name=name,
+                reference=plan.reference_of(name, lessons),
+                t_star=one.t_star,
+                benign_frames=one.frames,
+                benign=one.scores,
+                spread=spread,
+                known=known[i],
+                fresh=fresh[i],
+                drops={d.name: Interval(d.name, d.difference, d.low, d.high) for d in fallen},
+                gains=gains,
+            )
+        )
+    return found
+
+
+def _gain(before: Sequence[Figure], after: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:
+    """How far the first figure, AP50, rises; paired over frames."""
+    (one,) = differences(before[:1], after[:1], frames, draws, np.random.default_rng(study.seed))
+    return Interval(one.name, one.difference, one.low, one.high)
+
+
+def _spread(figures: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:
+    (one,) = intervals(figures[:1], frames, draws, np.random.default_rng(study.seed))
+    return one

@@ -1,0 +1,189 @@
+"""The figures of one arm: before and after the attack, what falls, and what falls more than in its controls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from detectors.types import CLASSES
+from drivesem.attack.judging import HEADLINE
+from drivesem.evaluation.coco import IOU_THRESHOLDS, ClassScores
+from drivesem.evaluation.outcome import Outcome
+from drivesem.evaluation.resampling import Averaged, Figure, Interval, Recalled, differences
+from drivesem.questions.study.running import ArmRun
+from drivesem.report.paper import PAPER_BENIGN
+from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.results import FrameResult
+
+FIGURES = {"ap50": "AP50", "ap70": "AP70", "ap": "AP50:95", "recall": "recall"}
+"""Fields of `ClassScores` whose fall is told, and their names for people."""
+MODES = ("paper", "moved")
+_SINGLE_OVERLAPS = {"ap50": 0.5, "ap70": 0.7}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One arm. benign, paper, moved: HEADLINE's figures in the photographs, and after the attack by either label
+    mode. drops: by mode and figure, from benign to attacked. effects: by control and mode, how far AP50 falls
+    below the control's. controls: their own rows. size: of a control's edits, relative to the arm's.
+    """
+
+    run: ArmRun
+    benign: ClassScores
+    paper: ClassScores
+    moved: ClassScores
+    drops: dict[str, dict[str, Interval]]
+    effects: dict[str, dict[str, Interval]]
+    controls: dict[str, Row]
+    size: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The arm's."""
+        return self.run.arm.name
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
+        arm, results = self.run.arm, self.run.results
+        found: dict[str, Any] = {
+            "name": arm.name,
+            "benign_ap50": self.benign.ap50,
+            "paper_ap50": self.paper.ap50,
+            "moved_ap50": self.moved.ap50,
+            "drop_paper": self.drops["paper"]["ap50"].value,
+            "drop_moved": self.drops["moved"]["ap50"].value,
+            "recall_paper": self.paper.recall,
+            "recall_moved": self.moved.recall,
+            "reference": arm.reference,
+            "reference_drop": None if arm.reference is None else PAPER_BENIGN - arm.reference,
+            "frames": len(results),
+            "objects": self.benign.objects,
+            "successes_paper": sum(r.success_paper for r in results),
+            "successes_moved": sum(r.success_moved for r in results),
+            "queries": sum(r.queries for r in results),
+            "feasible_fraction": feasible_fraction(results),
+        }
+        for key in ("ap70", "ap", "recall"):
+            found[f"benign_{key}"] = getattr(self.benign, key)
+            found |= {f"{mode}_{key}": getattr(getattr(self, mode), key) for mode in MODES}
+        for mode, falls in self.drops.items():
+            for key, one in falls.items():
+                name = f"drop_{mode}" if key == "ap50" else f"drop_{mode}_{key}"
+                found |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
+        for name, row in self.controls.items():
+            found |= {f"{name}_{mode}_ap50": getattr(row, mode).ap50 for mode in MODES}
+            found |= {f"{name}_drop_{mode}": row.drops[mode]["ap50"].value for mode in MODES}
+            found |= {f"{name}_successes_moved": sum(r.success_moved for r in row.run.results)}
+            found |= {f"{name}_size": row.size}
+            for mode, one in self.effects[name].items():
+                key = f"over_{name}_{mode}"
+                found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
+        return found
+
+
+def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[Row]:
+    """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
+    figures = {run.arm.name: Figures.of(run) for run in runs}
+    rows = []
+    for run in runs:
+        if run.arm.control is not None:
+            continue
+        beside = {other.arm.control: other for other in runs if other.arm.control and other.arm.of == run.arm.name}
+        rows.append(_row(run, beside, figures, draws, seed))
+    return rows
+
+
+def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
+    """Share of the frames in which the independent check finds nothing violated; None without frames."""
+    return sum(r.feasible for r in results) / len(results) if results else None
+
+
+def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figures], draws: int, seed: int) -> Row:
+    mine, summary = figures[run.arm.name], run.summary
+    effects = {
+        name: {mode: mine.falls(figures[other.arm.name], mode, draws, seed) for mode in MODES}
+        for name, other in beside.items()
+    }
+    controls = {
+        name: replace(_row(other, {}, figures, draws, seed), size=relative_size(other.results, run.results))
+        for name, other in beside.items()
+    }
+    return Row(
+        run=run,
+        benign=summary.benign.headline,
+        paper=summary.attacked_paper.headline,
+        moved=summary.attacked_moved.headline,
+        drops={mode: mine.drops(mode, draws, seed) for mode in MODES},
+        effects=effects,
+        controls=controls,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """An arm's figures, to be weighed by frames: before the attack, and after it by label mode."""
+
+    before: list[Figure]
+    after: dict[str, list[Figure]]
+    frames: int
+
+    @classmethod
+    def of(cls, run: ArmRun) -> Figures:
+        names, label = run.judged.names, run.judged.names.index(HEADLINE)
+        benign = [run.judged.targets(as_targets(r.targets_benign, CLASSES)) for r in run.results]
+        moved = [run.judged.targets(as_targets(r.targets_moved, CLASSES)) for r in run.results]
+        attacked = [as_detections(r.detections_attacked, names) for r in run.results]
+        photographs = [as_detections(r.detections_benign, names) for r in run.results]
+        return cls(
+            before=_figures(Outcome.of(benign, photographs, label)),
+            after={
+                "paper": _figures(Outcome.of(benign, attacked, label)),
+                "moved": _figures(Outcome.of(moved, attacked, label)),
+            },
+            frames=len(run.results),
+        )
+
+    def drops(self, mode: str, draws: int, seed: int) -> dict[str, Interval]:
+        """How far each figure falls, by figure; paired over frames."""
+        rng = np.random.default_rng(seed)
+        fallen = differences(self.after[mode], self.before, self.frames, draws, rng)
+        return {one.name: Interval(one.name, one.difference, one.low, one.high) for one in fallen}
+
+    def falls(self, control: Figures, mode: str, draws: int, seed: int) -> Interval:
+        """How far AP50 falls below the control's; paired over frames."""
+        rng = np.random.default_rng(seed)
+        (one,) = differences(self.after[mode][:1], control.after[mode][:1], self.frames, draws, rng)
+        return Interval(one.name, one.difference, one.low, one.high)
+
+
+def _figures(outcome: Outcome) -> list[Figure]:
+    """In the order of FIGURES."""
+    candidates = outcome.candidates
+    tallies = [candidates.tally(candidates.coco(overlap), 0) for overlap in IOU_THRESHOLDS]
+    single = [
+        Figure(key, (Averaged(tallies[int(np.abs(IOU_THRESHOLDS - overlap).argmin())], "coco"),))
+        for key, overlap in _SINGLE_OVERLAPS.items()
+    ]
+    mean = Figure("ap", tuple(Averaged(tally, "coco") for tally in tallies))
+    return [*single, mean, Figure("recall", (Recalled(tallies[0]),))]
+
+
+def relative_size(control: Sequence[FrameResult], attack: Sequence[FrameResult]) -> float | None:
+    """How large a control's edits are: the mean over frames of the ratio of norms of theta, each coordinate in
+    units of its bounds; None where no frame was changed by the attack.
+    """
+    ratios = []
+    for one, other in zip(control, attack, strict=True):
+        size = size_of(other)
+        if size > 0:
+            ratios.append(size_of(one) / size)
+    return float(np.mean(ratios)) if ratios else None
+
+
+def size_of(result: FrameResult) -> float:
+    """Norm of a frame's theta, each coordinate in units of its bounds."""
+    values = [c.value / (c.upper - c.lower) for c in result.theta if c.upper > c.lower]
+    return float(np.linalg.norm(values))

@@ -1,0 +1,117 @@
+"""The arms of a study run frame by frame: a scene is taken apart once, then each arm attacks it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from drivesem.attack.judging import JudgedClasses
+from drivesem.questions.study.arms import Arm
+from drivesem.run.attack import Worker, attack_frames, select_frames
+from drivesem.run.folder import PRESENTATION, claim
+from drivesem.run.frame import RESULT
+from drivesem.run.results import FrameResult, RunSummary, load_frame
+from drivesem.run.workers import outcomes
+from drivesem.scenes.sources import NoVehicleError, SceneSource
+from scene_ir import files
+from scene_ir.errors import SceneError
+
+ARMS = "arms"
+"""Folder of the arms' runs."""
+_FREE = (*PRESENTATION, "like")
+"""Settings of an arm that may change on the way: the study's folder may have moved, and what lies in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmRun:
+    """What came of an arm. results: of the frames that all arms have, in one order; judged: the detector's classes
+    that count.
+    """
+
+    arm: Arm
+    summary: RunSummary
+    results: tuple[FrameResult, ...]
+    judged: JudgedClasses
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """All arms. without_vehicles: frames that were passed over; failed: those that could not be used, and why."""
+
+    runs: tuple[ArmRun, ...]
+    without_vehicles: int
+    failed: dict[str, str]
+
+
+def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console: Console) -> Ran:
+    """Run or continue all arms in `out / ARMS`. workers: of the arms, as `workers_of` makes them.
+
+    Raises UsageError or SceneError for bad input.
+    """
+    first = workers[0]
+    names, without, failed = select_frames(first.source, first.config)
+    folders = [out / ARMS / arm.folder for arm in arms]
+    for worker, folder in zip(workers, folders, strict=True):
+        claim(folder, worker.config, shutil.rmtree, _FREE)
+    todo = [name for name in names if not all(_done(folder, name) for folder in folders)]
+    empty: set[str] = set()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not todo) as progress:
+        task = progress.add_task(f"frames, {len(arms)} attacks each", total=len(todo))
+        work = partial(_attack, workers=workers, folders=folders)
+        for name, outcome in outcomes(work, partial(_in_process, arms, folders), todo, first.config):
+            try:
+                outcome()
+            except NoVehicleError:
+                empty.add(name)
+            except SceneError as error:
+                if not first.config.keep_going:
+                    raise
+                failed[name] = str(error)
+            progress.advance(task)
+    names = [name for name in names if name not in failed and name not in empty]
+    runs = []
+    for arm, worker, folder in zip(arms, workers, folders, strict=True):
+        summary = attack_frames(worker, names, folder)
+        results = tuple(load_frame(folder / "frames" / name / RESULT) for name in names)
+        runs.append(ArmRun(arm, summary, results, JudgedClasses.of(worker.detector)))
+    return Ran(tuple(runs), without + len(empty), dict(sorted(failed.items())))
+
+
+def workers_of(arms: Sequence[Arm]) -> list[Worker]:
+    """One for each arm, with one source for all, and one detector for all that attack the same. The first arm of
+    each detector needs of it what any other needs. Raises UsageError or SceneError for settings that cannot be.
+    """
+    first: dict[str, Worker] = {}
+    source: SceneSource | None = None
+    for config in (arm.config for arm in arms):
+        if config.detector not in first:
+            worker = Worker.of(config)
+            source = source or worker.source
+            first[config.detector] = replace(worker, source=source)
+    return [first[arm.config.detector].beside(arm.config) for arm in arms]
+
+
+def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> None:
+    """One frame by all arms that have not done it, in their order."""
+    todo = [(w, folder) for w, folder in zip(workers, folders, strict=True) if not _done(folder, name)]
+    scene = workers[0].source.scene(name)
+    for worker, folder in todo:
+        worker.attack_scene(name, scene, folder)
+        # Photograph, background and what else all arms have is most of a frame's folder.
+        if folder != folders[0] and _done(folders[0], name):
+            files.share_alike(folder / "frames" / name, folders[0] / "frames" / name)
+
+
+def _in_process(arms: Sequence[Arm], folders: Sequence[Path]) -> Callable[[str], None]:
+    return partial(_attack, workers=workers_of(arms), folders=folders)
+
+
+def _done(folder: Path, name: str) -> bool:
+    return (folder / "frames" / name / RESULT).is_file()

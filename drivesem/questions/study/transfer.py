@@ -1,0 +1,250 @@
+"""Counterexamples of combination 2 before other detectors, beside the paper's figures for a YOLOv3."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from detectors.base import Predictor
+from detectors.squeezedet import SqueezeDet
+from detectors.yolov3.yolov3 import YoloV3
+from drivesem.attack.judging import HEADLINE
+from drivesem.evaluation.resampling import DRAWS, Interval, differences
+from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.report import Told
+from drivesem.questions.study.rows import MODES, feasible_fraction
+from drivesem.questions.study.running import ARMS, Ran, run_arms
+from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, rows_of
+from drivesem.questions.transfer.matrix import AP50, BROKEN, FRAMES, LOST, TRANSFER, Row
+from drivesem.questions.transfer.report import bounded
+from drivesem.questions.transfer.report import sheets as matrix_sheets
+from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
+from drivesem.report.tables import Sheet, percent
+from drivesem.run.attack import Worker
+from drivesem.run.finished import Run, load_runs
+from drivesem.settings.commands import DEFAULT_COMBO, Study, Transfer
+
+_SIDES = ("source", "target")
+_LABELS = "labels"
+_WORDS = (*_SIDES, _LABELS)
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """Counterexamples of one source before one target. placebo: what one random edit as large as the attack's does
+    there, where controls are asked for; beyond: how far AP50 falls below it, by label mode, paired over frames;
+    reference: the paper's mAP of such a pair, benign and attacked.
+    """
+
+    row: Row
+    placebo: Row | None
+    beyond: Mapping[str, Interval]
+    reference: tuple[float, float] | None
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
+        there, attacked = self.reference or (None, None)
+        found = self.row.flat() | {
+            "recall_paper": self.row.paper.headline.recall,
+            "recall_moved": self.row.moved.headline.recall,
+            "reference": attacked,
+            "reference_benign": there,
+            "reference_drop": None if there is None or attacked is None else there - attacked,
+        }
+        if self.placebo is not None:
+            theirs = self.placebo.flat()
+            told = ("paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "drop_moved_low", "drop_moved_high")
+            found |= {f"placebo_{key}": theirs[key] for key in (*told, BROKEN)}
+        for mode, one in self.beyond.items():
+            key = f"over_placebo_{mode}"
+            found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Matrix:
+    """All that the study found. failed: pictures that could not be used, and why."""
+
+    study: Study
+    draws: int
+    ran: Ran
+    rows: Sequence[Before]
+    failed: Mapping[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        results = [result for run in self.ran.runs for result in run.results]
+        return {
+            "study": self.study.name,
+            "headline": HEADLINE,
+            "frames": self.rows[0].row.frames,
+            "frames_without_vehicles": self.ran.without_vehicles,
+            "frames_failed": {**self.ran.failed, **self.failed},
+            "feasible_fraction": feasible_fraction(results),
+            "bootstrap": self.draws,
+            "rows": [one.flat() for one in self.rows],
+        }
+
+
+def detectors_asked(study: Study, out: Path) -> list[Asked]:
+    """The sources, then the others that are to be asked. Raises UsageError for what is no detector."""
+    named = detector_names(study.detectors)
+    sources = detector_names(study.sources or study.detector, "--sources")
+    return detectors_of(list(dict.fromkeys([*sources, *named])), _settings(study), out, study.t_star)
+
+
+def run(
+    study: Study,
+    arms: Sequence[Arm],
+    workers: Sequence[Worker],
+    asked: Sequence[Asked],
+    out: Path,
+    console: Console,
+) -> Matrix:
+    """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
+    ran = run_arms(arms, workers, out, console)
+    runs = load_runs([str(out / ARMS / arm.folder) for arm in arms])
+    named = [replace(run, name=arm.of or arm.name) for run, arm in zip(runs, arms, strict=True)]
+    settings = _settings(study)
+    rows, failed = rows_of(named, asked, settings, console)
+    split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
+    draws = DRAWS if study.bootstrap is None else study.bootstrap
+    found: list[Before] = []
+    for arm, worker, one in zip(arms, workers, named, strict=True):
+        if arm.control is not None:
+            continue
+        beside = next((o for a, o in zip(arms, named, strict=True) if a.of == arm.name), None)
+        for place, target in enumerate(asked):
+            placebo = None if beside is None else split[beside.folder][place]
+            reference = _reference(worker.detector, one, target)
+            row = split[one.folder][place]
+            beyond = {}
+            if placebo is not None:
+                beyond = {mode: _beyond(row, placebo, mode, draws, study.seed) for mode in MODES}
+            found.append(Before(row, placebo, beyond, reference))
+    return Matrix(study, draws, ran, found, failed)
+
+
+def _beyond(row: Row, placebo: Row, mode: str, draws: int, seed: int) -> Interval:
+    after, theirs = (one.figures[mode][:1] for one in (row, placebo))
+    (one,) = differences(after, theirs, row.frames, draws, np.random.default_rng(seed))
+    return Interval(one.name, one.difference, one.low, one.high)
+
+
+def _settings(study: Study) -> Transfer:
+    return Transfer(
+        limit=study.limit,
+        seed=study.seed,
+        workers=study.workers,
+        device=study.device,
+        keep_going=study.keep_going,
+        bootstrap=study.bootstrap,
+    )
+
+
+def _reference(source: Predictor, run: Run, target: Asked) -> tuple[float, float] | None:
+    """The paper's mAP for a SqueezeDet and itself, or a YOLOv3 of any size."""
+    if not isinstance(source, SqueezeDet):
+        return None
+    if target.order.detector == run.detector:
+        return PAPER_BENIGN, PAPER_COMBOS[DEFAULT_COMBO]
+    return PAPER_TRANSFER if isinstance(target.predictor, YoloV3) else None
+
+
+def told(found: Matrix) -> Told:
+    """The study as text."""
+    sources = list(dict.fromkeys(one.row.run.name for one in found.rows))
+    short = [_plain(sheet(found.rows), sources) for sheet in (_precision, _falls, _broken)]
+    further = matrix_sheets([one.row for one in found.rows])[0]
+    whole = [*short, replace(further, title=f"{HEADLINE}, further figures, %")]
+    tables = {"study": [one.flat() for one in found.rows]}
+    return Told(found.study.name, whole, short, notes(found), tables, _WORDS, _SIDES)
+
+
+def _plain(sheet: Sheet, sources: Sequence[str]) -> Sheet:
+    """The source in the title where there is one only, instead of in each row."""
+    if len(sources) > 1:
+        return sheet
+    title = f"{sheet.title}; counterexamples of {sources[0]}"
+    return Sheet(title, sheet.columns[1:], tuple(row[1:] for row in sheet.rows))
+
+
+def _precision(rows: Sequence[Before]) -> Sheet:
+    lines = []
+    for one in rows:
+        row, there = one.row, one.reference or (None, None)
+        scores = (row.benign, row.rerendered, row.paper, row.moved)
+        lines.append((*_sides(row), *(percent(s.headline.ap50) for s in scores), *map(percent, there)))
+    columns = (*_SIDES, "benign", "re-rendered", *MODES, "benign there", "attacked there")
+    return Sheet(f"{HEADLINE} AP50, %", columns, tuple(lines))
+
+
+def _falls(rows: Sequence[Before]) -> Sheet:
+    controlled = any(one.placebo is not None for one in rows)
+    lines = []
+    for one in rows:
+        there, attacked = one.reference or (None, None)
+        fallen = None if there is None or attacked is None else there - attacked
+        cells = [*_sides(one.row), *(bounded(_fall(one.row, mode)) for mode in MODES)]
+        if controlled:
+            cells.append("-" if one.placebo is None else bounded(_fall(one.placebo, "moved")))
+            cells.append(bounded(one.beyond["moved"]) if one.beyond else "-")
+        lines.append((*cells, "-" if fallen is None else f"{100 * fallen:.1f}"))
+    columns = [*_SIDES, *MODES, *(["placebo, moved", "attack less placebo"] if controlled else []), "there"]
+    return Sheet(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
+
+
+def _sides(row: Row) -> tuple[str, str]:
+    return row.run.name, row.target.name
+
+
+def _fall(row: Row, mode: str) -> Interval:
+    return next(one for one in row.drops[mode] if one.name == AP50)
+
+
+def _broken(rows: Sequence[Before]) -> Sheet:
+    lines = []
+    for row in (one.row for one in rows):
+        lost, shared, frames = (
+            f"{row.counts[name][0]} of {row.counts[name][1]}" for name in (LOST, TRANSFER, FRAMES)
+        )
+        lines.append((*_sides(row), bounded(row.shares[BROKEN]), lost, str(row.phantoms), shared, frames))
+    columns = (*_SIDES, "frames broken", "lost", "phantoms", "lost too", "frames too")
+    return Sheet("Frames broken, %, and what was lost or made up; moved labels", columns, tuple(lines))
+
+
+def notes(found: Matrix) -> list[str]:
+    """What the columns mean."""
+    spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
+    stars = "; ".join(dict.fromkeys(f"{o.row.target.name} {o.row.target.t_star:.3f}" for o in found.rows))
+    there = "{:.2f} to {:.2f}".format(*(100 * value for value in PAPER_TRANSFER))
+    lines = [
+        "Each source was attacked by combination 2; each target looked at the photographs, at the same rendered "
+        "again without any change, and at the counterexamples.",
+        f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
+        f"There: in the paper, whose SqueezeDet fell from {100 * PAPER_BENIGN:.1f} to "
+        f"{100 * PAPER_COMBOS[DEFAULT_COMBO]:.1f} on Virtual KITTI, and a YOLOv3, trained on KITTI, from {there} "
+        "before the same pictures.",
+    ]
+    if any(one.placebo is not None for one in found.rows):
+        lines.append(
+            "Placebo: one random edit as large as the attack's, before the same target. What the attack takes "
+            "beyond it is what transfers."
+        )
+    lines += [
+        "Lost: of the objects that the target found in the photograph. Lost too: of those among them that the "
+        "source lost. Frames too: of the frames that fail the source, those that fail the target. Counted from t* "
+        f"on: {stars}.",
+    ]
+    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
+    lines.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
+    if found.ran.without_vehicles:
+        lines.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
+    reasons = {**found.ran.failed, **found.failed}
+    lines += [f"{name} could not be used: {reason}" for name, reason in reasons.items()]
+    return lines

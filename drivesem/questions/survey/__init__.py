@@ -1,0 +1,1 @@
+"""The human study: the page, its key, answers, and how far people agree."""

@@ -1,0 +1,89 @@
+"""The matrix for people and programs: a table on the terminal, Markdown, CSV, a heat-map."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from drivesem.attack.judging import HEADLINE
+from drivesem.evaluation.resampling import Interval
+from drivesem.questions.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, Row
+from drivesem.questions.transfer.plot import write_heatmap
+from drivesem.report.tables import Sheet, percent
+from scene_ir import files
+
+_SHARES = {TRANSFER: "transfer rate", LOST: "lost anyway", FRAMES: "frames"}
+_SIDES = ("source", "target")
+_LABELS = "labels"
+"""Of the photographs (benign), or of the counterexamples by either label mode."""
+
+
+def sheets(rows: Sequence[Row]) -> list[Sheet]:
+    """Two tables, %: precision and recall by picture and label mode; what falls and what transfers."""
+    figures: list[tuple[str, ...]] = []
+    shares: list[tuple[str, ...]] = []
+    for row in rows:
+        sides = (row.run.name, row.target.name)
+        for name in ("benign", "paper", "moved"):
+            scores = getattr(row, name)
+            one = scores.headline
+            values = (one.ap50, one.ap70, one.ap, scores.overall.ap50, one.recall, one.recall_at_t_star)
+            figures.append((*sides, name, *map(percent, values)))
+        fall = {mode: next(one for one in row.drops[mode] if one.name == AP50) for mode in row.drops}
+        counted = [f"{bounded(row.shares[n])}\n{row.counts[n][0]} of {row.counts[n][1]}" for n in _SHARES]
+        shares.append((*sides, bounded(fall["paper"]), bounded(fall["moved"]), *counted))
+    scored = ("AP50", "AP70", "AP50:95", "mAP50", "recall", "recall at t*")
+    fallen = ("AP50 falls, paper", "AP50 falls, moved")
+    return [
+        Sheet(f"{HEADLINE}, %", (*_SIDES, _LABELS, *scored), tuple(figures)),
+        Sheet("transfer, %", (*_SIDES, *fallen, *_SHARES.values()), tuple(shares)),
+    ]
+
+
+def notes(rows: Sequence[Row], draws: int) -> list[str]:
+    """What the columns mean."""
+    spread = f" In brackets: 95 % of {draws} draws of frames." if draws else ""
+    stars = "; ".join(dict.fromkeys(f"{r.target.name}: t* {r.target.t_star:.3f}" for r in rows))
+    return [
+        "Labels: benign are the photographs, paper and moved the counterexamples by either label mode.",
+        f"mAP50: mean over the target's classes; AP50 falls: benign less attacked.{spread}",
+        "Transfer rate: of the objects that the source lost and the target found in the photograph, those that "
+        "the target loses too. Lost anyway: of all that it found in the photograph, those it loses. Frames: of "
+        "those that fail the source, those that fail the target. All by moved labels.",
+        f"{stars}.",
+    ]
+
+
+def print_rows(rows: Sequence[Row], draws: int, console: Console) -> None:
+    """The tables, and what they mean."""
+    for sheet in sheets(rows):
+        console.print(sheet.table((*_SIDES, _LABELS), show_lines=len(sheet.rows) == len(rows)))
+    for note in notes(rows, draws):
+        console.print(note, soft_wrap=True)
+
+
+def write_report(out: Path, rows: Sequence[Row], draws: int) -> None:
+    """transfer.md, transfer.csv and transfer.png."""
+    flat = [row.flat() for row in rows]
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(flat[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    files.write_text(out / "transfer.csv", buffer.getvalue())
+    lines = ["# Transfer", "", "![](transfer.png)", ""]
+    for sheet in sheets(rows):
+        lines += [*sheet.markdown((*_SIDES, _LABELS)), ""]
+    lines += [f"{note}\n" for note in notes(rows, draws)]
+    files.write_text(out / "transfer.md", "\n".join(lines))
+    write_heatmap(out / "transfer.png", rows)
+
+
+def bounded(one: Interval) -> str:
+    """A fraction and its bounds as percentages."""
+    if one.value is None or one.low is None or one.high is None:
+        return percent(one.value)
+    return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"

@@ -1,0 +1,276 @@
+"""One frame of a run, computed again from its folder: pictures, detections, labels, success."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from detectors.base import Predictor, predict
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.attack.aims import Aim
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.labels import Labeller, MovedLabels, to_kitti_labels
+from drivesem.attack.space import Budget, Parameter
+from drivesem.data.kitti import read_labels
+from drivesem.evaluation import failures
+from drivesem.questions.verify.change import check_change, check_feasibility
+from drivesem.questions.verify.differences import Difference, Tally
+from drivesem.run.frame import RESULT, as_targets, detection_records, target_records, to_uint8
+from drivesem.run.results import BoxRecord, FrameResult, load_frame
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import Labels, SceneIR
+
+BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"
+LEVELS = 1
+"""Levels of 255 by which the same picture may differ from one processor to another."""
+BOX_PX, SCORE = 0.05, 1e-3
+"""By how much a detection may differ: another number of threads adds up in another order."""
+LABEL = 1e-3
+"""Of numbers in label files, which have three decimals, and of recorded targets, in the label's units."""
+_DETECTIONS = {
+    BENIGN: "detections_benign",
+    RERENDER: "detections_rerendered",
+    COUNTEREXAMPLE: "detections_attacked",
+}
+"""The result's field of what was found in each picture."""
+_LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "size_lhw", "yaw")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the run's settings say. hashes: of files in frames' folders, by frame and name, as the manifest has
+    them; t_star: score from which a detection counts.
+    """
+
+    detector: Predictor
+    device: str
+    backend: str
+    params: tuple[Parameter, ...]
+    budget: Budget
+    aim: Aim
+    t_star: float
+    hashes: Mapping[str, Mapping[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """How far a picture is from the one on disk: the largest difference in levels of 255, and the share of pixels
+    that differ at all.
+    """
+
+    largest: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """One frame. compared: how often, by check; levels: of the three pictures, by file name."""
+
+    identifier: str
+    compared: dict[str, int]
+    differences: tuple[Difference, ...]
+    levels: dict[str, Level]
+
+
+def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
+    """Compare one frame's folder with itself: everything follows from `scene/` and the pictures, and must be what
+    the other files say.
+
+    No label file says that an object is ignored. Success is therefore judged twice: by boxes, classes and regions
+    of `labels_moved.txt` and `labels_paper.txt` with the flags that result.json records, and by the targets that
+    it records; the flags themselves are compared with those of the saved scene. Raises SceneError for files that
+    are missing or damaged.
+    """
+    result = load_frame(folder / RESULT)
+    perturbed = load_scene(folder / "scene")
+    base = perturbed.as_photographed()
+    tally = Tally()
+    for name, expected in given.hashes.get(identifier, {}).items():
+        found = hashlib.sha256(files.read_bytes(folder / name)).hexdigest()
+        tally.same("files", name, expected, found)
+    check_change(tally, folder, result, base, perturbed, given.params, given.budget)
+    check_feasibility(tally, result, base, perturbed, given.budget)
+    size = (base.camera.height, base.camera.width)
+    pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
+    with torch.no_grad():
+        levels, labels = _render(tally, pictures, base, perturbed, given.backend)
+        seen = {name: _detect(given, image) for name, image in pictures.items()}
+    names = JudgedClasses.of(given.detector).names
+    for name, field in _DETECTIONS.items():
+        _compare_boxes(tally, "detections", field, getattr(result, field), detection_records(seen[name], names))
+    _judge(tally, folder, result, labels, _Scenes(base, perturbed), seen, given)
+    return Checked(identifier, tally.compared, tuple(tally.differences), levels)
+
+
+@dataclass(frozen=True, slots=True)
+class _Scenes:
+    """A scene before and after the change."""
+
+    base: SceneIR
+    perturbed: SceneIR
+
+
+def _render(
+    tally: Tally, pictures: Mapping[str, np.ndarray], base: SceneIR, perturbed: SceneIR, backend: str
+) -> tuple[dict[str, Level], dict[str, MovedLabels]]:
+    """The three pictures against the scene; labels of the scene by mode."""
+    compositor = Compositor(base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
+    before, after = compositor.render(base), compositor.render(perturbed)
+    drawn = {BENIGN: base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
+    levels: dict[str, Level] = {}
+    for name, image in drawn.items():
+        apart = np.abs(pictures[name].astype(np.int16) - to_uint8(image)).max(axis=2)
+        levels[name] = Level(int(apart.max()), float((apart > 0).mean()))
+        found = f"up to {levels[name].largest} levels off, in {100 * levels[name].share:.3g} % of the pixels"
+        tally.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
+    labeller = Labeller(base, before)
+    return levels, {"paper": labeller.paper(), "moved": labeller.moved(perturbed, after)}
+
+
+def _detect(given: Given, image: np.ndarray) -> Detections:
+    """What the detector finds in a picture (H, W, 3) uint8, of judged classes, on the CPU."""
+    picture = torch.from_numpy(image).permute(2, 0, 1).to(given.device) / 255
+    found = JudgedClasses.of(given.detector).detections(predict(given.detector, picture[None])[0])
+    return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
+
+
+def _judge(
+    tally: Tally,
+    folder: Path,
+    result: FrameResult,
+    labels: Mapping[str, MovedLabels],
+    scenes: _Scenes,
+    seen: Mapping[str, Detections],
+    given: Given,
+) -> None:
+    """Labels against the scene, and success by them."""
+    recorded = {"paper": result.targets_benign, "moved": result.targets_moved}
+    count = len(scenes.base.objects)
+    for mode, own in labels.items():
+        _compare_targets(tally, f"targets_{mode}", recorded[mode], target_records(own.targets, CLASSES, count))
+    tally.same(
+        "labels",
+        "became_ignored",
+        list(result.became_ignored),
+        labels["moved"].became_ignored.nonzero()[:, 0].tolist(),
+    )
+    judged = {mode: {"": as_targets(records, CLASSES)} for mode, records in recorded.items()}
+    for mode, own in labels.items():
+        name = f"labels_{mode}.txt"
+        written = read_labels(folder / name)
+        if _compare_labels(tally, name, written, to_kitti_labels(own, scenes.base, scenes.perturbed)):
+            judged[mode][f" by {name}"] = _targets_of(written, own, judged[mode][""].ignore)
+    sizes = {len(targets) for kinds in judged.values() for targets in kinds.values()}
+    if len(sizes) > 1:
+        tally.told("success", "targets", "as many of either label mode", sorted(sizes), agrees=False)
+        return
+    for mode, kinds in judged.items():
+        for by, targets in kinds.items():
+            _compare_success(tally, result, mode, by, _failures(judged["paper"][""], targets, seen, given))
+
+
+def _failures(
+    benign: Targets, targets: Targets, seen: Mapping[str, Detections], given: Given
+) -> tuple[tuple[int, ...], tuple[BoxRecord, ...]]:
+    """Objects that are lost, and phantoms."""
+    judged = JudgedClasses.of(given.detector)
+    after = seen[COUNTEREXAMPLE]
+    try:
+        found = failures.find(judged.targets(benign), seen[RERENDER], judged.targets(targets), after, given.t_star)
+    except ValueError as error:
+        raise FormatError("targets_moved", "the objects of targets_benign", "others") from error
+    found = given.aim.failures(found, targets, after, judged.names)
+    records = detection_records(after, judged.names)
+    return found.lost, tuple(records[i] for i in found.phantoms)
+
+
+def _compare_success(
+    tally: Tally, result: FrameResult, mode: str, by: str, found: tuple[tuple[int, ...], tuple[BoxRecord, ...]]
+) -> None:
+    lost, phantoms = found
+    expected = result.success_moved if mode == "moved" else result.success_paper
+    tally.same("success", f"success_{mode}{by}", expected, bool(lost or phantoms))
+    if mode == "moved":
+        known = [f.index for f in result.failures if f.kind == "lost"]
+        tally.same("success", f"lost{by}", [f"objects[{i}]" for i in known], [f"objects[{i}]" for i in lost])
+        boxes = [BoxRecord(f.xyxy, f.label, f.score) for f in result.failures if f.kind == "phantom"]
+        _compare_boxes(tally, "success", f"phantoms{by}", boxes, phantoms)
+
+
+def _compare_boxes(
+    tally: Tally, check: str, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]
+) -> None:
+    """Detections, each with the first that is like it; order and what lies within the tolerance do not matter."""
+    left = list(found)
+    for record in expected:
+        like = next((other for other in left if _alike(record, other)), None)
+        if like is None:
+            tally.told(check, name, _said(record), "none like it", agrees=False)
+        else:
+            left.remove(like)
+            tally.told(check, name, "", "", agrees=True)
+    for record in left:
+        tally.told(check, name, "none like it", _said(record), agrees=False)
+
+
+def _alike(one: BoxRecord, other: BoxRecord) -> bool:
+    apart = max(abs(a - b) for a, b in zip(one.xyxy, other.xyxy, strict=True))
+    return one.label == other.label and apart <= BOX_PX and abs((one.score or 0) - (other.score or 0)) <= SCORE
+
+
+def _said(record: BoxRecord) -> str:
+    corners = " ".join(f"{value:.1f}" for value in record.xyxy)
+    score = "" if record.score is None else f" {record.score:.3f}"
+    return f"{record.label}{score} at {corners}"
+
+
+def _compare_targets(tally: Tally, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]) -> None:
+    """Recorded targets against those of the saved scene."""
+    tally.same("labels", f"{name}, how many", len(expected), len(found))
+    for i, (one, other) in enumerate(zip(expected, found, strict=False)):
+        apart = max(abs(a - b) for a, b in zip(one.xyxy, other.xyxy, strict=True))
+        same = (one.label, one.ignore, one.index) == (other.label, other.ignore, other.index)
+        told = [_said(r) + (", ignored" if r.ignore else "") for r in (one, other)]
+        tally.told("labels", f"{name}[{i}]", *told, agrees=same and apart <= LABEL)
+
+
+def _compare_labels(tally: Tally, name: str, written: Labels, own: Labels) -> bool:
+    """A label file against the saved scene. Returns whether both have the same objects and as many regions."""
+    tally.same("labels", f"{name}: type", list(written.kind), list(own.kind))
+    regions = len(written.ignore_xyxy), len(own.ignore_xyxy)
+    tally.same("labels", f"{name}: DontCare", *regions)
+    if written.kind != own.kind or regions[0] != regions[1]:
+        return False
+    for field in _LABEL_FIELDS:
+        _compare_rows(tally, f"{name}: objects[{{}}].{field}", getattr(written, field), getattr(own, field))
+    _compare_rows(tally, f"{name}: DontCare[{{}}]", written.ignore_xyxy, own.ignore_xyxy)
+    return True
+
+
+def _compare_rows(tally: Tally, name: str, written: Tensor, own: Tensor) -> None:
+    """Rows of numbers; name: with a place for the row's."""
+    for i, (one, other) in enumerate(zip(written.tolist(), own.tolist(), strict=True)):
+        pair = [side if isinstance(side, list) else [side] for side in (one, other)]
+        ways = [a - b for a, b in zip(*pair, strict=True)]
+        if name.endswith(".yaw"):
+            ways = [math.remainder(way, 2 * math.pi) for way in ways]
+        apart = max(map(abs, ways))
+        told = [" ".join(f"{value:.3f}" for value in side) for side in pair]
+        tally.told("labels", name.format(i), *told, agrees=apart <= LABEL)
+
+
+def _targets_of(written: Labels, own: MovedLabels, ignore: Tensor) -> Targets:
+    """What a label file holds as targets, with the recorded flags (M,) of what is ignored."""
+    boxes = replace(own, boxes_xyxy=written.boxes_xyxy, regions_xyxy=written.ignore_xyxy).targets
+    return Targets(boxes.boxes_xyxy, boxes.labels, ignore if len(ignore) == len(boxes) else boxes.ignore)

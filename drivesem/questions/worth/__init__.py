@@ -1,0 +1,1 @@
+"""Information worth and gain: how much counterexamples teach."""

@@ -1,0 +1,343 @@
+"""`drivesem attack`: every frame through the pipeline, then the figures and the page."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from detectors.base import Detector, DetectorError, Predictor
+from detectors.registry import ONNX, load_detector, load_predictor
+from drivesem.attack.aims import Aim
+from drivesem.attack.budgets import budget_of, written
+from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
+from drivesem.attack.methods.apgd import APGD
+from drivesem.attack.methods.base import Attack as AttackMethod
+from drivesem.attack.methods.cma_es import CMAES
+from drivesem.attack.methods.fgsm import FGSM
+from drivesem.attack.methods.placebo import Placebo
+from drivesem.attack.methods.restarts import Restarted
+from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.methods.scouted import Scouted
+from drivesem.attack.methods.scw import SCW
+from drivesem.attack.methods.sgd import SGD
+from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.attack.methods.subsets import Subsets
+from drivesem.attack.objective import OF_DETECTIONS
+from drivesem.attack.space import Parameter, combo, parse_params
+from drivesem.run.folder import claim
+from drivesem.run.frame import RESULT, FrameSettings, attack_frame
+from drivesem.run.page import write_run
+from drivesem.run.results import FrameResult, RunSummary, load_frame
+from drivesem.run.tally import tally
+from drivesem.run.workers import outcomes
+from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
+from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
+from drivesem.settings.devices import check_device
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.errors import RangeError, SceneError, ShapeError
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import SceneIR
+
+_PACKAGES = (
+    "drivesem",
+    "torch",
+    "kornia",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "warp-lang",
+    "pycocotools",
+)
+
+
+def attack_run(config: Attack) -> RunSummary:
+    """Run or continue an attack in the folder that the settings name, or in one under `runs`. Raises UsageError or
+    SceneError for bad input.
+    """
+    start = time.perf_counter()
+    config = _settled(config)
+    aim_of(config)
+    check_device(config.device)
+    worker = Worker.of(config)
+    out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
+    claim(out, config, _clear)
+    return _attacked(worker, select_frames(worker.source, config), out, start)
+
+
+def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary:
+    """Attack these frames, of all that the worker's source has, into the run folder `out`; those that are there
+    already stay. Raises as `run`.
+    """
+    start = time.perf_counter()
+    claim(out, worker.config, _clear)
+    return _attacked(worker, (list(names), 0, {}), out, start)
+
+
+def _attacked(
+    worker: Worker, selected: tuple[list[str], int, dict[str, str]], out: Path, start: float
+) -> RunSummary:
+    """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames."""
+    names, without_vehicles, failed = selected
+    config = worker.config
+    todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
+    empty = _attack_all(worker, todo, out, failed, Console(stderr=True))
+    done = [name for name in names if name not in failed and name not in empty]
+    results = [load_frame(out / "frames" / name / RESULT) for name in done]
+    summary = _summary(
+        config, worker.params, worker.detector, results, without_vehicles + len(empty), failed, out, start
+    )
+    files.write_json(out / "metrics.json", summary.to_json())
+    files.write_json(out / "manifest.json", _manifest(config, out, done))
+    write_run(out, config, summary, results)
+    return summary
+
+
+def _params(config: Attack) -> tuple[Parameter, ...]:
+    if config.params is not None:
+        return parse_params(config.params)
+    if config.method == "subsets" and config.combo is None:
+        return tuple(Parameter)
+    return combo(config.combo or DEFAULT_COMBO)
+
+
+def _settled(config: Attack) -> Attack:
+    """The configuration with the budget's numbers in place of its file, so that a run can be repeated without."""
+    return replace(config, budget=written(budget_of(config.budget)))
+
+
+@dataclass(frozen=True)
+class Worker:
+    """What one process needs: built once, used for many frames."""
+
+    config: Attack
+    params: tuple[Parameter, ...]
+    method: AttackMethod
+    source: SceneSource
+    detector: Predictor
+
+    @classmethod
+    def of(cls, config: Attack) -> Worker:
+        """Raises UsageError for a detector that cannot be used, SceneError for a source that cannot be read."""
+        config = _settled(config)
+        source, method = open_source(config), attack_method(config)
+        return cls(config, _params(config), method, source, _detector(config, method.needs_gradient))
+
+    def beside(self, config: Attack) -> Worker:
+        """For another attack on the same source and detector, which are shared."""
+        config = _settled(config)
+        return replace(self, config=config, params=_params(config), method=attack_method(config))
+
+    def attack(self, identifier: str, out: Path) -> FrameResult:
+        """One frame, from the source to its folder."""
+        return self.attack_scene(identifier, self.source.scene(identifier), out)
+
+    def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
+        """One frame that has been taken apart. Raises NoVehicleError where it has none."""
+        if len(scene.objects) == 0:
+            raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
+        config = self.config
+        aim = aim_of(config)
+        if aim.objects is not None and aim.objects[-1] >= len(scene.objects):
+            count = f"{len(scene.objects)} of them"
+            raise NoVehicleError(f"frame {identifier}", f"objects up to the {aim.objects[-1]}th from 0", count)
+        settings = FrameSettings(
+            attack=self.method if config.like is None else _placebo(Path(config.like), identifier),
+            params=self.params,
+            label_mode=config.objective_labels,
+            term=config.objective,
+            render=RenderSettings(backend=config.backend),
+            seed=config.seed,
+            t_star=config.t_star,
+            budget=budget_of(config.budget),
+            aim=aim,
+        )
+        try:
+            return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+        except (RangeError, ShapeError) as error:
+            # A loss or gradient that is no number says where in the scene, and not in which.
+            raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
+
+
+def aim_of(config: Attack) -> Aim:
+    """What the settings ask the attack to be after. Raises UsageError."""
+    return Aim.of(config.target_objects, config.target_classes)
+
+
+def attack_method(config: Attack) -> AttackMethod:
+    """The algorithm that the settings ask for."""
+    attack = _from_theta0(config)
+    if config.restarts:
+        attack = Restarted(attack, config.restarts, config.steps, config.early_stop)
+    return Scouted(attack, config.scouts, early_stop=config.early_stop) if config.scouts else attack
+
+
+def _from_theta0(config: Attack) -> AttackMethod:
+    steps, early_stop, queries = config.steps, config.early_stop, config.queries or DEFAULT_QUERIES
+    match config.method:
+        case "si-fgsm":
+            return SiFGSM(steps, early_stop, config.momentum, config.rate)
+        case "apgd":
+            return APGD(steps, early_stop, config.rate)
+        case "fgsm":
+            return FGSM(steps)
+        case "sgd":
+            return SGD(steps, early_stop, config.momentum, config.rate, config.step_form)
+        case "scw":
+            return SCW(queries, steps, config.norm, config.rate, early_stop)
+        case "placebo":
+            return Placebo()
+        case "subsets":
+            return Subsets(queries, steps)
+        case "cma-es":
+            return CMAES(queries, _reach(config), early_stop)
+        case "random" | "halton" | "sobol":
+            return Sampling(queries, _reach(config), early_stop, config.method)
+
+
+def _placebo(run: Path, identifier: str) -> Placebo:
+    """An edit as large as what a run did to the frame. Raises FormatError where the run has no such frame."""
+    return Placebo(tuple(c.value for c in load_frame(run / "frames" / identifier / RESULT).theta))
+
+
+def _reach(config: Attack) -> int | None:
+    """Steps around theta0 within which a search without gradient looks; None for all of the bounds."""
+    return config.steps if config.range == "steps" else None
+
+
+def _detector(config: Attack, needs_gradient: bool) -> Predictor:
+    """The detector under attack. Raises UsageError where it is none, knows no cars, or lacks a needed gradient."""
+    try:
+        if config.precision == "float32":
+            detector = load_predictor(config.detector, config.device, config.tiles)
+        else:
+            detector = load_detector(config.detector, config.device, getattr(torch, config.precision))
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    if isinstance(detector, Detector):
+        return detector
+    if needs_gradient:
+        expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
+        raise UsageError("--method", expected, config.method)
+    if config.objective not in OF_DETECTIONS:
+        expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"
+        raise UsageError("--objective", expected, config.objective)
+    return detector
+
+
+def _in_process(config: Attack, out: Path) -> Callable[[str], FrameResult]:
+    return partial(Worker.of(config).attack, out=out)
+
+
+def _attack_all(
+    worker: Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console
+) -> set[str]:
+    """Attack the frames of `todo`, in this process or in several; a bad frame goes to `failed` or ends the run.
+    Those without a vehicle are returned.
+    """
+    empty: set[str] = set()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not todo) as progress:
+        task = progress.add_task("attacking frames", total=len(todo))
+        build = partial(_in_process, worker.config, out)
+        for identifier, outcome in outcomes(partial(worker.attack, out=out), build, todo, worker.config):
+            try:
+                outcome()
+            except NoVehicleError:
+                empty.add(identifier)
+            except SceneError as error:
+                if not worker.config.keep_going:
+                    raise
+                failed[identifier] = str(error)
+            progress.advance(task)
+    return empty
+
+
+def select_frames(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
+    """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
+    names: list[str] = []
+    failed: dict[str, str] = {}
+    without = 0
+    for identifier in source.identifiers():
+        if config.limit is not None and len(names) == config.limit:
+            break
+        try:
+            usable = source.has_vehicles(identifier)
+        except SceneError as error:
+            if not config.keep_going:
+                raise
+            failed[identifier] = str(error)
+            continue
+        if usable:
+            names.append(identifier)
+        else:
+            without += 1
+    return names, without, failed
+
+
+def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
+    method = "" if config.method == Attack().method else f"-{config.method}"
+    return f"{config.dataset}-{'-'.join(params)}{method}-seed{config.seed}"
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run wrote, and nothing else."""
+    for name in ("metrics.json", "manifest.json", "report.html"):
+        (out / name).unlink(missing_ok=True)
+    if (out / "frames").is_dir():
+        shutil.rmtree(out / "frames")
+
+
+def _summary(
+    config: Attack,
+    params: tuple[Parameter, ...],
+    detector: Predictor,
+    results: Sequence[FrameResult],
+    without_vehicles: int,
+    failed: dict[str, str],
+    out: Path,
+    start: float,
+) -> RunSummary:
+    t_star = t_star_of(detector, config.t_star)
+    return RunSummary(
+        out=str(out),
+        dataset=config.dataset,
+        params=tuple(str(p) for p in params),
+        detector=config.detector,
+        headline=HEADLINE,
+        t_star=t_star,
+        frames_without_vehicles=without_vehicles,
+        frames_failed=dict(sorted(failed.items())),
+        seconds=round(time.perf_counter() - start, 3),
+        **tally(results, JudgedClasses.of(detector), t_star, HEADLINE),
+    )
+
+
+def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Versions, seed and hashes: what a second run must reproduce to the byte."""
+    hashed = [f"{name}.png" for name in ("benign", "rerender", "counterexample")]
+    hashed += ["theta.json", "labels_paper.txt", "labels_moved.txt"]
+    packages = [*_PACKAGES]
+    packages += ["cma"] if config.method == "cma-es" else []
+    packages += ["onnxruntime"] if config.detector.startswith(ONNX) else []
+    return {
+        "versions": {package: importlib.metadata.version(package) for package in packages},
+        "seed": config.seed,
+        "frames": {name: {part: _sha256(out / "frames" / name / part) for part in hashed} for name in names},
+    }
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(files.read_bytes(path)).hexdigest()

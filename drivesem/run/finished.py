@@ -1,0 +1,96 @@
+"""A finished run of `drivesem attack`, as transfer needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from drivesem.run.folder import CONFIG
+from drivesem.run.frame import RESULT
+from drivesem.run.results import FrameResult, load_frame
+from drivesem.settings.commands import Attack
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+MANIFEST, METRICS = "manifest.json", "metrics.json"
+PICTURES = {"benign": "benign.png", "rerendered": "rerender.png", "attacked": "counterexample.png"}
+"""A frame's photograph, the same rendered again without any change, and the picture that was found: all lossless,
+as the source was judged on them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame of a run: what came of it, and its pictures by name (PICTURES)."""
+
+    result: FrameResult
+    pictures: dict[str, Path]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """name: of the folder; detector, method, params: of the attack; frames: in the order of their names."""
+
+    name: str
+    folder: Path
+    detector: str
+    method: str
+    params: str
+    frames: tuple[Frame, ...]
+
+
+def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "--run") -> list[Run]:
+    """Runs by folder; limit: the first frames of each; setting: what names them on the command line. Raises
+    UsageError for a folder that holds no finished run, FormatError naming a file that is not as `drivesem attack`
+    writes it.
+    """
+    paths = [Path(folder) for folder in folders]
+    doubled = sorted({str(path) for path in paths if sum(p.resolve() == path.resolve() for p in paths) > 1})
+    if doubled:
+        raise UsageError(setting, "each run once", doubled[0])
+    # Runs of the same name in different folders are told apart by their whole paths.
+    plain = [path.resolve().name for path in paths]
+    names = [name if plain.count(name) == 1 else str(path) for name, path in zip(plain, paths, strict=True)]
+    return [_load(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
+
+
+def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
+    if not (folder / CONFIG).is_file():
+        raise UsageError(setting, "a folder of drivesem attack", folder)
+    try:
+        settings = yaml.safe_load(files.read_text(folder / CONFIG))
+    except yaml.YAMLError as error:
+        raise FormatError(str(folder / CONFIG), "YAML", " ".join(str(error).split())) from error
+    if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
+        raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
+    if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
+        raise UsageError(
+            setting, "a finished run (the same command finishes it)", f"{folder}, which stopped early"
+        )
+    manifest, metrics = files.read_json(folder / MANIFEST), files.read_json(folder / METRICS)
+    try:
+        identifiers, params = list(manifest["frames"]), ",".join(metrics["params"])
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
+    if not identifiers:
+        raise UsageError(setting, "a run with frames", f"{folder}, which has none")
+    return Run(
+        name=name,
+        folder=folder,
+        detector=str(settings["detector"]),
+        # Runs from before there was a choice followed the default.
+        method=str(settings.get("method", Attack().method)),
+        params=params,
+        frames=tuple(_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
+    )
+
+
+def _frame(folder: Path) -> Frame:
+    pictures = {name: folder / file for name, file in PICTURES.items()}
+    for path in pictures.values():
+        if not path.is_file():
+            raise FormatError(str(path), "a picture of the run", "none")
+    return Frame(load_frame(folder / RESULT), pictures)

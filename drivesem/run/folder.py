@@ -1,0 +1,89 @@
+"""The folder of a run: new, or one with the same settings to go on in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import MISSING, asdict, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from detectors.base import DetectorError, Predictor
+from detectors.registry import load_predictor
+from drivesem.attack.judging import JudgedClasses
+from drivesem.run.lock import LOCK, hold
+from drivesem.settings.commands import Attack, Common
+from drivesem.settings.errors import UsageError
+from drivesem.settings.text import to_yaml
+from scene_ir import files
+
+CONFIG = "config.yaml"
+"""The resolved settings, in the run's folder."""
+PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
+"""Settings that change no frame's result: a run may be continued with others."""
+
+
+def claim(
+    out: Path, config: Common, clear: Callable[[Path], None], presentation: Collection[str] = PRESENTATION
+) -> None:
+    """Make `out` this run's folder, and hold it. clear: removes what an earlier run wrote, for --no-resume.
+
+    Raises UsageError where `out` is a file, holds other files, a run whose settings were others, or what another
+    process is writing.
+    """
+    path = out / CONFIG
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
+        raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
+    hold(out)
+    if path.exists():
+        if config.resume:
+            _check_settings(path, config, presentation)
+        else:
+            clear(out)
+    files.write_text(path, to_yaml(config))
+
+
+def attack_of(run: Path) -> Attack:
+    """The configuration of a run of `drivesem attack`. Raises UsageError where the folder is none."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise UsageError("--run", "a run's folder, with its config.yaml", run)
+    loaded = yaml.safe_load(files.read_text(path))
+    known = {field.name for field in fields(Attack)}
+    if not isinstance(loaded, dict) or not set(loaded) <= known:
+        raise UsageError("--run", "a run of drivesem attack", run)
+    return Attack(**loaded)
+
+
+def detector_of(attack: Attack, device: str) -> Predictor:
+    """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
+
+    Raises UsageError where it cannot be had, or knows no cars.
+    """
+    try:
+        detector = load_predictor(attack.detector, device, attack.tiles)
+        JudgedClasses.of(detector)
+    except DetectorError as error:
+        raise UsageError("--run", "a run whose detector can be had", error) from error
+    return detector
+
+
+def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:
+    def identity(settings: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in settings.items() if key not in presentation}
+
+    before = yaml.safe_load(files.read_text(path))
+    # A setting that came with a later version had its default before.
+    defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
+    known = identity(defaults | before) if isinstance(before, dict) else {}
+    wanted = identity(asdict(config))
+    if known != wanted:
+        changed = [key for key, value in wanted.items() if known.get(key) != value]
+        raise UsageError(
+            str(path),
+            "the settings of this run (else another --out, or --no-resume)",
+            "other values of " + ", ".join(changed),
+        )

@@ -1,0 +1,48 @@
+"""One command at a time writes into a folder. Light: needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivesem.settings.errors import UsageError
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
+LOCK = ".lock"
+"""Empty file in the folder. It stays: the system forgets who held it when a process ends, however it ends."""
+_held: dict[Path, BaseFileLock] = {}
+"""Of this process, by file."""
+
+
+def hold(folder: Path) -> None:
+    """Make `folder`, and keep other processes that ask from writing into it, until `let_go` or this process' end.
+
+    This process may ask again. Raises UsageError where another one holds the folder.
+    """
+    from filelock import FileLock, Timeout  # when needed: `drivesem --help` starts without
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder.resolve() / LOCK
+    if path in _held:
+        return
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise UsageError("--out", "a folder that no other command writes into now", folder) from None
+    _held[path] = lock
+
+
+@contextmanager
+def let_go() -> Iterator[None]:
+    """What is held inside is free at the end."""
+    before = set(_held)
+    try:
+        yield
+    finally:
+        for path in set(_held) - before:
+            _held.pop(path).release()

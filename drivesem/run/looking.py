@@ -1,0 +1,123 @@
+"""What a detector finds in pictures on disk, remembered by content: of the picture, and of the detector."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from detectors.base import Predictor, predict
+from detectors.registry import load_predictor
+from detectors.types import Detections
+from drivesem.attack.judging import JudgedClasses
+from drivesem.run.frame import as_detections, detection_records
+from drivesem.run.results import BoxRecord
+from drivesem.run.workers import outcomes
+from drivesem.settings.commands import Transfer
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+_SCHEMA = 1
+_FINGERPRINT = 16
+"""Hexadecimal digits of a fingerprint: enough for folder names that never meet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """How to look: a detector by name or file, its device, tiles or not. folder: of what is remembered."""
+
+    detector: str
+    device: str
+    tiles: str
+    folder: Path
+
+    def load(self) -> Predictor:
+        """The detector. Raises DetectorError."""
+        return load_predictor(self.detector, self.device, self.tiles)
+
+
+class Memory:
+    """One detector's detections, a file for each picture. Pictures with the same bytes share one."""
+
+    def __init__(self, order: Order, predictor: Predictor) -> None:
+        self._folder = order.folder / fingerprint(order, predictor)
+        self._judged = JudgedClasses.of(predictor)
+
+    def has(self, picture: Path) -> bool:
+        """Whether a picture was looked at."""
+        return self.place(picture).is_file()
+
+    def keep(self, picture: Path, found: Detections) -> None:
+        """Remember detections whose labels are indices into the judged classes."""
+        records = [asdict(record) for record in detection_records(found, self._judged.names)]
+        files.write_json(self.place(picture), {"schema": _SCHEMA, "detections": records})
+
+    def recall(self, picture: Path) -> Detections:
+        """What was found in a picture. Raises FormatError where the file is damaged."""
+        path = self.place(picture)
+        data = files.read_json(path)
+        try:
+            records = tuple(BoxRecord(**record) for record in data["detections"])
+            return as_detections(records, self._judged.names)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FormatError(str(path), "detections as drivesem transfer writes them", error) from error
+
+    def place(self, picture: Path) -> Path:
+        """The file of a picture's detections: that of its bytes."""
+        return self._folder / f"{hashlib.sha256(files.read_bytes(picture)).hexdigest()}.json"
+
+
+def fingerprint(order: Order, predictor: Predictor) -> str:
+    """Differs where anything may that decides what is found: weights or files, classes, tiles, device, version."""
+    known = hashlib.sha256()
+    facts = [importlib.metadata.version("drivesem"), order.detector, order.tiles, order.device, *predictor.classes]
+    known.update(json.dumps(facts).encode())
+    if isinstance(predictor, nn.Module):
+        known.update(weights_digest(predictor).encode())
+    # The files that a name speaks of, such as an adapter's, and the settings that may lie beside one.
+    for part in re.split("[,:]", order.detector):
+        for path in (Path(part), Path(part).with_suffix(".yaml")) if part else ():
+            if path.is_file():
+                known.update(files.read_bytes(path))
+    return known.hexdigest()[:_FINGERPRINT]
+
+
+def weights_digest(module: nn.Module) -> str:
+    """Of all tensors and their names, hexadecimal."""
+    known = hashlib.sha256()
+    for name, tensor in module.state_dict().items():
+        known.update(name.encode())
+        known.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return known.hexdigest()
+
+
+def look(
+    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Transfer
+) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """Each picture that is not known yet, as it is done, with a call that raises what went wrong with it. Of
+    pictures with the same bytes the first stands for all.
+    """
+    memory = Memory(order, predictor)
+    unknown = {memory.place(picture): picture for picture in reversed(pictures) if not memory.has(picture)}
+    todo = list(reversed(unknown.values()))
+    work = partial(_look, predictor=predictor, memory=memory, device=order.device)
+    yield from outcomes(work, partial(_in_process, order), todo, config)
+
+
+def _look(picture: Path, predictor: Predictor, memory: Memory, device: str) -> None:
+    image = torch.from_numpy(files.read_image(picture)).permute(2, 0, 1).to(device) / 255
+    found = JudgedClasses.of(predictor).detections(predict(predictor, image[None])[0])
+    memory.keep(picture, Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu()))
+
+
+def _in_process(order: Order) -> Callable[[Path], None]:
+    predictor = order.load()
+    return partial(_look, predictor=predictor, memory=Memory(order, predictor), device=order.device)

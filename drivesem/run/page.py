@@ -1,0 +1,258 @@
+"""What a report shows of runs of `drivesem attack`: their figures on the frames that they share, and curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.space import combo
+from drivesem.data.label_table import WEATHERS
+from drivesem.evaluation.coco import ClassScores, Scores
+from drivesem.evaluation.curves import sampled_curve
+from drivesem.evaluation.outcome import Outcome
+from drivesem.report.html import render_report
+from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
+from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
+from drivesem.run.finished import METRICS, load_runs
+from drivesem.run.folder import attack_of
+from drivesem.run.results import FrameResult, RunSummary
+from drivesem.run.tally import boxes_of, tally
+from drivesem.settings.commands import COMBO_NUMBERS, GRADIENT_FREE, Attack
+from drivesem.settings.errors import UsageError
+from drivesem.settings.text import command_line
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+PICTURES = 200
+"""Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
+_NOT_TOLD = ("out", "json", "resume", "workers")
+"""Settings that change nothing in the result: left out of the report's command line."""
+_NOT_THE_PAPERS = (*GRADIENT_FREE, "placebo")
+"""Methods beside which the paper's figures for attacks by gradient say nothing."""
+_MOST_LINES = 7
+"""Of a chart: as many as there are colours."""
+
+
+def write_run(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> None:
+    """`report.html` of one run in its folder."""
+    write_report(out / "report.html", [_shown(out.name, out, config, summary, results)])
+
+
+def write_report(
+    path: Path,
+    runs: Sequence[ShownRun],
+    frames: int | None = None,
+    left_out: int = 0,
+    charts: Sequence[Chart] = (),
+) -> int:
+    """Write the page of runs on the same frames; how many bytes it has. frames: whose pictures are shown, worst
+    first, by default as many as PICTURES allow. charts: beside precision over recall.
+    """
+    shown = frames or max(PICTURES // (1 + len(runs)), 1)
+    page = Page(runs, [*precision_recall(runs), *charts], min(shown, len(runs[0].frames)), left_out)
+    text = render_report(page, path).encode("utf-8")
+    files.write_bytes(path, text)
+    return len(text)
+
+
+def load_shown(folders: Sequence[str]) -> tuple[list[ShownRun], int]:
+    """Finished runs, as far as their frames are in all of them, and how many frames are not. Figures are those of
+    `metrics.json` where all runs have the same frames, else computed again.
+
+    Raises UsageError for folders that hold no finished run, runs that share no frame, and runs on different
+    photographs; FormatError for a damaged file.
+    """
+    loaded = load_runs(folders, setting="RUN")
+    names = [{frame.result.identifier for frame in run.frames} for run in loaded]
+    shared, every = set.intersection(*names), set.union(*names)
+    if not shared:
+        raise UsageError("RUN", "runs that share frames", "none that is in all of them")
+    shown = []
+    for run in loaded:
+        results = [frame.result for frame in run.frames if frame.result.identifier in shared]
+        summary = _summary(run.folder / METRICS)
+        if len(shared) < len(every):
+            summary = _again(summary, results)
+        shown.append(_shown(run.name, run.folder, attack_of(run.folder), summary, results))
+    _check_photographs(shown)
+    return shown, len(every) - len(shared)
+
+
+def precision_recall(runs: Sequence[ShownRun]) -> list[Chart]:
+    """Precision over recall of the headline's class at IoU 0.5; nothing where there is no object to find.
+
+    Of one run by both label modes, of several by labels that moved.
+    """
+    several = len(runs) > 1
+    before: dict[str, Line | None] = {}
+    after: list[Line | None] = []
+    for run in runs:
+        detector = run.summary.detector
+        if detector not in before:
+            name = f"before, {detector}" if several else "before"
+            before[detector] = _curve(run, "benign", "benign", name)
+        after.append(_curve(run, "moved", "attacked", f"{run.name}, after" if several else "after, moved labels"))
+        if not several:
+            after.append(_curve(run, "benign", "attacked", "after, benign labels (paper)"))
+    told, unchanged = ([line for line in lines if line is not None] for lines in (after, before.values()))
+    if not told:
+        return []
+    note = "Best precision at that recall or a higher one, as AP50 has it; dots: where detections from t* on end."
+    room = max(_MOST_LINES - len(unchanged), 1)
+    if len(told) > room:
+        note += f" The first {room} of {len(told)} runs."
+    # several runs come first, so that each has one colour in all charts
+    lines = [*told[:room], *unchanged] if several else [*unchanged, *told]
+    headline = runs[0].summary.headline
+    title = f"Precision over recall: {headline}, IoU 0.5"
+    return [Chart(title, "recall, %", "precision, %", lines, note)]
+
+
+def query_curves(study: Path) -> list[Chart]:
+    """Frames broken after so many queries, where a study has these curves. Raises FormatError."""
+    found = files.read_json(study / "study.json")
+    points = found.get("curves", []) if isinstance(found, dict) else []
+    if not points:
+        return []
+    try:
+        # in the order in which the arms' folders are shown
+        lines = [_queries(name, points) for name in sorted({point["name"] for point in points})]
+        most = max(int(point["queries"]) for point in points)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(str(study / "study.json"), "curves of a study", error) from error
+    note = "A query is one gradient, or one judged render."
+    banded = [line.name for line in lines[:_MOST_LINES] if line.band]
+    if banded:
+        note += f" Band: 95 % of draws of frames, {banded[0]}."
+    if len(lines) > _MOST_LINES:
+        note += f" The first {_MOST_LINES} of {len(lines)} arms."
+    return [
+        Chart(
+            title="Frames broken after so many queries",
+            x_label="queries",
+            y_label="frames broken, %",
+            lines=lines[:_MOST_LINES],
+            note=note,
+            x_range=(1.0, float(max(most, 2))),
+            doubling=True,
+        )
+    ]
+
+
+def _queries(name: str, points: Sequence[dict[str, Any]]) -> Line:
+    mine = [p for p in points if p["name"] == name and p["share"] is not None]
+    first = name == points[0]["name"]
+    bounded = [p for p in mine if first and p["low"] is not None and p["high"] is not None]
+    return Line(
+        name=name,
+        points=tuple((float(p["queries"]), 100 * float(p["share"])) for p in mine),
+        mark=(float(mine[-1]["queries"]), 100 * float(mine[-1]["share"])) if mine else None,
+        band=tuple((float(p["queries"]), 100 * float(p["low"]), 100 * float(p["high"])) for p in bounded),
+        steps=True,
+    )
+
+
+def _shown(
+    name: str, folder: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]
+) -> ShownRun:
+    return ShownRun(
+        name=name,
+        folder=folder,
+        summary=summary,
+        frames=tuple(sorted(results, key=lambda r: r.identifier)),
+        method=config.method,
+        command=command_line("attack", config, _NOT_TOLD),
+        weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
+        paper=None if config.method in _NOT_THE_PAPERS else _paper(summary.params),
+    )
+
+
+def _paper(params: tuple[str, ...]) -> PaperFigure | None:
+    """The paper's mAP for the same parameters, alone or as one of its combinations."""
+    known = {(str(one),): after for one, after in PAPER_SINGLE.items()}
+    known |= {tuple(str(p) for p in combo(number)): PAPER_COMBOS[number] for number in COMBO_NUMBERS}
+    return PaperFigure(PAPER_BENIGN, known[params]) if params in known else None
+
+
+def _weather(identifier: str) -> str | None:
+    """Virtual KITTI's variation in a frame's name, where it is weather."""
+    return next((word for word in identifier.replace("_", "/").split("/") if word in WEATHERS), None)
+
+
+def _curve(run: ShownRun, labels: str, seen: str, name: str) -> Line | None:
+    summary = run.summary
+    judged = _judged(summary)
+    if summary.headline not in judged.names or not run.frames:
+        return None
+    targets, found = boxes_of(run.frames, judged, labels, seen)
+    outcome = Outcome.of(targets, found, judged.names.index(summary.headline))
+    samples = sampled_curve(outcome.candidates.tally(outcome.match, 0))
+    if not samples:
+        return None
+    points = tuple((100 * recall, 100 * precision) for recall, precision, _ in samples)
+    above = [i for i, (_, _, score) in enumerate(samples) if score >= summary.t_star]
+    return Line(name, points, points[above[-1]] if above else None)
+
+
+def _judged(summary: RunSummary) -> JudgedClasses:
+    """Without the detector: a run's results hold none but judged classes."""
+    names = tuple(summary.benign.per_class)
+    return JudgedClasses(names, names)
+
+
+def _again(summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
+    """The figures of some of a run's frames."""
+    return replace(summary, **tally(results, _judged(summary), summary.t_star, summary.headline))
+
+
+def _summary(path: Path) -> RunSummary:
+    """The inverse of `RunSummary.to_json`. Raises FormatError naming the file and what is wrong."""
+    data = files.read_json(path)
+    try:
+        plain = {
+            name: data[name]
+            for name in ("out", "dataset", "detector", "headline", "t_star", "frames", "frames_without_vehicles")
+        }
+        plain |= {name: data[name] for name in ("frames_failed", "objects", "successes_paper", "successes_moved")}
+        plain |= {name: data[name] for name in ("feasible_fraction", "queries", "seconds")}
+        return RunSummary(
+            **plain,
+            params=tuple(data["params"]),
+            benign=_scores(data["benign"]),
+            rerendered=_scores(data["rerendered"]),
+            attacked_paper=_scores(data["attacked"]["paper"]),
+            attacked_moved=_scores(data["attacked"]["moved"]),
+            lost_objects=dict(data["lost_objects_by_class"]),
+            phantoms=dict(data["phantoms_by_class"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(str(path), "the figures of a run", error) from error
+
+
+def _scores(data: dict[str, Any]) -> Scores:
+    names = ("ap50", "ap70", "ap", "recall", "recall_at_t_star", "objects")
+    return Scores(
+        headline=ClassScores(**{name: data[name] for name in names}),
+        overall=ClassScores(**data["overall"]),
+        per_class={name: ClassScores(**one) for name, one in data["per_class"].items()},
+    )
+
+
+def _check_photographs(runs: Sequence[ShownRun]) -> None:
+    """Frames of the same name must be the same photograph."""
+    first, *others = runs
+    for result in first.frames:
+        mine = _photograph(first, result.identifier)
+        for run in others:
+            if not np.array_equal(mine, _photograph(run, result.identifier)):
+                found = f"another picture of frame {result.identifier} in {run.folder} than in {first.folder}"
+                raise UsageError("RUN", "runs on the same photographs", found)
+
+
+def _photograph(run: ShownRun, identifier: str) -> np.ndarray:
+    return np.frombuffer(files.read_bytes(run.folder / "frames" / identifier / "benign.png"), np.uint8)

@@ -1,0 +1,46 @@
+"""What the frames of a run add up to: said once, for runs and for parts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.attack.judging import JudgedClasses
+from drivesem.evaluation import coco
+from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.results import FrameResult
+
+
+def boxes_of(
+    results: Sequence[FrameResult], judged: JudgedClasses, labels: str, seen: str
+) -> tuple[list[Targets], list[Detections]]:
+    """Targets and detections of each frame. labels: benign or moved; seen: benign, rerendered or attacked."""
+    targets = [judged.targets(as_targets(getattr(r, f"targets_{labels}"), CLASSES)) for r in results]
+    return targets, [as_detections(getattr(r, f"detections_{seen}"), judged.names) for r in results]
+
+
+def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, headline: str) -> dict[str, Any]:
+    """Those fields of `RunSummary` that follow from its frames, by name."""
+
+    def scores(labels: str, seen: str) -> coco.Scores:
+        return coco.evaluate(*boxes_of(results, judged, labels, seen), judged.names, t_star, headline)
+
+    def count(kind: str) -> dict[str, int]:
+        labels = [failure.label for r in results for failure in r.failures if failure.kind == kind]
+        return {name: labels.count(name) for name in judged.names}
+
+    return {
+        "frames": len(results),
+        "objects": sum(r.objects for r in results),
+        "benign": scores("benign", "benign"),
+        "rerendered": scores("benign", "rerendered"),
+        "attacked_paper": scores("benign", "attacked"),
+        "attacked_moved": scores("moved", "attacked"),
+        "lost_objects": count("lost"),
+        "phantoms": count("phantom"),
+        "successes_paper": sum(r.success_paper for r in results),
+        "successes_moved": sum(r.success_moved for r in results),
+        "feasible_fraction": sum(r.feasible for r in results) / len(results) if results else None,
+        "queries": sum(r.queries for r in results),
+    }

@@ -1,0 +1,1 @@
+"""Where scenes come from: data sets, photographs without labels, the embedded demo."""

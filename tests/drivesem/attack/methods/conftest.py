@@ -1,0 +1,65 @@
+"""Problems known in full: a loss that rises along one direction, of parameters in three groups."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from drivesem.attack.feasible import Projected
+from drivesem.attack.methods.base import Group, Problem, Score
+
+GROUPS = (Group("near", slice(0, 2)), Group("wide", slice(2, 5)), Group("code", slice(5, 6)))
+STEP = torch.tensor([0.1, 0.1, 0.02, 0.02, 0.02, 0.25])
+LOWER = torch.tensor([-0.5, -0.5, -1.0, -1.0, -1.0, 0.0])
+UPPER = torch.tensor([0.5, 0.5, 1.0, 1.0, 1.0, 1.0])
+SLOPE = torch.tensor([1.0, 0.2, 0.3, -0.3, 0.1, 2.0])
+"""Of the loss, for each step."""
+
+
+class Slope:
+    """Loss SLOPE . theta / STEP; feasible is the box, and a sum of the first two coordinates of at most `fence`;
+    something is lost where the loss is above `need` and all groups named in `together` are moved. Beyond a loss of
+    `sight` the render shows what may not be.
+    """
+
+    def __init__(
+        self, need: float = 6.0, fence: float = 10.0, together: tuple[str, ...] = (), sight: float = 1e6
+    ) -> None:
+        self.need, self.fence, self.together, self.sight = need, fence, together, sight
+        self.gradients: list[Tensor] = []
+        self.scored: list[Tensor] = []
+
+    def loss(self, theta: Tensor) -> Tensor:
+        return (SLOPE * theta / STEP).sum()
+
+    def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
+        self.gradients.append(theta.clone())
+        return float(self.loss(theta)), SLOPE / STEP
+
+    def project(self, theta: Tensor) -> Projected:
+        inside = torch.minimum(torch.maximum(theta, LOWER), UPPER)
+        active = () if torch.equal(inside, theta) else ("bounds",)
+        if float(inside[:2].sum()) > self.fence + 1e-6:
+            inside[:2] *= self.fence / inside[:2].sum()
+            active = (*active, "fence")
+        return Projected(inside, active)
+
+    def score(self, theta: Tensor) -> Score:
+        self.scored.append(theta.clone())
+        moved = {group.name for group in self.problem.moved(theta)}
+        lost = int(float(self.loss(theta)) > self.need and moved.issuperset(self.together))
+        violations = ("objects[0]: visibility",) if float(self.loss(theta)) > self.sight else ()
+        return Score(float(self.loss(theta)), lost, 0, bool(lost) and not violations, False, violations)
+
+    @property
+    def problem(self) -> Problem:
+        return Problem(self.loss_and_grad, self.project, self.score, STEP, LOWER, UPPER, GROUPS)
+
+
+@pytest.fixture
+def slope() -> Callable[..., Slope]:
+    """The factory of such problems."""
+    return Slope

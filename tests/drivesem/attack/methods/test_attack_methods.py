@@ -1,0 +1,152 @@
+"""Methods as a user types them, on an embedded scene; budgets in a run; options that belong to other methods."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from detectors.base import Detector, RawPredictions
+from detectors.types import CLASSES, Detections
+from drivesem.cli import main
+from drivesem.run import attack as run_attack
+from drivesem.run.finished import load_runs
+from drivesem.run.results import load_frame
+from drivesem.synth import demo
+
+WORDS = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--json", "--steps", "3"]
+
+
+class Dazzled(Detector):
+    """Sees a car in a corner where there is none, surer the darker the picture is than the first it was shown."""
+
+    name, classes, t_star = "dazzled", CLASSES, 0.5
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.usual: float | None = None
+
+    def forward(self, images: torch.Tensor) -> RawPredictions:
+        mean = images.mean()
+        if self.usual is None:
+            self.usual = float(mean)
+        score = 0.3 + 20 * (self.usual - mean)
+        box = torch.tensor([[[0.0, 0.0, 20.0, 20.0]]])
+        return RawPredictions(box, box, score.expand(1, 1, len(CLASSES)), score.expand(1, 1), (2, 2))
+
+    def loss(self, raw: RawPredictions, targets: Any) -> dict[str, torch.Tensor]:
+        return {"objectness": raw.confidence_logits.sum()}
+
+    def decode(self, raw: RawPredictions) -> list[Detections]:
+        score = raw.confidence_logits[0].clamp(0, 1)
+        return [Detections(raw.boxes_xyxy[0], torch.tensor([CLASSES.index("Car")]), score)]
+
+
+def attack(words: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main([*WORDS, "--out", str(out), *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+_scene_once = functools.cache(demo.demo_scene)
+
+
+@pytest.fixture(autouse=True)
+def dazzled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Dazzled())
+    monkeypatch.setattr(demo, "demo_scene", _scene_once)
+
+
+@pytest.mark.parametrize(
+    ("words", "queries"),
+    [
+        (["--method", "sgd", "--rate", "0.5"], 3),
+        (["--method", "sgd", "--step-form", "raw", "--rate", "2", "--momentum", "0.5"], 3),
+        (["--momentum", "1", "--restarts", "1"], 6),
+        (["--method", "scw", "--queries", "5", "--norm", "1"], 5),
+    ],
+)
+def test_methods_that_follow_the_gradient(
+    words: list[str], queries: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = attack(["--params", "weather,translate", *words], tmp_path, capsys)
+    assert figures["queries"] == queries
+    assert figures["feasible_fraction"] == 1.0
+    assert figures["attacked"]["moved"]["ap50"] is not None
+    result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
+    assert result.success_moved
+    assert [failure.kind for failure in result.failures] == ["phantom"]
+    assert any(c.value != 0 for c in result.theta)
+
+
+def test_subsets_name_the_one_parameter_that_is_enough(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = attack(["--method", "subsets", "--queries", "14"], tmp_path, capsys)
+    assert figures["params"] == ["color", "weather", "foliage", "translate", "rotate", "mesh"]
+    assert figures["queries"] <= 14
+    assert figures["feasible_fraction"] == 1.0
+    result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
+    assert result.success_moved
+    assert {c.name.split(".")[0] for c in result.theta if c.value != 0} == {"weather"}
+
+
+def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("translate: 0.02m\nweather: 0.125\n")
+    out = tmp_path / "run"
+    attack(["--params", "weather,translate,rotate", "--budget", str(own)], out, capsys)
+    own.unlink()
+    assert yaml.safe_load((out / "config.yaml").read_text())["budget"] == "weather=0.125,translate=0.02m"
+    theta = json.loads((out / "frames" / "demo-000" / "theta.json").read_text())
+    assert theta["weather.time_of_day"]["bounds"][1] <= 0.125
+    assert theta["weather.time_of_day"]["value"] == pytest.approx(0.125)
+    assert theta["objects[0].translate.along"]["bounds"][1] < 0.02
+    assert theta["objects[0].yaw"]["bounds"] == pytest.approx([-0.35, 0.35])
+    shown = [float(c["display"].split()[0]) for name, c in theta.items() if "translate" in name]
+    assert max(map(abs, shown)) == pytest.approx(0.02, abs=1e-4)
+    (run,) = load_runs([str(out)])
+    assert (run.params, len(run.frames)) == ("weather,translate,rotate", 1)
+    # The same numbers, written out, are the same run: it is finished already.
+    words = ["--params", "weather,translate,rotate", "--budget", "translate=0.02m,weather=0.125"]
+    before = (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
+    attack(words, out, capsys)
+    assert (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--rate", "0"], "--rate: expected a number above 0, found 0"),
+        (
+            ["--method", "fgsm", "--rate", "2"],
+            "--rate: expected --method si-fgsm, apgd, sgd, scw beside it, found fgsm",
+        ),
+        (["--step-form", "raw"], "--step-form: expected --method sgd beside it, found si-fgsm"),
+        (
+            ["--method", "scw", "--momentum", "1"],
+            "--momentum: expected --method si-fgsm, sgd beside it, found scw",
+        ),
+        (["--momentum", "2"], "--momentum: expected a number in [0, 1], found 2"),
+        (["--norm", "1"], "--norm: expected --method scw beside it, found si-fgsm"),
+        (["--restarts", "-1"], "--restarts: expected at least 0, found -1"),
+        (
+            ["--method", "halton", "--restarts", "1"],
+            "--restarts: expected --method si-fgsm, apgd, fgsm, sgd, scw beside it",
+        ),
+        (["--method", "sgd", "--queries", "9"], "--queries: expected --method random, halton, sobol, cma-es, scw"),
+        (["--method", "subsets", "--queries", "1"], "--queries: expected at least 2 with subsets, found 1"),
+        (["--method", "subsets", "--early-stop"], "--early-stop: expected a method that may end at the first"),
+        (["--budget", "parkng"], "--budget: expected paper, parking, a YAML file, or NAME=VALUE with commas"),
+        (["--budget", "nowhere.yaml"], "nowhere.yaml: expected a readable file"),
+        (["--budget", "spin=1"], "--budget: spin: expected one of color, weather"),
+    ],
+)
+def test_options_that_do_not_fit_are_named(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert refused(*WORDS, *words).startswith(f"drivesem: {message}")

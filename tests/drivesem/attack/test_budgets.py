@@ -1,0 +1,108 @@
+"""Budgets as people write them, and the bounds that come of them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivesem.attack.budgets import budget_of, written
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import FormatError, RangeError
+
+
+def test_presets():
+    assert budget_of("paper") == Budget()
+    parking = budget_of("parking")
+    assert parking == Budget(translate_m=0.5, rotate=math.radians(5))
+
+
+def test_a_file_says_what_is_tighter_than_the_papers(tmp_path: Path):
+    path = tmp_path / "own.yaml"
+    path.write_text("translate: 0.1\nrotate: 5deg\nmesh: 0.05\n")
+    assert budget_of(str(path)) == Budget(translate=0.1, rotate=math.radians(5), mesh=0.05)
+    path.write_text("translate: 0.3m\nrotate: 0.2\n")
+    assert budget_of(str(path)) == Budget(translate_m=0.3, rotate=0.2)
+    path.write_text("# nothing\n")
+    assert budget_of(str(path)) == Budget()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rotates: 5deg\n", "own.yaml: rotates: expected one of color, weather, foliage, translate, rotate, mesh"),
+        ("rotate: 5\n", "own.yaml: rotate: expected a positive number of at most 0.35, found 5"),
+        ("rotate: 5m\n", "own.yaml: rotate: expected a finite number, found '5m'"),
+        ("rotate: '0.1'\n", "own.yaml: rotate: expected a unit: 0.1deg or 0.1rad, found '0.1'"),
+        ("translate: 0\n", "own.yaml: translate: expected a positive number of at most 0.25, found 0"),
+        ("translate: -0.5m\n", "own.yaml: translate: expected a positive number, found -0.5m"),
+        ("mesh: true\n", "own.yaml: mesh: expected a finite number, found True"),
+        ("weather: .nan\n", "own.yaml: weather: expected a finite number, found nan"),
+        ("color: [0.1]\n", r"own.yaml: color: expected a finite number, found \[0.1\]"),
+        ("- rotate\n", "own.yaml: expected a mapping, found list"),
+        ("rotate: [\n", "own.yaml: expected YAML"),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, text: str, message: str):
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=message) as caught:
+        budget_of(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_budget_is_named(tmp_path: Path):
+    with pytest.raises(UsageError, match="--budget: expected paper, parking, a YAML file, or NAME=VALUE"):
+        budget_of("generous")
+    with pytest.raises(FormatError, match=r"nowhere\.yaml: expected a readable file"):
+        budget_of(str(tmp_path / "nowhere.yaml"))
+    with pytest.raises(FormatError, match="--budget: rotate: expected each parameter once"):
+        budget_of("rotate=5deg,rotate=6deg")
+
+
+_LIMITS = st.floats(1e-6, 0.25)
+
+
+@given(
+    narrowed=st.dictionaries(st.sampled_from([p.value for p in Parameter]), _LIMITS),
+    metres=st.none() | st.floats(1e-3, 10),
+)
+def test_what_is_written_reads_back(narrowed, metres):
+    if metres is not None:
+        narrowed = {**narrowed, "translate": 0.25, "translate_m": metres}
+    budget = Budget(**narrowed)
+    assert budget_of(written(budget)) == budget
+
+
+def test_metres_are_the_same_for_long_and_short_cars(street):
+    scene = street()
+    length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
+    scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
+    space = ParameterSpace(scene, ("translate", "rotate"), budget_of("parking"))
+    reach_m = (space.upper[:8].reshape(4, 2) * length_m[:, None]).tolist()
+    # A quarter of the third car's own length is less than half a metre.
+    assert reach_m == [pytest.approx([m, m]) for m in (0.5, 0.5, 0.4, 0.5)]
+    assert torch.equal(space.lower, -space.upper)
+    assert space.upper[8:].tolist() == pytest.approx([math.radians(5)] * 4)
+    far = FeasibleSet(space).project(space.theta0 + 1).theta
+    assert bool((far <= space.upper).all())
+    moved = space.apply(scene, space.upper).objects.translation - scene.objects.translation
+    assert float(moved.norm(dim=1).max()) <= 0.5 * math.sqrt(2) + 1e-5
+
+
+def test_the_papers_budget_is_the_same_for_all(street):
+    space = ParameterSpace(street(), ("translate",))
+    assert space.upper.tolist() == [0.25] * 8
+
+
+def test_metres_must_be_positive():
+    with pytest.raises(RangeError, match=r"budget\.translate_m: expected a positive number, found 0"):
+        Budget(translate_m=0.0)
+    with pytest.raises(RangeError, match=r"budget\.translate: expected a positive number, found inf"):
+        Budget(translate=math.inf)

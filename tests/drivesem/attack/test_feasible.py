@@ -1,0 +1,334 @@
+import ast
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import drivesem.attack.feasibility_check
+from drivesem.attack.feasibility_check import _Car, _collisions, check_scene, overlap_area
+from drivesem.attack.feasible import FeasibleSet, Limits, _Cars, _gap, _overlap, project, violations
+from drivesem.attack.space import COMBOS, ParameterSpace
+from scene_ir import ffd
+from scene_ir.errors import RangeError, ShapeError
+
+CROWDED = ((-2.2, 8.0), (-2.2, 12.9), (0.2, 8.3), (2.4, 10.0), (2.4, 15.2), (0.1, 14.0))
+
+
+def _names(lines) -> set[str]:
+    return {line.split(": ")[1] for line in lines}
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**31), scale=st.floats(0.1, 3.0), number=st.sampled_from(sorted(COMBOS)))
+def test_projection_is_inside_idempotent_and_confirmed_by_the_second_check(street, seed, scale, number):
+    scene = street(positions_xz=CROWDED, road_edge_x_m=4.0)
+    space = ParameterSpace(scene, COMBOS[number])
+    feasible = FeasibleSet(space)
+    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(seed)) * 10 * scale * space.step
+    once = feasible.project(theta)
+    assert feasible.violations(once.theta) == ()
+    assert bool((once.theta >= space.lower).all())
+    assert bool((once.theta <= space.upper).all())
+    twice = feasible.project(once.theta)
+    assert torch.equal(twice.theta, once.theta)
+    assert twice.active == ()
+    assert check_scene(scene, space.apply(scene, once.theta)) == []
+
+
+def test_projection_is_deterministic(street):
+    scene = street(positions_xz=CROWDED)
+    space = ParameterSpace(scene, COMBOS[2])
+    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(1)) * 10 * space.step
+    assert torch.equal(project(space, scene, theta).theta, project(space, scene, theta).theta)
+
+
+def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(street):
+    scene = street(positions_xz=((0.0, 10.0), (0.5, 11.0), (0.2, 10.5), (-9.0, 9.0)), road_edge_x_m=1.0)
+    strained = torch.randn(4, 64, 3, generator=torch.Generator().manual_seed(2)) * 0.2
+    scene = scene.with_objects(ffd=strained)
+    space = ParameterSpace(scene, COMBOS[2])
+    result = project(space, scene, space.theta0)
+    assert torch.equal(result.theta, space.theta0)
+    assert result.active == ()
+    assert violations(space, scene, space.theta0) == ()
+    assert check_scene(scene, space.apply(scene, space.theta0)) == []
+
+
+def test_a_start_that_violates_something_is_kept_and_named(street):
+    def named(**street_words):
+        space = ParameterSpace(street(**street_words), COMBOS[2])
+        feasible = FeasibleSet(space)
+        assert feasible.violations(space.theta0) == ()
+        assert torch.equal(feasible.project(space.theta0).theta, space.theta0)
+        return set(feasible.violated_at_start)
+
+    assert named() == set()
+    overlapping = {"positions_xz": ((0.0, 10.0), (1.0, 13.0), (6.0, 20.0)), "yaw": -math.pi / 2}
+    assert {"objects[0]: collision", "objects[1]: collision"} <= named(**overlapping)
+    assert not any(name.startswith("objects[2]") for name in named(**overlapping))
+    # Footprints 2 cm apart: less than the clearance.
+    assert named(positions_xz=((0.0, 10.0), (0.0, 14.22)), yaw=-math.pi / 2) >= {"objects[0]: collision"}
+    assert named(positions_xz=((0.0, 10.0), (6.0, 14.0)), road_edge_x_m=2.0) == {"objects[1]: road"}
+    assert "objects[0]: frame" in named(positions_xz=((9.5, 9.0),), yaw=0.0)
+    assert "objects[1]: visibility" in named(positions_xz=((0.0, 10.0), (0.5, 11.5)))
+
+
+def test_a_mesh_that_is_strained_at_the_start_is_named(street):
+    scene = street()
+    offsets = scene.objects.ffd.clone()
+    offsets[2] = 0.5 * _stretch(scene.objects)[2]
+    space = ParameterSpace(scene.with_objects(ffd=offsets), COMBOS[2])
+    assert FeasibleSet(space).violated_at_start == ("objects[2]: strain",)
+
+
+def test_a_feasible_theta_is_returned_to_the_bit(street):
+    scene = street()
+    space = ParameterSpace(scene, ("translate", "rotate"))
+    theta = 3 * space.step
+    assert torch.equal(project(space, scene, theta).theta, theta)
+
+
+def test_bounds_are_named(street):
+    scene = street()
+    space = ParameterSpace(scene, ("rotate",))
+    theta = space.theta0.clone()
+    theta[2] = 1.0
+    result = project(space, scene, theta)
+    assert float(result.theta[2]) == pytest.approx(0.35)
+    assert result.active == ("objects[2].yaw: bounds",)
+    assert violations(space, scene, theta) == ("objects[2].yaw: bounds",)
+
+
+def test_strain_and_the_lowest_layer(street):
+    scene = street()
+    space = ParameterSpace(scene, ("mesh",))
+    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(4)) * 0.15
+    result = project(space, scene, theta)
+    offsets = ffd.from_symmetric(result.theta.reshape(4, 96)).double()
+    assert float(offsets.reshape(4, 4, 4, 4, 3)[:, :, -1, :, 1].abs().max()) == 0
+    axis = torch.linspace(0, 1, 9, dtype=torch.float64)
+    points = torch.cartesian_prod(axis - 0.5, axis - 1, axis - 0.5)
+    strain = torch.linalg.svdvals(ffd.jacobian(points, offsets))
+    assert float(strain.min()) > 0.69
+    assert float(strain.max()) < 1.41
+    # Scaled back no further than needed: each car's strain is at its bound, to the bisection's resolution.
+    per_car = torch.maximum((1 - strain.amin(dim=(1, 2))) / 0.3, (strain.amax(dim=(1, 2)) - 1) / 0.4)
+    assert float(per_car.min()) > 0.8
+    assert {f"objects[{i}]: strain" for i in range(4)} <= set(result.active)
+
+
+def test_cars_that_would_collide_stop_short_of_each_other(street):
+    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0), (6.0, 14.0)), yaw=-math.pi / 2)
+    space = ParameterSpace(scene, ("translate",))
+    theta = space.theta0.clone()
+    theta[0], theta[2], theta[4] = 0.25, -0.25, 0.2  # 1.05 m each, with 0.8 m between them; the third is free
+    assert _names(violations(space, scene, theta)) == {"collision"}
+    result = project(space, scene, theta)
+    moved = space.apply(scene, result.theta).objects.translation
+    gap = float(moved[1, 2] - moved[0, 2]) - 4.2
+    assert 0.04 < gap < 0.4
+    assert float(result.theta[4]) == pytest.approx(0.2)
+    assert set(result.active) == {"objects[0]: collision", "objects[1]: collision"}
+
+
+def test_a_kerb_stops_the_car_across_but_not_along(street):
+    scene = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
+    space = ParameterSpace(scene, ("translate",))
+    result = project(space, scene, torch.tensor([0.2, 0.25]))
+    assert result.active == ("objects[0]: road",)
+    assert float(result.theta[0]) == pytest.approx(0.2)
+    assert 0 < float(result.theta[1]) < 0.12
+
+
+def test_a_car_beside_the_road_may_go_anywhere(street):
+    scene = street(positions_xz=((8.0, 14.0),), road_edge_x_m=3.0)
+    space = ParameterSpace(scene, ("translate",))
+    assert project(space, scene, torch.tensor([0.25, 0.25])).active == ()
+
+
+def test_a_car_stays_in_the_picture(street):
+    scene = street(positions_xz=((6.9, 9.0),), yaw=0.0)
+    space = ParameterSpace(scene, ("translate",))
+    theta = torch.tensor([0.25, 0.0])
+    assert _names(violations(space, scene, theta)) == {"frame"}
+    assert check_scene(scene, space.apply(scene, theta)) != []
+    result = project(space, scene, theta)
+    assert 0 < float(result.theta[0]) < 0.25
+    assert violations(space, scene, result.theta) == ()
+
+
+def test_a_car_is_not_hidden_behind_another(street):
+    # The far car looks out on one side of the near one and would go behind it.
+    scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
+    space = ParameterSpace(scene, ("translate",))
+    theta = torch.tensor([0.0, -0.2, 0.0, 0.25])  # across is towards -x: both move to one another in the picture
+    assert "visibility" in _names(violations(space, scene, theta))
+    result = project(space, scene, theta)
+    assert violations(space, scene, result.theta) == ()
+    assert "visibility" in _names(result.active)
+    assert float(result.theta.abs().max()) > 0.02
+
+
+def test_a_growing_mesh_does_not_reach_into_a_neighbour(street):
+    scene = street(positions_xz=((0.0, 10.0), (1.9, 10.0)), yaw=-math.pi / 2)
+    space = ParameterSpace(scene, ("mesh",))
+    wide = torch.zeros(2, 4, 4, 2, 3)
+    wide[..., 2] = -0.09  # the half at z < 0 goes outwards, and the other with it
+    theta = wide.reshape(-1)
+    assert _names(violations(space, scene, theta)) == {"collision"}
+    result = project(space, scene, theta)
+    assert check_scene(scene, space.apply(scene, result.theta)) == []
+    assert float(result.theta.abs().max()) > 0.005
+
+
+def test_errors_name_what_is_wrong(street):
+    scene = street()
+    space = ParameterSpace(scene, ("rotate",))
+    feasible = FeasibleSet(space)
+    with pytest.raises(ShapeError, match="theta"):
+        feasible.project(torch.zeros(3))
+    with pytest.raises(RangeError, match=r"objects\[1\]\.yaw: expected a finite value"):
+        feasible.project(torch.tensor([0.0, math.inf, 0.0, 0.0]))
+    with pytest.raises(RangeError, match="scene"):
+        project(space, street(), space.theta0)
+
+
+def test_a_scene_without_cars_is_projected_onto_its_bounds(street):
+    scene = street(positions_xz=())
+    space = ParameterSpace(scene, ("weather", "translate"))
+    result = project(space, scene, torch.tensor([2.0, -1.0, 0.5, 0.0]))
+    assert result.theta.tolist() == [1.0, 0.0, 0.5, 0.0]
+    assert check_scene(scene, space.apply(scene, result.theta)) == []
+
+
+def test_limits_are_settings(street):
+    scene = street()
+    space = ParameterSpace(scene, ("mesh",))
+    theta = 0.1 * torch.randn(space.dim, generator=torch.Generator().manual_seed(4))
+    loose = project(space, scene, theta, Limits(strain=(0.5, 2.0)))
+    tight = project(space, scene, theta, Limits(strain=(0.95, 1.05)))
+    assert float(tight.theta.norm()) < 0.5 * float(loose.theta.norm())
+
+
+# The second check.
+
+
+def test_the_second_check_shares_no_code():
+    tree = ast.parse(Path(drivesem.attack.feasibility_check.__file__).read_text(encoding="utf-8"))
+    imported = {
+        n.module if isinstance(n, ast.ImportFrom) else a.name
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Import | ast.ImportFrom)
+        for a in n.names
+    }
+    assert imported <= {
+        *("__future__", "collections.abc", "dataclasses", "math"),
+        *("cv2", "numpy", "numpy.typing", "scene_ir.types"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda o: {"translation": o.translation + torch.tensor([0.0, 0.1, 0.0])}, "off the ground"),
+        (lambda o: {"translation": o.translation + torch.tensor([0.0, 0.0, 1.2])}, "own lengths"),
+        (lambda o: {"yaw": o.yaw + 0.5}, "turned by 0.500 rad"),
+        (lambda o: {"size_lhw": o.size_lhw * 1.1}, "objects.size_lhw: changed"),
+        (lambda o: {"texture_code": o.texture_code + 2}, "objects.texture_code: outside"),
+        (lambda o: {"ffd": o.ffd + 0.3 * torch.randn(o.ffd.shape, generator=_generator())}, "strain in"),
+        (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.05, 0.0])}, "lowest lattice layer"),
+        (lambda o: {"ffd": -2 * _stretch(o)}, "mesh inverted"),
+        (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.0, 0.05])}, "mesh not symmetric"),
+        (lambda o: {"ffd": o.ffd + 0.6 * _stretch(o)}, "lattice bent by 0.300 unit boxes"),
+    ],
+)
+def test_the_second_check_finds_what_is_wrong(street, change, said):
+    scene = street()
+    found = check_scene(scene, scene.with_objects(**change(scene.objects)))
+    assert any(said in line for line in found), found
+
+
+def _generator():
+    return torch.Generator().manual_seed(0)
+
+
+def _stretch(objects):
+    """Offsets that double the length."""
+    along = torch.linspace(-0.5, 0.5, 4).reshape(4, 1, 1).expand(4, 4, 4).reshape(64)
+    offsets = torch.zeros_like(objects.ffd)
+    offsets[..., 0] = along
+    return offsets
+
+
+def test_the_second_check_finds_collisions_roads_and_hiding(street):
+    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=-math.pi / 2)
+    near = scene.with_objects(translation=scene.objects.translation - torch.tensor([[0.0, 0, 0], [0, 0, 1.0]]))
+    assert any("collision with objects[0]" in line for line in check_scene(scene, near))
+    narrow = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
+    left = narrow.with_objects(translation=narrow.objects.translation + torch.tensor([0.9, 0.0, 0.0]))
+    assert any("left the road" in line for line in check_scene(narrow, left))
+    # The near one is taller than the camera stands, so that it can hide the far one.
+    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
+    assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
+
+
+def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):
+    scene = street(positions_xz=((0.0, 10.0), (1.8, 10.0)), yaw=0.0)
+    scene = scene.with_objects(yaw=torch.tensor([0.0, math.pi / 2]))
+    before, after = [_Car(scene, i) for i in range(2)], [_Car(scene, i) for i in range(2)]
+    shared = overlap_area(before[0].outline, before[1].outline)
+    assert overlap_area(before[0].footprint, before[1].footprint) > shared > 1
+    # The same rectangles, and a mesh that was a spindle in one of them.
+    before[1].vertices = _spindle(before[1])
+    less = overlap_area(before[0].outline, before[1].outline)
+    assert less < shared - 0.2
+    found = _collisions(dict(enumerate(before)), dict(enumerate(after)))
+    assert found == [f"objects[1]: mesh runs into that of objects[0], {shared:.2f} m2 ({less:.2f} before)"]
+    assert _collisions(dict(enumerate(after)), dict(enumerate(before))) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(after))) == []
+
+
+def _spindle(car):
+    """The vertices of a car's mesh, the narrower the further they are from its middle."""
+    local = (car.vertices - car.position) @ car.axes.T
+    local[:, 2] *= 1 - np.abs(local[:, 0]) / (car.high[0] - car.low[0]) * 1.8
+    return local @ car.axes + car.position
+
+
+def test_overlap_area_of_known_shapes():
+    square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])
+    assert overlap_area(square, square + 1) == pytest.approx(1.0)
+    assert overlap_area(square, square + 3) == 0.0
+    assert overlap_area(square, square) == pytest.approx(4.0)
+    diamond = np.array([[1.0, -1], [3, 1], [1, 3], [-1, 1]])
+    assert overlap_area(square, diamond) == pytest.approx(4.0)
+    assert overlap_area(square, diamond + 1) == pytest.approx(2.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_both_ways_agree_on_gap_and_overlap(seed):
+    draw = np.random.default_rng(seed)
+    yaw = draw.uniform(-3, 3, 2)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    low, size, at = draw.uniform(-3, 0, (2, 3)), draw.uniform(1, 5, (2, 3)), draw.uniform(-2.5, 2.5, (2, 3))
+    cars = _Cars.of(low, low + size, yaw, at)
+    corners = np.array([[1, 0], [1, 1], [0, 1], [0, 0]]) * size[:, None, ::2] + low[:, None, ::2]
+    rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
+    footprints = corners @ rotation + at[:, None, ::2]
+    gap, area = _gap(cars, np.arange(2)), _overlap(cars, np.array([0, 1]), np.array([1, 0]))
+
+    def ccw(p):
+        x, z = p.T
+        return p if x @ np.roll(z, -1) - z @ np.roll(x, -1) > 0 else p[::-1]
+
+    expected = overlap_area(ccw(footprints[0]), ccw(footprints[1]))
+    assert area == pytest.approx([expected] * 2, abs=1e-9)
+    assert (gap[0, 1] < 0) == (expected > 0)
+    assert gap[0, 1] == pytest.approx(gap[1, 0], abs=1e-12)

@@ -1,0 +1,268 @@
+"""`drivesem attack` as a user types it: figures, files, going on where it stopped, bad frames."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import pytest
+import torch
+
+from detectors.types import Detections
+from drivesem.attack.feasibility_check import check_scene
+from drivesem.cli import main
+from drivesem.run import attack as run_attack
+from drivesem.run.results import load_frame
+from drivesem.settings.commands import GRADIENT_FREE, Attack
+from drivesem.synth.write import Order, synthesise
+from scene_ir.io import load_scene
+
+WORDS = ["attack", "--combo", "2", "--steps", "2", "--json"]
+PARTS = ("benign.png", "rerender.png", "counterexample.png", "overlay.png", "difference.png", "theta.json")
+
+
+def attack(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """Run a command that must succeed and print one JSON object on standard output, and nothing else."""
+    capsys.readouterr()
+    assert main(words) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: without_times(v) for k, v in value.items() if k not in ("seconds", "out")}
+    return [without_times(v) for v in value] if isinstance(value, list) else value
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Every file of a run: bytes of pictures and scenes, JSON without times; the page apart, which shows times."""
+    found: dict[str, Any] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "report.html"):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".json":
+            found[name] = without_times(json.loads(path.read_text()))
+        elif path.suffix == ".yaml":
+            found[name] = [ln for ln in path.read_text().splitlines() if not ln.startswith(("out:", "limit:"))]
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "whole"
+    assert main([*WORDS, "--limit", "2", "--out", str(out)]) == 0
+    return out
+
+
+def test_figures(finished: Path) -> None:
+    figures = json.loads((finished / "metrics.json").read_text())
+    for key in ("benign", "rerendered"):
+        assert {"ap50", "ap70", "ap", "recall"} <= set(figures[key])
+    assert set(figures["attacked"]) == {"paper", "moved"}
+    assert figures["out"] == str(finished)
+    assert figures["frames"] == 2
+    assert figures["frames_without_vehicles"] == 0
+    assert figures["objects"] >= 8
+    assert figures["queries"] == 4
+    assert figures["feasible_fraction"] == 1.0
+    assert figures["rerendered"]["ap50"] == pytest.approx(figures["benign"]["ap50"], abs=0.01)
+
+
+def test_folder(finished: Path) -> None:
+    for name in ("demo-000", "demo-001"):
+        folder = finished / "frames" / name
+        assert all((folder / part).is_file() for part in PARTS)
+        result = load_frame(folder / "result.json")
+        assert len(result.loss_trace) == 3
+        assert any(c.value != 0 for c in result.theta)
+        saved = load_scene(folder / "scene")
+        assert check_scene(saved.as_photographed(), saved) == list(result.violations) == []
+        assert (folder / "benign.png").read_bytes() == (folder / "rerender.png").read_bytes()
+        paper, moved = ((folder / f"labels_{mode}.txt").read_text().splitlines() for mode in ("paper", "moved"))
+        assert len(paper) == len(moved) >= result.objects
+    page = (finished / "report.html").read_text()
+    assert "demo-000" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "https://" not in page
+
+
+def test_a_stopped_run_goes_on_and_ends_the_same(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "stopped"
+    shutil.copytree(finished, out)
+    shutil.rmtree(out / "frames" / "demo-001")
+    for name in ("metrics.json", "manifest.json", "report.html"):
+        (out / name).unlink()
+    kept = (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
+    attack([*WORDS, "--limit", "2", "--out", str(out)], capsys)
+    assert (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == kept
+    assert contents(out) == contents(finished)
+
+
+def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(finished)
+    assert main([*WORDS, "--limit", "2", "--out", str(finished), "--seed", "5"]) == 2
+    assert "seed" in capsys.readouterr().err
+    assert contents(finished) == before
+
+
+def test_a_run_of_an_earlier_version_goes_on(finished: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    lines = (out / "config.yaml").read_text().splitlines()
+    assert "target_classes: null" in lines
+    (out / "config.yaml").write_text("\n".join(line for line in lines if line != "target_classes: null"))
+    assert attack([*WORDS, "--limit", "2", "--out", str(out)], capsys)["frames"] == 2
+    capsys.readouterr()
+    assert main([*WORDS, "--limit", "2", "--target-classes", "Car", "--out", str(out)]) == 2
+    assert "found other values of target_classes" in capsys.readouterr().err
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert main([*WORDS, "--limit", "1", "--out", str(tmp_path)]) == 2
+    assert "--out" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.fixture(scope="module")
+def kitti_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames in KITTI's layout: with vehicles, without, with a broken label, and with a car that is too far."""
+    root = tmp_path_factory.mktemp("kitti")
+    for _ in synthesise(Order(root, 4, seed=11, split="heldout")):
+        pass
+    labels = root / "training" / "label_2"
+    lines = [ln for ln in (labels / "000001.txt").read_text().splitlines() if ln.split()[0] == "Pedestrian"]
+    (labels / "000001.txt").write_text("".join(f"{ln}\n" for ln in lines))
+    (labels / "000002.txt").write_text("Car 0.00 0 nan 1 2 30 40 1.5 1.6 3.9 0 1.6 20 0\n")
+    (labels / "000003.txt").write_text("Car 0.00 0 0 600 170 606 173 1.5 1.6 3.9 0 1.6 400 0\n")
+    return root
+
+
+def test_kitti_folder(kitti_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [*WORDS, "--dataset", "kitti", "--root", str(kitti_folder), "--no-fit", "--out", str(tmp_path / "run")]
+    assert main(words) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "000002.txt" in error
+    figures = attack([*words, "--keep-going"], capsys)
+    assert figures["frames"] == 1
+    assert figures["frames_without_vehicles"] == 2
+    assert list(figures["frames_failed"]) == ["000002"]
+    assert figures["feasible_fraction"] == 1.0
+    assert "000002" in (tmp_path / "run" / "report.html").read_text()
+
+
+class Blinking:
+    """A detector without gradient: a car in the middle of the picture, surer the brighter that is."""
+
+    name, classes = "blinking", ("bus", "Car")
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        self.size_hw = images.shape[2:]
+        return images.mean(dim=(1, 2, 3))
+
+    def decode(self, raw: torch.Tensor) -> list[Detections]:
+        h, w = self.size_hw
+        box = torch.tensor([[w / 4, h / 4, 3 * w / 4, 3 * h / 4]])
+        return [Detections(box, torch.tensor([1]), mean[None].clamp(0, 1)) for mean in raw]
+
+
+@pytest.mark.parametrize("method", ["random", "cma-es"])
+def test_searches_run_on_a_detector_without_gradient(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blinking())
+    words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--json", "--out", str(tmp_path)]
+    figures = attack([*words, "--method", method, "--queries", "2", "--t-star", "0.2"], capsys)
+    assert figures["queries"] == 2
+    assert figures["t_star"] == 0.2
+    assert figures["feasible_fraction"] == 1.0
+    assert list(figures["benign"]["per_class"]) == ["Car"]
+    result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
+    assert len(result.loss_trace) == 3
+    assert [d.label for d in result.detections_attacked] == ["Car"]
+    assert ("cma" in json.loads((tmp_path / "manifest.json").read_text())["versions"]) == (method == "cma-es")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            [],
+            "--method: expected one of random, halton, sobol, cma-es for any, which has no gradient",
+        ),
+        (["--method", "sobol", "--objective", "confidence"], "--objective: expected one of objectness, hide"),
+        (["--queries", "3"], "--queries: expected --method random, halton"),
+        (["--method", "fgsm", "--range", "steps"], "--range: expected a method without gradient"),
+        (["--method", "random", "--queries", "0"], "--queries: expected at least 1, found 0"),
+        (["--method", "random", "--precision", "bfloat16"], "--precision: expected float32 with random"),
+        (["--method", "fgsm", "--early-stop"], "--early-stop: expected a method of several steps"),
+        (["--t-star", "1.5"], "--t-star: expected a score in (0, 1], found 1.5"),
+    ],
+)
+def test_what_does_not_go_together_is_named(
+    words: list[str], message: str, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blinking())
+    assert refused("attack", "--detector", "any", *words).startswith(f"drivesem: {message}")
+
+
+def test_methods_are_those_that_need_no_gradient() -> None:
+    names = get_args(get_type_hints(Attack)["method"])
+    free = [name for name in names if not run_attack.attack_method(Attack(method=name)).needs_gradient]
+    assert set(free) == {*GRADIENT_FREE, "placebo"}
+
+
+@pytest.mark.parametrize("objective", ["failure", "hide", "phantom", "localisation", "total"])
+def test_objectives_are_recorded_and_raised(
+    objective: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["attack", "--params", "rotate", "--steps", "2", "--limit", "1", "--json", "--objective", objective]
+    attack([*words, "--out", str(tmp_path / "run")], capsys)
+    (folder,) = (tmp_path / "run" / "frames").iterdir()
+    result = load_frame(folder / "result.json")
+    if not result.failures:  # then the loss alone chose among the iterates
+        assert result.loss_trace[-1] >= result.loss_trace[0] - 1e-3
+    assert f"objective: {objective}" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    aimed = [*WORDS, "--limit", "2", "--target-objects", "0"]
+    attack([*aimed, "--out", str(tmp_path / "one")], capsys)
+    for folder in (tmp_path / "one" / "frames").iterdir():
+        result = load_frame(folder / "result.json")
+        assert all(failure.kind == "lost" and failure.index == 0 for failure in result.failures)
+        assert result.success_moved == bool(result.failures)
+    beyond = attack([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")], capsys)
+    assert (beyond["frames"], beyond["frames_without_vehicles"]) == (0, 1)
+
+
+def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = torch.autograd.grad
+    frames: list[int] = []
+
+    def broken(losses: Any, leaves: Any) -> Any:
+        gradients = whole(losses, leaves)
+        frames.append(len(gradients[0]))
+        if len(frames) == 1:  # of the first frame alone
+            gradients[0][0] = torch.nan
+        return gradients
+
+    monkeypatch.setattr("drivesem.attack.objective.torch.autograd.grad", broken)
+    words = ["attack", "--params", "rotate", "--steps", "1", "--limit", "2", "--workers", "1"]
+    assert main([*words, "--out", str(tmp_path / "ends")]) == 2
+    (line,) = [ln for ln in capsys.readouterr().err.splitlines() if ln.startswith("drivesem:")]
+    assert "gradient of objects[0].yaw: expected a finite value, found nan" in line
+    assert line.startswith("drivesem: frame ")
+    frames.clear()
+    told = attack([*words, "--json", "--keep-going", "--out", str(tmp_path / "goes")], capsys)
+    ((name, reason),) = told["frames_failed"].items()
+    assert told["frames"] == 1
+    assert reason.startswith(f"frame {name}: gradient of objects[0].yaw")

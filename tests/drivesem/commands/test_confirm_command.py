@@ -1,0 +1,142 @@
+"""`drivesem confirm` on a small run of `drivesem attack`: the generator draws what the compositor drew."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from drivesem.cli import main
+from drivesem.questions.confirm import frame as confirm_frame
+from drivesem.questions.confirm.results import load
+from drivesem.run.results import load_frame
+from scene_ir import files
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one embedded frame."""
+    out = tmp_path_factory.mktemp("runs") / "source"
+    words = ["attack", "--method", "halton", "--queries", "2", "--limit", "1", "--workers", "1", "--json"]
+    assert main([*words, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def confirmed(attacked: Path) -> Path:
+    """The run with its frame drawn again beside."""
+    assert main(["confirm", "--run", str(attacked), "--workers", "1", "--json"]) == 0
+    return attacked
+
+
+@pytest.fixture
+def run(confirmed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(confirmed, tmp_path / "source"))
+
+
+@pytest.fixture
+def confirm(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def call(run: Path, *words: object) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main(["confirm", "--run", str(run), "--workers", "1", "--json", *map(str, words)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def test_vehicles_stand_where_the_compositor_put_them(run: Path) -> None:
+    out = run / "confirm"
+    data = json.loads((out / "confirm.json").read_text())
+    assert data["frames"] == 1
+    assert data["not_carried"] == data["frames_failed"] == {}
+    assert data["box_iou"]["boxes"] >= 4
+    # Moves of up to a quarter of a length and 20 degrees: a wrong sign or axis would leave far less.
+    assert data["box_iou"]["mean"] > 0.95
+    assert data["box_iou"]["least"] > 0.85
+    frame = run / "frames" / "demo-000"
+    result, found = (
+        load_frame(frame / "result.json"),
+        load(out / "frames" / "demo-000" / "result.json"),
+    )
+    assert len(found.compositor) == len(result.failures)
+    assert [s.iou_benign for s in found.stands] == pytest.approx([1.0] * result.objects, abs=1e-4)
+    # The photograph is the same picture: the detector finds the same.
+    assert [d.score for d in found.detections_benign] == pytest.approx([d.score for d in result.detections_benign])
+    drawn, benign = (
+        files.read_image(path).astype(float)
+        for path in (out / "frames" / "demo-000" / "generator.png", frame / "benign.png")
+    )
+    composed = files.read_image(frame / "counterexample.png").astype(float)
+    assert np.abs(drawn - composed).mean() < 0.5 * np.abs(benign - composed).mean()
+
+
+def test_files(run: Path) -> None:
+    out = run / "confirm"
+    (row,) = csv.DictReader((out / "confirm.csv").read_text().splitlines())
+    assert row["frame"] == "demo-000"
+    assert "## failures that survive, %" in (out / "confirm.md").read_text()
+    sheet = files.read_image(out / "frames" / "demo-000" / "sheet.png")
+    photograph = files.read_image(run / "frames" / "demo-000" / "benign.png")
+    assert sheet.shape[0] > 2 * photograph.shape[0]
+
+
+def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
+    run: Path, confirm: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = json.loads((run / "confirm" / "confirm.json").read_text())
+    draws: list[int] = []
+    draw = confirm_frame.render_frame
+    monkeypatch.setattr(confirm_frame, "render_frame", lambda plan: draws.append(1) or draw(plan))
+    again = confirm(run)
+    assert again == before | {"run": str(run)}
+    assert draws == []
+    path = run / "frames" / "demo-000" / "result.json"
+    path.write_text(path.read_text().replace('"seconds": ', '"seconds": 1'))
+    assert confirm(run)["rows"] == before["rows"]
+    assert draws == [1, 1]
+
+
+def test_another_picture_is_refused(
+    run: Path, confirm: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    benign = run / "frames" / "demo-000" / "benign.png"
+    image = files.read_image(benign)
+    image[5, 5] ^= 64
+    files.write_png(benign, image)
+    out = run / "again"
+    assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(out)]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert (
+        f"{benign}: expected the picture that the generator makes of this frame, found one 64 levels off" in told
+    )
+    words = ("--run", str(run), "--workers", "1", "--out", str(out), "--keep-going")
+    assert main(["confirm", *words]) == 2
+    assert "a run with frames that can be used" in " ".join(capsys.readouterr().err.split())
+
+
+def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*words: object) -> str:
+        capsys.readouterr()
+        assert main(["confirm", "--workers", "1", *map(str, words)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("drivesem: ")
+
+    assert refused() == "--run: expected a folder of drivesem attack, found nothing"
+    assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
+    assert refused("--run", run, "--root", tmp_path).startswith("--root: expected none for the embedded scenes")
+    path = run / "config.yaml"
+    settings = yaml.safe_load(path.read_text())
+    photographs = tmp_path / "kitti"
+    path.write_text(yaml.safe_dump(settings | {"dataset": "kitti", "root": str(photographs)}))
+    assert refused("--run", run).endswith(f"found one on {photographs}, which has no manifest.json")
+    path.write_text(yaml.safe_dump(settings | {"dataset": "coco", "root": str(photographs)}))
+    assert refused("--run", run).endswith("found one on data set 'coco'")
+    (run / "metrics.json").unlink()
+    assert "a finished run" in refused("--run", run)

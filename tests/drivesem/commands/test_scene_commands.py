@@ -1,0 +1,468 @@
+"""`drivesem derender`, `render` and `edit` as a user types them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from drivesem.attack.edits import read_frame_edit
+from drivesem.cli import main, parse
+from drivesem.data.registry import DATASETS as READERS
+from drivesem.data.registry import open_dataset
+from drivesem.run.lock import LOCK
+from drivesem.scenes.sheet import GAIN, PANEL_PX, scene_sheet
+from drivesem.settings.commands import DATASETS, DEMO, Derender, Edit, Render
+from scene_ir import files
+from scene_ir.derender.silhouette import extent, placed, silhouettes
+from scene_ir.errors import RangeError
+from scene_ir.io import VERSION, load_scene, save_scene
+from scene_ir.meshes.templates import template
+from scene_ir.types import Camera, Mesh
+
+KITTI = Path(__file__).parents[3].parent / "shared" / "data" / "kitti"
+
+
+def succeed(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
+    """What a command prints with --json, and what it says on standard error."""
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    captured = capsys.readouterr()
+    return json.loads(captured.out), captured.err
+
+
+def fail(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of a command that is refused."""
+    capsys.readouterr()
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes of the demo, with their sheets."""
+    out = tmp_path_factory.mktemp("scenes") / "S"
+    assert main(["derender", "--limit", "2", "--workers", "1", "--sheet", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def demo(taken: Path) -> Path:
+    """The first scene's folder, to be left as it is."""
+    return taken / "demo-000"
+
+
+def test_defaults() -> None:
+    assert parse(["derender"]) == Derender()
+    assert parse(["render", "a", "-o", "b.png"]) == Render(scene="a", out="b.png")
+    words = ["edit", "a", "--set", "weather=fog", "--set", "foliage.hue=1", "--remove", "1", "--remove", "3"]
+    assert parse(words) == Edit(scene="a", set=("weather=fog", "foliage.hue=1"), remove=("1", "3"))
+
+
+def test_presets_hold_repeated_settings(tmp_path: Path) -> None:
+    preset = tmp_path / "preset.yaml"
+    preset.write_text("set: [weather=fog, 'objects[1].color=0.3,0,0,0,0']\nremove: [all]\n")
+    config = parse(["edit", "a", "--config", str(preset), "--set", "foliage.hue=1"])
+    assert config == Edit(
+        scene="a", set=("weather=fog", "objects[1].color=0.3,0,0,0,0", "foliage.hue=1"), remove=("all",)
+    )
+
+
+def test_data_sets_are_those_that_can_be_read() -> None:
+    assert sorted(DATASETS) == sorted((DEMO, *READERS))
+
+
+@pytest.mark.parametrize("command", ["derender", "attack", "gradcheck"])
+def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = fail([command, "--dataset", "kitty", "--root", "."], capsys)
+    assert "--dataset: expected one of demo, kitti, vkitti1, vkitti2, coco, yolo, found 'kitty'" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--dataset", "kitti"], "--root"),
+        (["--root", "somewhere"], "--root"),
+        (["--velodyne"], "--velodyne: expected --dataset kitti"),
+        (["--device", "cuda"], "--device: expected cpu"),
+        (["--meshes", "."], "--meshes: expected a PHOTO or a --dataset"),
+        (["photo.png", "--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
+        (["--dataset", "kitti", "--root", "nowhere"], "nowhere: expected a KITTI folder"),
+        (["--dataset", "coco", "--root", "nowhere"], "nowhere"),
+        (["--limit", "0"], "--limit"),
+        (["photo.png"], "photo.png"),
+    ],
+)
+def test_derender_refuses(
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert message in fail(["derender", *words], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_a_frame(taken: Path) -> None:
+    assert sorted(p.name for p in taken.iterdir()) == [LOCK, "config.yaml", "demo-000", "demo-001"]
+    found = {p.name for p in (taken / "demo-000").iterdir()}
+    assert found == {"scene.json", "arrays.npz", "photograph.png", "background.png", "meshes", "sheet.jpg"}
+    assert load_scene(taken / "demo-000").provenance["frame"] == "demo-000"
+
+
+def empty_streets(root: Path, calibrated: tuple[int, ...], count: int = 3) -> np.ndarray:
+    """A KITTI folder of small pictures without objects; some frames have a calibration. -> the picture."""
+    image = np.full((60, 200, 3), 90, np.uint8)
+    for i in range(count):
+        files.write_png(root / "training" / "image_2" / f"{i:06d}.png", image)
+        files.write_text(root / "training" / "label_2" / f"{i:06d}.txt", "")
+        if i in calibrated:
+            text = f"P2: {90 + i} 0 100 0 0 {90 + i} 30 0 0 0 1 0\n"
+            files.write_text(root / "training" / "calib" / f"{i:06d}.txt", text)
+    return image
+
+
+@pytest.mark.slow
+def test_processes_do_not_matter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "D"
+    empty_streets(root, (0, 2))
+    words = ["derender", "--dataset", "kitti", "--root", str(root), "--keep-going"]
+    found = {}
+    for count in ("1", "2"):
+        found[count], _ = succeed([*words, "--workers", count, "--out", str(tmp_path / count)], capsys)
+    for folder in ("000000", "000002"):
+        assert contents(tmp_path / "1" / folder) == contents(tmp_path / "2" / folder) != {}
+    assert found["1"]["failed"] == found["2"]["failed"]
+    assert list(found["2"]["frames"]) == ["000000", "000002"]
+
+
+def test_what_it_tells_of_each_frame(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "S"
+    words = ["derender", "--limit", "1", "--workers", "1", "--sheet", "--out", str(out)]
+    found, _ = succeed(words, capsys)
+    assert contents(out / "demo-000") == contents(taken / "demo-000")
+    frame = found["frames"]["demo-000"]
+    assert frame["objects"] == len(load_scene(out / "demo-000").objects)
+    assert 0 < frame["seconds"] <= found["seconds"]
+    assert found["failed"] == {}
+    assert Path(found["out"]) == out
+    assert main(words) == 0
+    assert f"demo-000: {frame['objects']} vehicles, there before" in capsys.readouterr().out
+
+
+def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "S"
+    shutil.copytree(taken, out)
+    before = contents(out)
+    shutil.rmtree(out / "demo-001")
+    (out / "demo-000" / "sheet.jpg").unlink()
+    mark = (out / "demo-000" / "scene.json").stat().st_mtime_ns
+    words = ["derender", "--limit", "2", "--workers", "1", "--out", str(out)]
+    found, _ = succeed([*words, "--sheet"], capsys)
+    assert found["frames"]["demo-000"]["seconds"] is None
+    assert found["frames"]["demo-001"]["seconds"] > 0
+    assert (out / "demo-000" / "scene.json").stat().st_mtime_ns == mark
+    after = contents(out)
+    assert after.keys() == before.keys()
+    assert all(after[name] == before[name] for name in before if name != "config.yaml")
+    again, _ = succeed(words, capsys)
+    assert all(frame["seconds"] is None for frame in again["frames"].values())
+    assert again["frames"]["demo-000"]["objects"] == found["frames"]["demo-000"]["objects"]
+
+
+def test_a_scene_of_another_version_is_refused(
+    taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "S"
+    shutil.copytree(taken, out)
+    record = out / "demo-001" / "scene.json"
+    record.write_text(record.read_text().replace(f'"version": {VERSION}', '"version": 99'))
+    said = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
+    assert f"scene.json: version: expected {VERSION}, found 99" in said
+
+
+def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = fail(["derender", "--limit", "2", "--out", str(taken), "--seed", "1"], capsys)
+    assert "other values of seed" in said
+    said = fail(["derender", "--limit", "2", "--out", str(taken), "--fast"], capsys)
+    assert "other values of fit" in said
+    assert "which holds other files" in fail(["derender", "--out", str(taken / "demo-000")], capsys)
+
+
+def test_no_resume_starts_again(tmp_path: Path, taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "S"
+    shutil.copytree(taken, out)
+    (out / "mine.txt").write_text("kept")
+    words = ["derender", "--limit", "1", "--workers", "1", "--fast", "--no-resume", "--out", str(out)]
+    found, _ = succeed(words, capsys)
+    assert found["frames"]["demo-000"]["seconds"] > 0
+    assert not (out / "demo-000" / "sheet.jpg").exists()
+    assert "fit: false" in (out / "config.yaml").read_text()
+    assert (out / "mine.txt").read_text() == "kept"
+
+
+def test_identifiers_with_slashes_become_nested_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, out = tmp_path / "D", tmp_path / "S"
+    succeed(
+        ["synth", "--layout", "vkitti2", "--frames", "1", "--sequence", "1", "--workers", "1", "--out", str(root)],
+        capsys,
+    )
+    (name,) = open_dataset("vkitti2", root).identifiers
+    words = ["derender", "--dataset", "vkitti2", "--root", str(root), "--fast", "--workers", "1"]
+    found, _ = succeed([*words, "--out", str(out)], capsys)
+    assert list(found["frames"]) == [name]
+    assert name.count("/") == 3
+    scene = load_scene(out / name)
+    assert len(scene.objects) == found["frames"][name]["objects"] > 0
+    assert "fit: false" in (out / "config.yaml").read_text()
+
+
+def test_frames_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "D"
+    image = empty_streets(root, (1,), count=2)
+    (root / "training" / "velodyne").mkdir()
+    words = ["derender", "--dataset", "kitti", "--root", str(root), "--workers", "1", "--velodyne"]
+    assert main([*words, "--out", str(tmp_path / "A")]) == 2
+    assert "000000.txt: expected a readable file" in capsys.readouterr().err.splitlines()[-1]
+    found, _ = succeed([*words, "--out", str(tmp_path / "B"), "--keep-going"], capsys)
+    assert list(found["failed"]) == ["000000"]
+    assert found["frames"]["000001"]["objects"] == 0
+    assert main(["render", str(tmp_path / "B" / "000001")]) == 0
+    assert np.array_equal(files.read_image(tmp_path / "B" / "000001" / "render.png"), image)
+
+
+def street_with(mesh: Mesh, root: Path) -> None:
+    """A KITTI folder with one picture of a flat red vehicle of this shape, labelled as a van."""
+    camera = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
+    place, yaw, size = torch.tensor([0.5, 1.65, 12.0]), torch.tensor(0.3), torch.tensor([5.0, 1.7, 1.9])
+    mask = silhouettes([placed(mesh, place, yaw, size)], camera)[0]
+    rng = np.random.default_rng(3)
+    image = np.clip(120 + rng.normal(0, 12, (200, 480, 3)), 0, 255)
+    image[mask] = np.clip(np.array([190, 40, 40]) + rng.normal(0, 12, (int(mask.sum()), 3)), 0, 255)
+    files.write_png(root / "training" / "image_2" / "000000.png", image.astype(np.uint8))
+    x0, y0, x1, y1 = extent(mask)
+    label = f"Van 0 0 0.26 {x0} {y0} {x1 - 1} {y1 - 1} 1.7 1.9 5.0 0.5 1.65 12.0 0.3\n"
+    files.write_text(root / "training" / "label_2" / "000000.txt", label)
+    calibration = "P2: 380 0 239.5 0 0 380 88 0 0 0 1 0\n"
+    files.write_text(root / "training" / "calib" / "000000.txt", calibration)
+
+
+@pytest.mark.slow
+def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shape = template("pickup")
+    street_with(shape, tmp_path / "D")
+    (tmp_path / "meshes").mkdir()
+    metres = shape.vertices.numpy() * np.array([5.0, 1.7, 1.9])
+    turned = metres * np.array([1.0, -1.0, -1.0])
+    trimesh.Trimesh(turned, shape.faces.numpy(), process=False).export(tmp_path / "meshes" / "my-pickup.obj")
+    (tmp_path / "meshes" / "vehicles.yaml").write_text("my-pickup.obj: {front: +x, kind: van}\n")
+    words = ["derender", "--dataset", "kitti", "--root", str(tmp_path / "D"), "--workers", "1", "--fast"]
+    chosen = {}
+    for name, more in (("A", []), ("B", ["--meshes", str(tmp_path / "meshes")])):
+        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
+        chosen[name] = load_scene(tmp_path / name / "000000").provenance["objects[0].mesh"]
+    assert chosen["A"] != chosen["B"] == "my-pickup"
+    assert '"my-pickup"' in (tmp_path / "B" / "000000" / "scene.json").read_text()
+    said = fail([*words, "--out", str(tmp_path / "B")], capsys)
+    assert "other values of meshes" in said
+
+
+def test_points_are_kittis(tmp_path: Path) -> None:
+    with pytest.raises(RangeError, match="points: expected kitti, found coco"):
+        open_dataset("coco", tmp_path, with_points=True)
+
+
+def test_an_unperturbed_render_is_the_photograph(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, _ = succeed(["render", str(demo), "-o", str(tmp_path / "a.png")], capsys)
+    assert found["objects"] == len(load_scene(demo).objects)
+    assert Path(found["out"]) == tmp_path / "a.png"
+    assert np.array_equal(files.read_image(tmp_path / "a.png"), files.read_image(demo / "photograph.png"))
+
+
+def test_a_scene_that_went_through_files_renders_alike(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turn = ["--set", "objects[0].rotate=5deg", "--set", "weather.fog=0.3"]
+    succeed(["edit", str(demo), *turn, "--save", str(tmp_path / "S"), "-o", str(tmp_path / "a.png")], capsys)
+    succeed(["render", str(tmp_path / "S")], capsys)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "S" / "render.png").read_bytes()
+    again = load_scene(tmp_path / "S")
+    save_scene(again, tmp_path / "T")
+    assert contents(tmp_path / "T") == {k: v for k, v in contents(tmp_path / "S").items() if k != "render.png"}
+
+
+def test_an_edit_moves_what_it_should(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = load_scene(demo)
+    row = int(scene.objects.box2d[:, 3].argmax())
+    out = tmp_path / "a.png"
+    succeed(["edit", str(demo), "--set", f"objects[{row}].translate=0.5m,0m", "-o", str(out)], capsys)
+    changed = np.abs(files.read_image(out).astype(int) - files.read_image(demo / "photograph.png")).max(axis=2)
+    x0, y0, x1, y1 = scene.objects.box2d[row].round().int().tolist()
+    assert (changed[y0:y1, x0:x1] > 8).mean() > 0.1
+    wide, high = x1 - x0, y1 - y0
+    near = np.zeros_like(changed, dtype=bool)
+    # with room for the shadow, which moves along
+    near[max(y0 - high // 2, 0) : y1 + high, max(x0 - 3 * wide, 0) : x1 + 3 * wide] = True
+    assert not changed[~near].any()
+
+
+def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "edit.yaml"
+    path.write_text("objects:\n  0: {translate: [0.5m, 0.25m], rotate: 10deg}\n  1: {remove: true}\n")
+    words = ["edit", str(demo), "--edits", str(path), "--set", "objects[0].rotate=20deg", "--save"]
+    found, _ = succeed([*words, str(tmp_path / "S")], capsys)
+    assert "out" not in found, "nothing is drawn where only a folder is asked for"
+    before, after = load_scene(demo).objects, load_scene(tmp_path / "S").objects
+    assert len(after) == found["objects"] == len(before) - 1
+    shift = after.translation[0] - before.translation[0]
+    assert float(shift[[0, 2]].norm()) == pytest.approx(np.hypot(0.5, 0.25), abs=1e-4)
+    assert float(after.yaw[0] - before.yaw[0]) == pytest.approx(np.deg2rad(20), abs=1e-5)
+    assert torch.equal(after.translation[1:], before.translation[2:])
+    assert read_frame_edit(path)["objects"][1] == {"remove": True}
+
+
+def test_without_vehicles_the_background_is_left(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, _ = succeed(["edit", str(demo), "--remove", "all", "-o", str(tmp_path / "a.png")], capsys)
+    assert found["objects"] == 0
+    assert np.array_equal(files.read_image(tmp_path / "a.png"), files.read_image(demo / "background.png"))
+    found, _ = succeed(
+        ["edit", str(demo), "--remove", "0,2", "--remove", "1", "-o", str(tmp_path / "b.png")], capsys
+    )
+    assert found["objects"] == len(load_scene(demo).objects) - 3
+
+
+def test_impossible_places_are_said_and_drawn(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = load_scene(demo)
+    gap = scene.objects.translation[1:] - scene.objects.translation[0]
+    other = 1 + int(gap.norm(dim=1).argmin())
+    c, s = np.cos(float(scene.objects.yaw[0])), np.sin(float(scene.objects.yaw[0]))
+    x, z = gap[other - 1][[0, 2]].tolist()
+    onto = f"objects[0].translate={c * x - s * z}m,{s * x + c * z}m"
+    words = ["edit", str(demo), "--set", onto, "-o", str(tmp_path / "a.png")]
+    found, said = succeed(words, capsys)
+    lines = said.splitlines()
+    assert lines
+    assert all(line.startswith("drivesem: objects[") for line in lines)
+    assert f"objects[{other}]: collision with objects[0]" in said
+    assert found["notes"] == [line.removeprefix("drivesem: ") for line in lines]
+    _, said = succeed([*words, "--remove", str(other)], capsys)
+    assert f"objects[{other}]" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "edit: expected a change"),
+        (["--set", "objects[99].rotate=1deg"], "objects[99]: expected a row from 0 to"),
+        (["--set", "objects[0].rotate=1"], "expected a unit: 1deg or 1rad"),
+        (["--set", "objects[0].wheels=1"], "wheels"),
+        (["--set", "weather=snow"], "snow"),
+        (["--remove", "99"], "objects[99]: expected a row from 0 to"),
+        (["--remove", "red"], "--remove: expected rows from 0, or all, found 'red'"),
+        (["--edits", "nowhere.yaml"], "nowhere.yaml: expected a readable file"),
+        (["--remove", "0", "-o", "a.jpg"], "--out: expected a .png file, found a.jpg"),
+        (["--remove", "0", "--save", "."], "--save"),
+        (["--frobnicate"], "frobnicate"),
+    ],
+)
+def test_edit_refuses(
+    words: list[str],
+    message: str,
+    demo: Path,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "mine.txt").write_text("kept")
+    monkeypatch.chdir(tmp_path)
+    assert message in fail(["edit", str(demo), *words], capsys)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("command", [["render"], ["edit", "--remove", "0"]])
+def test_what_is_no_scene_is_named(
+    command: list[str], taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "expected a folder with a scene" in fail([*command, str(tmp_path / "nowhere")], capsys)
+    assert "scene.json" in fail([*command, str(taken)], capsys)
+    broken = tmp_path / "broken"
+    shutil.copytree(taken / "demo-000", broken)
+    (broken / "arrays.npz").write_bytes(b"no archive")
+    assert "arrays.npz" in fail([*command, str(broken)], capsys)
+    assert "SCENE" in fail(command, capsys)
+
+
+def test_the_sheet_shows_photograph_background_and_no_difference(taken: Path) -> None:
+    scene = load_scene(taken / "demo-001")
+    sheet = scene_sheet(scene, "demo-001")
+    written = files.read_image(taken / "demo-001" / "sheet.jpg")
+    assert np.abs(written.astype(int) - sheet).mean() < 2
+    tall = round(PANEL_PX * scene.camera.height / scene.camera.width)
+    panels = []
+    for line in range(3):
+        for column in range(3):
+            y = sheet.shape[0] - (3 - line) * (tall + 12) - (2 - line) * 23
+            x = 12 + column * (PANEL_PX + 12)
+            panels.append(sheet[y : y + tall, x : x + PANEL_PX])
+
+    def small(name: str) -> np.ndarray:
+        image = files.read_image(taken / "demo-001" / f"{name}.png")
+        return cv2.resize(image, (PANEL_PX, tall), interpolation=cv2.INTER_AREA)
+
+    assert (panels[0] != small("photograph")).any(axis=2).mean() < 0.1, "but for the outlines"
+    assert np.array_equal(panels[6], small("background"))
+    assert np.array_equal(panels[7], small("photograph"))
+    assert not panels[8].any()
+    for panel in panels[1:6]:
+        assert panel.std() > 1
+
+
+def test_the_sheet_tells_of_a_difference(taken: Path) -> None:
+    scene = load_scene(taken / "demo-001")
+    still = scene_sheet(scene, "t")
+    source = scene.objects.source[0]
+    darker = source.foreground.values.clone()
+    darker[:3] *= 0.9
+    spoilt = replace(source, foreground=replace(source.foreground, values=darker))
+    objects = replace(scene.objects, source=(spoilt, *scene.objects.source[1:]))
+    sheet = scene_sheet(replace(scene, objects=objects), "t")
+    part = np.abs(sheet[-300:].astype(int) - still[-300:])[..., -PANEL_PX:, :]
+    assert part.max() >= GAIN
+
+
+@pytest.mark.skipif(not KITTI.is_dir(), reason="needs ../shared/data/kitti")
+def test_a_photograph_of_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "S"
+    words = ["derender", "--dataset", "kitti", "--root", str(KITTI), "--out", str(out)]
+    found, _ = succeed([*words, "--fast", "--velodyne", "--limit", "2", "--workers", "1"], capsys)
+    assert list(found["frames"]) == ["000000", "000001"]
+    for name in found["frames"]:
+        succeed(["render", str(out / name)], capsys)
+        shown, photograph = (files.read_image(out / name / f"{n}.png") for n in ("render", "photograph"))
+        assert np.abs(shown.astype(int) - photograph).max() <= 1
+        assert np.array_equal(photograph, files.read_image(KITTI / "training" / "image_2" / f"{name}.png"))

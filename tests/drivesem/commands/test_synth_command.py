@@ -1,0 +1,78 @@
+"""`drivesem synth` as a user types it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from drivesem.cli import main, parse
+from drivesem.commands.synth import order_of
+from drivesem.data.registry import open_dataset
+from drivesem.settings.commands import Synth
+from scene_ir import files
+
+
+def test_defaults_follow_the_layout() -> None:
+    kitti, virtual = order_of(Synth(frames=12)), order_of(Synth(frames=12, layout="vkitti2"))
+    assert (kitti.variations, kitti.sequence, kitti.people) == (("mixed",), 1, True)
+    assert (virtual.variations, virtual.sequence, virtual.people) == (("clone",), 10, False)
+    assert order_of(Synth(frames=12, limit=3)).frames == 3
+    assert parse(["synth", "--people", "False", "--cameras", "2", "--layout", "vkitti2"]) == Synth(
+        people=False, cameras=2, layout="vkitti2"
+    )
+
+
+def test_it_writes_a_data_set_a_sheet_and_distributions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "set"
+    words = ["synth", "--layout", "coco", "--frames", "2", "--seed", "3", "--workers", "1", "--out", str(out)]
+    assert main([*words, "--sheet", "--compare", "--json"]) == 0
+    captured = capsys.readouterr()
+    told = json.loads(captured.out)
+    assert captured.out.count("\n") == 1
+    assert told["frames"] == 2
+    assert told["out"] == str(out)
+    assert len(open_dataset("coco", out).identifiers) == 2
+    assert files.read_image(out / "sheet.jpg").shape[1] > 1000
+    assert (out / "distributions.png").read_bytes().startswith(b"\x89PNG")
+    assert "depth" in (out / "distributions.md").read_text().lower()
+    before = (out / "manifest.json").read_bytes()
+    assert main([*words, "--no-resume", "--json"]) == 0
+    assert (out / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--frames", "0"], "--frames: expected at least 1, found 0"),
+        (["--sequence", "0"], "--sequence: expected at least 1, found 0"),
+        (["--validation", "1.5"], "--validation: expected a share in [0, 1), found 1.5"),
+        (["--cameras", "2"], "--cameras: expected 1, or --layout vkitti2, found 2"),
+        (["--layout", "vkitti2", "--people", "True"], "--people: expected False with --layout vkitti2"),
+        (["--variations", "night"], "variations: expected all, or names among mixed, clone"),
+        (["--edits", "nothing.yaml"], "nothing.yaml: expected a readable file"),
+        (["--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
+        (["--assets", "nowhere"], "--assets: expected a folder, found nowhere"),
+        (["--layout", "voc"], "command line: expected known options"),
+    ],
+)
+def test_bad_input_is_one_line(
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["synth", *words, "--out", str(out)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_folder_that_is_a_file_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "file"
+    path.write_text("")
+    assert main(["synth", "--out", str(path)]) == 2
+    assert "--out: expected a folder, found the file" in capsys.readouterr().err

@@ -1,0 +1,205 @@
+"""`drivesem transfer` on a small run of `drivesem attack`: the shipped detector, and one without gradient."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+
+from detectors.types import Detections
+from drivesem.cli import main
+from drivesem.questions.transfer import asking
+from drivesem.run import looking
+from drivesem.run.results import load_frame
+
+
+class Blind:
+    """A detector that finds nothing in a picture with any change, and `first` in the others."""
+
+    name, classes = "blind", ("bus", "Car")
+
+    def __init__(self, seen: dict[bytes, Detections]) -> None:
+        self.seen = seen
+
+    def forward(self, images: torch.Tensor) -> list[bytes]:
+        return [image.numpy().tobytes() for image in images]
+
+    def decode(self, raw: list[bytes]) -> list[Detections]:
+        nothing = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+        return [self.seen.get(key, nothing) for key in raw]
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two embedded frames."""
+    out = tmp_path_factory.mktemp("runs") / "source"
+    words = ["attack", "--combo", "2", "--limit", "2", "--workers", "1", "--json"]
+    assert main([*words, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def run(attacked: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(attacked, tmp_path / "source"))
+
+
+@pytest.fixture
+def transfer(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def call(*words: object) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main(["transfer", "--workers", "1", "--json", *map(str, words)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def test_the_source_itself_finds_what_the_run_says(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+    (row,) = transfer("--run", run, "--detectors", "squeezedet")["rows"]
+    figures = json.loads((run / "metrics.json").read_text())
+    for key in ("ap50", "ap70", "recall_at_t_star"):
+        assert row[f"benign_{key}"] == pytest.approx(figures["benign"][key], abs=1e-9)
+        assert row[f"moved_{key}"] == pytest.approx(figures["attacked"]["moved"][key], abs=1e-9)
+        assert row[f"paper_{key}"] == pytest.approx(figures["attacked"]["paper"][key], abs=1e-9)
+    assert row["drop_moved"] == pytest.approx(row["benign_ap50"] - row["moved_ap50"], abs=1e-9)
+    assert row["drop_moved_low"] <= row["drop_moved"] + 1e-9
+    assert row["frames"] == 2
+    assert row["frame_rate"] == 1.0
+    assert row["frame_rate_of"] == figures["successes_moved"] > 0
+    assert row["transfer_rate"] in (1.0, None)
+    assert (row["transfer_rate"] is None) == (figures["lost_objects"] == 0)
+
+
+def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+    data = transfer("--run", run, "--detectors", "squeezedet", "--bootstrap", "10")
+    out = run / "transfer"
+    assert json.loads((out / "transfer.json").read_text()) == data
+    (line,) = csv.DictReader((out / "transfer.csv").read_text().splitlines())
+    assert float(line["moved_ap50"]) == data["rows"][0]["moved_ap50"]
+    assert "| source | squeezedet | moved |" in (out / "transfer.md").read_text()
+    picture = cv2.imread(str(out / "transfer.png"))
+    assert min(picture.shape[:2]) > 200
+
+
+def test_a_second_call_looks_at_nothing_twice(
+    run: Path, transfer: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = transfer("--run", run, "--detectors", "squeezedet")
+    kept = sorted((run / "transfer" / "detections").rglob("*.json"))
+    assert len(kept) == 4
+    kept[1].unlink()
+    looks: list[int] = []
+    predict = looking.predict
+    monkeypatch.setattr(looking, "predict", lambda *words: looks.append(1) or predict(*words))
+    assert transfer("--run", run, "--detectors", "squeezedet") == first
+    assert len(looks) == 1
+    assert transfer("--run", run, "--detectors", "squeezedet", "--no-resume") == first
+    assert len(looks) == 5
+
+
+def test_what_another_detector_loses(
+    run: Path, transfer: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that finds all cars in the photographs, and nothing once anything moves, loses them all."""
+    seen = {}
+    lost = known = 0
+    for folder in sorted((run / "frames").iterdir()):
+        result = load_frame(folder / "result.json")
+        cars = [t for t in result.targets_benign if t.label == "Car" and not t.ignore]
+        image = cv2.cvtColor(cv2.imread(str(folder / "benign.png")), cv2.COLOR_BGR2RGB)
+        boxes = torch.tensor([t.xyxy for t in cars])
+        found = Detections(boxes, torch.ones(len(cars), dtype=torch.int64), torch.full((len(cars),), 0.5))
+        seen[(torch.from_numpy(image).permute(2, 0, 1) / 255).numpy().tobytes()] = found
+        moved = {t.index: t for t in result.targets_moved}
+        known += sum(not moved[t.index].ignore for t in cars)
+        lost += sum(f.kind == "lost" and f.label == "Car" for f in result.failures)
+    monkeypatch.setattr(looking, "load_predictor", lambda *_: Blind(seen))
+    (row,) = transfer("--run", run, "--detectors", "onnx:some/blind.onnx")["rows"]
+    assert row["target"] == "onnx:blind.onnx"
+    assert row["t_star"] == 0.3
+    assert (row["benign_ap50"], row["moved_ap50"], row["paper_recall"]) == (1.0, 0.0, 0.0)
+    assert (row["drop_moved"], row["drop_moved_low"], row["drop_moved_high"]) == (1.0, 1.0, 1.0)
+    assert (row["lost_rate"], row["lost_rate_of"]) == (1.0, known)
+    assert row["transfer_rate_of"] == lost
+    assert row["transfer_rate"] == (1.0 if lost else None)
+    (high,) = transfer("--run", run, "--detectors", "onnx:some/blind.onnx", "--t-star", "0.6")["rows"]
+    assert high["lost_rate_of"] == 0
+    assert high["lost_rate"] is None
+
+
+def test_a_matrix_of_two_runs(run: Path, tmp_path: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+    other = shutil.copytree(run, tmp_path / "again")
+    out = tmp_path / "matrix"
+    rows = transfer("--run", f"{run},{other}", "--detectors", "squeezedet", "--out", out, "--limit", "1")["rows"]
+    assert [row["source"] for row in rows] == ["source", "again"]
+    assert {row["frames"] for row in rows} == {1}
+    # the same pictures are looked at once
+    assert len(list((out / "detections").rglob("*.json"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("squeezedet, a.safetensors", ["squeezedet", "a.safetensors"]),
+        ("darknet:y.cfg,y.weights,squeezedet", ["darknet:y.cfg,y.weights", "squeezedet"]),
+        ("onnx:n.onnx,n.yaml,onnx:m.onnx,b.safetensors", ["onnx:n.onnx,n.yaml", "onnx:m.onnx", "b.safetensors"]),
+    ],
+)
+def test_detectors_are_told_apart(text: str, names: list[str]) -> None:
+    assert asking.detector_names(text) == names
+
+
+def test_names_lose_their_folders_where_that_is_clear() -> None:
+    assert asking.short_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
+    assert asking.short_names(["onnx:a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
+
+
+def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*words: object) -> str:
+        capsys.readouterr()
+        assert main(["transfer", "--workers", "1", *map(str, words)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("drivesem: ")
+
+    asked = ("--detectors", "squeezedet")
+    assert refused(*asked) == "--run: expected a folder of drivesem attack, found nothing"
+    assert refused("--run", tmp_path / "none", *asked).startswith("--run: expected a folder of drivesem attack")
+    assert refused("--run", run) == "--detectors: expected detectors with commas, found nothing"
+    assert refused("--run", run, "--detectors", "squeezdet").startswith("--detectors: expected detectors, found")
+    assert "each detector once, found squeezedet" in refused("--run", run, "--detectors", "squeezedet,squeezedet")
+    assert "each run once" in refused("--run", f"{run},{run}", *asked)
+    assert "--bootstrap" in refused("--run", run, *asked, "--bootstrap", "-1")
+    assert not (run / "transfer").exists()
+    broken = run / "frames" / "demo-001" / "counterexample.png"
+    broken.write_bytes(broken.read_bytes()[:999])
+    # its progress bar may stand before the line
+    assert main(["transfer", "--run", str(run), *asked, "--workers", "1"]) == 2
+    assert str(broken) in " ".join(capsys.readouterr().err.split())
+    (run / "metrics.json").unlink()
+    assert "a finished run" in refused("--run", run, *asked)
+    (run / "config.yaml").write_text("photo: street.png\n")
+    assert "a run of another command" in refused("--run", run, *asked)
+
+
+def test_bad_frames_are_left_out_where_asked(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+    broken = run / "frames" / "demo-001" / "counterexample.png"
+    broken.write_bytes(b"no picture")
+    data = transfer("--run", run, "--detectors", "squeezedet", "--keep-going")
+    assert data["rows"][0]["frames"] == 1
+    assert list(data["frames_failed"]) == [str(broken)]
+
+
+def test_a_detector_without_cars_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blind = Blind({})
+    monkeypatch.setattr(blind, "classes", ("bus",), raising=False)
+    monkeypatch.setattr(looking, "load_predictor", lambda *_: blind)
+    assert main(["transfer", "--run", str(run), "--detectors", "onnx:blind.onnx"]) == 2
+    assert "expected one that knows Car, found bus" in capsys.readouterr().err

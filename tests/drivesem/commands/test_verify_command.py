@@ -1,0 +1,258 @@
+"""`drivesem verify`: a fresh run agrees with its files, and whatever is changed afterwards is found and named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from detectors.types import CLASSES, Detections
+from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.space import ParameterSpace
+from drivesem.cli import main
+from drivesem.questions.verify.differences import CHECKS
+from drivesem.run import attack as run_attack
+from drivesem.run import folder as run_folder
+from drivesem.run.results import load_frame
+from scene_ir import files
+from scene_ir.io import load_scene
+
+FRAME = Path("frames") / "demo-000"
+WORDS = ("--detector", "any", "--limit", "1", "--workers", "1", "--json", "--params", "weather,translate")
+
+
+class Drifting:
+    """A detector without gradient: sees one car, which is not there, further to the right the brighter it is."""
+
+    name, classes, t_star = "drifting", CLASSES, 0.5
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+    def decode(self, raw: torch.Tensor) -> list[Detections]:
+        lefts = (2000 * raw) % 300
+        boxes = [torch.stack([x, 0 * x, x + 20, 0 * x + 20])[None] for x in lefts]
+        return [Detections(box, torch.tensor([CLASSES.index("Car")]), torch.tensor([0.9])) for box in boxes]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drifting() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for command in (run_attack, run_folder):
+            patch.setattr(command, "load_predictor", lambda *_: Drifting())
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(drifting: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of an embedded frame in a budget that is tighter than the paper's."""
+    out = tmp_path_factory.mktemp("runs") / "source"
+    words = ("--method", "random", "--queries", "2", "--budget", "translate=0.05m,weather=0.5")
+    assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "source"))
+
+
+@pytest.fixture
+def verify(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def call(run: Path, *words: object, code: int = 1) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main(["verify", "--run", str(run), "--workers", "1", "--json", *map(str, words)]) == code
+        data = json.loads(capsys.readouterr().out)
+        assert data["agree"] == (code == 0)
+        return data
+
+    return call
+
+
+def change(path: Path, edit: Callable[[Any], None]) -> None:
+    """Edit a JSON file in place."""
+    data = json.loads(path.read_text())
+    edit(data)
+    path.write_text(json.dumps(data))
+
+
+def told(data: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Differences by field; all of them are in the first frame or the run's."""
+    assert {one["frame"] for one in data["differences"]} <= {"demo-000", "(run)"}
+    return {one["field"]: one for one in data["differences"]}
+
+
+def checks(data: dict[str, Any]) -> set[str]:
+    return {row["name"] for row in data["checks"] if row["differing"]}
+
+
+def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    result = load_frame(run / FRAME / "result.json")
+    assert (result.success_moved, result.success_paper) == (True, True)
+    saved = load_scene(run / FRAME / "scene").as_photographed()
+    assert result.violated_at_start == FeasibleSet(ParameterSpace(saved, ("translate",))).violated_at_start
+    data = verify(run, code=0)
+    assert data["frames"] == data["frames_of_run"] == 1
+    assert data["differences"] == []
+    assert [row["name"] for row in data["checks"]] == list(CHECKS)
+    assert all(row["compared"] > 0 for row in data["checks"])
+    assert data["rendered_again"]["rerender.png"] == {"largest_level": 0, "largest_share": 0.0}
+    # Another number of threads may round a pixel otherwise.
+    assert data["rendered_again"]["counterexample.png"]["largest_share"] < 1e-4
+    assert json.loads((run / "verify.json").read_text()) == data
+
+
+def test_for_people_and_elsewhere(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "told.json"
+    capsys.readouterr()
+    assert main(["verify", "--run", str(run), "--limit", "1", "--workers", "1", "--out", str(out)]) == 0
+    assert "all agree" in capsys.readouterr().out
+    assert json.loads(out.read_text())["frames"] == 1
+    assert not (run / "verify.json").exists()
+
+
+def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    pictures = {
+        "benign.png": "detections_benign",
+        "rerender.png": "detections_rerendered",
+        "counterexample.png": "detections_attacked",
+    }
+    for name in pictures:
+        image = files.read_image(run / FRAME / name)
+        image[20:60, 30:70] ^= 128
+        files.write_png(run / FRAME / name, image)
+    data = verify(run)
+    assert checks(data) >= {"files", "pictures", "detections"}
+    assert set(told(data)) >= {*pictures, *pictures.values()}
+    share = f"up to 128 levels off, in {100 * 1600 / (image.shape[0] * image.shape[1]):.3g} % of the pixels"
+    found = {d["field"]: d["found"] for d in data["differences"] if d["check"] == "pictures"}
+    assert found == dict.fromkeys(pictures, share)
+
+
+def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    for name in ("labels_paper.txt", "labels_moved.txt"):
+        lines = (run / FRAME / name).read_text().splitlines()
+        words = lines[1].split()
+        words[4] = f"{float(words[4]) - 3:.2f}"
+        (run / FRAME / name).write_text("\n".join([lines[0], " ".join(words), *lines[2:]]) + "\n")
+    data = verify(run)
+    assert set(told(data)) == {
+        *("labels_paper.txt", "labels_paper.txt: objects[1].boxes_xyxy"),
+        *("labels_moved.txt", "labels_moved.txt: objects[1].boxes_xyxy"),
+    }
+    assert checks(data) == {"files", "labels"}
+
+
+def test_an_object_struck_from_the_labels_and_another_sum(
+    run: Path, verify: Callable[..., dict[str, Any]]
+) -> None:
+    path = run / FRAME / "labels_moved.txt"
+    path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines()[1:]))
+    change(run / "metrics.json", lambda data: data.update(successes_paper=7))
+    data = verify(run)
+    assert set(told(data)) == {path.name, f"{path.name}: type", "metrics.json: successes_paper"}
+    assert data["differences"][-1]["expected"] == "7"
+
+
+def test_a_success_that_is_none(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    def flip(data: dict[str, Any]) -> None:
+        data["success_moved"] = not data["success_moved"]
+
+    change(run / FRAME / "result.json", flip)
+    data = verify(run)
+    found = told(data)
+    assert set(found) == {
+        "success_moved",
+        "success_moved by labels_moved.txt",
+        "metrics.json: successes_moved",
+    }
+    assert (found["success_moved"]["expected"], found["success_moved"]["found"]) == ("False", "True")
+    assert checks(data) == {"success", "totals"}
+
+
+def test_failures_detections_and_targets_that_are_others(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    def spoil(data: dict[str, Any]) -> None:
+        (phantom,) = data["failures"]
+        data["failures"] = [phantom | {"kind": "lost", "index": 1, "score": None}]
+        data["detections_rerendered"][0]["score"] = 0.6
+        data["targets_moved"][1]["ignore"] ^= True
+
+    change(run / FRAME / "result.json", spoil)
+    found = told(verify(run))
+    assert {"lost", "phantoms", "lost by labels_moved.txt", "phantoms by labels_moved.txt"} <= set(found)
+    assert (found["lost"]["expected"], found["lost"]["found"]) == ("objects[1]", "none")
+    assert found["targets_moved[1]"]["check"] == "labels"
+    assert "detections_rerendered" in found
+
+
+def shift(data: dict[str, Any], metres: float) -> None:
+    data["objects"]["translation"][0][0] += metres
+
+
+def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
+    run: Path, verify: Callable[..., dict[str, Any]]
+) -> None:
+    change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 0.15))
+    data = verify(run)
+    found = told(data)
+    assert "scene: objects[0].translation" in found
+    assert found["budget"]["found"].startswith("objects[0]: moved by")
+    assert "violations" not in found
+    assert {"pictures", "feasibility", "theta", "labels"} <= checks(data)
+
+
+def test_a_scene_that_cannot_be(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 3.0))
+    found = told(verify(run))
+    assert found["violations"]["expected"] == "none"
+    assert "own lengths" in found["violations"]["found"]
+
+
+def test_theta_beyond_the_budget_and_another_in_its_own_file(
+    run: Path, verify: Callable[..., dict[str, Any]]
+) -> None:
+    def beyond(data: dict[str, Any]) -> None:
+        (own,) = [c for c in data["theta"] if c["name"] == "weather.fog"]
+        own["value"] = own["upper"] = 0.9
+
+    name = "objects[0].translate.along"
+    change(run / FRAME / "result.json", beyond)
+    change(run / FRAME / "theta.json", lambda data: data[name].update(value=0.0))
+    found = told(verify(run))
+    assert set(found) == {
+        *("weather.fog, budget", "weather.fog, bounds", "theta.json: weather.fog", "scene: weather"),
+        *("theta.json", f"theta.json: {name}"),
+    }
+    assert found["weather.fog, budget"]["expected"] == "a value in [0, 0.5]"
+
+
+def test_what_cannot_be_read(
+    run: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / FRAME / "scene" / "arrays.npz").write_bytes(b"no archive")
+    assert main(["verify", "--run", str(run), "--workers", "1"]) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "arrays.npz" in line
+    data = verify(run, "--keep-going")
+    assert list(data["frames_failed"]) == ["demo-000"]
+    assert data["frames"] == 0
+
+
+def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*words: object) -> str:
+        capsys.readouterr()
+        assert main(["verify", "--workers", "1", *map(str, words)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("drivesem: ")
+
+    assert refused() == "--run: expected a folder of drivesem attack, found nothing"
+    assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
+    assert refused("--run", run, "--limit", "0") == "--limit: expected at least 1, found 0"
+    assert refused("--run", run, "--out", tmp_path).startswith("--out: expected a file")
+    (run / "metrics.json").unlink()
+    assert "a finished run" in refused("--run", run)

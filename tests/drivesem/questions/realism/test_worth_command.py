@@ -1,0 +1,216 @@
+"""`drivesem worth` on hand-made runs and tables."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from detectors.types import Detections
+from drivesem.cli import main
+from drivesem.run import looking
+from drivesem.training.retraining import WEIGHTS
+from scene_ir import files
+
+CARS = [[13.0, 20.0, 63.0, 50.0], [73.0, 10.0, 128.0, 60.0]]
+
+
+class Sees:
+    """A detector that finds the first `count` of the moved cars in every picture."""
+
+    name, classes, t_star = "sees", ("Car",), 0.5
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def forward(self, images: torch.Tensor) -> list[int]:
+        return [0] * len(images)
+
+    def decode(self, raw: list[int]) -> list[Detections]:
+        n = self.count
+        one = Detections(torch.tensor(CARS[:n]).reshape(-1, 4), torch.zeros(n, dtype=torch.int64), torch.ones(n))
+        return [one] * len(raw)
+
+
+@pytest.fixture
+def worth(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def call(*words: object) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main(["worth", "--bootstrap", "20", "--json", *map(str, words)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def pick(data: dict[str, Any], of: str, **which: object) -> dict[str, Any]:
+    found = [r for r in data["rows"] if of in r["set"] and all(r[k] == v for k, v in which.items())]
+    (row,) = found
+    return row
+
+
+def entropy(*shares: float) -> float:
+    return -sum(p * math.log(p) for p in shares if p)
+
+
+def test_runs(write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
+    """Three frames of two cars; afterwards a car of two frames is lost: 4 cars, and 2 cars with 6 empty places."""
+    run = write_run(tmp_path / "run")
+    data = worth(run, "--distance", "perceptual")
+    assert json.loads((run / "worth" / "worth.json").read_text()) == data
+    before = pick(data, "photographs", membership="binary", realism_weight=False)
+    assert (before["value"], before["points"]) == (0, 12)
+    after = pick(data, "counterexamples", membership="binary", realism_weight=False)
+    assert after["value"] == pytest.approx(8 / 12 * entropy(2 / 8, 6 / 8))
+    assert after["low"] <= after["value"] <= after["high"]
+    # 0.8 of each car that is found, 0.2 and all of a lost one are nothing: 3.2 cars; 2.8 cars and 6 empty places
+    fractional = pick(data, "counterexamples", membership="fractional", realism_weight=False)
+    assert fractional["value"] == pytest.approx(8.8 / 12 * entropy(2.8 / 8.8, 6 / 8.8))
+    # lost cars changed most: they count for less
+    weighted = pick(data, "counterexamples", membership="binary", realism_weight=True)
+    assert 0 < weighted["value"] < after["value"]
+    lines = list(csv.DictReader((run / "worth" / "worth.csv").read_text().splitlines()))
+    assert len(lines) == len(data["rows"]) == 8
+    assert "| run (rotate): counterexamples |" in (run / "worth" / "worth.md").read_text()
+
+
+def test_bases_and_no_realism(
+    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
+) -> None:
+    run = write_run(tmp_path / "run")
+    plain = worth(run, "--distance", "none", "--out", tmp_path / "e")
+    assert plain["distance"] is None
+    assert len(plain["rows"]) == 4
+    two = worth(run, "--distance", "none", "--base", "2", "--out", tmp_path / "2")
+    for a, b in zip(plain["rows"], two["rows"], strict=True):
+        assert b["value"] == pytest.approx(a["value"] / math.log(2))
+
+
+def test_nothing_changed(
+    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
+) -> None:
+    data = worth(write_run(tmp_path / "run", same=True), "--distance", "perceptual")
+    for kind in ("binary", "fractional"):
+        for weighted in (False, True):
+            which = {"membership": kind, "realism_weight": weighted}
+            before, after = (pick(data, of, **which)["value"] for of in ("photographs", "counterexamples"))
+            assert before == pytest.approx(after, abs=1e-12)
+
+
+@pytest.mark.parametrize(("count", "gain"), [(2, 8 / 12 * entropy(2 / 8, 6 / 8)), (0, None)])
+def test_gain_of_a_second_detector(
+    count: int,
+    gain: float | None,
+    write_run: Callable[..., Path],
+    tmp_path: Path,
+    worth: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(looking, "load_predictor", lambda *_: Sees(count))
+    data = worth(write_run(tmp_path / "run"), "--distance", "none", "--second", "sees")
+    assert data["detectors"] == ["squeezedet", "sees"]
+    row = pick(data, "counterexamples", membership="binary", what="gain")
+    if gain is None:
+        # blind: all is left to know
+        gain = 8 / 12 * entropy(2 / 8, 6 / 8) - math.log(2)
+    assert row["value"] == pytest.approx(gain)
+
+
+def test_a_folder_of_retrain_is_a_second_detector(
+    write_run: Callable[..., Path],
+    tmp_path: Path,
+    worth: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights = tmp_path / "retrained" / WEIGHTS
+    weights.parent.mkdir()
+    weights.touch()
+    loaded: list[str] = []
+
+    def load(name: str, *_: object) -> Sees:
+        loaded.append(name)
+        return Sees(2)
+
+    monkeypatch.setattr(looking, "load_predictor", load)
+    data = worth(write_run(tmp_path / "run"), "--distance", "none", "--second", weights.parent)
+    assert set(loaded) == {str(weights)} == {data["detectors"][1]}
+
+
+TABLE = "label,bench,bus,distance\nbench,0.9,0.1,0\nbench,0.3,0.7,0.2\nbus,0.2,0.8,0.4\n"
+
+
+def test_tables(tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
+    path = tmp_path / "answers.csv"
+    path.write_text(TABLE)
+    data = worth("--table", path)
+    plain = pick(data, "answers", membership="binary", realism_weight=False)
+    assert plain["value"] == pytest.approx(2 / 3 * entropy(0.5, 0.5))
+    # realism 1, 0.5, 0: the third point does not count
+    assert pick(data, "answers", membership="binary", realism_weight=True)["value"] == 0
+    after = tmp_path / "after.csv"
+    after.write_text("label,bench,bus\nbench,1,0\nbench,0.6,0.4\nbus,0,1\n")
+    data = worth("--table", path, "--after", after, "--out", tmp_path / "gain")
+    gain = pick(data, "answers", membership="binary", realism_weight=False, what="gain")
+    assert gain["value"] == pytest.approx(plain["value"])
+    assert (tmp_path / "worth" / "worth.json").is_file()
+
+
+def test_a_table_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "answers.csv"
+    path.write_text(TABLE)
+    assert main(["worth", "--table", str(path), "--bootstrap", "0"]) == 0
+    assert "information worth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected columns label and one a class, found nothing"),
+        ("label,bus\n", "expected a line a point, found none"),
+        ("label,bus,bus\nbus,1,0\n", "expected columns label and one a class"),
+        ("label,bus,distance,realism\nbus,1,0,1\n", "expected one of distance and realism, found both"),
+        ("label,bench,bus\ntram,1,0\n", ":2: label: expected one of bench, bus, found 'tram'"),
+        ("label,bench,bus\nbus,0.5,nan\n", ":2: bus: expected a number in [0, 1], found 'nan'"),
+        ("label,bench,bus\nbus,0.5\n", ":2: bus: expected a number in [0, 1], found None"),
+        ("label,bench,bus\nbus,0.5,0.4\n", ":2: expected probabilities that add up to 1, found 0.9"),
+        ("label,bench,bus,distance\nbus,0.5,0.5,-1\n", ":2: distance: expected a number of at least 0"),
+        ("label,bench,bus,realism\nbus,0.5,0.5,2\n", ":2: realism: expected a number in [0, 1]"),
+    ],
+)
+def test_bad_tables(text: str, message: str, tmp_path: Path, refused: Callable[..., str]) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    assert message in refused("worth", "--table", str(path))
+
+
+def test_bad_input(write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
+    run = write_run(tmp_path / "run")
+
+    def says(*words: object) -> str:
+        line = refused("worth", *map(str, words))
+        (tmp_path / "empty").rmdir()
+        return line
+
+    assert "RUN: expected folders of drivesem attack, or --table, found nothing" in says()
+    assert "found both" in says(run, "--table", "x.csv")
+    assert "--after: expected --table beside it" in says(run, "--after", "x.csv")
+    assert "--second: expected runs" in says("--table", "x.csv", "--second", "squeezedet")
+    assert "--base: expected e, or a number above 1, found '1'" in says(run, "--base", "1")
+    assert "--base" in says(run, "--base", "two")
+    assert "--distance: expected none, perceptual" in says(run, "--distance", "psnr")
+    assert "--second: expected a detector" in says(run, "--distance", "none", "--second", "nobody")
+    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
+    (tmp_path / "table.csv").write_text(TABLE)
+    (tmp_path / "other.csv").write_text(TABLE.replace("bus,0.2", "bench,0.2"))
+    message = says("--table", tmp_path / "table.csv", "--after", tmp_path / "other.csv")
+    assert "--after: expected the classes and labels of table.csv" in message
+    other = write_run(tmp_path / "other")
+    files.write_text(
+        other / "config.yaml", files.read_text(run / "config.yaml").replace("squeezedet", "yolov3-slim")
+    )
+    assert "RUN: expected runs against one detector" in says(run, other)

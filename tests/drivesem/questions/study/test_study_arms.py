@@ -1,0 +1,75 @@
+"""Which attacks a study compares."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, arms_of
+from drivesem.settings.checks import validate
+from drivesem.settings.commands import Study
+
+OUT = Path("out")
+NAMES = ("single", "multi", "samples", "steps", "labels")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("quick", [True, False])
+def test_arms_are_attacks_that_the_command_takes(name: str, quick: bool, tmp_path: Path) -> None:
+    arms = arms_of(Study(name=name, quick=quick), tmp_path)
+    assert len({arm.folder for arm in arms}) == len(arms)
+    for arm in arms:
+        if arm.config.like is not None:
+            Path(arm.config.like).mkdir(parents=True)
+        validate(arm.config)
+        assert arm.config.limit == (QUICK_FRAMES if quick else FRAMES)
+    assert arms[0].config.method == "si-fgsm"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_full_study_goes_on_where_the_quick_one_stopped(name: str) -> None:
+    quick, full = ({a.folder: a for a in arms_of(Study(name=name, quick=q), OUT)} for q in (True, False))
+    assert set(quick) <= set(full)
+    for folder, arm in quick.items():
+        assert replace(arm.config, limit=FRAMES) == full[folder].config
+
+
+@pytest.mark.parametrize(("name", "count"), [("single", 6), ("multi", 5)])
+def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> None:
+    arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7), OUT)}
+    assert len(arms) == 3 * count
+    for arm in [a for a in arms.values() if a.control is None]:
+        assert arm.reference is not None
+        samples, edit = arms[f"{arm.name} {RANDOM}"], arms[f"{arm.name} {PLACEBO}"]
+        assert samples.of == edit.of == arm.name
+        assert (samples.config.method, samples.config.range, samples.config.queries) == (
+            "random",
+            "steps",
+            arm.config.steps,
+        )
+        assert (edit.config.method, edit.config.like) == ("placebo", f"out/arms/{arm.folder}")
+        for control in (samples, edit):
+            assert (control.config.params, control.config.combo) == (arm.config.params, arm.config.combo)
+            assert list(arms).index(control.name) > list(arms).index(arm.name)
+    assert len(arms_of(Study(name=name, controls=False), OUT)) == count
+
+
+def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
+    arms = arms_of(Study(name="multi", steps=7, controls=False), OUT)
+    assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
+    assert (arms[-1].config.combo, arms[-1].reference) == (2, arms[1].reference)
+    alone = arms_of(Study(name="multi", method="apgd", controls=False), OUT)
+    assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize("name", ["samples", "steps"])
+def test_these_name_their_own_methods(name: str) -> None:
+    assert arms_of(Study(name=name), OUT) == arms_of(Study(name=name, method="apgd"), OUT)
+
+
+def test_samples_end_at_the_first_success() -> None:
+    arms = arms_of(Study(name="samples", queries=9), OUT)
+    assert all(arm.config.early_stop or arm.config.method == "fgsm" for arm in arms)
+    searches = [arm.config for arm in arms if arm.config.queries]
+    assert {config.queries for config in searches} == {9}
+    assert {config.range for config in searches} == {"steps", "bounds"}

@@ -1,0 +1,239 @@
+"""`drivesem study retrain`: how detectors are judged, what is said of them, and the whole on embedded frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from detectors.registry import load_detector, save_detector
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.methods.base import Attack
+from drivesem.cli import main
+from drivesem.questions.study import lessons, retrain, retrain_report
+from drivesem.questions.study.lessons import BENIGN, lessons_of
+from drivesem.questions.study.report import print_told, write_tables
+from drivesem.questions.study.retrain import Taught
+from drivesem.questions.study.running import Ran
+from drivesem.questions.transfer.matrix import Row, Target, row
+from drivesem.run.finished import Run
+from drivesem.run.frame import as_detections
+from drivesem.run.results import FrameResult
+from drivesem.settings.commands import Study
+
+FRAMES, DRAWS = 8, 40
+ASKED = (
+    *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
+    *("recall_moved", "reference"),
+)
+"""What other programs read of a row."""
+CAR = torch.tensor([[10.0, 20.0, 60.0, 50.0]])
+
+
+def benign_frames(missed: Sequence[int]) -> tuple[list[Detections], list[Targets]]:
+    """Frames of one car; it is not found in those of `missed`."""
+    wanted = [Targets(CAR, torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.bool))] * FRAMES
+    none = Detections(CAR[:0], torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+    hit = Detections(CAR, torch.zeros(1, dtype=torch.int64), torch.tensor([0.9]))
+    return [none if i in missed else hit for i in range(FRAMES)], wanted
+
+
+def seen(missed: Sequence[int] = ()) -> retrain.Seen:
+    return retrain.seen_by(load_detector("squeezedet"), *benign_frames(missed), 0.5)
+
+
+def known(name: str, results: Sequence[FrameResult], kept: int) -> Row:
+    """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
+    run = Run(BENIGN, Path("run"), "squeezedet", "si-fgsm", "rotate", ())
+    target = Target(name, name, JudgedClasses(CLASSES, CLASSES), 0.5)
+    found = {
+        "benign": [as_detections(r.detections_benign, CLASSES) for r in results],
+        "rerendered": [as_detections(r.detections_benign, CLASSES) for r in results],
+        "attacked": [
+            as_detections(r.detections_benign if i < kept else r.detections_attacked, CLASSES)
+            for i, r in enumerate(results)
+        ],
+    }
+    return row(run, target, results, found, DRAWS, 0)
+
+
+@pytest.fixture
+def found(frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]) -> Taught:
+    """Four frames: the detector as it was loses a car in all of them; the retrained ones in half."""
+    study = Study(name="retrain", quick=True)
+    plan = lessons_of(study)
+    lost = [frame(str(i), found=False, success=True) for i in range(4)]
+    half = [frame(str(i), found=i < 2, success=i >= 2) for i in range(4)]
+    names = [BENIGN, *(lesson.name for lesson in plan)]
+    runs = [arm_run(arm(name), lost if name == BENIGN else half) for name in names]
+    before = {name: seen() if name == BENIGN else seen([0]) for name in names}
+    rows = retrain.rows_for(
+        study, plan, before, [known(name, lost, 0 if name == BENIGN else 2) for name in names], runs, DRAWS
+    )
+    learned = Ran((arm_run(arm("combo 2"), lost),), 1, {})
+    taught = {lesson.name: (lesson, 4) for lesson in plan}
+    return Taught(study, DRAWS, learned, Ran(tuple(runs), 0, {"9": "no camera"}), taught, 4, rows)
+
+
+def test_the_drop_is_paired_over_frames(found: Taught) -> None:
+    """One car a frame, the first missed: at weights w the recall is 1 - w0 / n, and precision 1 up to it."""
+    flat = found.rows[1].flat()
+    weights = np.random.default_rng(0).multinomial(FRAMES, np.full(FRAMES, 1 / FRAMES), size=DRAWS)
+    falls = 1 - (np.floor(100 * (1 - weights[:, 0] / FRAMES) + 1e-9) + 1) / 101
+    assert flat["benign_drop"] == pytest.approx(1 - (np.floor(100 * 7 / 8) + 1) / 101)
+    assert flat["benign_drop_low"] == pytest.approx(np.quantile(falls, 0.025))
+    assert flat["benign_drop_high"] == pytest.approx(np.quantile(falls, 0.975))
+    assert flat["benign_recall_drop"] == pytest.approx(1 / 8)
+    assert flat["benign_ap50"] == pytest.approx(1 - flat["benign_drop"])
+    first = found.rows[0].flat()
+    assert (first["benign_drop"], first["benign_drop_low"], first["benign_drop_high"]) == (0.0, 0.0, 0.0)
+
+
+def test_gains_are_over_the_detector_as_it_was(found: Taught) -> None:
+    before, after = (r.flat() for r in found.rows[:2])
+    assert (before["gain_moved"], before["fresh_gain_moved"]) == (0.0, 0.0)
+    for prefix in ("", "fresh_"):
+        rise = after[f"{prefix}moved_ap50"] - before[f"{prefix}moved_ap50"]
+        assert rise > 0.2
+        assert after[f"{prefix}gain_moved"] == pytest.approx(rise)
+        assert after[f"{prefix}gain_moved_low"] <= rise <= after[f"{prefix}gain_moved_high"]
+    assert (before["broken_rate"], after["broken_rate"]) == (1.0, 0.5)
+    assert (before["fresh_broken_rate"], after["fresh_broken_rate"]) == (1.0, 0.5)
+    assert after["drop_moved"] == pytest.approx(after["photographs_ap50"] - after["moved_ap50"])
+
+
+def test_what_is_told(found: Taught, tmp_path: Path) -> None:
+    data = found.to_json()
+    json.dumps(data, allow_nan=False)
+    assert [set(ASKED) - set(r) for r in data["rows"]] == [set()] * 3
+    assert [(r["reference"], r["reference_benign"]) for r in data["rows"]] == [
+        (0.659, 0.994),
+        (0.659, 0.994),
+        (0.7276, 0.8473),
+    ]
+    assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (4, FRAMES, 1.0)
+    shown = {name: (t["pictures"], t["labels"]) for name, t in data["training"].items()}
+    assert shown["retrained, ours"] == ("counterexample", "moved")
+    assert shown["retrained on benign re-rendered images"] == ("rerender", "benign")
+    told = retrain_report.told(found)
+    write_tables(tmp_path, told, "study.png", "drivesem study retrain")
+    text = (tmp_path / "study.md").read_text()
+    assert all(f"## {sheet.title}" in text for sheet in told.sheets)
+    for part in ("72.76", "84.73", "92.97", "Frame 9 could not be used: no camera", "1 frames without vehicles"):
+        assert part in text
+    lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
+    assert [line["name"] for line in lines] == [r.name for r in found.rows]
+    stream = io.StringIO()
+    print_told(told, Console(file=stream, width=100))
+    assert "retrained, ours" in stream.getvalue()
+    retrain_report.write_plot(tmp_path / "study.png", found)
+    assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
+
+
+def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Store:
+        names = ("a", "b")
+
+        def __len__(self) -> int:
+            return len(self.names)
+
+    looks: list[int] = []
+
+    def detect(detector: object, store: Store, indices: Sequence[int], device: str) -> list[Detections]:
+        looks.append(len(indices))
+        return benign_frames([1])[0][: len(indices)]
+
+    monkeypatch.setattr(retrain, "detect", detect)
+    detector, store, path = load_detector("squeezedet"), Store(), tmp_path / "seen.json"
+    first = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    again = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    assert looks == [2]
+    assert [len(one) for one in again] == [len(one) for one in first] == [1, 0]
+    assert torch.equal(again[0].boxes_xyxy, first[0].boxes_xyxy)
+    assert torch.equal(again[0].scores, first[0].scores)
+    with torch.no_grad():
+        next(iter(detector.parameters())).add_(1.0)
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    store.names = ("a",)  # pyright: ignore[reportAttributeAccessIssue]
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    assert looks == [2, 2, 1], "other weights, other frames"
+
+
+def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
+    weights = tmp_path / "w.safetensors"
+    detector = load_detector("squeezedet")
+    save_detector(detector, weights, {"retrained_from": "squeezedet", "steps": "2"})
+    retrain.set_threshold(detector, weights, 0.123456789)
+    assert load_detector(weights).t_star == detector.t_star == 0.123457
+    written = weights.stat().st_mtime_ns
+    retrain.set_threshold(load_detector(weights), weights, 0.123456789)
+    assert weights.stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--train-steps", "0"], "--train-steps: expected at least 1, found 0"),
+        (["--fresh", "0"], "--fresh: expected at least 1, found 0"),
+        (["--benign-frames", "-3"], "--benign-frames: expected at least 1, found -3"),
+        (["--held-out", "x"], "--held-out, --benign-root: expected none with the embedded frames"),
+        (["--detector", "squeezdet"], "--detector: expected a detector that can be trained"),
+        (["--detector", "onnx:none.onnx"], "--detector: expected a detector"),
+        (["--mix", "half"], "half"),
+        (["--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert message in refused("study", "retrain", *words)
+
+
+@pytest.mark.slow
+def test_the_whole_study_and_going_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    words = ["study", "retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
+    words += ["--train-steps", "2", "--workers", "1", "--bootstrap", "5", "--out", str(out), "--json"]
+    assert main(words) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert [r["name"] for r in data["rows"]] == [
+        "benign detector",
+        "retrained on benign re-rendered images",
+        "retrained, ours",
+    ]
+    assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (1, 2, 1.0)
+    assert json.loads((out / "study.json").read_text()) == data
+    folders = {path.name for path in (out / "arms").iterdir()}
+    assert folders == {"combo-2", "held-out", "held-out-re-rendered", "held-out-ours"}
+    learned, judged = ((out / "arms" / n / "frames" / "demo-000" / "benign.png") for n in ("combo-2", "held-out"))
+    assert learned.read_bytes() != judged.read_bytes()
+    settings = (out / "arms" / "held-out-ours" / "config.yaml").read_text()
+    assert f"detector: {out / 'retrained' / 'ours' / 'retrained.safetensors'}" in settings
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("done before")
+
+    (out / "study.json").unlink()
+    with monkeypatch.context() as patch:
+        for place, name in ((lessons, "train_on"), (retrain, "detect"), (Attack, "__call__")):
+            patch.setattr(place, name, never)
+        assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == data
+    # other weights: what was attacked with the old ones is no longer fresh
+    shutil.copy(out / "retrained" / "ours" / "retrained.safetensors", out / "retrained" / "re-rendered")
+    assert main(words) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows[1]["fresh_moved_ap50"] == rows[2]["fresh_moved_ap50"]
+    assert main([*words, "--limit", "1"]) == 2, "other frames to train on"
+    assert "other values of limit" in capsys.readouterr().err

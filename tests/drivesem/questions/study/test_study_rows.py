@@ -1,0 +1,86 @@
+"""A study's table: what falls, by which labels, and beyond the controls."""
+
+import numpy as np
+import pytest
+
+from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.rows import relative_size, rows_of
+from drivesem.report.paper import PAPER_BENIGN
+
+FRAMES = 8
+FAR = 40.0
+"""px: the moved car's label meets the old one at an IoU of 1/9."""
+
+
+@pytest.fixture
+def runs(frame, arm_run, arm):
+    """An attack that makes the detector lose a car in half of the frames; a random control that moves the car in
+    all of them and is followed; a placebo that does nothing.
+    """
+    names = [f"{i:03d}" for i in range(FRAMES)]
+    lost = [frame(n, moved_by=5.0, found=i % 2 == 0, success=i % 2 == 1, yaw=0.2) for i, n in enumerate(names)]
+    followed = [frame(n, moved_by=FAR) for n in names]
+    nothing = [frame(n, yaw=0.1) for n in names]
+    return [
+        arm_run(arm("rotate", 0.982), lost),
+        arm_run(arm("rotate random", control=(RANDOM, "rotate")), followed),
+        arm_run(arm("rotate placebo", control=(PLACEBO, "rotate")), nothing),
+    ]
+
+
+def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
+    (row,) = rows_of(runs, draws=50, seed=0)
+    flat = row.flat()
+    assert (flat["name"], flat["reference"], flat["frames"], flat["objects"]) == ("rotate", 0.982, 8, 16)
+    assert flat["reference_drop"] == pytest.approx(PAPER_BENIGN - 0.982)
+    assert flat["benign_ap50"] == 1.0
+    # 12 of 16 cars are found, nothing else: precision is 1 up to a recall of 0.75
+    assert flat["moved_ap50"] == pytest.approx(76 / 101)
+    assert flat["recall_moved"] == 0.75
+    assert flat["drop_moved"] == pytest.approx(25 / 101)
+    assert flat["drop_moved_low"] < flat["drop_moved"] < flat["drop_moved_high"]
+    assert flat["successes_moved"] == 4
+    assert flat["queries"] == 80
+    assert flat["feasible_fraction"] == 1.0
+
+
+def test_drops_are_those_of_the_figures(runs) -> None:
+    """The bootstrap's figures and pycocotools' are the same numbers."""
+    (row,) = rows_of(runs, draws=0, seed=0)
+    flat = row.flat()
+    for mode in ("paper", "moved"):
+        for key in ("ap50", "ap70", "ap", "recall"):
+            drop = flat[f"drop_{mode}" if key == "ap50" else f"drop_{mode}_{key}"]
+            after = flat[f"recall_{mode}"] if key == "recall" else flat[f"{mode}_{key}"]
+            assert drop == pytest.approx(flat[f"benign_{key}"] - after, abs=1e-9)
+    assert flat["drop_moved_low"] is None
+
+
+def test_the_controls_stand_beside(runs) -> None:
+    (row,) = rows_of(runs, draws=50, seed=0)
+    flat = row.flat()
+    assert flat["placebo_drop_moved"] == 0
+    assert flat["over_placebo_moved"] == pytest.approx(flat["drop_moved"])
+    assert flat["over_placebo_moved_low"] <= flat["over_placebo_moved"] <= flat["over_placebo_moved_high"]
+    # a car that moved and was found there is wrong by the labels that stay, and right by those that move
+    assert flat["random_drop_moved"] == 0
+    assert flat["random_drop_paper"] > 0.4
+    assert flat["over_random_paper"] == pytest.approx(flat["random_paper_ap50"] - flat["paper_ap50"])
+    assert flat["random_successes_moved"] == 0
+    assert flat["placebo_size"] == pytest.approx(0.5)
+
+
+def test_sizes_are_compared_frame_by_frame(frame) -> None:
+    attack = [frame("a", yaw=0.2), frame("b", yaw=0.1), frame("c", yaw=0.0)]
+    control = [frame("a", yaw=-0.2), frame("b", yaw=0.05), frame("c", yaw=0.3)]
+    assert relative_size(control, attack) == pytest.approx(np.mean([1.0, 0.5]))
+    assert relative_size([control[2]], [attack[2]]) is None
+
+
+def test_equal_arms_have_no_effect_and_no_spread(frame, arm_run, arm) -> None:
+    results = [frame(f"{i}", found=i % 2 == 0) for i in range(4)]
+    runs = [arm_run(arm("one"), results), arm_run(arm("two", control=(PLACEBO, "one")), results)]
+    (row,) = rows_of(runs, draws=20, seed=3)
+    effect = row.effects[PLACEBO]["moved"]
+    assert (effect.value, effect.low, effect.high) == (0.0, 0.0, 0.0)
+    assert row.drops["moved"]["ap50"].value == pytest.approx(25 / 101)

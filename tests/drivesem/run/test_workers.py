@@ -1,0 +1,170 @@
+"""Work shared by processes: results, errors, and what each process makes for itself."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from drivesem.run.workers import outcomes
+from drivesem.settings.commands import Common
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
+
+
+def square(job: int, offset: int = 0) -> tuple[int, int]:
+    """A job's square and who found it. FormatError for 3."""
+    if job == 3:
+        raise FormatError("three", "another number", job)
+    return job * job + offset, os.getpid()
+
+
+def build(offset: int) -> Callable[[int], tuple[int, int]]:
+    return partial(square, offset=offset)
+
+
+def in_order(jobs: list[int], config: Common) -> dict[int, tuple[int, int] | str]:
+    found: dict[int, tuple[int, int] | str] = {}
+    for job, outcome in outcomes(square, partial(build, 100), jobs, config):
+        try:
+            found[job] = outcome()
+        except SceneError as error:
+            found[job] = str(error)
+    return found
+
+
+def test_one_process_does_it_here() -> None:
+    found = in_order([1, 2, 3], Common(workers=1))
+    assert found == {1: (1, os.getpid()), 2: (4, os.getpid()), 3: "three: expected another number, found 3"}
+    assert in_order([2], Common(workers=4)) == {2: (4, os.getpid())}, "one job is not worth a process"
+    assert in_order([], Common(workers=4)) == {}
+
+
+def test_processes_make_their_own_and_hand_errors_back() -> None:
+    found = in_order([1, 2, 3, 4], Common(workers=2))
+    assert found[3] == "three: expected another number, found 3"
+    for job in (1, 2, 4):
+        value = found[job]
+        assert isinstance(value, tuple)
+        assert value[0] == job * job + 100
+        assert value[1] != os.getpid()
+
+
+@pytest.mark.parametrize("kind", [ShapeError, RangeError, FormatError, UsageError])
+def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> None:
+    error = kind("file:3", "a number", [1, 2])
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is kind
+    assert str(again) == str(error) == "file:3: expected a number, found [1, 2]"
+
+
+@pytest.mark.parametrize("jobs", [[], [1], [1, 2]])
+def test_threads_are_shared_among_processes_only_while_they_work(jobs: list[int]) -> None:
+    before, shared = torch.get_num_threads(), max((os.cpu_count() or 1) // 2, 1)
+    try:
+        torch.set_num_threads(shared + 1)
+        for _, outcome in outcomes(square, partial(build, 0), jobs, Common(workers=2)):
+            outcome()
+            assert torch.get_num_threads() == shared
+        assert torch.get_num_threads() == shared + 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def stumble(job: int) -> int:
+    return 12 // job
+
+
+def stumbling() -> Callable[[int], int]:
+    return stumble
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None:
+    def found(*, keep_going: bool) -> dict[int, int | str]:
+        results: dict[int, int | str] = {}
+        config = Common(workers=workers, keep_going=keep_going)
+        for job, outcome in outcomes(stumble, stumbling, [3, 0, 4], config):
+            try:
+                results[job] = outcome()
+            except SceneError as error:
+                results[job] = str(error)
+        return results
+
+    said = found(keep_going=True)
+    assert (said[3], said[4]) == (4, 3)
+    assert re.fullmatch(
+        r"drivesem: expected no defect of its own, found ZeroDivisionError at test_workers.py:\d+: .*", str(said[0])
+    )
+    with pytest.raises(ZeroDivisionError):
+        found(keep_going=False)
+
+
+@pytest.mark.parametrize("keep_going", [False, True])
+def test_bad_settings_end_it_in_any_case(keep_going: bool) -> None:
+    def refuse(job: int) -> int:
+        raise UsageError("--detector", "another", job)
+
+    ((_, outcome),) = outcomes(refuse, stumbling, [1], Common(workers=1, keep_going=keep_going))
+    with pytest.raises(UsageError, match="--detector"):
+        outcome()
+
+
+def linger(job: int, folder: str) -> None:
+    """Say who works, and never end."""
+    Path(folder, f"{job}-{os.getpid()}").touch()
+    time.sleep(600)
+
+
+def lingering(folder: str) -> Callable[[int], None]:
+    return partial(linger, folder=folder)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
+def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
+    script = (
+        "from drivesem.settings.commands import Common\n"
+        "from drivesem.run.workers import outcomes\n"
+        "from tests.drivesem.run.test_workers import lingering\n"
+        "from functools import partial\n"
+        "if __name__ == '__main__':\n"
+        f"    list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Common(workers=2)))\n"
+    )
+    file = tmp_path / "killed.py"
+    file.write_text(script)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    parent = subprocess.Popen([sys.executable, str(file)], env=environment, stderr=subprocess.DEVNULL)
+    _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
+    found = list(tmp_path.glob("[12]-*"))
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    assert len(found) == 2
+    workers = [int(path.name.partition("-")[2]) for path in found]
+    assert _soon(lambda: not any(_lives(pid) for pid in workers))
+
+
+def _soon(what: Callable[[], bool], seconds: float = 60) -> bool:
+    until = time.monotonic() + seconds
+    while not what():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def _lives(pid: int) -> bool:
+    """Whether a process runs: one that ended and that nobody has asked for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

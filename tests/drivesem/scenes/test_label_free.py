@@ -1,0 +1,318 @@
+"""Photographs without labels: camera, detections as labels, and how well the shipped network places vehicles."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from detectors.types import CLASSES, Detections
+from drivesem.cli import main
+from drivesem.data.kitti import KittiDataset
+from drivesem.data.registry import open_dataset
+from drivesem.scenes.label_free import (
+    DEFAULT_FOCAL,
+    FITTING,
+    camera_of,
+    detect,
+    focal_of,
+    label_free,
+    photograph,
+    settings_for,
+)
+from drivesem.synth.frames import SynthFrame, generate_frame
+from scene_ir.derender import pose
+from scene_ir.derender.derender import DerenderSettings
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.geometry import clip_boxes, project_boxes
+from scene_ir.io import load_scene
+from scene_ir.types import Camera, Frame
+
+KITTI = Path(__file__).parents[3].parent / "shared" / "data" / "kitti"
+SEED, FRAMES = 2027, range(12)
+"""Held-out streets that the network was neither trained nor judged on."""
+CAR, TRUCK, PEDESTRIAN = (CLASSES.index(name) for name in ("Car", "Truck", "Pedestrian"))
+
+
+def save(
+    path: Path, tags: dict[int, object], own: dict[int, object], size_wh: tuple[int, int] = (400, 300)
+) -> Path:
+    """A JPEG with these tags of EXIF, and of its own directory; its upper left quarter is red."""
+    pixels = np.full((size_wh[1], size_wh[0], 3), 128, np.uint8)
+    pixels[: size_wh[1] // 2, : size_wh[0] // 2] = (200, 20, 20)
+    image = Image.fromarray(pixels)
+    exif = Image.Exif()
+    for tag, value in tags.items():
+        exif[tag] = value
+    exif.get_ifd(0x8769).update(own)
+    image.save(path, exif=exif, quality=95)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        ({0xA405: 26}, (400 * 26 / 36, "EXIF")),
+        ({0x920A: 4.0, 0xA20E: 1000.0, 0xA210: 3}, (400.0, "EXIF")),
+        ({0x920A: 4.0, 0xA20E: 2540.0}, (400.0, "EXIF")),
+        ({0x920A: 4.0}, (DEFAULT_FOCAL * 400, "default")),
+        ({0xA405: 0}, (DEFAULT_FOCAL * 400, "default")),
+        ({}, (DEFAULT_FOCAL * 400, "default")),
+    ],
+)
+def test_focal_length_of_a_file(own: dict[int, object], expected: tuple[float, str], tmp_path: Path) -> None:
+    path = save(tmp_path / "a.jpg", {}, own)
+    found = focal_of(path)
+    assert (found.length_px, found.source) == (pytest.approx(expected[0], rel=1e-4), expected[1])
+    assert focal_of(path, 333.0).length_px == 333.0
+    camera = camera_of(path)
+    assert (camera.width, camera.height) == (400, 300)
+    assert camera.intrinsics[:2, 2].tolist() == [199.5, 149.5]
+    assert float(camera.intrinsics[0, 0]) == pytest.approx(expected[0], rel=1e-4)
+
+
+@pytest.mark.parametrize(("orientation", "red"), [(1, (0, 0)), (3, (-1, -1)), (6, (0, -1)), (8, (-1, 0))])
+def test_a_turned_photograph_is_put_upright(orientation: int, red: tuple[int, int], tmp_path: Path) -> None:
+    path = save(tmp_path / "a.jpg", {0x0112: orientation}, {0xA405: 36})
+    frame = photograph(path)
+    assert frame.photograph.shape[1:] == ((400, 300) if orientation in (6, 8) else (300, 400))
+    assert (camera_of(path).height, camera_of(path).width) == frame.photograph.shape[1:]
+    y, x = (5 if r == 0 else -5 for r in red)
+    assert float(frame.photograph[0, y, x]) > 0.7
+    assert float(frame.photograph[0, -y, -x]) < 0.6
+    assert float(frame.camera.intrinsics[0, 0]) == pytest.approx(400)  # of the longer side
+    assert frame.identifier == "a"
+    assert frame.provenance["focal"] == "400.0 px, EXIF"
+
+
+def test_what_is_no_photograph_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no image")
+    for path in (tmp_path / "a.png", tmp_path / "none.png"):
+        for call in (camera_of, focal_of, photograph):
+            with pytest.raises(FormatError, match=path.name):
+                call(path)
+    path = save(tmp_path / "b.jpg", {}, {})
+    for focal in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(RangeError, match="focal"):
+            camera_of(path, focal)
+
+
+def frame_of(width: int = 1242, height: int = 375) -> Frame:
+    k = torch.tensor([[720.0, 0.0, (width - 1) / 2], [0.0, 720.0, 172.0], [0.0, 0.0, 1.0]])
+    picture = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
+    return Frame("one", picture, Camera(k, height, width))
+
+
+def seen(boxes: list[list[float]], labels: list[int]) -> Detections:
+    return Detections(torch.tensor(boxes).reshape(-1, 4), torch.tensor(labels), torch.full((len(labels),), 0.9))
+
+
+def test_detections_become_labels() -> None:
+    frame = frame_of()
+    boxes = [[550.0, 170, 650, 240], [0, 170, 120, 320], [560, 150, 590, 260], [700, 120, 800, 230]]
+    found = label_free(frame, seen(boxes, [CAR, CAR, PEDESTRIAN, TRUCK]))
+    labels = found.labels
+    assert labels is not None
+    assert labels.kind == ("Car", "Car", "Pedestrian", "Truck")
+    for values in (labels.translation, labels.yaw, labels.size_lhw, labels.truncation):
+        assert bool(torch.isfinite(values).all())
+    full = project_boxes(labels.size_lhw, labels.yaw, labels.translation, frame.camera.matrix)
+    vehicles = [0, 1, 3]
+    torch.testing.assert_close(labels.boxes_xyxy[vehicles], clip_boxes(full, 375, 1242)[vehicles])
+    assert labels.boxes_xyxy[2].tolist() == boxes[2]
+    assert labels.truncation[[0, 2, 3]].tolist() == [0, 0, 0]
+    assert found.provenance["labels"] == "estimated"
+    assert set(found.provenance) >= {"labels[0].score", "labels[0].facing", "labels[3].depth_sigma"}
+    assert found.photograph is frame.photograph
+    # the pedestrian stands on the ground that the cars stand on, or is as far as it is small
+    assert float(labels.translation[2, 2]) == pytest.approx(720 * 1.75 / 110, rel=0.6)
+
+
+def known(places: torch.Tensor) -> Callable[..., pose.Poses]:
+    """An estimate that puts cars, all heading away, at these places on a level road."""
+    count = len(places)
+    one, ground = torch.ones(count), torch.tensor([0.0, -1, 0, 1.65])
+    size = torch.tensor([4.0, 1.5, 1.7]).expand(count, 3)
+    poses = pose.Poses(places, one * math.pi / 2, size, ("sedan",) * count, 0.05 * one, one, ground)
+    return lambda *_, **__: poses
+
+
+def cars(count: int) -> Detections:
+    return seen([[100.0 * i, 100, 100 * i + 50, 150] for i in range(count)], [CAR] * count)
+
+
+def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One car behind another, one beside, one half out of the image, one behind the camera."""
+    places = torch.tensor([[0.0, 1.65, 10], [0.3, 1.65, 20], [9, 1.65, 20], [-8, 1.65, 9.5], [0, 1.65, -5]])
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
+    labels = label_free(frame_of(), cars(5)).labels
+    assert labels is not None
+    assert torch.equal(labels.translation, places[:4])
+    assert labels.occlusion.tolist() == [0, 3, 0, 0]
+    assert labels.truncation[:3].tolist() == [0, 0, 0]
+    assert 0.2 < float(labels.truncation[3]) < 0.8
+    assert float(labels.boxes_xyxy[3, 0]) == 0
+
+
+def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two cars in one place the surer one stays; one above the ground goes; neighbours stay."""
+    places = torch.tensor([[0.0, 1.65, 10], [0.4, 1.65, 11], [3.0, 1.65, 10], [6.0, -1.5, 15], [8.0, 2.2, 25]])
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
+    found = cars(5)
+    found.scores[1] = 0.95
+    labels = label_free(frame_of(), found).labels
+    assert labels is not None
+    assert torch.equal(labels.translation, places[[1, 2, 4]])
+
+
+def test_no_detections_and_wrong_labels() -> None:
+    none = label_free(frame_of(), seen([], []))
+    assert none.labels is not None
+    assert none.labels.kind == ()
+    with pytest.raises(RangeError, match="labels"):
+        label_free(frame_of(), seen([[0.0, 0, 50, 50]], [9]))
+    with pytest.raises(RangeError, match="boxes_xyxy"):
+        label_free(frame_of(), seen([[50.0, 0, 50, 50]], [CAR]))
+
+
+def test_the_fit_may_go_farther_than_from_labels() -> None:
+    settings = settings_for(DerenderSettings(fit=False, seed=3))
+    assert (settings.fit, settings.seed, settings.fitting) == (False, 3, FITTING)
+    usual = DerenderSettings().fitting
+    assert FITTING.max_shift_m > usual.max_shift_m
+    assert FITTING.max_turn_rad > usual.max_turn_rad
+
+
+@pytest.fixture(scope="module")
+def streets() -> list[SynthFrame]:
+    return [generate_frame(SEED, index, "heldout") for index in FRAMES]
+
+
+def plain(frame: SynthFrame) -> Frame:
+    return Frame("street", torch.from_numpy(frame.image).permute(2, 0, 1).float() / 255, frame.camera)
+
+
+def clear(frame: SynthFrame) -> list[int]:
+    """Rows of cars and trucks that are large and visible."""
+    labels = frame.labels
+    height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    good = (height >= 25) & (labels.occlusion <= 1) & (labels.truncation <= 0.3)
+    return [i for i in range(len(labels.kind)) if labels.kind[i] in ("Car", "Van", "Truck") and bool(good[i])]
+
+
+def test_shipped_weights_keep_what_their_card_says(streets: list[SynthFrame]) -> None:
+    turn, depth, size, kind = [], [], [], []
+    for street in streets:
+        labels, rows = street.labels, clear(street)
+        kinds = ["Truck" if labels.kind[i] == "Truck" else "Car" for i in rows]
+        found = pose.estimate(plain(street).photograph, labels.boxes_xyxy[rows], kinds, street.camera)
+        turn += [
+            abs(math.remainder(float(a - b), 2 * math.pi))
+            for a, b in zip(found.yaw, labels.yaw[rows], strict=False)
+        ]
+        depth += (found.translation[:, 2] / labels.translation[rows, 2] - 1).abs().tolist()
+        size += (found.size_lhw / labels.size_lhw[rows]).log().abs().tolist()
+        true = [t.actor.kind for t in street.truths if t.labelled]
+        kind += [a == true[i] for a, i in zip(found.kind, rows, strict=True)]
+    assert len(turn) >= 12
+    assert math.degrees(float(np.median(turn))) < 4
+    assert float(np.median(depth)) < 0.05
+    assert np.median(size, 0).tolist() < [0.10, 0.06, 0.06]
+    assert np.mean(np.array(turn) > math.pi / 2) < 0.15
+    assert np.mean(kind) > 0.6
+
+
+def test_found_vehicles_are_placed(streets: list[SynthFrame]) -> None:
+    near = []
+    for street in streets[:3]:
+        frame = plain(street)
+        found = label_free(frame, detect(frame)).labels
+        assert found is not None
+        places = found.translation[[i for i, kind in enumerate(found.kind) if kind in ("Car", "Truck")]]
+        for row in clear(street):
+            true = street.labels.translation[row]
+            apart = (places - true).norm(dim=1).min() if len(places) else torch.tensor(math.inf)
+            near.append(float(apart / true[2]) < 0.15)
+    assert np.mean(near) > 0.5
+
+
+def test_a_larger_picture_of_the_same_street_gives_the_same_cars(streets: list[SynthFrame]) -> None:
+    frame = plain(streets[0])
+    k = frame.camera.intrinsics.clone()
+    k[:2] *= 2
+    k[:2, 2] += 0.5
+    height, width = frame.photograph.shape[1:]
+    large = torch.nn.functional.interpolate(frame.photograph[None], scale_factor=2, mode="bilinear")[0]
+    one, two = detect(frame), detect(Frame("two", large, Camera(k, 2 * height, 2 * width)))
+    assert len(one) > 0
+    assert len(two) == pytest.approx(len(one), abs=max(1, len(one) // 3))
+    sides = (two.boxes_xyxy[0, 2:] - two.boxes_xyxy[0, :2]) / 2
+    apart = (one.boxes_xyxy - (two.boxes_xyxy[0] - 0.5) / 2).abs().amax(1).min()
+    assert float(apart) < 0.25 * float(sides.max())
+
+
+def test_derender_takes_a_photograph(
+    streets: list[SynthFrame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(streets[0].image).save(tmp_path / "street.png")
+    focal = float(streets[0].camera.intrinsics[0, 0])
+    words = ["derender", str(tmp_path / "street.png"), "--focal", str(focal), "--fast", "--json", "--workers", "1"]
+    assert main([*words, "--out", str(tmp_path / "S")]) == 0
+    captured = capsys.readouterr()
+    assert f"focal length {focal:.0f} px (given)" in captured.err
+    told = json.loads(captured.out)["frames"]["street"]
+    scene = load_scene(tmp_path / "S" / "street")
+    assert told["objects"] == len(scene.objects) > 0
+    assert scene.provenance["labels"] == "estimated"
+    assert torch.equal(
+        (scene.photograph * 255).round().byte(), torch.from_numpy(streets[0].image).permute(2, 0, 1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.png"], "none.png: expected a readable file"),
+        (["a.txt"], "a.txt: expected an image"),
+        (["none.png", "--dataset", "kitti", "--root", "."], "PHOTO: expected no --dataset beside it"),
+        (["--focal", "700"], "--focal: expected a PHOTO"),
+        (["none.png", "--focal", "-1"], "--focal: expected positive px"),
+    ],
+)
+def test_derender_refuses_photographs(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.txt").write_text("text")
+    assert main(["derender", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.skipif(not (KITTI / "training" / "label_2").is_dir(), reason="../shared/data/kitti is not there")
+def test_cars_of_real_photographs_are_placed() -> None:
+    dataset = open_dataset("kitti", KITTI)
+    assert isinstance(dataset, KittiDataset)
+    turn, depth = [], []
+    for identifier in ("000003", "000008", "000010"):
+        frame = dataset.frame(identifier)
+        labels = frame.labels
+        assert labels is not None
+        rows = [i for i, k in enumerate(labels.kind) if k == "Car" and int(labels.occlusion[i]) <= 1]
+        found = pose.estimate(frame.photograph, labels.boxes_xyxy[rows], ["Car"] * len(rows), frame.camera)
+        turn += [
+            abs(math.remainder(float(a - b), math.pi)) for a, b in zip(found.yaw, labels.yaw[rows], strict=False)
+        ]
+        depth += (found.translation[:, 2] / labels.translation[rows, 2] - 1).abs().tolist()
+    assert math.degrees(float(np.median(turn))) < 10  # front or back apart
+    assert float(np.median(depth)) < 0.12
