@@ -28,7 +28,8 @@ from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
-from scene_ir.render.environment import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, time_gain
+from scene_ir.render.environment import time_gain
+from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M
 from scene_ir.render.texture import apply_texture_code
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]

@@ -310,6 +310,49 @@ def pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=
     return wp.vec3i(x0 + within - row * width, y0 + row, width)
 
 
+@wp.struct
+class Hit:
+    """A triangle at a pixel: its corners, edge functions, 1 over their sum, and perspective-correct weights."""
+
+    i0: int
+    i1: int
+    i2: int
+    c0: wp.vec3d
+    c1: wp.vec3d
+    c2: wp.vec3d
+    e: wp.vec3d
+    scale: wp.float64
+    b: wp.vec3d
+
+
+@wp.func
+def find_hit(f: int, x: int, y: int, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)):
+    hit = Hit()
+    corners = faces[f]
+    hit.i0 = corners[0]
+    hit.i1 = corners[1]
+    hit.i2 = corners[2]
+    hit.c0 = wp.vec3d(clip[hit.i0])
+    hit.c1 = wp.vec3d(clip[hit.i1])
+    hit.c2 = wp.vec3d(clip[hit.i2])
+    e0 = edge(wp.cross(hit.c1, hit.c2), x, y)
+    e1 = edge(wp.cross(hit.c2, hit.c0), x, y)
+    e2 = edge(wp.cross(hit.c0, hit.c1), x, y)
+    hit.e = wp.vec3d(e0, e1, e2)
+    hit.scale = ONE / ((e0 + e1) + e2)
+    hit.b = hit.e * hit.scale
+    return hit
+
+
+@wp.func
+def add_to_corners(hit: Hit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: wp.array(dtype=wp.vec3d)):
+    """Add what gradients to the edge functions, each times the pixel (x, y, 1), mean for the corners."""
+    # q . (a x b) has the gradients b x q to a and q x a to b; here gathered by corner.
+    wp.atomic_add(grad_clip, hit.i0, wp.cross(q1, hit.c2) + wp.cross(hit.c1, q2))
+    wp.atomic_add(grad_clip, hit.i1, wp.cross(q2, hit.c0) + wp.cross(hit.c2, q0))
+    wp.atomic_add(grad_clip, hit.i2, wp.cross(q0, hit.c1) + wp.cross(hit.c0, q1))
+
+
 @wp.kernel
 def interpolate_kernel(
     start: int,
@@ -325,20 +368,10 @@ def interpolate_kernel(
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        corner = faces[f]
-        i0 = corner[0]
-        i1 = corner[1]
-        i2 = corner[2]
-        c0 = wp.vec3d(clip[i0])
-        c1 = wp.vec3d(clip[i1])
-        c2 = wp.vec3d(clip[i2])
-        e0 = edge(wp.cross(c1, c2), at[0], at[1])
-        e1 = edge(wp.cross(c2, c0), at[0], at[1])
-        e2 = edge(wp.cross(c0, c1), at[0], at[1])
-        scale = ONE / ((e0 + e1) + e2)
+        hit = find_hit(f, at[0], at[1], clip, faces)
         for k in range(attributes.shape[1]):
-            value = e0 * wp.float64(attributes[i0, k]) + e1 * wp.float64(attributes[i1, k])
-            out[i, k] = wp.float32((value + e2 * wp.float64(attributes[i2, k])) * scale)
+            value = hit.e[0] * wp.float64(attributes[hit.i0, k]) + hit.e[1] * wp.float64(attributes[hit.i1, k])
+            out[i, k] = wp.float32((value + hit.e[2] * wp.float64(attributes[hit.i2, k])) * hit.scale)
 
 
 @wp.kernel
@@ -360,20 +393,7 @@ def interpolate_backward_kernel(
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        corner = faces[f]
-        i0 = corner[0]
-        i1 = corner[1]
-        i2 = corner[2]
-        c0 = wp.vec3d(clip[i0])
-        c1 = wp.vec3d(clip[i1])
-        c2 = wp.vec3d(clip[i2])
-        e0 = edge(wp.cross(c1, c2), at[0], at[1])
-        e1 = edge(wp.cross(c2, c0), at[0], at[1])
-        e2 = edge(wp.cross(c0, c1), at[0], at[1])
-        scale = ONE / ((e0 + e1) + e2)
-        b0 = e0 * scale
-        b1 = e1 * scale
-        b2 = e2 * scale
+        hit = find_hit(f, at[0], at[1], clip, faces)
         # d out_k / d e_i = (a_ik - out_k) / sum e
         g0 = ZERO
         g1 = ZERO
@@ -381,26 +401,20 @@ def interpolate_backward_kernel(
         for k in range(attributes.shape[1]):
             g = wp.float64(grad_out[i, k])
             if with_clip:
-                a0 = wp.float64(attributes[i0, k])
-                a1 = wp.float64(attributes[i1, k])
-                a2 = wp.float64(attributes[i2, k])
-                value = b0 * a0 + b1 * a1 + b2 * a2
+                a0 = wp.float64(attributes[hit.i0, k])
+                a1 = wp.float64(attributes[hit.i1, k])
+                a2 = wp.float64(attributes[hit.i2, k])
+                value = hit.b[0] * a0 + hit.b[1] * a1 + hit.b[2] * a2
                 g0 += g * (a0 - value)
                 g1 += g * (a1 - value)
                 g2 += g * (a2 - value)
             if with_attributes:
-                wp.atomic_add(grad_attributes, i0, k, wp.float32(g * b0))
-                wp.atomic_add(grad_attributes, i1, k, wp.float32(g * b1))
-                wp.atomic_add(grad_attributes, i2, k, wp.float32(g * b2))
+                wp.atomic_add(grad_attributes, hit.i0, k, wp.float32(g * hit.b[0]))
+                wp.atomic_add(grad_attributes, hit.i1, k, wp.float32(g * hit.b[1]))
+                wp.atomic_add(grad_attributes, hit.i2, k, wp.float32(g * hit.b[2]))
         if with_clip:
             p = wp.vec3d(wp.float64(at[0]), wp.float64(at[1]), ONE)
-            # q . (a x b) has the gradients b x q to a and q x a to b; here gathered by corner.
-            q0 = p * (g0 * scale)
-            q1 = p * (g1 * scale)
-            q2 = p * (g2 * scale)
-            wp.atomic_add(grad_clip, i0, wp.cross(q1, c2) + wp.cross(c1, q2))
-            wp.atomic_add(grad_clip, i1, wp.cross(q2, c0) + wp.cross(c2, q0))
-            wp.atomic_add(grad_clip, i2, wp.cross(q0, c1) + wp.cross(c0, q1))
+            add_to_corners(hit, p * (g0 * hit.scale), p * (g1 * hit.scale), p * (g2 * hit.scale), grad_clip)
 
 
 @wp.func

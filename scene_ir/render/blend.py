@@ -13,7 +13,7 @@ from torch import Tensor
 from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import Layout
 from scene_ir.raster.verbs import Backend
-from scene_ir.render.texture import SATURATED
+from scene_ir.render.model import SATURATED
 from scene_ir.types import Front
 
 _STANDING_M = 0.4

@@ -13,33 +13,16 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster.verbs import Backend
+from scene_ir.render import model
 from scene_ir.render.texture import lab, rgb_of, smoothstep
 from scene_ir.types import Environment
-
-FOG_EXTINCTION_PER_M = 0.03
-"""Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""
-RAIN_EXTINCTION_PER_M = 0.006
-"""Haze of strong rain at rain code 1."""
-HAZE_CAP_M = 300.0
-"""Haze is a layer on the ground: the sky is seen through this much of it."""
-FEWEST_LEAVES = 0.004
-"""Below this share of foliage a pixel stays as it is: one step of a picture of 8 bits."""
-_SKY_RGB = (0.78, 0.82, 0.87)
-"""Colour of the air where the photograph shows no sky."""
-LUMA = (0.299, 0.587, 0.114)
-"""ITU-R BT.601."""
-DARKENING = (2.0 / 2.2, 1.75 / 2.2, 1.25 / 2.2)
-"""Optical depth of red, green and blue at time code 1, the light's over the display's exponent: the end of civil
-twilight, blue and dark, while what stands on the road can still be told apart without lamps."""
-WARMTH = (0.70, 0.12, -0.42)
-"""What dusk, at half the time code, adds to red, green and blue."""
 
 
 def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
     """Mean colour (3,) of the photographed sky, where there is some; a bright overcast otherwise."""
     weight = sky * (sky > 0.5)
     total = weight.sum()
-    default = photograph.new_tensor(_SKY_RGB)
+    default = photograph.new_tensor(model.SKY_RGB)
     mean = (photograph * weight).flatten(1).sum(dim=1) / total.clamp(min=1.0)
     share = (total / 500.0).clamp(max=1.0)
     return share * mean + (1.0 - share) * default
@@ -47,17 +30,17 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 def shadow_softening(weather: Tensor) -> Tensor:
     """The factor () by which overcast, fog, rain and twilight weaken cast shadows; 1 at code 0. weather (4,)."""
-    fog, rain, time, overcast = weather.unbind(-1)
-    return torch.exp(-(0.5 * fog + 0.4 * rain + 0.5 * time + 0.6 * overcast))
+    fog, rain, time, overcast = (rate * code for rate, code in zip(model.SHADOW_SOFTENING, weather, strict=True))
+    return torch.exp(-(fog + rain + time + overcast))
 
 
 def time_gain(time: Tensor) -> Tensor:
     """What the time of day, a code () in [0, 1], adds to a display value of 1, (3,) RGB: warm light at one half,
     then blue twilight; 0 at code 0."""
     square = time * time
-    darkening, warmth = time.new_tensor(DARKENING), time.new_tensor(WARMTH)
-    warm = warmth * time * torch.exp(-3.5 * square) - 0.25 * time * torch.exp(-2.0 * square)
-    return torch.expm1(-darkening * square) + warm
+    darkening, warmth = time.new_tensor(model.DARKENING), time.new_tensor(model.WARMTH)
+    dusk, dim = torch.exp(-model.DUSK_ENDS * square), torch.exp(-model.DIMMING_ENDS * square)
+    return torch.expm1(-darkening * square) + (warmth * time * dusk - model.DIMMING * time * dim)
 
 
 def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference") -> Tensor:
@@ -73,7 +56,7 @@ def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend:
 
         return effects.foliage(image, environment, air, gaps)
     amount = environment.foliage_map.to(image)
-    index = (amount.flatten() > FEWEST_LEAVES).nonzero()[:, 0]
+    index = (amount.flatten() > model.FEWEST_LEAVES).nonzero()[:, 0]
     if index.numel() == 0:
         return image
     rows = image.flatten(1)[:, index].T
@@ -88,20 +71,20 @@ def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
     """The leaf model on rows (R, 3); gaps (R,) in [0, 1] says where a thin crown lets light through."""
     hue, shift, density = code.unbind(-1)
     lightness, a, b = lab(rgb.clamp(0.0, 1.0)).unbind(-1)
-    level = (lightness / 100.0).clamp(0.01, 0.99)
-    lifted = torch.sigmoid(torch.logit(level) + 1.5 * shift)
-    chroma = (1.0 + 0.3 * hue) * (lifted / level).sqrt()
+    level = (lightness / 100.0).clamp(*model.LEVEL)
+    lifted = torch.sigmoid(torch.logit(level) + model.LEAF_LIGHTNESS * shift)
+    chroma = (1.0 + model.LEAF_CHROMA * hue) * (lifted / level).sqrt()
     level = lifted
-    angle = -(0.70 + 0.35 * torch.tanh(2.0 * hue)) * hue  # green is nearer to blue than to orange
+    angle = -(model.LEAF_TURN + model.LEAF_TURN_MORE * torch.tanh(model.LEAF_TURN_BEND * hue)) * hue
     cos, sin = torch.cos(angle), torch.sin(angle)
     room = 4.0 * level * (1.0 - level)
-    red = chroma * (cos * a - sin * b) + 10.0 * hue * room
-    yellow = chroma * (sin * a + cos * b) + 8.0 * hue * room
+    red = chroma * (cos * a - sin * b) + model.LEAF_RED * hue * room
+    yellow = chroma * (sin * a + cos * b) + model.LEAF_YELLOW * hue * room
     out = rgb_of(torch.stack([100.0 * level, red, yellow], dim=-1))
-    thick = density * torch.sigmoid(6.0 * density)
-    thin = -density * torch.sigmoid(-6.0 * density)
-    out = out + (thick * 0.5 * (1.0 - gaps))[:, None] * (0.25 * out - out)
-    return out + (thin * 0.8 * gaps)[:, None] * (air - out)
+    thick = density * torch.sigmoid(model.CROWN_BEND * density)
+    thin = -density * torch.sigmoid(-model.CROWN_BEND * density)
+    out = out + (thick * model.THICK_SHARE * (1.0 - gaps))[:, None] * (model.THICK_DARKNESS * out - out)
+    return out + (thin * model.THIN_SHARE * gaps)[:, None] * (air - out)
 
 
 def apply_weather(
@@ -119,18 +102,19 @@ def apply_weather(
         return effects.weather(image, inverse_depth, environment, air, streaks)
     fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
     sky, road = environment.sky.to(image), environment.road.to(image)
-    depth = 1.0 / inverse_depth.clamp(min=1.0 / HAZE_CAP_M)
-    luma = image.new_tensor(LUMA)
+    depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
+    luma = image.new_tensor(model.LUMA)
     grey_air = (air * luma).sum().expand(3)
 
     # Overcast: less colour, less contrast, a plain sky.
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
-    flat = 0.45 * image + 0.55 * grey
-    flat = 0.40 + 0.72 * (flat - 0.42)
-    cover = (0.55 * grey_air + 0.30)[:, None, None] + 0.15 * (grey - grey_air.mean())
+    flat = model.OVERCAST_COLOUR * image + (1.0 - model.OVERCAST_COLOUR) * grey
+    flat = model.OVERCAST_TO + model.OVERCAST_CONTRAST * (flat - model.OVERCAST_FROM)
+    cover = (model.COVER_AIR * grey_air + model.COVER_LIGHT)[:, None, None]
+    cover = cover + model.COVER_STRUCTURE * (grey - grey_air.mean())
     target = flat + sky * (cover - flat)
-    image = image + 0.85 * overcast * (target - image)
-    air = air + 0.85 * overcast * (0.9 * grey_air - air)
+    image = image + model.OVERCAST * overcast * (target - image)
+    air = air + model.OVERCAST * overcast * (model.OVERCAST_AIR * grey_air - air)
 
     gain = time_gain(time)
     image = image + gain[:, None, None] * image
@@ -138,28 +122,24 @@ def apply_weather(
 
     # Rain: wet and dark, haze, a sheen on the road that mirrors what stands above, streaks.
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
-    damp = 0.72 * (0.65 * image + 0.35 * grey)
-    image = image + 0.9 * rain * (damp - image)
+    damp = model.DAMP_LIGHT * (model.DAMP_COLOUR * image + (1.0 - model.DAMP_COLOUR) * grey)
+    image = image + model.DAMP * rain * (damp - image)
     mirrored = _mirror(image)
-    grazing = 0.15 + 0.45 * smoothstep(depth, 4.0, 45.0)
-    sheen = 0.55 * mirrored + 0.40 * air[:, None, None]
+    grazing = model.SHEEN_NEAR + model.SHEEN_FAR * smoothstep(depth, *model.SHEEN_M)
+    sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air[:, None, None]
     image = image + rain * (road * grazing) * (sheen - image)
-    image = image - torch.expm1(-RAIN_EXTINCTION_PER_M * rain * depth) * (0.85 * air[:, None, None] - image)
+    veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
+    image = image + veil * (model.RAIN_AIR * air[:, None, None] - image)
     streaks = _streaks(*sky.shape).to(image)
-    image = image + 0.22 * rain * streaks * (air[:, None, None] - image)
+    image = image + model.STREAKS * rain * streaks * (air[:, None, None] - image)
 
     # Fog (Koschmieder 1924).
-    return image - torch.expm1(-FOG_EXTINCTION_PER_M * fog * depth) * (air[:, None, None] - image)
-
-
-def mirror_reach(height: int) -> int:
-    """Over how many rows of a picture of `height` rows a wet road smears what it mirrors: an odd number."""
-    return max(3, (height // 12) | 1)
+    return image - torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth) * (air[:, None, None] - image)
 
 
 def _mirror(image: Tensor) -> Tensor:
     """What a wet road reflects, coarsely: the picture smeared downwards."""
-    height, reach = image.shape[1], mirror_reach(image.shape[1])
+    height, reach = image.shape[1], model.mirror_reach(image.shape[1])
     smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate", separable=True)[0]
     shift = reach // 2
     return torch.cat([smeared[:, :1].expand(-1, shift, -1), smeared[:, : height - shift]], dim=1)

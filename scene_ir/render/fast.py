@@ -1,6 +1,6 @@
 """The fast path: what the plain torch of `reference` and `texture` does, in few passes.
 
-The kernels are in `kernels.shading`, which is imported on first use. Shapes as in `reference`.
+The kernels are in `kernels.photographed`, which is imported on first use. Shapes as in `reference`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster import verbs
-from scene_ir.render import texture
+from scene_ir.render import channels, texture
 from scene_ir.render.prepare import Drawn, Prepared
 
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
     """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the
-    camera then, paint, height; own (V, 17): colours (3), local normal (3), paint, glass, height, mirror clip (3),
-    mirror cosine, gain (3), lift; texels, dark: values (S, 8) and (S, 3), rects (N, 4), offsets (N + 1,); patches
+    camera then, paint, height; own (V, channels.OWN), with local normals, without depth; texels, dark: values (S,
+    channels.TEXEL) and (S, 3), rects (N, 4), offsets (N + 1,); patches
     (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
     frame_wh (N, 2) px; sun (N, 4): direction, strength; unproject (N, 3, 3).
     """
@@ -42,15 +42,13 @@ class Fixed:
         fleet, base, count = prepared.fleet, prepared.base, len(prepared.scene.objects)
         assert prepared.texels is not None
         assert prepared.shadows is not None
-        own = (fleet.colours, prepared.sharp, fleet.paint[:, None], fleet.glass[:, None], prepared.height[:, None])
-        mirror = (prepared.mirror_clip, prepared.mirror_cos[:, None])
         height, width = prepared.frame_hw
         sun = prepared.scene.environment.sun.to(prepared.like)
         return cls(
             faces=fleet.faces.to(torch.int32).contiguous(),
             base_clip=base.clip,
             base=torch.stack([base.cos, fleet.paint, prepared.height], dim=1),
-            own=torch.cat([*own, *mirror, prepared.finish], dim=1),
+            own=prepared.all_attributes(prepared.sharp, torch.zeros_like(prepared.height)),
             texels=(
                 prepared.texels.values[: int(prepared.texels.offsets[count])],
                 prepared.texels.rects[:count],
@@ -111,7 +109,7 @@ def photographed(
 
     reach_px: of each halo; code: texture codes, if there are any.
     """
-    from scene_ir.render.kernels import shading
+    from scene_ir.render.kernels.photographed import Photographed, Setting
 
     def paint(
         mesh: Tensor, halo: Tensor, look: Tensor, fill: Tensor, values: Tensor, table: Tensor, nearest: Tensor
@@ -123,15 +121,15 @@ def photographed(
         anchor = look.index_select(0, nearest.clamp(min=0))
 
         def painted(rgba: Tensor, looked: Tensor, unseen: Tensor) -> Tensor:
-            paint = looked[:, 6]
+            paint = looked[:, channels.PAINT]
             if texels.values.numel():
-                uv = table[:, 1:3].to(looked) + looked[:, :2]
+                uv = table[:, 1:3].to(looked) + looked[:, : channels.W_THEN]
                 found = verbs.texture_packed(
                     texels.values, texels.rects, texels.offsets, drawn.mesh.layout, uv, "warp", "zero"
                 )
                 paint = texture.paint_share(paint, found[:, 0], unseen, known)
             colour = texture.apply_texture_code(
-                rgba[:, :3], rgba[:, 3], rows, paint, looked[:, 7], lightness, "warp"
+                rgba[:, :3], rgba[:, 3], rows, paint, looked[:, channels.HEIGHT], lightness, "warp"
             )
             return torch.cat([colour, rgba[:, 3:]], dim=1)
 
@@ -139,7 +137,7 @@ def photographed(
 
     inside = torch.linalg.inv_ex(patches(drawn.geometry.ground_clip)).inverse
     then = fixed.patches @ inside
-    setting = shading.Setting(
+    setting = Setting(
         fragments=drawn.mesh,
         ground=drawn.ground_layout,
         inside=inside.detach().contiguous(),
@@ -149,7 +147,7 @@ def photographed(
     )
     geometry = drawn.geometry
     codes = code.values if code is not None else yaw.new_zeros(0)
-    return shading.Photographed.apply(
+    return Photographed.apply(
         geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, setting
     )
 

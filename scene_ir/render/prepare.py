@@ -22,7 +22,7 @@ from torch import Tensor
 
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
-from scene_ir.render import blend, finish, surfaces, texture
+from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import sky_colour
 from scene_ir.render.surfaces import Fleet, Rig, Surface
 from scene_ir.render.texture import Regions, Texels, smoothstep
@@ -198,9 +198,7 @@ class Prepared:
         self.outwards = surfaces.outwards(self.corners, base.size_lhw, self.sun_offset)
         self._lit: Tensor | None = None
         self.base_yaw = base.yaw
-        self.sunlight = self.like.new_tensor(
-            [s.sunlight for s in objects.source] or [texture.SUNLIGHT] * len(base)
-        )
+        self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
         self.size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
         # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
@@ -271,7 +269,7 @@ class Prepared:
             unseen = hidden[i] if hidden else texture.hidden_behind(before, self.frame_hw, self.like)
             x0, y0, x1, y1 = rects[i]
             if x1 <= x0:
-                crops.append(Crop(self.like.new_zeros(texture.CHANNELS, 0, 0), 0, 0))
+                crops.append(Crop(self.like.new_zeros(channels.TEXEL, 0, 0), 0, 0))
                 continue
             depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self.frame_hw))
@@ -340,7 +338,7 @@ class Prepared:
         if self._lit is None:
             self._lit = self._sun_on(self.base_yaw)
         sunlight = self.fleet.spread(self.sunlight)
-        then = texture.AMBIENT[0] + texture.AMBIENT[1] * (0.5 - 0.5 * self.smooth[:, 1]) + sunlight * self._lit
+        then = model.AMBIENT[0] + model.AMBIENT[1] * (0.5 - 0.5 * self.smooth[:, 1]) + sunlight * self._lit
         return texture.brightened(sunlight * (self._sun_on(objects.yaw) - self._lit) / then, self.fleet.paint)
 
     def _sun_on(self, yaw: Tensor) -> Tensor:
@@ -376,18 +374,26 @@ class Prepared:
         distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
         return (self.halo / distance).clamp(max=HALO_MAX_PX).tolist()
 
-    def own_attributes(self, objects: Objects, geometry: Geometry) -> Tensor:
-        """(V, 10): colour (3), normal (3), paint, glass, depth m, height."""
-        fleet = self.fleet
-        normals = surfaces.rotate(self.sharp, fleet.spread(objects.yaw))
-        parts = (fleet.paint, fleet.glass, geometry.clip[:, 2], self.height)
-        return torch.cat([fleet.colours, normals, torch.stack(parts, dim=1)], dim=1)
+    def own_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
+        """(V, channels.PLAIN): the templates' own looks. normals (V, 3); depth (V,) m."""
+        shares = torch.stack([self.fleet.paint, self.fleet.glass, depth, self.height], dim=1)
+        return torch.cat([self.fleet.colours, normals, shares], dim=1)
+
+    def all_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
+        """(V, channels.OWN): `own_attributes`, and what completes a photographed vehicle."""
+        own = self.own_attributes(normals, depth)
+        return torch.cat([own, self.mirror_clip, self.mirror_cos[:, None], self.finish], dim=1)
+
+    def normals(self, objects: Objects) -> Tensor:
+        """Unit normals (V, 3) of objects where they stand, with sharp edges."""
+        return surfaces.rotate(self.sharp, self.fleet.spread(objects.yaw))
 
     def own_colour(self, xy: Tensor, owner: Tensor, own: Tensor) -> Tensor:
         """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
-        `_own_attributes` (K, 10)."""
+        `own_attributes` (K, ...)."""
         sunlight = self.sunlight.index_select(0, owner)
-        albedo, normal, sheen, height = own[:, :3], own[:, 3:6], own[:, 6:8], own[:, 9]
+        albedo, normal = own[:, : channels.NORMAL], own[:, channels.NORMAL : channels.OWN_PAINT]
+        sheen, height = own[:, channels.OWN_PAINT : channels.OWN_DEPTH], own[:, channels.OWN_HEIGHT]
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self.unproject.T
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
         to_eye = -torch.nn.functional.normalize(ray, dim=-1)
@@ -431,8 +437,9 @@ class Prepared:
         assert self.texels is not None
         counts = torch.bincount(owner, minlength=2 * count)
         seen = self.texels.sample(xy, counts, self.settings.backend, "clamp")
-        weight = smoothstep(seen[:, 3], 0.9, 0.99) * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
-        weight = weight * (1.0 - smoothstep(seen[:, 5], 0.0, 1.0))
+        weight = smoothstep(seen[:, channels.ALPHA], 0.9, 0.99)
+        for channel in (channels.HIDDEN, channels.OUTLINE):
+            weight = weight * (1.0 - smoothstep(seen[:, channel], 0.0, 1.0))
         plain = (weight > 0.0).nonzero()[:, 0]
         # By their places within the object, so that others beside it change nothing.
         size = torch.bincount(owner[plain], minlength=count)
@@ -441,14 +448,15 @@ class Prepared:
         pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
         corner = self.fleet.faces[drawn.mesh.face[pixel].long()]
         share = surfaces.weights_at(drawn.geometry.clip[corner], xy).to(self.like)
-        own = torch.cat([self.own_attributes(objects, drawn.geometry), drawn.geometry.cos[:, None]], dim=1)
+        looks = self.own_attributes(self.normals(objects), drawn.geometry.clip[:, 2])
+        own = torch.cat([looks, drawn.geometry.cos[:, None]], dim=1)
         own = (own[corner] * share[..., None]).sum(dim=1)
-        weight = weight * smoothstep(own[:, 10], *texture.SQUARE)
-        template = self.own_colour(xy, owner, own[:, :10])
-        normal = torch.nn.functional.normalize(own[:, 3:6], dim=-1, eps=1e-6)
+        weight = weight * smoothstep(own[:, channels.PLAIN], *model.SQUARE)
+        template = self.own_colour(xy, owner, own)
+        normal = torch.nn.functional.normalize(own[:, channels.NORMAL : channels.OWN_PAINT], dim=-1, eps=1e-6)
         sun = self.scene.environment.sun.to(self.like)
         sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
-        columns = (corner, share, template, seen[:, :3], sky, lit - sky, weight)
+        columns = (corner, share, template, seen[:, : channels.ALPHA], sky, lit - sky, weight)
         out = []
         for i, (start, _) in enumerate(self.fleet.vertex_ranges.tolist()):
             mine = (owner == i) & (weight > 0.0)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster import verbs
-from scene_ir.render import texture
+from scene_ir.render import channels, model, texture
 from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
 from scene_ir.render.texture import smoothstep
 from scene_ir.types import Objects
@@ -76,9 +76,9 @@ class _Fringe:
         exists = torch.stack([column > 0, column < width - 1, line > 0, line < y1 - y0 - 1], dim=1)
         neighbour = torch.where(exists, pixel[:, None] + steps, pixel[:, None])
         known = exists & hit[neighbour]
-        weight = ((2.0 * coverage[neighbour] - 1.0).clamp(min=0.0) + 1e-3) * known
-        weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-3)
-        own = smoothstep(coverage[pixel], 0.5, 1.0) * hit[pixel]
+        weight = ((2.0 * coverage[neighbour] - 1.0).clamp(min=0.0) + model.LEAST_NEIGHBOUR) * known
+        weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=model.LEAST_NEIGHBOUR)
+        own = smoothstep(coverage[pixel], *model.COVERED) * hit[pixel]
         own = torch.where(known.any(dim=1), own, torch.ones_like(own))
         rank = torch.zeros_like(hit, dtype=torch.int64)
         rank[mesh_pixel] = torch.arange(mesh_pixel.shape[0], device=hit.device)
@@ -100,9 +100,10 @@ def layers(prepared: Prepared, objects: Objects, drawn: Drawn) -> Layers:
     if objects.source:
         shaded = _photographed_rows(prepared, objects, drawn, rows)
     else:
-        own = _mesh_attributes(prepared, drawn, rows, prepared.own_attributes(objects, drawn.geometry))
-        colour = prepared.own_colour(rows.xy, rows.owner, own).clamp(0.0, 1.0)
-        shaded = _Shaded(colour, torch.ones_like(own[:, 8]), own[:, 8], own[:, 6], own[:, 9])
+        plain = prepared.own_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
+        own = _mesh_attributes(prepared, drawn, rows, plain)
+        colour, z = prepared.own_colour(rows.xy, rows.owner, own).clamp(0.0, 1.0), own[:, channels.OWN_DEPTH]
+        shaded = _Shaded(colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT])
     colour, depth = shaded.colour, shaded.depth
     if active(objects.texture_code):
         code, base = objects.texture_code.index_select(0, rows.owner), prepared.paint_lightness[rows.owner]
@@ -166,13 +167,14 @@ def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows:
     attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
     dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, prepared.settings.backend)
     mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
-    move, rest = torch.cat([mesh, mesh.index_select(0, rows.anchor)]).split([2, 7], dim=1)
+    look = torch.cat([mesh, mesh.index_select(0, rows.anchor)])
+    move, rest = look.split([channels.W_THEN, channels.LOOK - channels.W_THEN], dim=1)
     z_then, z_now, turned, cos_then, paint, up, brighter = rest.unbind(1)
 
     assert prepared.texels is not None
     uv = rows.xy + move
     seen = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
-    rgb, rest = seen.split([3, texture.CHANNELS - 3], dim=1)
+    rgb, rest = seen.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
     alpha, hidden, outline, z_seen, support = rest.unbind(1)
     rgb = texture.relit(rgb, brighter)
     clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
@@ -181,18 +183,19 @@ def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows:
     facing = texture.facing_weight(turned, cos_then, paint)
     weight = facing * visible
     if bool((inside.detach() < 1.0).any()):
-        near = texture.inside_weight(uv, *prepared.frame_hw, texture.EXTENDED_PX) * smoothstep(alpha, 0.5, 0.95)
+        near = texture.inside_weight(uv, *prepared.frame_hw, model.EXTENDED_PX)
+        near = near * smoothstep(alpha, *model.SOLID_ALPHA)
         weight = weight + facing * (1.0 - inside) * near * clear
-    weight = weight * (1.0 - smoothstep(z_then - z_seen, *texture.DEPTH_TOLERANCE_M))
+    weight = weight * (1.0 - smoothstep(z_then - z_seen, *model.DEPTH_TOLERANCE_M))
     kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
     weight = torch.cat([weight[:m], weight[m:] * kept])
-    rim = 1.0 - smoothstep(cos_then[:m], *texture.RIM)
-    opened = smoothstep(turned[:m], *texture.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
+    rim = 1.0 - smoothstep(cos_then[:m], *model.RIM)
+    opened = smoothstep(turned[:m], *model.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
     # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
-    empty = visible[:m] * (1.0 - smoothstep(support[:m], 0.1, 0.9))
+    empty = visible[:m] * (1.0 - smoothstep(support[:m], *model.SUPPORTED))
     # What opens up is as opaque as the inside, in its own colour, where there is enough of it to tell.
-    closed = weight[:m] * opened * (1.0 - empty) * smoothstep(alpha[:m], *texture.OPEN_ALPHA)
-    gain = torch.cat([closed / alpha[:m].clamp(min=texture.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
+    closed = weight[:m] * opened * (1.0 - empty) * smoothstep(alpha[:m], *model.OPEN_ALPHA)
+    gain = torch.cat([closed / alpha[:m].clamp(min=model.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
     fill = (1.0 - weight[:m]) * (1.0 - empty)
     colour, opacity = (weight + gain)[:, None] * rgb, (weight + gain) * alpha
     need = (fill != 0.0).nonzero()[:, 0]
@@ -217,14 +220,13 @@ def _completion(
 
     cos_now: (Rm,) towards the camera.
     """
-    own = prepared.own_attributes(objects, drawn.geometry)
-    mirror = torch.cat([prepared.mirror_clip, prepared.mirror_cos[:, None]], dim=1)
-    both = _mesh_attributes(prepared, drawn, rows, torch.cat([own, mirror, prepared.finish], dim=1))[need]
-    gain, lift = both[:, 14:17], both[:, 17:]
-    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], both[:, :10]), gain, lift)
-    clip, cos_then = both[:, 10:13], both[:, 13]
+    attributes = prepared.all_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
+    own = _mesh_attributes(prepared, drawn, rows, attributes)[need]
+    gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
+    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], own), gain, lift)
+    clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
-    safe = z.clamp(min=0.1)
+    safe = z.clamp(min=model.NEAREST_MIRRORED_M)
     uv = clip[:, :2] / safe[:, None]
     counts = torch.bincount(rows.owner[need], minlength=rows.counts.shape[0])
     assert prepared.texels is not None
@@ -232,14 +234,15 @@ def _completion(
     height, width = prepared.frame_hw
     weight = (
         texture.inside_weight(uv, height, width)
-        * (1.0 - smoothstep(seen[:, 4], 0.0, 1.0))
-        * smoothstep(seen[:, 3], 0.5, 0.95)
-        * (1.0 - smoothstep(z - seen[:, 6], *texture.DEPTH_TOLERANCE_M))
-        * texture.facing_weight(cos_now[need] - cos_then, cos_then, both[:, 6])
-        * smoothstep(cos_then, 0.05, 0.2)
-        * (1.0 - smoothstep(seen[:, 5], *texture.MIRRORED_RIM))
+        * (1.0 - smoothstep(seen[:, channels.HIDDEN], 0.0, 1.0))
+        * smoothstep(seen[:, channels.ALPHA], *model.SOLID_ALPHA)
+        * (1.0 - smoothstep(z - seen[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
+        * texture.facing_weight(cos_now[need] - cos_then, cos_then, own[:, channels.OWN_PAINT])
+        * smoothstep(cos_then, *model.MIRRORED_COS)
+        * (1.0 - smoothstep(seen[:, channels.OUTLINE], *model.MIRRORED_RIM))
     )
-    straight = seen[:, :3] / seen[:, 3:4].clamp(min=0.4)
+    rgb, alpha = seen[:, : channels.ALPHA], seen[:, channels.ALPHA : channels.HIDDEN]
+    straight = rgb / alpha.clamp(min=model.LEAST_MIRRORED_ALPHA)
     return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
 
 
@@ -268,7 +271,7 @@ def _shadow_factors(prepared: Prepared, objects: Objects, drawn: Drawn) -> Tenso
     hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)
     counts = torch.bincount(owner[reached], minlength=len(objects))
     dark = prepared.shadows.sample(uv, counts, prepared.settings.backend, "zero")
-    dark = dark * texture.inside_weight(wanted, height, width, texture.SHADOW_EXTENDED_PX)[:, None]
+    dark = dark * texture.inside_weight(wanted, height, width, model.SHADOW_EXTENDED_PX)[:, None]
     return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 
 
@@ -283,5 +286,5 @@ def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
     before = then > verbs.NEAR_M
     safe = torch.where(before, then, torch.ones_like(then))
     moved = (delta[:, :2] - xy * delta[:, 2:]) / safe
-    moved = torch.where(before, moved, torch.full_like(moved, 1e5))
+    moved = torch.where(before, moved, torch.full_like(moved, model.FAR_AWAY_PX))
     return torch.cat([moved, then, then - delta[:, 2:], attributes[:, 4:]], dim=1)

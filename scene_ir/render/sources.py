@@ -19,14 +19,14 @@ from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
-from scene_ir.render import blend, finish, surfaces, texture
+from scene_ir.render import blend, finish, model, surfaces, texture
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import Drawn, RenderSettings
 from scene_ir.render.surfaces import nearest_true
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _EXTENSION_PX = 4.5
-"""How far colours are continued under a nearer object: beyond `texture.HIDDEN_PX`, plus the lookups' kernel."""
+"""How far colours are continued under a nearer object: beyond `model.HIDDEN_PX`, plus the lookups' kernel."""
 _KEEP = 0.02
 """A given background is kept under a shadow where background times shadow is this near to the photograph."""
 _SOLID = 0.95
@@ -167,7 +167,7 @@ def _source(
     alpha_rgba = torch.cat([torch.zeros_like(alpha.values).expand(3, -1, -1), alpha.values])
     return Source(
         translation, objects.yaw[index], objects.size_lhw[index], objects.ffd[index],
-        replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation), texture.SUNLIGHT,
+        replace(alpha, values=alpha_rgba), shadow, inflation, torch.ones_like(translation), model.SUNLIGHT,
     )  # fmt: skip
 
 
@@ -367,7 +367,7 @@ def _by_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
     if not bool((core > 0.0).any()):
         return None
     left = 1.0 - float(core[core > 0.5 * core.max()].median())
-    level = sum(texture.AMBIENT)
+    level = sum(model.AMBIENT)
     return (_OPEN * level / max(left, 0.05) - level) / max(-float(sun[1]), 0.3)
 
 

@@ -16,58 +16,12 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster import verbs
+from scene_ir.render import model
 from scene_ir.render.surfaces import nearest_true
 from scene_ir.types import Crop, Source
 
-DEPTH_TOLERANCE_M = (0.25, 0.6)
-"""A point this much behind the photographed surface begins to be, and is, unseen: thicker than a mirror or a
-seat."""
-STRETCH = (1.0, 2.2)
-"""Growth of the cosine towards the camera, in units of what the photograph saw, at which its texels begin to
-smear, and at which what stands for unseen parts looks better: drawn out to twice and three times their width."""
-GRAZING = (0.06, 0.04)
-"""Cosine added to what the photograph saw, of all but paint and of paint: at its very outline a surface would
-else have none. Tyres, arches and trims are small and curved; drawn out a little they look better than their
-templates, whose dark edges lie where the mesh has them."""
-SQUARE = (0.15, 0.4)
-"""Cosine towards the camera from which on, and beyond which wholly, a pixel tells of the finish there: near the
-outline, pixels mix with the background, and a mesh that is off by a little shows another part."""
-OPEN_TURN = (0.02, 0.1)
-"""Growth of that cosine over which the outline's half-transparent texels, now inside the outline, are filled."""
-OPEN_ALPHA = (0.2, 0.5)
-"""Opacity of those texels up to which they show the background, and from which on the vehicle, for certain."""
-RIM = (0.3, 0.5)
-"""That cosine, in the photograph, up to and beyond which a point is near the outline, and not."""
-OUTLINE_TURN = (0.1, 0.25)
-"""Change of that cosine at which a point begins to leave, and has left, the outline."""
-OUTLINE_PX = (1.0, 2.2)
-"""Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the
-inside."""
-MIRRORED_RIM = (0.0, 1.0)
-"""How much of a texel is outline, from which on, and where no longer, it stands for the other side: at the outline
-a matte may have taken in what lies behind, and a pixel there is drawn out over many."""
-HIDDEN_PX = (1.0, 3.0)
-"""Distance inside a nearer object's matte at which texels begin to be, and are, unknown."""
-BORDER_PX = (0.5, 1.5)
-"""Distance beyond the photograph's border over which what it shows ends."""
-EXTENDED_PX = (2.0, 14.0)
-"""Distance beyond it over which a vehicle's looks at the border give way to its other side's or the template's: a
-soft change shows less than a seam, and drawn out farther the border's pixels become bars."""
-SHADOW_EXTENDED_PX = (4.0, 60.0)
-"""The same of its shadow, which has no other side to go by, and is smooth."""
-SUPPORT_PX = 2
-"""Beyond the matte by more than this, the photograph shows that there is no vehicle."""
-SATURATED = 1e-6
-"""A colour this near to 0 or 1 is at the bound: rounding decides on which side of it."""
-CHANNELS = 8
-"""Of a texel: premultiplied RGB, opacity, hidden, outline, depth m, support."""
 _PAD = 2
 """Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
-LIGHTNESS_GAIN, CHROMA_GAIN, GLOSS_GAIN, DIRT_GAIN = 2.2, 45.0, 0.9, 0.55
-GAMUT_SHARPNESS = 20.0
-"""Colours bend within about 1/20 of black and white."""
-DUST_RGB = (0.47, 0.42, 0.35)
-"""Dry road dust."""
 
 
 def smoothstep(x: Tensor, low: float, high: float) -> Tensor:
@@ -181,7 +135,7 @@ def crop_of(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tenso
 def source_texels(
     source: Source, mesh_depth: Crop, hidden: Tensor, rect: Sequence[int], frame_hw: tuple[int, int]
 ) -> Crop:
-    """The `CHANNELS` texels of one object inside `rect`, padded.
+    """The `channels.TEXEL` numbers of the texels of one object inside `rect`, padded.
 
     mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
     object stands before this one. Beyond the mesh, texels are of the outline and as deep as its nearest piece.
@@ -197,9 +151,9 @@ def source_texels(
     depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    outline = 1.0 - smoothstep(torch.from_numpy(np.ascontiguousarray(distance)).to(rgba), *OUTLINE_PX)
-    pool = 2 * SUPPORT_PX + 1
-    support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=SUPPORT_PX)[0]
+    outline = 1.0 - smoothstep(torch.from_numpy(np.ascontiguousarray(distance)).to(rgba), *model.OUTLINE_PX)
+    pool = 2 * model.SUPPORT_PX + 1
+    support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=model.SUPPORT_PX)[0]
     values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth, support])
     return Crop(values, x0, y0)
 
@@ -232,7 +186,7 @@ def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
     window = (slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1))
     padded = np.pad(support[window], 1, mode="edge")
     distance = np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])
-    out[window] = smoothstep(torch.from_numpy(distance).to(like), *HIDDEN_PX)
+    out[window] = smoothstep(torch.from_numpy(distance).to(like), *model.HIDDEN_PX)
     return out
 
 
@@ -242,18 +196,19 @@ def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:
     turned: cosine towards the camera now minus then; cos_source: then; paint: share of the mesh. Exactly 1, with
     zero slope, where nothing turned.
     """
-    positive = 0.5 * (cos_source + (cos_source.square() + 1e-4).sqrt())
-    return 1.0 - smoothstep(turned / (positive + GRAZING[0] + (GRAZING[1] - GRAZING[0]) * paint), *STRETCH)
+    positive = 0.5 * (cos_source + (cos_source.square() + model.SQUARED_COS).sqrt())
+    rest, coat = model.GRAZING
+    return 1.0 - smoothstep(turned / (positive + rest + (coat - rest) * paint), *model.STRETCH)
 
 
 def outline_weight(turned: Tensor) -> Tensor:
     """1 where a point of the outline still is one, 0 where it turned away or towards the camera; 1 where turned is
     0."""
-    low, high = OUTLINE_TURN
+    low, high = model.OUTLINE_TURN
     return 1.0 - smoothstep(turned.square(), low * low, high * high)
 
 
-def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, float] = BORDER_PX) -> Tensor:
+def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, float] = model.BORDER_PX) -> Tensor:
     """1 for pixels uv (R, 2) in the photograph and up to fade_px[0] beyond it, fading to 0 at fade_px[1]."""
     limit = uv.new_tensor([width - 1.0, height - 1.0])
     beyond = torch.maximum(-uv, uv - limit)
@@ -284,7 +239,7 @@ def apply_texture_code(
     if index.numel() == 0:
         return colour
     alpha = opacity[index]
-    straight = (colour[index] / alpha.clamp(min=0.02)[:, None]).clamp(0.0, 1.0)
+    straight = (colour[index] / alpha.clamp(min=model.LEAST_ALPHA)[:, None]).clamp(0.0, 1.0)
     arguments = (height[index], base_lightness[index])
     change = _paint(straight, code[index], *arguments) - _paint(
         straight, torch.zeros_like(code[index]), *arguments
@@ -296,14 +251,15 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
     """The paint model: a curve in CIE L*, shifts of a* and b*, and a veil of dust. rgb (R, 3), code (R, 5)."""
     lightness, a, b = lab(rgb).unbind(-1)
     shift, red, yellow, gloss, dirt = code.unbind(-1)
-    level = (lightness / 100.0).clamp(0.01, 0.99)
-    glossy = gloss * GLOSS_GAIN * (lightness - base_lightness) / 30.0
-    level = torch.sigmoid(torch.logit(level) + LIGHTNESS_GAIN * shift + glossy)
+    level = (lightness / 100.0).clamp(*model.LEVEL)
+    glossy = gloss * model.GLOSS_GAIN * (lightness - base_lightness) / model.GLOSSY_L
+    level = torch.sigmoid(torch.logit(level) + model.LIGHTNESS_GAIN * shift + glossy)
     room = 4.0 * level * (1.0 - level)
-    changed = torch.stack([100.0 * level, a + CHROMA_GAIN * red * room, b + CHROMA_GAIN * yellow * room], dim=-1)
+    red, yellow = a + model.CHROMA_GAIN * red * room, b + model.CHROMA_GAIN * yellow * room
+    changed = torch.stack([100.0 * level, red, yellow], dim=-1)
     out = rgb_of(changed)
-    veil = (dirt * DIRT_GAIN * (1.0 - 0.75 * height.clamp(0.0, 1.0)))[:, None]
-    return out + veil * (out.new_tensor(DUST_RGB) - out)
+    veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * height.clamp(0.0, 1.0)))[:, None]
+    return out + veil * (out.new_tensor(model.DUST_RGB) - out)
 
 
 def lab(rgb: Tensor) -> Tensor:
@@ -319,7 +275,7 @@ def rgb_of(lab_rows: Tensor) -> Tensor:
     """
     rgb = rgb_exact(lab_rows)
     softplus = torch.nn.functional.softplus
-    return softplus(rgb, beta=GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=GAMUT_SHARPNESS)
+    return softplus(rgb, beta=model.GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=model.GAMUT_SHARPNESS)
 
 
 def rgb_exact(lab_rows: Tensor) -> Tensor:
@@ -328,28 +284,16 @@ def rgb_exact(lab_rows: Tensor) -> Tensor:
     return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
 
 
-GROUND_RGB, HORIZON_RGB, ZENITH_RGB = (0.30, 0.29, 0.28), (0.46, 0.47, 0.47), (0.52, 0.66, 0.86)
-"""What surfaces mirror. Level with them stand houses, hedges and other cars, not the sky."""
-AMBIENT = (0.30, 0.38)
-"""Light from all around, and what the sky adds to a surface that looks up; in display values, as all here."""
-RELIT = (0.3, 0.6)
-"""Share of the change of light that a photographed colour follows, of all but paint and of paint: glass and rubber
-show less of it, and the sun that the shading knows may be behind a tree. Held against generated truth."""
-RELIT_MOST = 0.5
-"""Largest share by which a photographed colour brightens or darkens as its surface turns."""
-SUNLIGHT = 0.62
-"""What the sun adds to a surface that faces it, on a clear day with some haze."""
-
-
 def daylight(normal: Tensor, sun: Tensor, sunlight: Tensor | float) -> Tensor:
     """Light (R,) on surfaces in the open: sky dome and ground bounce, and a sun of a strength (R,). normal (R, 3),
     sun (3,) unit; sun (R, 3) too."""
-    return (AMBIENT[0] + AMBIENT[1] * (0.5 - 0.5 * normal[:, 1])) + sunlight * sunward((normal * sun).sum(-1))
+    around, above = model.AMBIENT
+    return (around + above * (0.5 - 0.5 * normal[:, 1])) + sunlight * sunward((normal * sun).sum(-1))
 
 
 def sunward(cos: Tensor) -> Tensor:
     """How squarely the sun meets a surface whose normal has this cosine to it: 0 from behind, smooth."""
-    return 0.5 * (cos + (cos.square() + 0.01).sqrt())
+    return 0.5 * (cos + (cos.square() + model.TERMINATOR).sqrt())
 
 
 def shade(
@@ -359,7 +303,7 @@ def shade(
     sheen: Tensor,
     height: Tensor,
     sun: Tensor,
-    sunlight: Tensor | float = SUNLIGHT,
+    sunlight: Tensor | float = model.SUNLIGHT,
 ) -> Tensor:
     """Daylight on a vehicle's own colours: RGB (R, 3), not clamped, the template's look where no photograph helps.
 
@@ -367,29 +311,34 @@ def shade(
     at the roof; sun (3,) unit; sunlight (R,). Sky dome and ground bounce, a sun with a highlight, and a Fresnel
     reflection of a plain street and sky.
     """
-    occluded = 0.45 + 0.55 * smoothstep(height, -0.05, 0.4)
+    foot, *heights = model.OCCLUDED
+    occluded = foot + (1.0 - foot) * smoothstep(height, *heights)
     diffuse = daylight(normal, sun, sunlight) * occluded
     cos = (normal * to_eye).sum(-1).clamp(0.0, 1.0)
     mirror = 2.0 * cos[:, None] * normal - to_eye
     sky_up = -mirror[:, 1]
-    ground, horizon, zenith = (albedo.new_tensor(c) for c in (GROUND_RGB, HORIZON_RGB, ZENITH_RGB))
-    above = horizon + (zenith - horizon) * smoothstep(sky_up, 0.0, 0.9)[:, None]
-    surround = ground + (above - ground) * smoothstep(sky_up, -0.08, 0.12)[:, None]
-    fresnel = 0.04 + 0.96 * (1.0 - cos).pow(5)
+    ground, horizon, zenith = (
+        albedo.new_tensor(c) for c in (model.GROUND_RGB, model.HORIZON_RGB, model.ZENITH_RGB)
+    )
+    above = horizon + (zenith - horizon) * smoothstep(sky_up, *model.ZENITH_UP)[:, None]
+    surround = ground + (above - ground) * smoothstep(sky_up, *model.HORIZON_UP)[:, None]
+    fresnel = model.FRESNEL + (1.0 - model.FRESNEL) * (1.0 - cos).pow(5)
     paint, glass = sheen[:, 0], sheen[:, 1]
-    strength = (0.55 * paint * fresnel + glass * (0.10 + 0.75 * fresnel)) * (0.5 + 0.5 * occluded)
-    glint = ((mirror * sun).sum(-1).clamp(0.0, 1.0)).pow(40) * (0.35 * paint + 0.5 * glass)
+    least, more = model.GLASS_MIRRORS
+    mirrored = model.PAINT_MIRRORS * paint * fresnel + glass * (least + more * fresnel)
+    strength = mirrored * (0.5 + 0.5 * occluded)
+    glint = ((mirror * sun).sum(-1).clamp(0.0, 1.0)).pow(40) * (model.GLINT[0] * paint + model.GLINT[1] * glass)
     lit = albedo * diffuse[:, None]
     return lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)
 
 
 def brightened(ratio: Tensor, paint: Tensor) -> Tensor:
-    """How much brighter a surface is after it turned: a share of what it was, within `RELIT_MOST`.
+    """How much brighter a surface is after it turned: a share of what it was, within `model.RELIT_MOST`.
 
     ratio: by how much the light on it grew, relative, above -1; paint: share of it. 0 for 0.
     """
-    share = RELIT[0] + (RELIT[1] - RELIT[0]) * paint
-    return share * ratio / (1.0 + (ratio / RELIT_MOST).square()).sqrt()
+    share = model.RELIT[0] + (model.RELIT[1] - model.RELIT[0]) * paint
+    return share * ratio / (1.0 + (ratio / model.RELIT_MOST).square()).sqrt()
 
 
 def relit(rgb: Tensor, brighter: Tensor) -> Tensor:

@@ -16,12 +16,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from scene_ir.raster.launch import array, between, field, launch, start_warp
-from scene_ir.render.texture import SATURATED as _SATURATED
+from scene_ir.render import model
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": False})
-
-SATURATED = wp.constant(wp.float32(_SATURATED))
 
 
 @wp.struct
@@ -67,9 +65,9 @@ def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.u
         return
     for c in range(3):
         away = wp.abs(image[c, y, x] - 0.5)
-        if away > 0.5 + SATURATED:
+        if away > 0.5 + model.SATURATED:
             bits += 1 << c
-        elif away >= 0.5 - SATURATED:
+        elif away >= 0.5 - model.SATURATED:
             bits += 8 << c
         if away > 0.5:
             image[c, y, x] = wp.clamp(image[c, y, x], 0.0, 1.0)

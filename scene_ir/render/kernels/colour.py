@@ -17,17 +17,14 @@ from torch.autograd.function import once_differentiable
 
 from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, log_, store, store3
 from scene_ir.raster.launch import halves, launch, start_warp
-from scene_ir.render import texture as model
+from scene_ir.render import model
 
 start_warp()
 wp.set_module_options(OPTIONS)
 
-SHARPNESS = wp.constant(wp.float32(model.GAMUT_SHARPNESS))
-BEYOND = wp.constant(wp.float32(math.exp(-model.GAMUT_SHARPNESS)))
-LIGHTNESS_GAIN = wp.constant(wp.float32(model.LIGHTNESS_GAIN))
-CHROMA_GAIN = wp.constant(wp.float32(model.CHROMA_GAIN))
-GLOSS_PER_L = wp.constant(wp.float32(model.GLOSS_GAIN / 30.0))
-DIRT_GAIN = wp.constant(wp.float32(model.DIRT_GAIN))
+SHARPNESS, BEYOND = model.GAMUT_SHARPNESS, math.exp(-model.GAMUT_SHARPNESS)
+GLOSS_PER_L = model.GLOSS_GAIN / model.GLOSSY_L
+LEVEL_LOW, LEVEL_HIGH = model.LEVEL
 DUST = wp.constant(wp.vec3f(*model.DUST_RGB))
 
 # sRGB to and from XYZ relative to white, D65: kornia's matrices, their rows divided, columns multiplied, by it.
@@ -183,7 +180,7 @@ def clamped_adjoint(x: wp.vec3f, g: wp.vec3f):
 
 @wp.func
 def level_of(lightness: wp.float32):
-    return wp.min(wp.max(lightness * 0.01, 0.01), 0.99)
+    return wp.min(wp.max(lightness * 0.01, LEVEL_LOW), LEVEL_HIGH)
 
 
 @wp.func
@@ -207,44 +204,44 @@ class Coat:
 @wp.func
 def painted(lab: wp.vec3f, coat: Coat, base: wp.float32):
     """The paint model before dust: L*a*b*. base: L* about which gloss turns contrast."""
-    odds = exp_(LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
+    odds = exp_(model.LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
     level = lifted(level_of(lab[0]), odds)
-    room = 4.0 * CHROMA_GAIN * level * (1.0 - level)
+    room = 4.0 * model.CHROMA_GAIN * level * (1.0 - level)
     return wp.vec3f(100.0 * level, lab[1] + coat.red * room, lab[2] + coat.yellow * room)
 
 
 @wp.func
 def dusted(rgb: wp.vec3f, coat: Coat):
-    return rgb + (DIRT_GAIN * coat.dirt * coat.grip) * (DUST - rgb)
+    return rgb + (model.DIRT_GAIN * coat.dirt * coat.grip) * (DUST - rgb)
 
 
 @wp.func
 def painted_adjoint(lab: wp.vec3f, coat: Coat, base: wp.float32, g: wp.vec3f):
     """-> the colour, dusted; gradients to lab, (shift, red, yellow), (gloss, dirt, grip), base."""
-    odds = exp_(LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
+    odds = exp_(model.LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
     before = level_of(lab[0])
     level = lifted(before, odds)
-    room = 4.0 * CHROMA_GAIN * level * (1.0 - level)
+    room = 4.0 * model.CHROMA_GAIN * level * (1.0 - level)
     changed = wp.vec3f(100.0 * level, lab[1] + coat.red * room, lab[2] + coat.yellow * room)
     out = rgb_of(changed)
-    veil = DIRT_GAIN * coat.dirt * coat.grip
-    g_veil = DIRT_GAIN * wp.dot(g, DUST - out)
+    veil = model.DIRT_GAIN * coat.dirt * coat.grip
+    g_veil = model.DIRT_GAIN * wp.dot(g, DUST - out)
     g_lab = rgb_adjoint(changed, (1.0 - veil) * g)
     g_room = coat.red * g_lab[1] + coat.yellow * g_lab[2]
-    g_level = 100.0 * g_lab[0] + 4.0 * CHROMA_GAIN * (1.0 - 2.0 * level) * g_room
+    g_level = 100.0 * g_lab[0] + 4.0 * model.CHROMA_GAIN * (1.0 - 2.0 * level) * g_room
     g_odds = g_level * level * (1.0 - level)
     bottom = before * odds + (1.0 - before)
     g_before = g_level * odds / (bottom * bottom)
-    g_tint = wp.vec3f(LIGHTNESS_GAIN * g_odds, room * g_lab[1], room * g_lab[2])
+    g_tint = wp.vec3f(model.LIGHTNESS_GAIN * g_odds, room * g_lab[1], room * g_lab[2])
     g_finish = wp.vec3f(GLOSS_PER_L * (lab[0] - base) * g_odds, coat.grip * g_veil, coat.dirt * g_veil)
     g_base = -GLOSS_PER_L * coat.gloss * g_odds
-    g_light = 0.01 * within(lab[0] * 0.01, 0.01, 0.99) * g_before - g_base
+    g_light = 0.01 * within(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before - g_base
     return out + veil * (DUST - out), wp.vec3f(g_light, g_lab[1], g_lab[2]), g_tint, g_finish, g_base
 
 
 @wp.func
 def grip_at(height: wp.float32):
-    return 1.0 - 0.75 * wp.min(wp.max(height, 0.0), 1.0)
+    return 1.0 - model.CLEAN_ROOF * wp.min(wp.max(height, 0.0), 1.0)
 
 
 @wp.func
@@ -305,7 +302,7 @@ def paint_kernel(
     i = start + wp.tid()
     alpha = load(opacity, i)
     own = load3(colour, 3 * i, 1)
-    straight = clamped((1.0 / wp.max(alpha, 0.02)) * own)
+    straight = clamped((1.0 / wp.max(alpha, model.LEAST_ALPHA)) * own)
     change = paint_change(straight, coat_at(code, i, load(height, i)), load(base, i))
     store3(out, 3 * i, 1, own + painted_share(alpha, load(paint, i)) * change)
 
@@ -328,7 +325,7 @@ def paint_adjoint_kernel(
     alpha = load(opacity, i)
     own = load3(colour, 3 * i, 1)
     g = load3(grad, 3 * i, 1)
-    scale = 1.0 / wp.max(alpha, 0.02)
+    scale = 1.0 / wp.max(alpha, model.LEAST_ALPHA)
     straight = scale * own
     rgb = clamped(straight)
     up = load(height, i)
@@ -340,10 +337,10 @@ def paint_adjoint_kernel(
     )
     along = touched * wp.dot(g, change)
     g_straight = scale * clamped_adjoint(straight, g_rgb)
-    thin = wp.where(alpha >= 0.02, wp.dot(g_straight, straight), 0.0)
+    thin = wp.where(alpha >= model.LEAST_ALPHA, wp.dot(g_straight, straight), 0.0)
     store(grads, i, share * along - thin)
     store(grads, i + rows, alpha * along)
-    store(grads, i + 2 * rows, -0.75 * within(up, 0.0, 1.0) * g_finish[2])
+    store(grads, i + 2 * rows, -model.CLEAN_ROOF * within(up, 0.0, 1.0) * g_finish[2])
     store(grads, i + 3 * rows, g_base)
     store3(grads, i + 4 * rows, rows, g_tint)
     store(grads, i + 7 * rows, g_finish[0])

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, store, store3, total
 from scene_ir.raster.launch import halves, launch, start_warp, threads
-from scene_ir.render import environment as model
+from scene_ir.render import model
 from scene_ir.render.kernels.colour import (
     array,
     clamped,
@@ -37,19 +37,30 @@ from scene_ir.types import Environment
 start_warp()
 wp.set_module_options(OPTIONS)
 
-FOG = wp.constant(wp.float32(model.FOG_EXTINCTION_PER_M))
-RAIN = wp.constant(wp.float32(model.RAIN_EXTINCTION_PER_M))
-NEAREST = wp.constant(wp.float32(1.0 / model.HAZE_CAP_M))
-FEWEST_LEAVES = wp.constant(wp.float32(model.FEWEST_LEAVES))
+FOG, RAIN, NEAREST = model.FOG_EXTINCTION_PER_M, model.RAIN_EXTINCTION_PER_M, 1.0 / model.HAZE_CAP_M
+FLAT, FLAT_GREY = (
+    model.OVERCAST_CONTRAST * share for share in (model.OVERCAST_COLOUR, 1.0 - model.OVERCAST_COLOUR)
+)
+FLAT_LIGHT = model.OVERCAST_TO - model.OVERCAST_CONTRAST * model.OVERCAST_FROM
+COVER_AIR = model.COVER_AIR - model.COVER_STRUCTURE
+"""Overcast, multiplied out."""
+DAMP, DAMP_GREY = (model.DAMP_LIGHT * share for share in (model.DAMP_COLOUR, 1.0 - model.DAMP_COLOUR))
+SHEEN_FROM, SHEEN_OVER = model.SHEEN_M[0], model.SHEEN_M[1] - model.SHEEN_M[0]
+THICK = model.THICK_SHARE * (1.0 - model.THICK_DARKNESS)
+LEVEL_LOW, LEVEL_HIGH = model.LEVEL
+LEAF_TURN_SLOPE = model.LEAF_TURN_MORE * model.LEAF_TURN_BEND
 LUMA = wp.constant(wp.vec3f(*model.LUMA))
 DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
 WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
 """Columns that a thread of the CPU smears at a time; `mirror` and `unmirror` have room for this many."""
-_SETTINGS = 19
-"""Numbers that are the same for all pixels, in this order: 0.85 overcast; rain; fog; what overcast makes of a
-black sky; gain of the time of day (3) and its slope (3); airlight (3) and its slopes along
+OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, SETTINGS = (
+    *(0, 1, 2, 3, 4),
+    *(7, 10, 13, 16, 19),
+)
+"""Numbers that are the same for all pixels: where they begin, and their count. Overcast as a share; rain; fog;
+what overcast makes of a black sky; gain of the time of day (3) and its slope (3); airlight (3), its slopes along
 overcast (3) and time (3)."""
 
 
@@ -68,30 +79,34 @@ def settings_kernel(
     """One thread a channel."""
     c = start + wp.tid()
     time = wp.float64(code[2])
-    overcast = wp.float64(0.85) * wp.float64(code[3])
+    overcast = wp.float64(model.OVERCAST) * wp.float64(code[3])
     square = time * time
-    dusk = wp.exp(wp.float64(-3.5) * square)
-    dim = wp.exp(wp.float64(-2.0) * square)
+    dusk = wp.exp(wp.float64(-model.DUSK_ENDS) * square)
+    dim = wp.exp(wp.float64(-model.DIMMING_ENDS) * square)
     dark = wp.exp(-DARKENING[c] * square)
     one = wp.float64(1.0)
-    gain = (dark - one) + WARMTH[c] * time * dusk - wp.float64(0.25) * time * dim
+    two = wp.float64(2.0)
+    warmth = WARMTH[c] * time
+    dimming = wp.float64(model.DIMMING)
+    gain = (dark - one) + warmth * dusk - dimming * time * dim
     slope = (
-        wp.float64(-2.0) * DARKENING[c] * time * dark
-        + WARMTH[c] * (one - wp.float64(7.0) * square) * dusk
-        - wp.float64(0.25) * (one - wp.float64(4.0) * square) * dim
+        -two * DARKENING[c] * time * dark
+        + WARMTH[c] * (one - two * wp.float64(model.DUSK_ENDS) * square) * dusk
+        - dimming * (one - two * wp.float64(model.DIMMING_ENDS) * square) * dim
     )
     grey = grey_air_of(air)
-    plain = wp.float64(air[c]) + overcast * (wp.float64(0.9) * grey - wp.float64(air[c]))
+    away = wp.float64(model.OVERCAST_AIR) * grey - wp.float64(air[c])
+    plain = wp.float64(air[c]) + overcast * away
     if c == 0:
-        settings[0] = wp.float32(overcast)
-        settings[1] = code[1]
-        settings[2] = code[0]
-        settings[3] = wp.float32(wp.float64(0.40) * grey + wp.float64(0.30))
-    settings[4 + c] = wp.float32(gain)
-    settings[7 + c] = wp.float32(slope)
-    settings[10 + c] = wp.float32(plain + gain * plain)
-    settings[13 + c] = wp.float32(wp.float64(0.85) * (wp.float64(0.9) * grey - wp.float64(air[c])) * (one + gain))
-    settings[16 + c] = wp.float32(slope * plain)
+        settings[OVERCAST] = wp.float32(overcast)
+        settings[WET] = code[1]
+        settings[MIST] = code[0]
+        settings[COVER] = wp.float32(wp.float64(COVER_AIR) * grey + wp.float64(model.COVER_LIGHT))
+    settings[GAIN + c] = wp.float32(gain)
+    settings[GAIN_SLOPE + c] = wp.float32(slope)
+    settings[AIR + c] = wp.float32(plain + gain * plain)
+    settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * away * (one + gain))
+    settings[AIR_BY_TIME + c] = wp.float32(slope * plain)
 
 
 @wp.func
@@ -113,22 +128,22 @@ def grown(x: wp.vec3f, gain: wp.vec3f):
 def cover_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
     """What overcast, fully on, would add."""
     y = grey(x)
-    flat = 0.324 * x + same(0.396 * y + 0.0976)  # 0.40 + 0.72 ((0.45 x + 0.55 y) - 0.42)
-    return (flat + sky * (same(load(settings, 3) + 0.15 * y) - flat)) - x
+    flat = FLAT * x + same(FLAT_GREY * y + FLAT_LIGHT)
+    return (flat + sky * (same(load(settings, COVER) + model.COVER_STRUCTURE * y) - flat)) - x
 
 
 @wp.func
 def damp_change(x: wp.vec3f):
-    """What rain, at 1 / 0.9, would add by wetting."""
-    return (0.468 * x + same(0.252 * grey(x))) - x
+    """What rain, at 1 / `model.DAMP`, would add by wetting."""
+    return (DAMP * x + same(DAMP_GREY * grey(x))) - x
 
 
 @wp.func
 def before(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after overcast, time of day and damp."""
-    covered = x + load(settings, 0) * cover_change(x, sky, settings)
-    timed = grown(covered, load3(settings, 4, 1))
-    return timed + (0.9 * load(settings, 1)) * damp_change(timed)
+    covered = x + load(settings, OVERCAST) * cover_change(x, sky, settings)
+    timed = grown(covered, load3(settings, GAIN, 1))
+    return timed + (model.DAMP * load(settings, WET)) * damp_change(timed)
 
 
 @wp.func
@@ -138,29 +153,29 @@ def depth_of(inverse: wp.float32):
 
 @wp.func
 def far_share(depth: wp.float32):
-    return wp.min(wp.max((depth - 4.0) * (1.0 / 41.0), 0.0), 1.0)
+    return wp.min(wp.max((depth - SHEEN_FROM) * (1.0 / SHEEN_OVER), 0.0), 1.0)
 
 
 @wp.func
 def grazing_at(depth: wp.float32):
     t = far_share(depth)
-    return 0.15 + 0.45 * (t * t * (3.0 - 2.0 * t))
+    return model.SHEEN_NEAR + model.SHEEN_FAR * (t * t * (3.0 - 2.0 * t))
 
 
 @wp.func
 def hazed(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after haze, streaks and fog."""
-    rain = load(settings, 1)
-    air = load3(settings, 10, 1)
-    far = x + (1.0 - exp_(-RAIN * rain * depth)) * (0.85 * air - x)
-    streaked = far + (0.22 * rain * streak) * (air - far)
-    return streaked + (1.0 - exp_(-FOG * load(settings, 2) * depth)) * (air - streaked)
+    rain = load(settings, WET)
+    air = load3(settings, AIR, 1)
+    far = x + (1.0 - exp_(-RAIN * rain * depth)) * (model.RAIN_AIR * air - x)
+    streaked = far + (model.STREAKS * rain * streak) * (air - far)
+    return streaked + (1.0 - exp_(-FOG * load(settings, MIST) * depth)) * (air - streaked)
 
 
 @wp.func
 def shiny(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel with the road's sheen, of which `wet` in [0, 1] is seen."""
-    return x + wet * (0.55 * mirrored + 0.40 * load3(settings, 10, 1) - x)
+    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - x)
 
 
 @wp.kernel
@@ -211,7 +226,7 @@ def wet_kernel(
 ):
     i = start + wp.tid()
     depth = depth_of(load(inverse, i))
-    share = load(settings, 1) * (load(road, i) * grazing_at(depth))
+    share = load(settings, WET) * (load(road, i) * grazing_at(depth))
     x = shiny(load3(damp, i - first, kept), load3(mirrored, i - first, kept), share, settings)
     store3(out, i, plane, hazed(x, depth, load(streaks, i), settings))
 
@@ -219,19 +234,19 @@ def wet_kernel(
 @wp.func
 def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
     """Of `before`: the gradient to x, and to rain, time and overcast (3)."""
-    overcast = load(settings, 0)
-    damping = 0.9 * load(settings, 1)
-    gain = load3(settings, 4, 1)
+    overcast = load(settings, OVERCAST)
+    damping = model.DAMP * load(settings, WET)
+    gain = load3(settings, GAIN, 1)
     change = cover_change(x, sky, settings)
     covered = x + overcast * change
-    rain = 0.9 * wp.dot(g, damp_change(grown(covered, gain)))
-    wetted = g + damping * ((0.468 * g + 0.252 * total(g) * LUMA) - g)
-    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, 7, 1))
+    rain = model.DAMP * wp.dot(g, damp_change(grown(covered, gain)))
+    wetted = g + damping * ((DAMP * g + DAMP_GREY * total(g) * LUMA) - g)
+    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, GAIN_SLOPE, 1))
     timed = grown(wetted, gain)
     flat = (1.0 - sky) * timed
-    grey_slope = 0.396 * total(flat) + 0.15 * sky * total(timed)
-    out = timed + overcast * ((0.324 * flat + grey_slope * LUMA) - timed)
-    return out, wp.vec3f(rain, time, 0.85 * wp.dot(timed, change))
+    grey_slope = FLAT_GREY * total(flat) + model.COVER_STRUCTURE * sky * total(timed)
+    out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
+    return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change))
 
 
 @wp.func
@@ -245,44 +260,44 @@ def after_adjoint(
     settings: wp.array(dtype=wp.float32),
 ):
     """Of `shiny` and `hazed`: the gradient to x, to mirrored, to (fog, rain, time, overcast), to inverse."""
-    rain = load(settings, 1)
-    fog = load(settings, 2)
-    air = load3(settings, 10, 1)
+    rain = load(settings, WET)
+    fog = load(settings, MIST)
+    air = load3(settings, AIR, 1)
     depth = depth_of(inverse)
     t = far_share(depth)
     seen = road * grazing_at(depth)
     wet = rain * seen
-    sheen = 0.55 * mirrored + 0.40 * air - x
+    sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air - x
     wetted = x + wet * sheen
     clear = exp_(-RAIN * rain * depth)
-    to_haze = 0.85 * air - wetted
+    to_haze = model.RAIN_AIR * air - wetted
     far = wetted + (1.0 - clear) * to_haze
-    streaked = far + (0.22 * rain * streak) * (air - far)
+    streaked = far + (model.STREAKS * rain * streak) * (air - far)
     visible = exp_(-FOG * fog * depth)
 
     g_fogged = FOG * visible * wp.dot(g, air - streaked)
     g_far = visible * g
     g_streak = wp.dot(g_far, air - far)
-    g_haze = (1.0 - 0.22 * rain * streak) * g_far
+    g_haze = (1.0 - model.STREAKS * rain * streak) * g_far
     g_hazed = RAIN * clear * wp.dot(g_haze, to_haze)
     g_wet = clear * g_haze
     g_sheen = wp.dot(g_wet, sheen)
     g_air = (
         (1.0 - visible) * g
-        + (0.22 * rain * streak) * g_far
-        + (0.85 * (1.0 - clear)) * g_haze
-        + (0.40 * wet) * g_wet
+        + (model.STREAKS * rain * streak) * g_far
+        + (model.RAIN_AIR * (1.0 - clear)) * g_haze
+        + (model.SHEEN_AIR * wet) * g_wet
     )
     code = wp.vec4f(
         g_fogged * depth,
-        g_hazed * depth + 0.22 * streak * g_streak + seen * g_sheen,
-        wp.dot(g_air, load3(settings, 16, 1)),
-        wp.dot(g_air, load3(settings, 13, 1)),
+        g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen,
+        wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
+        wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
     )
-    bend = (0.45 * 6.0 / 41.0) * (t - t * t)
+    bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
     g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
-    return (1.0 - wet) * g_wet, (0.55 * wet) * g_wet, code, g_inverse
+    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, code, g_inverse
 
 
 @wp.kernel
@@ -538,7 +553,7 @@ class _Weather(torch.autograd.Function):
         plane, wet = height * width, _Wet.of(road)
         first, last = wet.top * width, wet.bottom * width
         kept = last - first
-        settings, out = image.new_empty(_SETTINGS), torch.empty_like(image, memory_format=torch.contiguous_format)
+        settings, out = image.new_empty(SETTINGS), torch.empty_like(image, memory_format=torch.contiguous_format)
         damp, mirrored = _scratch.planes(image, 3 * kept)[0], image.new_empty(3 * kept)
         kept_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
         picture, sight, cover, way, drops = (array(t) for t in kept_maps)
@@ -592,10 +607,11 @@ def _mirror(wet: _Wet, width: int, source: Any, target: Any, forward: bool) -> N
     launch(mirror_kernel, edges, inputs)
 
 
-_LEAF_SETTINGS = 14
-"""Numbers that are the same for all leaves, in this order: factor of the odds of lightness; of chroma; cosine and
-sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn along hue, of thicker
-and thinner along density; airlight (3)."""
+ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
+LEAF_AIR, LEAF_SETTINGS = 11, 14
+"""Numbers that are the same for all leaves: where they stand, and their count. Factor of the odds of lightness; of
+chroma; cosine and sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn
+along hue, of thicker and thinner along density; airlight (3)."""
 
 
 @wp.kernel
@@ -611,46 +627,48 @@ def leaf_settings_kernel(
     one = wp.float64(1.0)
     hue = on * wp.float64(code[0])
     density = on * wp.float64(code[2])
-    bend = wp.tanh(wp.float64(2.0) * hue)
-    rate = wp.float64(0.70) + wp.float64(0.35) * bend
-    thick = one / (one + wp.exp(wp.float64(-6.0) * density))
-    steep = wp.float64(6.0) * density * thick * (one - thick)
-    first = t * 14
-    settings[first] = wp.float32(wp.exp(on * wp.float64(1.5) * wp.float64(code[1])))
-    settings[first + 1] = wp.float32(one + wp.float64(0.3) * hue)
-    settings[first + 2] = wp.float32(wp.cos(-rate * hue))
-    settings[first + 3] = wp.float32(wp.sin(-rate * hue))
-    settings[first + 4] = wp.float32(wp.float64(10.0) * hue)
-    settings[first + 5] = wp.float32(wp.float64(8.0) * hue)
-    settings[first + 6] = wp.float32(density * thick)
-    settings[first + 7] = wp.float32(-density * (one - thick))
-    settings[first + 8] = wp.float32(-rate - wp.float64(0.70) * (one - bend * bend) * hue)
-    settings[first + 9] = wp.float32(thick + steep)
-    settings[first + 10] = wp.float32(thick - one + steep)
+    bend = wp.tanh(wp.float64(model.LEAF_TURN_BEND) * hue)
+    rate = wp.float64(model.LEAF_TURN) + wp.float64(model.LEAF_TURN_MORE) * bend
+    rate_slope = wp.float64(LEAF_TURN_SLOPE) * (one - bend * bend)
+    thick = one / (one + wp.exp(wp.float64(-model.CROWN_BEND) * density))
+    steep = wp.float64(model.CROWN_BEND) * density * thick * (one - thick)
+    first = t * LEAF_SETTINGS
+    settings[first + ODDS] = wp.float32(wp.exp(on * wp.float64(model.LEAF_LIGHTNESS) * wp.float64(code[1])))
+    settings[first + CHROMA] = wp.float32(one + wp.float64(model.LEAF_CHROMA) * hue)
+    settings[first + COS] = wp.float32(wp.cos(-rate * hue))
+    settings[first + SIN] = wp.float32(wp.sin(-rate * hue))
+    settings[first + RED] = wp.float32(wp.float64(model.LEAF_RED) * hue)
+    settings[first + YELLOW] = wp.float32(wp.float64(model.LEAF_YELLOW) * hue)
+    settings[first + THICKER] = wp.float32(density * thick)
+    settings[first + THINNER] = wp.float32(-density * (one - thick))
+    settings[first + TURN_SLOPE] = wp.float32(-rate - rate_slope * hue)
+    settings[first + THICKER_SLOPE] = wp.float32(thick + steep)
+    settings[first + THINNER_SLOPE] = wp.float32(thick - one + steep)
     for c in range(3):
-        settings[first + 11 + c] = air[c]
+        settings[first + LEAF_AIR + c] = air[c]
 
 
 @wp.func
 def leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     """The leaf model before its crown's density: L*a*b*."""
     before = level_of(lab[0])
-    odds = load(settings, at)
+    odds = load(settings, at + ODDS)
     level = lifted(before, odds)
-    chroma = load(settings, at + 1) * wp.sqrt(odds / (before * odds + (1.0 - before)))
-    cos = load(settings, at + 2)
-    sin = load(settings, at + 3)
+    chroma = load(settings, at + CHROMA) * wp.sqrt(odds / (before * odds + (1.0 - before)))
+    cos = load(settings, at + COS)
+    sin = load(settings, at + SIN)
     room = 4.0 * level * (1.0 - level)
-    red = chroma * (cos * lab[1] - sin * lab[2]) + load(settings, at + 4) * room
-    yellow = chroma * (sin * lab[1] + cos * lab[2]) + load(settings, at + 5) * room
+    red = chroma * (cos * lab[1] - sin * lab[2]) + load(settings, at + RED) * room
+    yellow = chroma * (sin * lab[1] + cos * lab[2]) + load(settings, at + YELLOW) * room
     return wp.vec3f(100.0 * level, red, yellow)
 
 
 @wp.func
 def crown(rgb: wp.vec3f, gap: wp.float32, settings: wp.array(dtype=wp.float32), at: int):
     """Leaves in a thicker or thinner crown."""
-    dense = (1.0 - 0.375 * load(settings, at + 6) * (1.0 - gap)) * rgb
-    return dense + (0.8 * load(settings, at + 7) * gap) * (load3(settings, at + 11, 1) - dense)
+    dense = (1.0 - THICK * load(settings, at + THICKER) * (1.0 - gap)) * rgb
+    air = load3(settings, at + LEAF_AIR, 1)
+    return dense + (model.THIN_SHARE * load(settings, at + THINNER) * gap) * (air - dense)
 
 
 @wp.func
@@ -658,35 +676,36 @@ def leaf_adjoint(lab: wp.vec3f, gap: wp.float32, g: wp.vec3f, settings: wp.array
     """-> gradients to lab and to hue, lightness and density (3)."""
     changed = leaf_lab(lab, settings, at)
     rgb = rgb_of(changed)
-    keep = 1.0 - 0.375 * load(settings, at + 6) * (1.0 - gap)
-    through = 0.8 * load(settings, at + 7) * gap
-    g_thin = 0.8 * gap * wp.dot(g, load3(settings, at + 11, 1) - keep * rgb)
+    keep = 1.0 - THICK * load(settings, at + THICKER) * (1.0 - gap)
+    through = model.THIN_SHARE * load(settings, at + THINNER) * gap
+    g_thin = model.THIN_SHARE * gap * wp.dot(g, load3(settings, at + LEAF_AIR, 1) - keep * rgb)
     g_dense = (1.0 - through) * g
-    g_thick = -0.375 * (1.0 - gap) * wp.dot(g_dense, rgb)
+    g_thick = -THICK * (1.0 - gap) * wp.dot(g_dense, rgb)
     g_lab = rgb_adjoint(changed, keep * g_dense)
 
     before = level_of(lab[0])
-    odds = load(settings, at)
+    odds = load(settings, at + ODDS)
     bottom = before * odds + (1.0 - before)
     level = before * odds / bottom
     root = wp.sqrt(odds / bottom)
-    chroma = load(settings, at + 1) * root
-    cos = load(settings, at + 2)
-    sin = load(settings, at + 3)
+    chroma = load(settings, at + CHROMA) * root
+    cos = load(settings, at + COS)
+    sin = load(settings, at + SIN)
     along = g_lab[1] * (cos * lab[1] - sin * lab[2]) + g_lab[2] * (sin * lab[1] + cos * lab[2])
     across = g_lab[2] * (cos * lab[1] - sin * lab[2]) - g_lab[1] * (sin * lab[1] + cos * lab[2])
     room = 4.0 * level * (1.0 - level)
-    shift = load(settings, at + 4) * g_lab[1] + load(settings, at + 5) * g_lab[2]
+    shift = load(settings, at + RED) * g_lab[1] + load(settings, at + YELLOW) * g_lab[2]
     g_level = 100.0 * g_lab[0] + 4.0 * (1.0 - 2.0 * level) * shift
     g_odds = g_level * level * (1.0 - level) + 0.5 * along * chroma * (1.0 - level)
     g_before = g_level * odds / (bottom * bottom) - 0.5 * along * chroma * (odds - 1.0) / bottom
+    tint = model.LEAF_RED * g_lab[1] + model.LEAF_YELLOW * g_lab[2]
     code = wp.vec3f(
-        0.3 * root * along + load(settings, at + 8) * chroma * across + (10.0 * g_lab[1] + 8.0 * g_lab[2]) * room,
-        1.5 * g_odds,
-        load(settings, at + 9) * g_thick + load(settings, at + 10) * g_thin,
+        model.LEAF_CHROMA * root * along + load(settings, at + TURN_SLOPE) * chroma * across + tint * room,
+        model.LEAF_LIGHTNESS * g_odds,
+        load(settings, at + THICKER_SLOPE) * g_thick + load(settings, at + THINNER_SLOPE) * g_thin,
     )
     out = wp.vec3f(
-        0.01 * within(lab[0] * 0.01, 0.01, 0.99) * g_before,
+        0.01 * within(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before,
         chroma * (cos * g_lab[1] + sin * g_lab[2]),
         chroma * (cos * g_lab[2] - sin * g_lab[1]),
     )
@@ -695,7 +714,7 @@ def leaf_adjoint(lab: wp.vec3f, gap: wp.float32, g: wp.vec3f, settings: wp.array
 
 @wp.func
 def leaf_share(amount: wp.float32):
-    return wp.where(amount > FEWEST_LEAVES, amount, 0.0)
+    return wp.where(amount > model.FEWEST_LEAVES, amount, 0.0)
 
 
 @wp.kernel
@@ -714,7 +733,7 @@ def foliage_kernel(
     gap = load(gaps, i)
     lab = lab_of(clamped(own))
     now = crown(rgb_of(leaf_lab(lab, settings, 0)), gap, settings, 0)
-    then = crown(rgb_of(leaf_lab(lab, settings, 14)), gap, settings, 14)
+    then = crown(rgb_of(leaf_lab(lab, settings, LEAF_SETTINGS)), gap, settings, LEAF_SETTINGS)
     size = wp.abs(load(code, 0)) + wp.abs(load(code, 1)) + wp.abs(load(code, 2))
     share = wp.where(size > 0.0, leaf_share(load(amount, i)), 0.0)
     store3(out, i, plane, own + share * (now - then))
@@ -758,7 +777,7 @@ def foliage_image_kernel(
     lab = lab_of(rgb)
     part = leaf_share(load(amount, i)) * g
     now, _code = leaf_adjoint(lab, load(gaps, i), part, settings, 0)
-    then, _none = leaf_adjoint(lab, load(gaps, i), part, settings, 14)
+    then, _none = leaf_adjoint(lab, load(gaps, i), part, settings, LEAF_SETTINGS)
     store3(grad_image, i, plane, g + clamped_adjoint(own, lab_adjoint(rgb, now - then)))
 
 
@@ -771,7 +790,7 @@ class _Foliage(torch.autograd.Function):
         plane = height * width
         top, bottom = (0, height) if image.is_cuda else _rows(amount > model.FEWEST_LEAVES)
         kept_maps = [t.detach().contiguous() for t in (image, amount, gaps)]
-        settings = image.new_empty(2 * _LEAF_SETTINGS)
+        settings = image.new_empty(2 * LEAF_SETTINGS)
         out = kept_maps[0].clone()
         given, own_code, maps = array(settings), array(code), [array(t) for t in kept_maps]
         launch(leaf_settings_kernel, [0, 2], [own_code, array(air)], [given])

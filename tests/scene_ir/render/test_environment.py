@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.render import environment as env
+from scene_ir.render import model
 from scene_ir.types import Environment
 
 H, W = 40, 64
@@ -71,7 +72,7 @@ def _code(index: int, value: float) -> Tensor:
 def test_fog_follows_koschmieder() -> None:
     image, after = _weather(_code(FOG, 0.5))
     _, inverse, _, air = _inputs()
-    depth = 1.0 / inverse.clamp(min=1.0 / env.HAZE_CAP_M)
+    depth = 1.0 / inverse.clamp(min=1.0 / model.HAZE_CAP_M)
     clear = torch.exp(-0.015 * depth)
     torch.testing.assert_close(after, image * clear + air[:, None, None] * (1 - clear))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.render import finish, texture
+from scene_ir.render import finish, model, texture
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.render.surfaces import Surface
@@ -118,7 +118,7 @@ def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
     still = compositor.brighter(replace(objects, yaw=live))
     assert bool((still == 0).all())
     turned = compositor.brighter(replace(objects, yaw=objects.yaw + 0.3))
-    assert 0.02 < float(turned.abs().max()) <= texture.RELIT_MOST
+    assert 0.02 < float(turned.abs().max()) <= model.RELIT_MOST
     # A side that turned to the sun is brighter.
     sun = photographed.environment.sun
     normal = compositor.smooth

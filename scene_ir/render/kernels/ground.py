@@ -1,0 +1,154 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
+# ruff: noqa: E501, UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
+# returns the gradients of all arguments.
+"""Photographed shadows on the ground as Warp kernels: what `reference` does in plain torch; float32.
+
+A patch of ground is a plane: a 3 x 3 matrix takes a pixel to the photograph, and no triangles are drawn.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scene_ir.raster.kernels import Taps
+from scene_ir.raster.launch import start_warp
+from scene_ir.raster.verbs import NEAR_M
+from scene_ir.render import model
+from scene_ir.render.kernels.shading import inside_weight, rect_of, taps_at
+
+start_warp()
+wp.set_module_options({"fuse_fp": True, "fast_math": False})
+
+NEAR = wp.constant(wp.float32(NEAR_M))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+EXTENDED = wp.constant(wp.vec2f(*model.SHADOW_EXTENDED_PX))
+
+
+@wp.struct
+class Ground:
+    """Photographed shadows: what they take away, three numbers a texel, and where the crops lie; from a pixel (x, y, 1)
+    to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then, over w now.
+    """
+
+    inside: wp.array(dtype=wp.mat33d)
+    then: wp.array(dtype=wp.mat33d)
+    dark: wp.array(dtype=wp.vec3f)
+    rects: wp.array2d(dtype=wp.int64)
+    offsets: wp.array(dtype=wp.int64)
+    frame_wh: wp.array(dtype=wp.vec2f)
+
+
+@wp.func
+def ground_place(ground: Ground, o: int, x: int, y: int):
+    """Where the photograph shows the ground point that a pixel shows, px, and 1 where the patch reaches, else 0."""
+    p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
+    q = ground.inside[o] @ p
+    out = wp.vec3f(model.FAR_AWAY_PX, model.FAR_AWAY_PX, 0.0)
+    if q[2] > ZERO and q[2] * wp.float64(NEAR) <= ONE:
+        if q[0] >= ZERO and q[0] <= q[2] and q[1] >= ZERO and q[1] <= q[2]:
+            r = ground.then[o] @ p
+            if r[2] > wp.float64(NEAR) * q[2]:
+                out = wp.vec3f(wp.float32(r[0] / r[2]), wp.float32(r[1] / r[2]), 1.0)
+    return out
+
+
+@wp.func
+def dark_row(dark: wp.array(dtype=wp.vec3f), row: int, t: Taps, w: wp.vec4f):
+    low = dark[row + t.columns[0]] * w[0] + dark[row + t.columns[1]] * w[1]
+    return low + (dark[row + t.columns[2]] * w[2] + dark[row + t.columns[3]] * w[3])
+
+
+@wp.func
+def in_frame(uv: wp.vec2f, wh: wp.vec2f):
+    """Kept within two pixels of the frame, where crops repeat their border."""
+    return wp.vec2f(wp.min(wp.max(uv[0], -2.0), wh[0] + 1.0), wp.min(wp.max(uv[1], -2.0), wh[1] + 1.0))
+
+
+@wp.func
+def reached(uv: wp.vec2f, rect: wp.vec4i):
+    """Whether a lookup can find anything in a crop."""
+    found = uv[0] > wp.float32(rect[0] - 2) and uv[0] < wp.float32(rect[2] + 1)
+    return found and uv[1] > wp.float32(rect[1] - 2) and uv[1] < wp.float32(rect[3] + 1)
+
+
+@wp.kernel(enable_backward=False)
+def shadow_kernel(start: int, table: wp.array(dtype=wp.vec4i), ground: Ground, out: wp.array(dtype=wp.vec3f)):
+    i = start + wp.tid()
+    at = table[i]
+    factor = wp.vec3f(1.0, 1.0, 1.0)
+    place = ground_place(ground, at[0], at[1], at[2])
+    if place[2] > 0.0:
+        rect = rect_of(ground.rects, at[0])
+        wh = ground.frame_wh[at[0]]
+        uv = in_frame(wp.vec2f(place[0], place[1]), wh)
+        if reached(uv, rect):
+            t = taps_at(uv, rect, ground.offsets[at[0]], False)
+            dark = dark_row(ground.dark, t.rows[0], t, t.wx) * t.wy[0]
+            dark += dark_row(ground.dark, t.rows[1], t, t.wx) * t.wy[1]
+            dark += dark_row(ground.dark, t.rows[2], t, t.wx) * t.wy[2]
+            dark += dark_row(ground.dark, t.rows[3], t, t.wx) * t.wy[3]
+            factor = factor - dark * inside_weight(place[0], place[1], wh, EXTENDED)
+    out[i] = factor
+
+
+@wp.func
+def border_loss(place: wp.vec2f, wh: wp.vec2f):
+    return inside_weight(place[0], place[1], wh, EXTENDED)
+
+
+@wp.kernel(enable_backward=False)
+def shadow_backward_kernel(
+    start: int,
+    table: wp.array(dtype=wp.vec4i),
+    ground: Ground,
+    grad_out: wp.array(dtype=wp.vec3f),
+    grad_then: wp.array(dtype=wp.mat33d),
+):
+    i = start + wp.tid()
+    g = grad_out[i]
+    if g[0] == 0.0 and g[1] == 0.0 and g[2] == 0.0:
+        return  # under a vehicle
+    at = table[i]
+    o = at[0]
+    place = ground_place(ground, o, at[1], at[2])
+    if place[2] > 0.0:
+        rect = rect_of(ground.rects, o)
+        wh = ground.frame_wh[o]
+        flat = wp.vec2f(place[0], place[1])
+        uv = in_frame(flat, wh)
+        if reached(uv, rect):
+            t = taps_at(uv, rect, ground.offsets[o], False)
+            dark = float(0.0)
+            to_u = float(0.0)
+            to_v = float(0.0)
+            for k in range(4):
+                e0 = wp.dot(g, ground.dark[t.rows[k] + t.columns[0]])
+                e1 = wp.dot(g, ground.dark[t.rows[k] + t.columns[1]])
+                e2 = wp.dot(g, ground.dark[t.rows[k] + t.columns[2]])
+                e3 = wp.dot(g, ground.dark[t.rows[k] + t.columns[3]])
+                along = e0 * t.wx[0] + e1 * t.wx[1] + e2 * t.wx[2] + e3 * t.wx[3]
+                dark += t.wy[k] * along
+                to_v += t.sy[k] * along
+                to_u += t.wy[k] * (e0 * t.sx[0] + e1 * t.sx[1] + e2 * t.sx[2] + e3 * t.sx[3])
+            if uv[0] != place[0]:
+                to_u = float(0.0)
+            if uv[1] != place[1]:
+                to_v = float(0.0)
+            if uv[0] != place[0] or uv[1] != place[1]:
+                border = border_loss(flat, wh)
+                to_border, to_wh = wp.grad(border_loss)(flat, wh)
+                to_u = to_u * border + dark * to_border[0]
+                to_v = to_v * border + dark * to_border[1]
+            if to_u != 0.0 or to_v != 0.0:
+                p = wp.vec3d(wp.float64(at[1]), wp.float64(at[2]), ONE)
+                scale = -ONE / wp.dot(ground.then[o][2], p)
+                a = wp.float64(to_u) * scale
+                b = wp.float64(to_v) * scale
+                c = -(a * wp.float64(place[0]) + b * wp.float64(place[1]))
+                wp.atomic_add(grad_then, o, wp.outer(wp.vec3d(a, b, c), p))
+
+
+@wp.kernel(enable_backward=True)
+def adjoints_kernel(out: wp.array(dtype=wp.float32)):
+    """Never run: see `shading.adjoints_kernel`."""
+    out[0] = border_loss(wp.vec2f(0.0, 0.0), wp.vec2f(0.0, 0.0))

@@ -1,0 +1,230 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
+# ruff: noqa: E501 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
+# returns the gradients of all arguments.
+"""All pixels of photographed vehicles, and of their shadows: the stages of `shading` and `ground`, one after the other.
+
+Shapes: N objects, V vertices, T packed pixels, Ts of the shadows' patches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from scene_ir.raster.launch import array, between, field, halves, launch, load, share
+from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.render import channels, surfaces
+from scene_ir.render.kernels import ground, shading
+
+Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""From mesh, halo, look, fill, codes, table and nearest to mesh and halo."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What `Photographed` reads and does not change. See `fast.Fixed` and `prepare.Drawn` for what is not said here.
+
+    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `ground.Ground`. painter: None, or what
+    repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 9), how much of
+    them was filled (T,) and the codes, differentiable. reach_px: how far each halo reaches.
+    """
+
+    fragments: Fragments
+    ground: Layout
+    inside: Tensor
+    reach_px: Sequence[float]
+    faces: Tensor
+    base_clip: Tensor
+    base: Tensor
+    own: Tensor
+    texels: tuple[Tensor, Tensor, Tensor]
+    dark: tuple[Tensor, Tensor, Tensor]
+    frame_wh: Tensor
+    sun: Tensor
+    unproject: Tensor
+    painter: Painter | None
+
+
+class _Parts:
+    """Objects [start, end) as ranges of packed pixels: what one thread draws from the first stage to the last."""
+
+    def __init__(self, s: Setting, code: Tensor | None) -> None:
+        self.pixels = s.fragments.layout.offsets.tolist()
+        self.ground = s.ground.offsets.tolist()
+        count = len(self.pixels) - 1
+        work = [
+            2.0 * (self.pixels[i + 1] - self.pixels[i]) + self.ground[i + 1] - self.ground[i] for i in range(count)
+        ]
+        # A GPU works on all at once; a painter is torch's.
+        whole = s.faces.device.type != "cpu" or code is not None
+        self.edges = [0, count] if whole else between(list(range(count + 1)), work)
+
+
+@dataclass(slots=True)
+class _Kept:
+    """What the forward pass leaves to the backward one. turn (N, 2): cosine and sine of the yaws; painted: leaves and
+    results of the painter; needs: of each part, the pixels that were completed."""
+
+    parts: _Parts
+    pixels: Any
+    vertices: Any
+    photograph: Any
+    looks: Any
+    shadows: list[Any]
+    turn: Tensor
+    needs: dict[int, Tensor]
+    painted: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
+
+
+class Photographed(torch.autograd.Function):
+    """All pixels of photographed objects, and of their shadows.
+
+    clip (V, 3), facing (V,), brighter (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `ground.Ground`),
+    code (N, 5) or (0,): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth
+    (T, 4), opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, s: Setting):
+        size, device = coverage.shape[0], clip.device
+        clip, facing, brighter, coverage = (t.detach().contiguous() for t in (clip, facing, brighter, coverage))
+        parts = _Parts(s, code if s.painter is not None else None)
+        table, ground_table = (
+            torch.empty(layout.size, 4, dtype=torch.int32, device=device)
+            for layout in (s.fragments.layout, s.ground)
+        )
+        nearest = torch.empty(size, dtype=torch.int64, device=device)
+        turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1).detach()
+        found, look = clip.new_empty(size, channels.LOOK), clip.new_empty(size, channels.LOOK)
+        mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
+        colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
+        shadow = clip.new_empty(s.ground.size, 3)
+        pixels = _struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
+        vertices = _struct(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
+        photograph = _struct(shading.Photograph, *s.texels, s.frame_wh, turn, s.sun, s.unproject)
+        looks = _struct(shading.Looks, found, look, mesh, halo, fill)
+        layers = _struct(shading.Layers, colour, opacity, depth)
+        patches = _struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
+        shadows = [array(ground_table, wp.vec4i), patches]
+        tables = [
+            [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
+            for layout, out in ((s.fragments.layout, table), (s.ground, ground_table))
+        ]
+        darkened = array(shadow, wp.vec3f)
+        needs: dict[int, Tensor] = {}
+
+        def work(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            for inputs in tables:
+                launch(shading.table_kernel, [start, end], inputs, (), device)
+            launch(
+                ground.shadow_kernel, [parts.ground[start], parts.ground[end]], [*shadows, darkened], (), device
+            )
+            if last == first:
+                return
+            surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
+            launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
+            launch(shading.fill_kernel, [first, last], [pixels, looks], (), device)
+            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks], (), device)
+            needs[start] = need = fill[first:last].nonzero()[:, 0] + first
+            if need.numel():
+                inputs = [array(need), pixels, vertices, photograph, looks]
+                launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
+            if s.painter is None:
+                launch(shading.combine_kernel, [first, last], [pixels, looks, layers], (), device)
+
+        for kernel in (shading.look_kernel, ground.shadow_kernel):
+            load(kernel)
+        share(work, parts.edges)
+        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs)
+        if s.painter is not None:
+            with torch.enable_grad():
+                leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
+                kept.painted = leaves, s.painter(*leaves, table, nearest)
+            looks.mesh, looks.halo = (field(t.detach().contiguous(), wp.vec4f) for t in kept.painted[1])
+            launch(shading.combine_kernel, halves(size), [pixels, looks, layers], (), device)
+        ctx.setting, ctx.kept = s, kept
+        ctx.mark_non_differentiable(depth)
+        return colour, opacity, depth, shadow
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor, grad_shadow: Tensor):
+        s: Setting = ctx.setting
+        kept: _Kept = ctx.kept
+        parts, pixels, vertices, photograph, looks = (
+            *(kept.parts, kept.pixels, kept.vertices),
+            *(kept.photograph, kept.looks),
+        )
+        grad_colour, grad_opacity = grad_colour.contiguous(), grad_opacity.contiguous()
+        size, count, device = grad_opacity.shape[0], s.base_clip.shape[0], grad_colour.device
+        new, zeros = grad_colour.new_empty, grad_colour.new_zeros
+        grad_look, grad_kept = new(size, channels.LOOK), new(size, channels.LOOK)
+        grad_mesh, grad_halo, grad_fill, grad_coverage = new(size, 4), new(size, 4), new(size), new(size)
+        grad_facing, grad_brighter = zeros(count), zeros(count)
+        grad_clip = zeros(count, 3, dtype=torch.float64)
+        grad_then = torch.zeros_like(s.inside)
+        grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
+        to_layers = shading.Layers()
+        to_layers.colour, to_layers.opacity = field(grad_colour, wp.vec4f), field(grad_opacity)
+        grads = _struct(
+            *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
+            *(grad_clip, grad_facing, grad_brighter, grad_turn),
+        )
+        shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
+
+        def combine(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            grad_look[first:last].zero_()
+            inputs = [pixels, looks, to_layers, grads]
+            launch(shading.combine_backward_kernel, [first, last], inputs, (), device)
+
+        def work(start: int, end: int) -> None:
+            first, last = parts.pixels[start], parts.pixels[end]
+            ranges = [parts.ground[start], parts.ground[end]]
+            launch(ground.shadow_backward_kernel, ranges, shadowed, (), device)
+            if last == first:
+                return
+            if kept.painted is None:
+                combine(start, end)
+                grad_fill[first:last].zero_()
+            need = kept.needs[start]
+            if need.numel():
+                inputs = [array(need), pixels, vertices, photograph, looks, grads]
+                launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
+            inputs = [pixels, photograph, looks, grads]
+            launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
+            launch(shading.keep_kernel, [first, last], [pixels, grads], (), device)
+            launch(shading.fill_backward_kernel, [first, last], [pixels, looks, grads], (), device)
+            launch(shading.look_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
+
+        grad_code = None
+        if kept.painted is not None:
+            combine(0, len(parts.pixels) - 1)
+            leaves, painted = kept.painted
+            grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
+                painted, leaves, (grad_mesh, grad_halo), allow_unused=True
+            )
+            grad_fill.copy_(torch.zeros_like(grad_fill) if to_fill is None else to_fill)
+            grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
+            grads.mesh, grads.halo = field(grad_mesh, wp.vec4f), field(grad_halo, wp.vec4f)
+            grad_look += more
+        share(work, parts.edges)
+        turn = kept.turn
+        grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
+        to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
+        return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, None
+
+
+def _struct(kind: Any, *tensors: Tensor) -> Any:
+    """A struct of arrays, one a tensor, in the order of its fields."""
+    out = kind()
+    for (name, variable), values in zip(kind.vars.items(), tensors, strict=True):
+        setattr(out, name, field(values, variable.type.dtype))
+    return out
