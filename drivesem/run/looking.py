@@ -72,7 +72,7 @@ class Memory:
 
     def place(self, picture: Path) -> Path:
         """The file of a picture's detections: that of its bytes."""
-        return self._folder / f"{hashlib.sha256(files.read_bytes(picture)).hexdigest()}.json"
+        return self._folder / f"{files.digest(picture)}.json"
 
 
 def fingerprint(order: Order, predictor: Predictor) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,7 +72,7 @@ def confirm_frame(
     names = JudgedClasses.of(detector).names
     result = Confirmed(
         identifier=identifier,
-        source=fingerprint(source),
+        source=files.digest(source / RESULT),
         compositor=found[0],
         generator=found[1],
         stands=stands(frame.result, planned.tracks, exact, before, after),
@@ -89,11 +88,6 @@ def confirm_frame(
         files.write_png(part / SHEET, sheet_of(frame, result, after.image, ask.t_star))
         files.write_text(part / RESULT, dump(result))
     return result
-
-
-def fingerprint(source: Path) -> str:
-    """Of a frame's result in the run: another result is another frame."""
-    return hashlib.sha256(files.read_bytes(source / RESULT)).hexdigest()
 
 
 def _rendered(plan: Plan) -> SynthFrame:

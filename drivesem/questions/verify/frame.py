@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -96,7 +95,7 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     base = perturbed.as_photographed()
     tally = Tally()
     for name, expected in given.hashes.get(identifier, {}).items():
-        found = hashlib.sha256(files.read_bytes(folder / name)).hexdigest()
+        found = files.digest(folder / name)
         tally.same("files", name, expected, found)
     check_change(tally, folder, result, base, perturbed, given.params, given.budget)
     check_feasibility(tally, result, base, perturbed, given.budget)
