@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.frame import Asked, confirm_frame
+from drivesem.questions.confirm.frame import confirm_frame
 from drivesem.questions.confirm.plans import open_plans
 from drivesem.questions.confirm.report import Report, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, load
@@ -38,12 +38,12 @@ def confirm_run(config: Confirm) -> tuple[Report, Answer]:
     if not confirmed:
         raise UsageError("--run", "a run with frames that can be used", run.folder)
     results = [frame.result for frame in run.frames if frame.result.identifier not in failed]
-    report = summarise(confirmed, results, JudgedClasses.of(worker.detector).names, worker.asked.t_star)
+    report = summarise(confirmed, results, JudgedClasses.of(worker.detector).names, worker.t_star)
     facts = {
         "run": str(run.folder),
         "detector": run.detector,
         "params": run.params,
-        "t_star": worker.asked.t_star,
+        "t_star": worker.t_star,
     }
     answer = answer_of(out, report, confirmed, facts, failed)
     answer.write()
@@ -59,10 +59,10 @@ class ConfirmWorker:
         self.frames = {frame.result.identifier: frame for frame in run.frames}
         self.plans = open_plans(attack, config.root)
         self.detector = detector_of(attack, config.device)
-        self.asked = Asked(config.device, float(files.read_json(run.folder / METRICS)["t_star"]))
+        self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
 
     def __call__(self, name: str) -> Confirmed:
         """One frame of the run, into its folder."""
-        source = self.run.folder / FRAMES / name
-        folder = self.out / FRAMES / name
-        return confirm_frame(self.frames[name], source, self.plans, self.detector, self.asked, folder)
+        source, folder = self.run.folder / FRAMES / name, self.out / FRAMES / name
+        frame = self.frames[name]
+        return confirm_frame(frame, source, self.plans, self.detector, self.device, self.t_star, folder)

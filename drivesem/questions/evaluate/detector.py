@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from detectors.base import DetectorError, Predictor, predict
+from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from detectors.types import Detections, Targets
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
@@ -23,6 +23,7 @@ from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.mistakes import marked
 from drivesem.report.progress import progress_bar
 from drivesem.report.tables import percent
+from drivesem.run.looking import detections_in
 from drivesem.settings.commands import Eval
 from drivesem.settings.errors import UsageError
 from drivesem.training.targets import judged_targets, suited
@@ -105,8 +106,7 @@ def _look(
             frame = dataset.frame(name)
             if frame.labels is None:
                 raise FormatError(f"frame {name}", "labels", "none")
-            seen = judged.detections(predict(detector, frame.photograph[None].to(config.device))[0])
-            found.append(Detections(seen.boxes_xyxy.cpu(), seen.labels.cpu(), seen.scores.cpu()))
+            found.append(detections_in(detector, frame.photograph.to(config.device)))
             labels.append(frame.labels)
     limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
     return found, [judged_targets(one, limits, judged.names) for one in labels]
