@@ -24,6 +24,7 @@ from torch import Tensor
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.meshes.load import load_mesh, save_mesh
+from scene_ir.pixels import to_tensor
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -375,8 +376,7 @@ def _load_image(folder: Path, node: _Node, arrays: _Arrays, size_hw: tuple[int, 
         return arrays.tensor(name, 3, *size_hw)
     if node.text() != "png":
         raise FormatError(node.where, "'png' or 'npz'", repr(node.value))
-    image = files.read_image(folder / f"{name}.png", size_hw)
-    return torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255
+    return to_tensor(files.read_image(folder / f"{name}.png", size_hw))
 
 
 def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:

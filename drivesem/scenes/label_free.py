@@ -28,6 +28,7 @@ from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
+from scene_ir.pixels import to_tensor
 from scene_ir.types import Camera, Frame, Labels
 
 DEFAULT_FOCAL = 0.58
@@ -134,7 +135,7 @@ def photograph(path: Path, focal_px: float | None = None) -> Frame:
     """A photograph, upright, with its camera, without labels. FormatError naming the file; RangeError."""
     focal = focal_of(path, focal_px)
     pixels = np.rot90(files.read_image(path), _turns(_header(path)[0]))
-    image = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
+    image = to_tensor(pixels)
     told = f"{focal.length_px:.1f} px, {focal.source}"
     provenance = {"dataset": "photograph", "image": path.name, "focal": told}
     return Frame(path.stem, image, pinhole(image.shape[1], image.shape[2], focal.length_px), provenance=provenance)
