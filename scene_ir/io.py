@@ -24,7 +24,6 @@ from torch import Tensor
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.meshes.load import load_mesh, save_mesh
-from scene_ir.pixels import to_tensor
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -405,3 +404,13 @@ def _load_front(index: int, node: _Node, arrays: _Arrays) -> Front:
 
 def _load_mesh(path: Path) -> Mesh:
     return _Node(str(path), None).build(lambda: load_mesh(path))
+
+
+def to_uint8(image: Tensor) -> np.ndarray:
+    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+
+def to_tensor(picture: np.ndarray) -> Tensor:
+    """A picture (H, W, 3) uint8 as (3, H, W) float32 in [0, 1]; `to_uint8` gives it back."""
+    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).to(torch.float32) / 255

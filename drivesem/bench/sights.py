@@ -13,7 +13,7 @@ from torch import Tensor
 from detectors.base import Predictor, predict
 from detectors.boxes import ioa_matrix, iou_matrix
 from detectors.types import CLASSES, Detections
-from scene_ir.pixels import to_uint8
+from scene_ir.io import to_uint8
 from scene_ir.types import Category
 
 Picture = NDArray[np.uint8]

@@ -15,8 +15,7 @@ from drivesem.settings.commands import Render
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.compositor import render
-from scene_ir.io import load_scene
-from scene_ir.pixels import to_uint8
+from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import SceneIR
 
 

@@ -25,8 +25,7 @@ from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
-from scene_ir.io import load_scene, save_scene
-from scene_ir.pixels import to_uint8
+from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.types import SceneIR
 
 RESULT = "result.json"

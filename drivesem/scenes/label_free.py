@@ -28,7 +28,7 @@ from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
-from scene_ir.pixels import to_tensor
+from scene_ir.io import to_tensor
 from scene_ir.types import Camera, Frame, Labels
 
 DEFAULT_FOCAL = 0.58

@@ -24,7 +24,7 @@ from drivesem.report.drawing import (
     write_text,
 )
 from scene_ir.compositor import Compositor
-from scene_ir.pixels import to_uint8
+from scene_ir.io import to_uint8
 from scene_ir.raster import verbs
 from scene_ir.surfaces import rotate
 from scene_ir.types import Crop, SceneIR

@@ -19,7 +19,7 @@ from scene_ir import files
 from scene_ir.compositor import Compositor
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import SceneError
-from scene_ir.pixels import to_uint8
+from scene_ir.io import to_uint8
 from scene_ir.types import Frame, Labels
 
 VARIANTS = 4

@@ -31,7 +31,7 @@ from drivesem.settings.errors import UsageError
 from drivesem.training.targets import judged_targets, suited
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.pixels import to_uint8
+from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 

@@ -42,8 +42,7 @@ from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
-from scene_ir.pixels import to_uint8
+from scene_ir.io import load_scene, to_uint8
 
 KINDS: tuple[Kind, ...] = ("parameter", "object")
 

@@ -27,8 +27,7 @@ from drivesem.run.results import BoxRecord, FrameResult, load_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
-from scene_ir.pixels import to_uint8
+from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import Labels, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"

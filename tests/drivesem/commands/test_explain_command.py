@@ -27,7 +27,6 @@ from drivesem.run import folder as run_folder
 from drivesem.run.results import load_frame
 from scene_ir.compositor import Compositor
 from scene_ir.io import load_scene
-from scene_ir.pixels import to_uint8
 from scene_ir.sources import solve_sources
 from scene_ir.types import SceneIR
 
@@ -194,7 +193,7 @@ def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     rendered = objective.evaluate(small)
     assert check_scene(load_scene(frame / "scene").as_photographed(), rendered.scene) == []
     written = cv2.cvtColor(cv2.imread(str(folder / "minimal.png")), cv2.COLOR_BGR2RGB)
-    np.testing.assert_array_equal(written, to_uint8(rendered.render.image))
+    np.testing.assert_array_equal(written, explaining.to_uint8(rendered.render.image))
 
 
 def test_files(explained: Path) -> None:
