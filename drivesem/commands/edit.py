@@ -11,7 +11,8 @@ from typing import Any
 from rich.console import Console
 
 from drivesem.attack.scene_edits import edited
-from drivesem.commands.render import picture, picture_path
+from drivesem.commands.render import picture_path
+from drivesem.scenes.scene import Scene, free_folder
 from drivesem.settings.commands import Edit
 from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.settings.errors import UsageError
@@ -35,7 +36,7 @@ def run(config: Edit) -> int:
     if save is not None:
         save_scene(result.scene, save)
     if out is not None:
-        files.write_png(out, picture(result.scene))
+        files.write_png(out, Scene(result.scene).render())
     seconds = round(time.perf_counter() - start, 3)
     written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
     if config.json:
@@ -65,8 +66,6 @@ def _changes(config: Edit) -> dict[Any, Any]:
 
 def _save_path(path: Path, scene: Path) -> Path:
     """Where the changed scene goes. UsageError where that would destroy something else than a scene."""
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not (path / "scene.json").is_file()):
-        raise UsageError("--save", "a new folder, or one of a scene", path)
-    if path.resolve() in scene.resolve().parents:
+    if free_folder(path, "--save").resolve() in scene.resolve().parents:
         raise UsageError("--save", "a folder that does not hold the scene", path)
     return path

@@ -89,9 +89,7 @@ def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
     """
     exif, width, height = _header(image_path)
     if focal_px is not None:
-        if not (math.isfinite(focal_px) and focal_px > 0):
-            raise RangeError("focal", "positive px", focal_px)
-        return Focal(float(focal_px), "given")
+        return Focal(_checked(focal_px), "given")
     longer = max(width, height)
     told = exif.get_ifd(_EXIF)
     film = _positive(told.get(_FOCAL_35))
@@ -102,6 +100,18 @@ def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
     if unit and length and density:
         return Focal(length / unit * density, "EXIF")
     return Focal(DEFAULT_FOCAL * longer, "default")
+
+
+def camera_for(height: int, width: int, focal_px: float | None = None) -> Camera:
+    """The camera of pixels that nothing is told of: 0.58 of the longer side where no focal length is given."""
+    focal = DEFAULT_FOCAL * max(width, height) if focal_px is None else _checked(focal_px)
+    return pinhole(height, width, focal)
+
+
+def _checked(focal_px: float) -> float:
+    if not (math.isfinite(focal_px) and focal_px > 0):
+        raise RangeError("focal", "positive px", focal_px)
+    return float(focal_px)
 
 
 def _positive(value: Any) -> float:
