@@ -14,7 +14,7 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import LabelMode, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.base import AttackResult

@@ -169,8 +169,8 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
         ("detectors/training.py", "from rich.progress import Progress"),
         ("drivesem/attack/methods/base.py", "from drivesem.attack import objective"),
         ("drivesem/attack/methods/base.py", "from detectors import types"),
-        ("drivesem/attack/feasible.py", "from scene_ir import compositor"),
-        ("drivesem/attack/feasibility_check.py", "from drivesem.attack.feasible import project"),
+        ("drivesem/attack/feasible/sight.py", "from scene_ir import compositor"),
+        ("drivesem/attack/feasibility_check.py", "from drivesem.attack.feasible.projection import FeasibleSet"),
         ("drivesem/evaluation/coco.py", "from scene_ir.types import Labels"),
         (
             "drivesem/evaluation/coco.py",

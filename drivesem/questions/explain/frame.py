@@ -17,7 +17,7 @@ from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
 from drivesem.attack.aims import Aim
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Parameter, ParameterSpace
