@@ -39,7 +39,7 @@ from torch import Tensor
 from detectors.base import DetectorError, RawPredictions
 from detectors.registry import load_detector
 from detectors.squeezedet import Assignment, SqueezeDet
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 from drivesem.run.workers import outcomes

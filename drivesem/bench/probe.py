@@ -101,7 +101,7 @@ def _attack(order: ProbeOrder) -> Resident:
     import torch
 
     from detectors.registry import load_detector
-    from drivesem.attack.feasible import FeasibleSet
+    from drivesem.attack.feasible.projection import FeasibleSet
     from drivesem.attack.objective import Objective
     from drivesem.attack.space import ParameterSpace, combo
     from scene_ir.compositor import Compositor

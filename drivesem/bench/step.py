@@ -11,7 +11,7 @@ from torch import Tensor
 
 from detectors.base import Detector
 from detectors.types import Targets
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace, combo
