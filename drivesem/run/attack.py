@@ -33,7 +33,7 @@ from drivesem.attack.objective import OF_DETECTIONS
 from drivesem.attack.space import Parameter, combo, parse_params
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import FRAMES, claim
-from drivesem.run.frame import RESULT, FrameSettings, attack_frame
+from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
@@ -128,11 +128,15 @@ class Worker:
     detector: Predictor
 
     @classmethod
-    def of(cls, config: Attack) -> Worker:
-        """Raises UsageError for a detector that cannot be used, SceneError for a source that cannot be read."""
+    def of(cls, config: Attack, detector: Predictor | None = None) -> Worker:
+        """detector: by default the one that the settings name. Raises UsageError for a detector that cannot be
+        used, SceneError for a source that cannot be read.
+        """
         config = _settled(config)
         source, method = open_source(config), attack_method(config)
-        return cls(config, _params(config), method, source, _detector(config, method.needs_gradient))
+        detector = _load(config) if detector is None else detector
+        _check_detector(config, detector, method.needs_gradient)
+        return cls(config, _params(config), method, source, detector)
 
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""
@@ -147,7 +151,11 @@ class Worker:
             return None
 
     def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
-        """One frame that has been taken apart. Raises NoVehicleError where it has none."""
+        """One frame that has been taken apart, to its folder. Raises NoVehicleError where it has no vehicle."""
+        return write_frame(self.search(identifier, scene), out / FRAMES / identifier)
+
+    def search(self, identifier: str, scene: SceneIR) -> AttackedScene:
+        """One frame that has been taken apart, in memory. Raises NoVehicleError where it has no vehicle."""
         if len(scene.objects) == 0:
             raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
         config = self.config
@@ -167,7 +175,7 @@ class Worker:
             aim=aim,
         )
         try:
-            return attack_frame(identifier, scene, self.detector, settings, out / FRAMES / identifier)
+            return attack_scene(identifier, scene, self.detector, settings)
         except (RangeError, ShapeError) as error:
             # A loss or gradient that is no number says where in the scene, and not in which.
             raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
@@ -219,25 +227,30 @@ def _reach(config: Attack) -> int | None:
     return config.steps if config.range == "steps" else None
 
 
-def _detector(config: Attack, needs_gradient: bool) -> Predictor:
-    """The detector under attack. Raises UsageError where it is none, knows no cars, or lacks a needed gradient."""
+def _load(config: Attack) -> Predictor:
+    """The detector under attack. Raises UsageError where it is none."""
     try:
         if config.precision == "float32":
-            detector = load_predictor(config.detector, config.device, config.tiles)
-        else:
-            detector = load_detector(config.detector, config.device, getattr(torch, config.precision))
+            return load_predictor(config.detector, config.device, config.tiles)
+        return load_detector(config.detector, config.device, getattr(torch, config.precision))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+
+
+def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -> None:
+    """Raises UsageError where the detector knows no cars, or lacks a gradient that the settings need."""
+    try:
         JudgedClasses.of(detector)
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
     if isinstance(detector, Detector):
-        return detector
+        return
     if needs_gradient:
         expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
         raise UsageError("--method", expected, config.method)
     if config.objective not in OF_DETECTIONS:
         expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"
         raise UsageError("--objective", expected, config.objective)
-    return detector
 
 
 def _attacker(config: Attack, out: Path) -> Callable[[str], FrameResult | None]:
