@@ -5,8 +5,8 @@ import torch
 
 from drivesem.bench.render import SceneSize
 from drivesem.bench.scenes import Placed, bench_scene
-from scene_ir.types import scene_to
 from scene_ir.raster import verbs
+from scene_ir.types import scene_to
 from tools.bench import renderers, rivals
 from tools.bench.renderers import RenderTask
 
