@@ -13,7 +13,7 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
-from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import LabelMode, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
@@ -77,11 +77,11 @@ def attack_frame(
     with files.whole_folder(folder) as part:
         save_scene(rendered.scene, part / "scene")
         saved = load_scene(part / "scene")
-        result = _result(
-            identifier, objective, attacked, rendered, benign, tuple(check_scene(saved.as_photographed(), saved))
-        )
+        judge = judge_at_hand()
+        violations = tuple(check_scene(saved.as_photographed(), saved, judge))
+        result = _result(identifier, objective, attacked, rendered, benign, violations)
         seconds = round(time.perf_counter() - start, 3)
-        result = replace(result, seconds=seconds, violated_at_start=feasible.violated_at_start)
+        result = replace(result, seconds=seconds, violated_at_start=feasible.violated_at_start, checked_by=judge)
         _write(part, scene, objective, rendered, result)
     return result
 
