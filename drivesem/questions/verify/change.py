@@ -88,5 +88,6 @@ def check_feasibility(
     tally: Tally, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
 ) -> None:
     """What the second check finds in the saved scene, and whether the poses in it lie within the run's budget."""
-    tally.same("feasibility", "violations", list(result.violations), check_scene(base, perturbed))
+    found = check_scene(base, perturbed, result.checked_by)
+    tally.same("feasibility", "violations", list(result.violations), found)
     tally.same("feasibility", "budget", [], check_reach(base, perturbed, Reach(**asdict(budget))))
