@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
 from drivesem.settings.commands import Synth, processes
 from drivesem.settings.errors import UsageError
@@ -30,9 +31,7 @@ _SHEET_FRAMES = 8
 
 def order_of(config: Synth) -> Order:
     """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
-    out = Path(config.out or f"data/synth-{config.layout}-{config.split}-seed{config.seed}")
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    out = folder_of(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
     for name in ("meshes", "assets"):
         folder = getattr(config, name)
