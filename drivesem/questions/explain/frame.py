@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 import zlib
 from collections.abc import Mapping, Sequence
@@ -99,11 +98,6 @@ class Judge:
         return self._problem.score(theta)
 
 
-def digest(folder: Path) -> str:
-    """Of the result in a frame's folder of a run: differs where the run was made anew."""
-    return hashlib.sha256(files.read_bytes(folder / RESULT)).hexdigest()
-
-
 def explain_frame(
     folder: Path,
     attack: Attack,
@@ -138,7 +132,7 @@ def explain_frame(
     views = _views(objective, theta)
     explanation = Explanation(
         identifier=result.identifier,
-        source=digest(folder),
+        source=files.digest(folder / RESULT),
         objects=result.objects,
         benign=judge.outcome(theta, ~everything),
         found=found,
