@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import tyro
 import yaml
 
 from drivesem.cli import main, parse
+from tools.bench.settings import BenchTool
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -110,6 +112,8 @@ def test_commands_are_read_by_the_parser(where: str, words: list[str], monkeypat
     program = Path(words[0]).name
     if program == "drivesem":
         parse(words[1:])
+    elif words[1:3] == ["-m", "tools.bench"]:
+        tyro.cli(BenchTool, args=words[3:])
     elif program.startswith("python") and words[1] != "-m":
         assert (ROOT / words[1]).is_file()
     else:
