@@ -55,7 +55,7 @@ RULES = (
     Rule(
         "drivesem.attack.feasibility_check",
         _LOGIC,
-        (*_LOGIC_LIBRARIES, "cv2"),
+        (*_LOGIC_LIBRARIES, "cv2", "open3d"),
         never=("drivesem.attack.feasible",),
     ),
     Rule(
