@@ -35,7 +35,7 @@ K = TypeVar("K", bound=Kept)
 
 
 @dataclass(frozen=True, slots=True)
-class Answers(Generic[J, R]):
+class JobResults(Generic[J, R]):
     """What came of jobs. results: by job, as they were done; failed: why, by the names of the others."""
 
     results: dict[J, R]
@@ -59,7 +59,7 @@ def ask(
     bar: Bar,
     name: Callable[[J], str] = str,
     size: Callable[[J], int] = lambda job: 1,
-) -> Answers[J, R]:
+) -> JobResults[J, R]:
     """Do all jobs, in this process or in several, with a bar. With `keep_going` a job that cannot be done is
     listed as failed; without, its SceneError ends it all.
 
@@ -79,7 +79,7 @@ def ask(
                     raise
                 failed[name(job)] = str(error)
             progress.advance(task, size(job))
-    return Answers(results, failed)
+    return JobResults(results, failed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,8 +35,7 @@ def claim(out: Path, config: Common, written: Iterable[str], presentation: Colle
     process is writing.
     """
     path = out / CONFIG
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    folder_of(None, out)
     if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     hold(out)
@@ -54,6 +53,14 @@ def _remove(paths: Iterable[Path]) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+
+
+def folder_of(given: str | None, default: Path) -> Path:
+    """The folder that --out names, or the default. Raises UsageError for a file."""
+    out = Path(given) if given else default
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    return out
 
 
 def attack_of(run: Path) -> Attack:

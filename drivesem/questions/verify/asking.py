@@ -12,7 +12,7 @@ from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import t_star_of
 from drivesem.attack.space import parse_params
-from drivesem.questions.verify.differences import CHECKS, Difference, Tally
+from drivesem.questions.verify.differences import CHECKS, CheckLog, Disagreement
 from drivesem.questions.verify.frame import BOX_PX, LABEL, LEVELS, SCORE, Checked, Given, check_frame
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
@@ -76,13 +76,13 @@ def _hashes(run: Run) -> Mapping[str, Mapping[str, str]]:
     return frames
 
 
-def _totals(run: Run, t_star: float) -> Tally:
+def _totals(run: Run, t_star: float) -> CheckLog:
     """metrics.json against what all frames of the run hold."""
     results = [frame.result for frame in run.frames]
-    tally, metrics = Tally(), files.read_json(run.folder / METRICS)
+    log, metrics = CheckLog(), files.read_json(run.folder / METRICS)
     for name, found in {**_added_up(results), "t_star": t_star}.items():
-        tally.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
-    return tally
+        log.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
+    return log
 
 
 def _added_up(results: Sequence[FrameResult]) -> dict[str, Any]:
@@ -99,9 +99,9 @@ def _added_up(results: Sequence[FrameResult]) -> dict[str, Any]:
     }
 
 
-def _data(run: Run, checked: Sequence[Checked], totals: Tally, failed: dict[str, str]) -> dict[str, Any]:
+def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[str, str]) -> dict[str, Any]:
     """JSON's form."""
-    differences: list[tuple[str, Difference]] = [(c.identifier, d) for c in checked for d in c.differences]
+    differences: list[tuple[str, Disagreement]] = [(c.identifier, d) for c in checked for d in c.differences]
     differences += [(_WHOLE_RUN, d) for d in totals.differences]
     rows = []
     for check, holds in CHECKS.items():
