@@ -405,3 +405,8 @@ def _load_front(index: int, node: _Node, arrays: _Arrays) -> Front:
 
 def _load_mesh(path: Path) -> Mesh:
     return _Node(str(path), None).build(lambda: load_mesh(path))
+
+
+def to_uint8(image: Tensor) -> np.ndarray:
+    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()

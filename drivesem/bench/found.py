@@ -20,7 +20,6 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.registry import load_predictor
-from drivesem.attack.edits import FrameEdit, ObjectEdit
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, MovedLabels
 from drivesem.attack.scene_edits import moved
@@ -30,6 +29,7 @@ from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
 from drivesem.settings.commands import Bench, Derender
+from drivesem.settings.edits import FrameEdit, ObjectEdit
 from scene_ir import files
 from scene_ir.compositor import Compositor, render
 from scene_ir.errors import FormatError

@@ -10,11 +10,11 @@ from typing import Any
 
 from rich.console import Console
 
-from drivesem.attack.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.scene_edits import moved, removed_rows
 from drivesem.commands.render import picture, picture_path
 from drivesem.settings.commands import Edit
+from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from drivesem.settings.commands import Render
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.compositor import render
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import SceneIR
 
 
@@ -48,10 +47,4 @@ def picture_path(given: str | None, default: Path) -> Path:
 def picture(scene: SceneIR) -> np.ndarray:
     """The scene as it stands, (H, W, 3) uint8 RGB."""
     with torch.no_grad():
-        return as_bytes(render([scene])[0].image)
-
-
-def as_bytes(image: Tensor) -> np.ndarray:
-    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8."""
-    rounded = (image.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
-    return np.ascontiguousarray(rounded.permute(1, 2, 0).numpy())
+        return to_uint8(render([scene])[0].image)

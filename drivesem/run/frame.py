@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +25,7 @@ from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
-from scene_ir.io import load_scene, save_scene
+from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.types import SceneIR
 
 RESULT = "result.json"
@@ -144,11 +143,6 @@ def _write(part: Path, scene: SceneIR, objective: Objective, rendered: Rendered,
         },
     )
     files.write_text(part / RESULT, dump_frame(result))
-
-
-def to_uint8(image: Tensor) -> np.ndarray:
-    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
 
 def failure_records(objective: Objective, rendered: Rendered) -> tuple[Failure, ...]:

@@ -25,13 +25,13 @@ from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.mistakes import marked
 from drivesem.report.tables import percent
-from drivesem.run.frame import to_uint8
 from drivesem.settings.commands import Eval
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from drivesem.training.targets import judged_targets, suited
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 

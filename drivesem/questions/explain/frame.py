@@ -36,13 +36,13 @@ from drivesem.questions.explain.results import (
 )
 from drivesem.questions.explain.shapley import MOST_EXACT, Flags, Floats, shapley
 from drivesem.report import pictures
-from drivesem.run.frame import RESULT, detection_records, failure_records, target_records, to_uint8
+from drivesem.run.frame import RESULT, detection_records, failure_records, target_records
 from drivesem.run.results import Coordinate, FrameResult, load_frame
 from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 
 KINDS: tuple[Kind, ...] = ("parameter", "object")
 

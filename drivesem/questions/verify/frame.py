@@ -22,12 +22,12 @@ from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.questions.verify.change import check_change, check_feasibility
 from drivesem.questions.verify.differences import Difference, Tally
-from drivesem.run.frame import RESULT, as_targets, detection_records, target_records, to_uint8
+from drivesem.run.frame import RESULT, as_targets, detection_records, target_records
 from drivesem.run.results import BoxRecord, FrameResult, load_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import Labels, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"

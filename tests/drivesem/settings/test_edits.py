@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from drivesem.attack.edits import (
+from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.scene_edits import moved, removed_rows
+from drivesem.attack.space import ParameterSpace, Perturbation
+from drivesem.settings.edits import (
     ALL,
     WEATHER_NAMES,
     WEATHERS,
@@ -21,9 +24,6 @@ from drivesem.attack.edits import (
     parse_setting,
     read_frame_edit,
 )
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.scene_edits import moved, removed_rows
-from drivesem.attack.space import ParameterSpace, Perturbation
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
 from scene_ir.types import SceneIR
