@@ -28,7 +28,8 @@ from drivesem.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Bench, Derender
+from drivesem.settings.blocks import Scenes
+from drivesem.settings.commands import Bench
 from drivesem.settings.edits import FrameEdit, ObjectEdit
 from scene_ir import files
 from scene_ir.compositor import Compositor, render
@@ -103,7 +104,7 @@ def _in_process(config: Bench, sheets: Path | None) -> Callable[[str], list[CarR
 
 
 def _source(config: Bench) -> SceneSource:
-    asked = Derender(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
+    asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 

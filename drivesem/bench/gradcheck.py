@@ -44,7 +44,7 @@ from drivesem.attack.labels import Labeller
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Attack, Gradcheck, processes
+from drivesem.settings.commands import Gradcheck
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -460,10 +460,7 @@ class _Worker:
     def __init__(self, config: Gradcheck) -> None:
         self.config = config
         check_device(config.device)
-        attack = Attack(
-            dataset=config.dataset, root=config.root, fit=config.fit, seed=config.seed, limit=config.limit
-        )
-        self.source: SceneSource = open_source(attack)
+        self.source: SceneSource = open_source(config)
         self._detectors: dict[Backend, SqueezeDet] = {
             "reference": _detector(config.detector, "cpu").double(),
             "warp": _detector(config.detector, config.device),
@@ -496,7 +493,7 @@ def _check_all(worker: _Worker, names: Sequence[str], failed: dict[str, str]) ->
     """The rows of each scene; a frame that cannot be used goes to `failed` or ends the run."""
     parts = (None, *Parameter)
     per_scene = {name: [_Task(name, at, part) for at in POINTS for part in parts] for name in names}
-    if len(names) >= processes(worker.config):
+    if len(names) >= worker.config.processes:
         jobs = list(per_scene.values())
     else:  # too few scenes to keep every process busy: each makes the scene ready for itself
         jobs = [[task] for tasks in per_scene.values() for task in tasks]

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from detectors.boxes import iou_matrix
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import DEMO, Bench
+from drivesem.settings.blocks import DEMO
+from drivesem.settings.commands import Bench
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
 from scene_ir.types import Camera, Frame, Labels
 

@@ -18,7 +18,7 @@ from detectors.registry import SHIPPED, load_detector
 from drivesem.bench import derender, detector, evaluation, found, label_free, memory, render, step, synth, tables
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.timing import machine, versions
-from drivesem.settings.commands import Bench, processes
+from drivesem.settings.commands import Bench
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir import files
@@ -125,7 +125,7 @@ def _synth(config: Bench, cars: list[int], triangles: list[int], console: Consol
     if config.device != "cpu":
         raise UsageError("--device", "cpu", config.device)
     frames = config.frames or (synth.QUICK_FRAMES if config.quick else synth.FULL_FRAMES)
-    workers = processes(config)
+    workers = config.processes
     measured = list(_watched(synth.measure(frames, config.seed, workers), 3, console))
     return {
         "frames_per_second": measured[0].frames_per_second,
@@ -144,7 +144,7 @@ def _derender(config: Bench, cars: list[int], triangles: list[int], console: Con
     targets = _targets(config)
     sheets = None if targets is None else targets[0].with_suffix("")
     rows = list(
-        _watched(derender.measure(frames, config.seed, processes(config), config.ablate, sheets), frames, console)
+        _watched(derender.measure(frames, config.seed, config.processes, config.ablate, sheets), frames, console)
     )
     return {
         "rows": [asdict(row) for row in rows],

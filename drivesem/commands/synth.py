@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from drivesem.run.lock import hold
-from drivesem.settings.commands import Synth, processes
+from drivesem.settings.commands import Synth
 from drivesem.settings.errors import UsageError
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, in_processes, synthesise
@@ -67,7 +67,7 @@ def run(config: Synth) -> int:
         *(TimeElapsedColumn(), TimeRemainingColumn()),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        done = synthesise(order, in_processes(min(processes(config), total)))
+        done = synthesise(order, in_processes(min(config.processes, total)))
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}

@@ -24,7 +24,7 @@ from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import attack_of, detector_of
 from drivesem.run.results import FrameResult
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import Common, Verify
+from drivesem.settings.commands import Verify
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -99,11 +99,10 @@ def _check_all(worker: _Worker, names: Sequence[str], console: Console) -> tuple
     checked: dict[str, Checked] = {}
     failed: dict[str, str] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    shared = Common(workers=worker.config.workers, keep_going=worker.config.keep_going)
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("checking frames", total=len(names))
         build = partial(_in_process, worker.config, worker.one)
-        for name, outcome in outcomes(worker.check, build, names, shared):
+        for name, outcome in outcomes(worker.check, build, names, worker.config):
             try:
                 checked[name] = outcome()
             except SceneError as error:

@@ -2,8 +2,8 @@
 
 A block is a base class. A command's settings are its blocks' fields and its own, in one flat dataclass: options,
 keys of config.yaml and attributes do not tell which block a setting is from. A function takes the narrowest block
-that it reads, as `open_source(config: Scenes)` does. Where a setting means something else in a command, that command
-declares it again, with a default or a docstring of its own.
+that it reads, as `open_source(config: Scenes)` does. A command for which a setting means something else declares
+it again, with a default or a docstring of its own.
 
 This module is loaded by `drivesem --help`: it imports nothing heavy.
 """

@@ -54,7 +54,7 @@ RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
 """Attacks that may begin elsewhere."""
 
 _RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
-Runs = Annotated[_RunWords, Required("folders of drivesem attack", "none", "RUN")]
+Runs = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
 Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
 
 
@@ -357,11 +357,13 @@ class SurveyResults(Draws, Command):
     answers: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="CSV..."),
-        Required("files that the page of drivesem survey saved", setting="CSV"),
+        Required("files that the page of drivesem survey saved", "CSV"),
     ] = ()
     """Files that the page saved."""
     survey: Annotated[str | None, Required("the folder of drivesem survey")] = None
     """The folder of drivesem survey, or its key."""
+    bootstrap: NotNegative | None = None
+    """Draws of people for intervals, by default 200; 0 leaves them out."""
     out: str | None = None
     """Folder for the results; by default results beside the key."""
 
@@ -724,7 +726,7 @@ class Retrain(Training, FrameCommand):
     """Share of the training set that are counterexamples."""
     mix: Literal["replace", "add"] = "replace"
     """Counterexamples in the place of benign frames, drawn at random, or beside all of them."""
-    label_mode: LabelMode = "paper"
+    label_mode: Literal["paper", "moved"] = "paper"
     """Labels of counterexamples in training: the benign ones as in the paper, or moved with the cars."""
     ramp: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.0
     """Share of the steps over which counterexamples come in little by little; 0: all from the first step."""

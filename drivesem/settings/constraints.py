@@ -25,7 +25,7 @@ class Within:
     ends: str = "[]"
     expected: str = ""
 
-    def check(self, setting: str, value: float) -> None:
+    def check(self, setting: str, value: Any) -> None:
         above = value >= self.low if self.ends[0] == "[" else value > self.low
         below = value <= self.high if self.ends[1] == "]" else value < self.high
         interval = f"a number in {self.ends[0]}{self.low}, {self.high}{self.ends[1]}"
@@ -46,7 +46,7 @@ class OneOf:
 
     names: tuple[str, ...]
 
-    def check(self, setting: str, value: str) -> None:
+    def check(self, setting: str, value: Any) -> None:
         refuse(value not in self.names, setting, f"one of {', '.join(self.names)}", repr(value))
 
 
@@ -56,7 +56,7 @@ class Folder:
 
     expected: str = "a folder"
 
-    def check(self, setting: str, value: str) -> None:
+    def check(self, setting: str, value: Any) -> None:
         refuse(not Path(value).is_dir(), setting, self.expected, value)
 
 
@@ -66,22 +66,19 @@ class Parsed:
 
     parse: Callable[[str, str], object]
 
-    def check(self, setting: str, value: str) -> None:
+    def check(self, setting: str, value: Any) -> None:
         self.parse(setting, value)
 
 
 @dataclass(frozen=True)
 class Required:
-    """A setting that has no default. expected, found: what an error says; setting: its name there, where it is a
-    word without an option.
-    """
+    """A setting that has no default. setting: what an error calls it, where it is a word without an option."""
 
     expected: str
-    found: str = "nothing"
     setting: str | None = None
 
     def check(self, setting: str, value: Any) -> None:
-        refuse(not value, self.setting or setting, self.expected, self.found)
+        refuse(not value, self.setting or setting, self.expected, "nothing")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from drivesem.settings.errors import UsageError
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
 _FOR = "for"
-"""Key of a preset: the commands that it is for. A setting that only some of them have is left out for the others."""
+"""Key of a preset: the commands that it is for. A setting that only some of them have is left out for others."""
 
 
 def parse(argv: Sequence[str]) -> Command:
