@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from detectors.training import Sample
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.data import kitti

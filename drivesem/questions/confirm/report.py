@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
 
 from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE, JudgedClasses
 from drivesem.evaluation import coco
 from drivesem.evaluation.resampling import wilson
 from drivesem.questions.confirm.results import Confirmed
+from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-from scene_ir import files
 
 SURVIVE, SAME, LOST, PHANTOMS, NEW = (
     "frames",
@@ -55,7 +51,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class Confirmation:
     """frames: those whose change was carried over whole, on which all figures rest; left: reasons by frame, of the
     others. scores: by picture, with the labels it is judged by. overlap: mean and least IoU of judged vehicles'
     boxes in both pictures, and how many; None where there is none.
@@ -84,7 +80,7 @@ class Report:
 
 def summarise(
     found: Sequence[Confirmed], results: Sequence[FrameResult], names: tuple[str, ...], t_star: float
-) -> Report:
+) -> Confirmation:
     """The figures of confirmed frames. results: of the run, of the same frames; names: the judged classes."""
     pairs = [(one, result) for one, result in zip(found, results, strict=True) if not one.not_carried]
     whole = [one for one, _ in pairs]
@@ -101,7 +97,7 @@ def summarise(
         Share.of(NEW, [bool(one.generator) for one in whole if not one.compositor]),
     )
     ious = [s.iou for one in whole for s in one.stands if s.judged and s.iou is not None]
-    return Report(
+    return Confirmation(
         frames=len(whole),
         left={one.identifier: list(one.not_carried) for one in found if one.not_carried},
         shares=shares,
@@ -134,7 +130,7 @@ def _scores(
     }
 
 
-def sheets(report: Report) -> list[Sheet]:
+def sheets(report: Confirmation) -> list[Sheet]:
     """Two tables, %: what survives; precision and recall in either picture."""
     shares = tuple(
         (s.name, str(s.failures), str(s.survive), percent(s.share), f"{percent(s.low)} to {percent(s.high)}")
@@ -151,7 +147,7 @@ def sheets(report: Report) -> list[Sheet]:
     ]
 
 
-def notes(report: Report) -> list[str]:
+def notes(report: Confirmation) -> list[str]:
     """What the figures mean, and what they leave out."""
     told = [
         "Survive: the detector fails in the generator's picture of the same change too, by exact labels. Frames: "
@@ -168,27 +164,24 @@ def notes(report: Report) -> list[str]:
     return told
 
 
-def print_report(report: Report, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in sheets(report):
-        console.print(sheet.table(sheet.columns[:1]))
-    for note in notes(report):
-        console.print(note, soft_wrap=True)
-
-
-def write_report(out: Path, report: Report, found: Sequence[Confirmed]) -> None:
-    """confirm.md and confirm.csv, a line a frame."""
-    lines = ["# The second renderer", ""]
-    for sheet in sheets(report):
-        lines += [*sheet.markdown(sheet.columns[:1]), ""]
-    lines += [f"{note}\n" for note in notes(report)]
-    files.write_text(out / "confirm.md", "\n".join(lines))
-    buffer = io.StringIO()
-    rows = [_row(one) for one in found]
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    files.write_text(out / "confirm.csv", buffer.getvalue())
+def answer_of(
+    out: Path,
+    report: Confirmation,
+    confirmed: Sequence[Confirmed],
+    facts: Mapping[str, Any],
+    failed: Mapping[str, str],
+) -> Answer:
+    """confirm.json (with `facts` in front), confirm.md, and confirm.csv, a line a frame."""
+    return Answer(
+        out=out,
+        name="confirm",
+        heading="The second renderer",
+        data={**facts, **report.to_json(), "frames_failed": failed},
+        tables={"confirm": [_row(frame) for frame in confirmed]},
+        sheets=sheets(report),
+        notes=notes(report),
+        failed={f"frame {name}": reason for name, reason in failed.items()},
+    )
 
 
 def _row(one: Confirmed) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 import ast
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import drivesem.attack.feasibility_check
-from drivesem.attack.feasibility_check import _Car, _collisions, check_scene, overlap_area
-from drivesem.attack.feasible import FeasibleSet, Limits, _Cars, _gap, _overlap, project, violations
+from drivesem.attack.feasibility_check import (
+    _Car,
+    _collisions,
+    _Outlines,
+    check_scene,
+    judge_at_hand,
+    overlap_area,
+)
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.feasible.cars import Cars
+from drivesem.attack.feasible.collisions import gap_between, shared_ground
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import COMBOS, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
@@ -43,7 +54,7 @@ def test_projection_is_deterministic(street):
     scene = street(positions_xz=CROWDED)
     space = ParameterSpace(scene, COMBOS[2])
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(1)) * 10 * space.step
-    assert torch.equal(project(space, scene, theta).theta, project(space, scene, theta).theta)
+    assert torch.equal(FeasibleSet(space).project(theta).theta, FeasibleSet(space).project(theta).theta)
 
 
 def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(street):
@@ -51,10 +62,10 @@ def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(st
     strained = torch.randn(4, 64, 3, generator=torch.Generator().manual_seed(2)) * 0.2
     scene = scene.with_objects(ffd=strained)
     space = ParameterSpace(scene, COMBOS[2])
-    result = project(space, scene, space.theta0)
+    result = FeasibleSet(space).project(space.theta0)
     assert torch.equal(result.theta, space.theta0)
     assert result.active == ()
-    assert violations(space, scene, space.theta0) == ()
+    assert FeasibleSet(space).violations(space.theta0) == ()
     assert check_scene(scene, space.apply(scene, space.theta0)) == []
 
 
@@ -89,7 +100,7 @@ def test_a_feasible_theta_is_returned_to_the_bit(street):
     scene = street()
     space = ParameterSpace(scene, ("translate", "rotate"))
     theta = 3 * space.step
-    assert torch.equal(project(space, scene, theta).theta, theta)
+    assert torch.equal(FeasibleSet(space).project(theta).theta, theta)
 
 
 def test_bounds_are_named(street):
@@ -97,17 +108,17 @@ def test_bounds_are_named(street):
     space = ParameterSpace(scene, ("rotate",))
     theta = space.theta0.clone()
     theta[2] = 1.0
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     assert float(result.theta[2]) == pytest.approx(0.35)
     assert result.active == ("objects[2].yaw: bounds",)
-    assert violations(space, scene, theta) == ("objects[2].yaw: bounds",)
+    assert FeasibleSet(space).violations(theta) == ("objects[2].yaw: bounds",)
 
 
 def test_strain_and_the_lowest_layer(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(4)) * 0.15
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     offsets = ffd.from_symmetric(result.theta.reshape(4, 96)).double()
     assert float(offsets.reshape(4, 4, 4, 4, 3)[:, :, -1, :, 1].abs().max()) == 0
     axis = torch.linspace(0, 1, 9, dtype=torch.float64)
@@ -126,8 +137,8 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
     space = ParameterSpace(scene, ("translate",))
     theta = space.theta0.clone()
     theta[0], theta[2], theta[4] = 0.25, -0.25, 0.2  # 1.05 m each, with 0.8 m between them; the third is free
-    assert _names(violations(space, scene, theta)) == {"collision"}
-    result = project(space, scene, theta)
+    assert _names(FeasibleSet(space).violations(theta)) == {"collision"}
+    result = FeasibleSet(space).project(theta)
     moved = space.apply(scene, result.theta).objects.translation
     gap = float(moved[1, 2] - moved[0, 2]) - 4.2
     assert 0.04 < gap < 0.4
@@ -138,7 +149,7 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
 def test_a_kerb_stops_the_car_across_but_not_along(street):
     scene = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
     space = ParameterSpace(scene, ("translate",))
-    result = project(space, scene, torch.tensor([0.2, 0.25]))
+    result = FeasibleSet(space).project(torch.tensor([0.2, 0.25]))
     assert result.active == ("objects[0]: road",)
     assert float(result.theta[0]) == pytest.approx(0.2)
     assert 0 < float(result.theta[1]) < 0.12
@@ -147,18 +158,18 @@ def test_a_kerb_stops_the_car_across_but_not_along(street):
 def test_a_car_beside_the_road_may_go_anywhere(street):
     scene = street(positions_xz=((8.0, 14.0),), road_edge_x_m=3.0)
     space = ParameterSpace(scene, ("translate",))
-    assert project(space, scene, torch.tensor([0.25, 0.25])).active == ()
+    assert FeasibleSet(space).project(torch.tensor([0.25, 0.25])).active == ()
 
 
 def test_a_car_stays_in_the_picture(street):
     scene = street(positions_xz=((6.9, 9.0),), yaw=0.0)
     space = ParameterSpace(scene, ("translate",))
     theta = torch.tensor([0.25, 0.0])
-    assert _names(violations(space, scene, theta)) == {"frame"}
+    assert _names(FeasibleSet(space).violations(theta)) == {"frame"}
     assert check_scene(scene, space.apply(scene, theta)) != []
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     assert 0 < float(result.theta[0]) < 0.25
-    assert violations(space, scene, result.theta) == ()
+    assert FeasibleSet(space).violations(result.theta) == ()
 
 
 def test_a_car_is_not_hidden_behind_another(street):
@@ -166,9 +177,9 @@ def test_a_car_is_not_hidden_behind_another(street):
     scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
     space = ParameterSpace(scene, ("translate",))
     theta = torch.tensor([0.0, -0.2, 0.0, 0.25])  # across is towards -x: both move to one another in the picture
-    assert "visibility" in _names(violations(space, scene, theta))
-    result = project(space, scene, theta)
-    assert violations(space, scene, result.theta) == ()
+    assert "visibility" in _names(FeasibleSet(space).violations(theta))
+    result = FeasibleSet(space).project(theta)
+    assert FeasibleSet(space).violations(result.theta) == ()
     assert "visibility" in _names(result.active)
     assert float(result.theta.abs().max()) > 0.02
 
@@ -179,8 +190,8 @@ def test_a_growing_mesh_does_not_reach_into_a_neighbour(street):
     wide = torch.zeros(2, 4, 4, 2, 3)
     wide[..., 2] = -0.09  # the half at z < 0 goes outwards, and the other with it
     theta = wide.reshape(-1)
-    assert _names(violations(space, scene, theta)) == {"collision"}
-    result = project(space, scene, theta)
+    assert _names(FeasibleSet(space).violations(theta)) == {"collision"}
+    result = FeasibleSet(space).project(theta)
     assert check_scene(scene, space.apply(scene, result.theta)) == []
     assert float(result.theta.abs().max()) > 0.005
 
@@ -193,14 +204,12 @@ def test_errors_name_what_is_wrong(street):
         feasible.project(torch.zeros(3))
     with pytest.raises(RangeError, match=r"objects\[1\]\.yaw: expected a finite value"):
         feasible.project(torch.tensor([0.0, math.inf, 0.0, 0.0]))
-    with pytest.raises(RangeError, match="scene"):
-        project(space, street(), space.theta0)
 
 
 def test_a_scene_without_cars_is_projected_onto_its_bounds(street):
     scene = street(positions_xz=())
     space = ParameterSpace(scene, ("weather", "translate"))
-    result = project(space, scene, torch.tensor([2.0, -1.0, 0.5, 0.0]))
+    result = FeasibleSet(space).project(torch.tensor([2.0, -1.0, 0.5, 0.0]))
     assert result.theta.tolist() == [1.0, 0.0, 0.5, 0.0]
     assert check_scene(scene, space.apply(scene, result.theta)) == []
 
@@ -209,8 +218,8 @@ def test_limits_are_settings(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
     theta = 0.1 * torch.randn(space.dim, generator=torch.Generator().manual_seed(4))
-    loose = project(space, scene, theta, Limits(strain=(0.5, 2.0)))
-    tight = project(space, scene, theta, Limits(strain=(0.95, 1.05)))
+    loose = FeasibleSet(space, Limits(strain=(0.5, 2.0))).project(theta)
+    tight = FeasibleSet(space, Limits(strain=(0.95, 1.05))).project(theta)
     assert float(tight.theta.norm()) < 0.5 * float(loose.theta.norm())
 
 
@@ -226,7 +235,7 @@ def test_the_second_check_shares_no_code():
         for a in n.names
     }
     assert imported <= {
-        *("__future__", "collections.abc", "dataclasses", "math"),
+        *("__future__", "collections.abc", "dataclasses", "functools", "importlib", "math", "typing"),
         *("cv2", "numpy", "numpy.typing", "scene_ir.types"),
     }
 
@@ -288,10 +297,10 @@ def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):
     before[1].vertices = _spindle(before[1])
     less = overlap_area(before[0].outline, before[1].outline)
     assert less < shared - 0.2
-    found = _collisions(dict(enumerate(before)), dict(enumerate(after)))
+    found = _collisions(dict(enumerate(before)), dict(enumerate(after)), _Outlines())
     assert found == [f"objects[1]: mesh runs into that of objects[0], {shared:.2f} m2 ({less:.2f} before)"]
-    assert _collisions(dict(enumerate(after)), dict(enumerate(before))) == []
-    assert _collisions(dict(enumerate(after)), dict(enumerate(after))) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(before)), _Outlines()) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(after)), _Outlines()) == []
 
 
 def _spindle(car):
@@ -299,6 +308,63 @@ def _spindle(car):
     local = (car.vertices - car.position) @ car.axes.T
     local[:, 2] *= 1 - np.abs(local[:, 0]) / (car.high[0] - car.low[0]) * 1.8
     return local @ car.axes + car.position
+
+
+@pytest.fixture
+def rays():
+    """Open3D as the judge."""
+    pytest.importorskip("open3d", reason="Open3D or its libusb is not installed", exc_type=ImportError)
+    return drivesem.attack.feasibility_check._judge()
+
+
+def test_rays_see_what_outlines_see(street, rays):
+    for places in (CROWDED, ((0.0, 6.0), (0.0, 12.0)), ((7.5, 9.0), (0.0, 3.0)), ()):
+        scene = street(positions_xz=places)
+        cars = [_Car(scene, i) for i in range(len(places))]
+        (shown, whole), (pixels, all_pixels) = rays.seen(scene, cars), _Outlines().seen(scene, cars)
+        shares = [a / b for a, b in zip(shown, whole, strict=True)]
+        assert shares == pytest.approx([a / b for a, b in zip(pixels, all_pixels, strict=True)], abs=0.1)
+
+
+def test_rays_measure_the_ground_that_two_meshes_share(street, rays):
+    scene = street(positions_xz=((0.0, 10.0), (1.0, 12.0)), yaw=0.3)
+    cars = [_Car(scene, i) for i in range(2)]
+    shared = overlap_area(cars[0].outline, cars[1].outline)
+    assert rays.shared_m2(*cars) == pytest.approx(shared, abs=0.05)
+    assert rays.shared_m2(cars[0], cars[0]) == pytest.approx(overlap_area(*(cars[0].outline,) * 2), rel=0.02)
+    apart = [_Car(street(positions_xz=((0.0, 10.0), (0.0, 20.0))), i) for i in range(2)]
+    assert rays.shared_m2(*apart) == 0
+    # One mesh above the other: their outlines overlap, and they do not meet.
+    cars[1].vertices = cars[1].vertices - [0.0, 5.0, 0.0]
+    assert rays.shared_m2(*cars) == 0
+
+
+def test_rays_find_a_mesh_in_another_and_a_car_behind_another(street, rays):
+    scene = street(positions_xz=((0.0, 10.0), (1.8, 10.0)), yaw=0.0)
+    scene = scene.with_objects(yaw=torch.tensor([0.0, math.pi / 2]))
+    before, after = [_Car(scene, i) for i in range(2)], [_Car(scene, i) for i in range(2)]
+    before[1].vertices = _spindle(before[1])
+    (line,) = _collisions(dict(enumerate(before)), dict(enumerate(after)), rays)
+    assert line.startswith("objects[1]: mesh runs into that of objects[0]")
+    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
+    assert "objects[1]: hidden" in check_scene(pair, hidden, "open3d")
+
+
+@pytest.mark.parametrize("asked", [None, "open3d", "outlines"])
+def test_without_open3d_outlines_judge(street, monkeypatch, asked):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    drivesem.attack.feasibility_check._open3d.cache_clear()
+    try:
+        assert judge_at_hand() == "outlines"
+        pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+        pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+        moved = pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]])
+        assert "objects[1]: hidden" in check_scene(pair, pair.with_objects(translation=moved), asked)
+        assert check_scene(pair, pair, asked) == []
+    finally:
+        drivesem.attack.feasibility_check._open3d.cache_clear()
 
 
 def test_overlap_area_of_known_shapes():
@@ -318,11 +384,11 @@ def test_both_ways_agree_on_gap_and_overlap(seed):
     yaw = draw.uniform(-3, 3, 2)
     cos, sin = np.cos(yaw), np.sin(yaw)
     low, size, at = draw.uniform(-3, 0, (2, 3)), draw.uniform(1, 5, (2, 3)), draw.uniform(-2.5, 2.5, (2, 3))
-    cars = _Cars.of(low, low + size, yaw, at)
+    cars = Cars.of(low, low + size, yaw, at)
     corners = np.array([[1, 0], [1, 1], [0, 1], [0, 0]]) * size[:, None, ::2] + low[:, None, ::2]
     rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
     footprints = corners @ rotation + at[:, None, ::2]
-    gap, area = _gap(cars, np.arange(2)), _overlap(cars, np.array([0, 1]), np.array([1, 0]))
+    gap, area = gap_between(cars, np.arange(2)), shared_ground(cars, np.array([0, 1]), np.array([1, 0]))
 
     def ccw(p):
         x, z = p.T

@@ -11,12 +11,12 @@ import pytest
 
 from drivesem.questions.explain.players import Size
 from drivesem.questions.explain.plots import write_waterfalls
-from drivesem.questions.explain.report import means, sheets, what_if, write_report
+from drivesem.questions.explain.report import answer_of, means, sheets, what_if
 from drivesem.questions.explain.results import (
     Contribution,
     Explanation,
     Least,
-    Outcome,
+    PartOutcome,
     Sensitivity,
     read_explanation,
     write_explanation,
@@ -24,7 +24,7 @@ from drivesem.questions.explain.results import (
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import FormatError
 
-GOOD, BAD = Outcome(1.0, 0, 0, False, False), Outcome(3.0, 1, 2, True, False)
+GOOD, BAD = PartOutcome(1.0, 0, 0, False, False), PartOutcome(3.0, 1, 2, True, False)
 
 
 def contribution(kind: str, name: str, loss: float, fails: float, error: float | None = None) -> Contribution:
@@ -138,7 +138,7 @@ def test_tables() -> None:
 
 def test_files(tmp_path: Path) -> None:
     frames = [explanation("a"), explanation("b", 1.5)]
-    write_report(tmp_path, frames, means(frames, 20, 0), 20)
+    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}}).write()
     rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
     assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")
