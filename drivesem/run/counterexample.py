@@ -5,7 +5,7 @@
 >>> found.picture.shape, found.feasible
 ((376, 1241, 3), True)
 >>> sorted(found.theta)[0]
-'objects[0].rotate'
+'objects[0].translate.across'
 """
 
 from __future__ import annotations
