@@ -9,8 +9,9 @@ from rich.console import Console
 
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
+from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
-from drivesem.settings.commands import Synth, processes
+from drivesem.settings.commands import Synth
 from drivesem.settings.errors import UsageError
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, in_processes, synthesise
@@ -22,9 +23,7 @@ _SHEET_FRAMES = 8
 
 def order_of(config: Synth) -> Order:
     """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
-    out = Path(config.out or f"data/synth-{config.layout}-{config.split}-seed{config.seed}")
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    out = folder_of(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
     for name in ("meshes", "assets"):
         folder = getattr(config, name)
@@ -55,7 +54,7 @@ def run(config: Synth) -> int:
     total = len(order.places())
     hold(order.out)
     with progress_bar(Console(stderr=True), remaining=True) as progress:
-        done = synthesise(order, in_processes(min(processes(config), total)))
+        done = synthesise(order, in_processes(min(config.processes, total)))
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}
