@@ -14,9 +14,10 @@ import torch
 from drivesem.attack.space import Parameter
 from drivesem.bench import gradcheck
 from drivesem.bench.gradcheck import LOSS, PICTURE, Differences, GradcheckRow, rows_of, worst
-from drivesem.cli import main, parse
+from drivesem.cli import main
 from drivesem.commands import gradcheck as gradcheck_command
 from drivesem.settings.commands import Gradcheck
+from drivesem.settings.parsing import parse
 from scene_ir.types import Camera, Mesh, SceneIR
 
 COUNT, OUTPUTS = 12, gradcheck.FUNCTIONALS + 1
