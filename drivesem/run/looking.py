@@ -22,7 +22,7 @@ from drivesem.attack.judging import JudgedClasses
 from drivesem.run.ask import Bar, ask
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.results import BoxRecord
-from drivesem.settings.commands import Common
+from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -112,7 +112,7 @@ def weights_digest(module: nn.Module) -> str:
 
 
 def look(
-    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Common, title: str
+    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Sharing, title: str
 ) -> dict[str, str]:
     """Look at each picture that is not known yet. Returns which could not be used, and why, where the settings
     keep going; else the first ends it. Pictures with the same bytes are looked at once. title: of the bar.

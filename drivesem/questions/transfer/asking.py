@@ -19,6 +19,7 @@ from drivesem.report.answer import Answer
 from drivesem.run.finished import PICTURES, Frame, Run, load_runs
 from drivesem.run.folder import claim
 from drivesem.run.looking import Memory, Order, look
+from drivesem.settings.blocks import Asking
 from drivesem.settings.commands import Transfer
 from drivesem.settings.errors import UsageError
 
@@ -73,7 +74,7 @@ def short_names(names: Sequence[str]) -> list[str]:
     return short if len(set(short)) == len(short) else list(names)
 
 
-def detectors_of(specs: Sequence[str], config: Transfer, out: Path, t_star: float | None = None) -> list[Asked]:
+def detectors_of(specs: Sequence[str], config: Asking, out: Path, t_star: float | None = None) -> list[Asked]:
     """All of them loaded, before the first picture: a name that is misspelt shall not show after hours.
 
     out: in its folder DETECTIONS is remembered what they find; t_star: of all of them. Raises UsageError for what
@@ -107,7 +108,7 @@ def transfer_run(config: Transfer) -> Answer:
     return answer
 
 
-def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Transfer) -> tuple[list[Row], dict[str, str]]:
+def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Asking) -> tuple[list[Row], dict[str, str]]:
     """Each run before each detector, and the pictures that could not be used, with reasons.
 
     Raises UsageError where no frame of a run is left, SceneError for a bad picture unless `keep_going`.
@@ -126,7 +127,7 @@ def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Transfer) -
     return rows, failed
 
 
-def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Transfer, draws: int) -> Row:
+def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> Row:
     memory, predictor = Memory(asked.order, asked.predictor), asked.predictor
     otherwise = DEFAULT_T_STAR if config.t_star is None else config.t_star
     t_star = t_star_of(predictor, asked.t_star, otherwise)
