@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from drivesem.questions.confirm.judge import Finding, Stand
+from drivesem.questions.confirm.judge import RendererFailure, Stand
+from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -26,8 +25,8 @@ class Confirmed:
 
     identifier: str
     source: str
-    compositor: tuple[Finding, ...]
-    generator: tuple[Finding, ...]
+    compositor: tuple[RendererFailure, ...]
+    generator: tuple[RendererFailure, ...]
     stands: tuple[Stand, ...]
     targets_benign: tuple[BoxRecord, ...]
     targets_changed: tuple[BoxRecord, ...]
@@ -48,14 +47,6 @@ def load(path: Path) -> Confirmed:
     try:
         if data.pop("schema") != SCHEMA:
             raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        kinds: dict[str, Callable[..., Any]] = {"compositor": Finding, "generator": Finding, "stands": Stand}
-        kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
-        for name, kind in kinds.items():
-            data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])
-        return Confirmed(**{**data, "not_carried": tuple(data["not_carried"])})
+        return from_json(Confirmed, data)
     except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
-
-
-def _box_of(entry: dict[str, Any]) -> dict[str, Any]:
-    return {"xyxy": tuple(entry["xyxy"])} if "xyxy" in entry else {}
