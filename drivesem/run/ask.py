@@ -17,7 +17,7 @@ from drivesem.run.finished import Run
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import Common
+from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import SceneError
 
@@ -55,7 +55,7 @@ def ask(
     jobs: Sequence[J],
     work: Callable[[J], R],
     build: Callable[[], Callable[[J], R]],
-    config: Common,
+    config: Sharing,
     bar: Bar,
     name: Callable[[J], str] = str,
     size: Callable[[J], int] = lambda job: 1,
@@ -98,7 +98,7 @@ class KeptFrames(Generic[K]):
         names: Sequence[str],
         work: Callable[[str], object],
         build: Callable[[], Callable[[str], object]],
-        config: Common,
+        config: Sharing,
         bar: Bar,
     ) -> tuple[list[K], dict[str, str]]:
         """The answers about frames in their order, and why others have none. work: writes a frame's folder."""

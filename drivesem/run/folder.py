@@ -14,7 +14,8 @@ from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from drivesem.attack.judging import JudgedClasses
 from drivesem.run.lock import LOCK, hold
-from drivesem.settings.commands import Attack, Common
+from drivesem.settings.blocks import Output
+from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import to_yaml
 from scene_ir import files
@@ -27,7 +28,7 @@ PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
 """Settings that change no frame's result: a run may be continued with others."""
 
 
-def claim(out: Path, config: Common, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
+def claim(out: Path, config: Output, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
     """Make `out` this run's folder, and hold it. written: names of the files and folders in it that an earlier run
     wrote, which --no-resume removes, and nothing else.
 
@@ -88,7 +89,7 @@ def detector_of(attack: Attack, device: str) -> Predictor:
     return detector
 
 
-def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:
+def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
     def identity(settings: dict[str, Any]) -> dict[str, Any]:
         return {key: value for key, value in settings.items() if key not in presentation}
 

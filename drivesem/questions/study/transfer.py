@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from detectors.base import Predictor
 from detectors.squeezedet import SqueezeDet
@@ -27,7 +26,8 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.attack import Worker
 from drivesem.run.finished import Run, load_runs
-from drivesem.settings.commands import DEFAULT_COMBO, Study, Transfer
+from drivesem.settings.blocks import Asking
+from drivesem.settings.commands import DEFAULT_COMBO, Study
 
 _SIDES = ("source", "target")
 _LABELS = "labels"
@@ -104,14 +104,13 @@ def run(
     workers: Sequence[Worker],
     asked: Sequence[Asked],
     out: Path,
-    console: Console,
 ) -> Matrix:
     """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
-    ran = run_arms(arms, workers, out, console)
+    ran = run_arms(arms, workers, out)
     runs = load_runs([str(out / ARMS / arm.folder) for arm in arms])
     named = [replace(run, name=arm.of or arm.name) for run, arm in zip(runs, arms, strict=True)]
     settings = _settings(study)
-    rows, failed = rows_of(named, asked, settings, console)
+    rows, failed = rows_of(named, asked, settings)
     split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
     draws = DRAWS if study.bootstrap is None else study.bootstrap
     found: list[Before] = []
@@ -136,9 +135,8 @@ def _beyond(row: Row, placebo: Row, mode: str, draws: int, seed: int) -> Interva
     return Interval(one.name, one.difference, one.low, one.high)
 
 
-def _settings(study: Study) -> Transfer:
-    return Transfer(
-        limit=study.limit,
+def _settings(study: Study) -> Asking:
+    return Asking(
         seed=study.seed,
         workers=study.workers,
         device=study.device,

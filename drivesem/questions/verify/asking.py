@@ -18,7 +18,7 @@ from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import FRAMES, attack_of, detector_of
 from drivesem.run.results import FrameResult
-from drivesem.settings.commands import Common, Verify
+from drivesem.settings.commands import Verify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -38,8 +38,7 @@ def verify_run(config: Verify) -> tuple[dict[str, Any], Path]:
     if out.is_dir():
         raise UsageError("--out", "a file", f"the folder {out}")
     names = [frame.result.identifier for frame in run.frames][: config.limit]
-    shared = Common(workers=config.workers, keep_going=config.keep_going)
-    answers = ask(names, worker, build, shared, Bar("checking frames", stays=False))
+    answers = ask(names, worker, build, config, Bar("checking frames", stays=False))
     checked = [answers.results[name] for name in names if name in answers.results]
     data = _data(run, checked, _totals(run, worker.given.t_star), answers.failed)
     files.write_json(out, data)

@@ -41,7 +41,8 @@ from drivesem.run.folder import folder_of
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.looking import Memory, Order, look
 from drivesem.run.results import BoxRecord
-from drivesem.settings.commands import Transfer, Worth
+from drivesem.settings.blocks import Sharing
+from drivesem.settings.commands import Worth
 from drivesem.settings.errors import UsageError
 from drivesem.training.retraining import WEIGHTS
 from scene_ir import files
@@ -188,7 +189,7 @@ class _Second:
         assert config.second is not None
         path = Path(config.second)
         name = str(path / WEIGHTS) if (path / WEIGHTS).is_file() else config.second
-        self._settings = Transfer(workers=1, device=config.device, tiles=config.tiles)
+        self._settings = Sharing(workers=1)
         self._order = Order(name, config.device, config.tiles, out / DETECTIONS)
         try:
             self._predictor = self._order.load()
@@ -200,8 +201,7 @@ class _Second:
 
     def find(self, picture: Path) -> Detections:
         """Detections whose labels are places in CLASSES."""
-        for _, outcome in look(self._order, self._predictor, [picture], self._settings):
-            outcome()
+        look(self._order, self._predictor, [picture], self._settings, self.name)
         found = self._memory.recall(picture)
         places = torch.tensor([CLASSES.index(name) for name in self._names])
         return Detections(found.boxes_xyxy, places[found.labels], found.scores)
