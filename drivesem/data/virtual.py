@@ -169,8 +169,8 @@ def objects_in(table: LabelTable) -> tuple[list[list[TrackedObject]], dict[str, 
         used = {int(tracks[row]) for row in rows if tracks[row] is not None}
         spare = (n for n in range(len(rows) + len(used) + 1) if n not in used)
         shown = [row for row in rows if not (flat[row] or (table.ignore[row] and kinds[row] is None))]
-        lost["region"] += len(rows) - len(shown)
         frames.append([_object_in(table, row, spare, lost, assumed) for row in shown])
+        lost["region"] += len(rows) - len(shown)
     return frames, dict(lost), dict(assumed)
 
 
