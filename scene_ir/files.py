@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import filecmp
+import hashlib
 import io
 import json
 import os
@@ -112,6 +113,11 @@ def whole_folder(folder: Path) -> Iterator[Path]:
             os.replace(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal. FormatError where it is missing or cannot be read."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def read_bytes(path: Path) -> bytes:

@@ -375,8 +375,7 @@ def _load_image(folder: Path, node: _Node, arrays: _Arrays, size_hw: tuple[int, 
         return arrays.tensor(name, 3, *size_hw)
     if node.text() != "png":
         raise FormatError(node.where, "'png' or 'npz'", repr(node.value))
-    image = files.read_image(folder / f"{name}.png", size_hw)
-    return torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255
+    return to_tensor(files.read_image(folder / f"{name}.png", size_hw))
 
 
 def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
@@ -405,3 +404,13 @@ def _load_front(index: int, node: _Node, arrays: _Arrays) -> Front:
 
 def _load_mesh(path: Path) -> Mesh:
     return _Node(str(path), None).build(lambda: load_mesh(path))
+
+
+def to_uint8(image: Tensor) -> np.ndarray:
+    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+
+def to_tensor(picture: np.ndarray) -> Tensor:
+    """A picture (H, W, 3) uint8 as (3, H, W) float32 in [0, 1]; `to_uint8` gives it back."""
+    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).to(torch.float32) / 255

@@ -1,6 +1,6 @@
 """How well methods fill the holes that removed vehicles leave, as a Markdown table.
 
-python tools/compare_fills.py --frames 8
+python -m tools.compare_fills --frames 8
 
 Generated streets of the held-out pools; the generator's own picture without the vehicles is the truth. All methods
 get the same holes: the pixels that truly change, grown by 3 px. PSNR over the holes, and over their ground and
@@ -19,12 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.bench.derender import changed_region, make_case, share_of, without
-from drivesem.questions.realism.closeness import Perception, Picture, psnr
+from drivesem.questions.realism.closeness import Perception, Picture
 from drivesem.synth.layout import footprint
 from scene_ir.derender import background, maps, segment, street, upright
 from scene_ir.derender.derender import VEHICLES
 from scene_ir.derender.silhouette import grow
+from tools.bench.derender import changed_region, make_case, share_of, without
+from tools.bench.pictures import psnr
 
 Mask = NDArray[np.bool_]
 SEED = 0

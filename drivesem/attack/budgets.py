@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from drivesem.attack.edits import ANGLE_UNITS, LENGTH_UNITS, finite_number, load_yaml, mapping_of, measure
 from drivesem.attack.space import Budget, Parameter
+from drivesem.settings.edits import ANGLE_UNITS, LENGTH_UNITS, finite_number, load_yaml, mapping_of, measure
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 

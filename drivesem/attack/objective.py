@@ -13,7 +13,7 @@ from detectors.base import Detector, Predictor, RawPredictions, predict
 from detectors.types import Detections, Targets
 from drivesem.attack import detection_loss, goals
 from drivesem.attack.aims import EVERYTHING, Aim
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.attack.methods.base import Group, Problem, Score

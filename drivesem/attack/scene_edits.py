@@ -1,23 +1,41 @@
 """Edits applied to a scene: vehicles moved, turned, bent, painted, removed; other weather and foliage.
 
-The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.attack.edits`.
+The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.settings.edits`.
 Objects are numbered by their row.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
-from drivesem.attack.edits import ALL, FrameEdit, ObjectEdit
+from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.space import Budget, ground_axes
+from drivesem.settings.edits import ALL, FrameEdit, ObjectEdit
 from scene_ir import ffd
 from scene_ir.errors import RangeError
+from scene_ir.removal import without_objects
 from scene_ir.types import SceneIR
 
 
-def removed_rows(scene: SceneIR, edit: FrameEdit) -> list[int]:
-    """The rows that an edit removes. RangeError where it names a row that the scene does not have."""
-    return [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
+@dataclass(frozen=True, slots=True)
+class EditedScene:
+    """A scene after an edit. removed: rows of the scene before; notes: which vehicles left the ground or the road,
+    or stand in one another: lines as of `check_places`.
+    """
+
+    scene: SceneIR
+    removed: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def edited(scene: SceneIR, edit: FrameEdit) -> EditedScene:
+    """The scene after an edit. RangeError where the edit names a row that the scene does not have."""
+    removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
+    changed = moved(scene, edit)
+    notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
+    return EditedScene(without_objects(changed, removed), tuple(removed), tuple(notes))
 
 
 def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:

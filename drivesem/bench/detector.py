@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -17,12 +12,19 @@ from torch import Tensor
 from detectors.base import Detector, RawPredictions
 from detectors.registry import load_detector
 from drivesem.bench import memory
-from drivesem.bench.detector_probe import Order, both
+from drivesem.bench.probe import ProbeOrder, image_gradient, probe
 from drivesem.bench.scenes import bench_scene
+from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
-from scene_ir import files
-from scene_ir.errors import FormatError
 
+TITLE = "The detectors"
+COLUMNS: Columns = {
+    "detector": ("detector", "detector"), "size": ("size", "size"), "threads": ("threads", "threads"),
+    "forward_ms": ("forward, ms", "forward ms"), "forward_min_ms": ("fastest", "fastest"),
+    "both_ms": ("forward and backward, ms", "both"), "both_min_ms": ("fastest", "fastest"),
+    "decode_ms": ("decode, ms", "decode"), "decode_worst_ms": ("at worst", "at worst"),
+    "peak_mb": ("peak, MB", "peak MB"), "rounds": ("rounds", None),
+}  # fmt: skip
 METHOD = (
     "A generated street of 8 cars, resized to each size. forward: without gradient, up to the raw predictions; "
     "forward and backward: raw predictions, the loss that attacks raise for one object, and its gradient to the "
@@ -36,11 +38,13 @@ _CARS, _TRIANGLES = 8, 600
 _FEWEST, _MOST = 3, 400
 _SURE = 30.0
 """Added to the logits of all confidences: every anchor is a candidate."""
+_STEPS = 6
+"""Of the process whose memory is measured: the peak is reached in the first steps."""
 _KB = 1024.0
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DetectorRow:
     """One detector at one size, width x height. Times in ms, medians, and the fastest; peak_mb: MB above the
     loaded detector, None where it is not measured; rounds: how often each was done.
     """
@@ -59,7 +63,7 @@ class Row:
     rounds: int
 
 
-def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Iterator[Row]:
+def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Iterator[DetectorRow]:
     """One row a detector and size, within about `seconds` for all of them.
 
     DetectorError for a detector that cannot be had or has no gradient, FormatError where the process that tells
@@ -75,14 +79,14 @@ def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Ite
             yield _row(name, detector, image, Clock(device), budget.share())
 
 
-def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: float) -> Row:
+def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: float) -> DetectorRow:
     height, width = image.shape[2:]
     with torch.no_grad():
         raw = detector(image)
     sure = replace(raw, confidence_logits=raw.confidence_logits + _SURE)
     calls: dict[str, Callable[[], object]] = {
         "forward": lambda: _judge(detector, image),
-        "both": lambda: both(detector, image),
+        "both": lambda: image_gradient(detector, image),
         "decode": lambda: detector.decode(raw),
         "worst": lambda: detector.decode(sure),
     }
@@ -94,7 +98,7 @@ def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: fl
             times[key].append(clock.ms(call))
     median = {key: round(Spread.of(found).median, 3) for key, found in times.items()}
     fastest = {key: round(min(found), 3) for key, found in times.items()}
-    return Row(
+    return DetectorRow(
         detector=name,
         size=f"{width}x{height}",
         threads=torch.get_num_threads(),
@@ -117,13 +121,7 @@ def _judge(detector: Detector, image: Tensor) -> RawPredictions:
 
 def _peak_mb(name: str, height: int, width: int) -> float:
     """Peak of a fresh process above what it holds with the detector loaded, MB."""
-    order = Order(name, height, width, torch.get_num_threads())
-    with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as folder:
-        answer = Path(folder) / "found.json"
-        words = [sys.executable, "-m", "drivesem.bench.detector_probe", json.dumps(asdict(order)), str(answer)]
-        done = subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
-        if done.returncode != 0 or not answer.is_file():
-            last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-            raise FormatError("bench detector: process", "a result", f"exit code {done.returncode}: {last}")
-        found = files.read_json(answer)
-    return round((found["peak_kb"] - found["loaded_kb"]) / _KB, 1)
+    resident = probe(
+        "detector", ProbeOrder(name, torch.get_num_threads(), (height, width), steps=_STEPS), "bench detector"
+    )
+    return round((resident.peak_kb - resident.loaded_kb) / _KB, 1)

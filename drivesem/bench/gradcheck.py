@@ -16,12 +16,11 @@ Shapes: D coordinates of theta, K directions, S steps, F + 1 outputs: F function
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -32,24 +31,25 @@ import torch
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from torch import Tensor
 
 from detectors.base import DetectorError, RawPredictions
 from detectors.registry import load_detector
 from detectors.squeezedet import Assignment, SqueezeDet
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
-from drivesem.run.workers import outcomes
+from drivesem.report.answer import print_json
+from drivesem.run.ask import Bar, ask
+from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import SceneSource, open_source
 from drivesem.settings.commands import Attack, Gradcheck, processes
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings, scene_to
-from scene_ir.errors import RangeError, SceneError
+from scene_ir.errors import RangeError
 from scene_ir.raster.verbs import Backend
 from scene_ir.types import SceneIR
 
@@ -408,12 +408,12 @@ def run(config: Gradcheck) -> int:
     Raises UsageError or SceneError for bad input.
     """
     start = time.perf_counter()
-    worker = _Worker(config)
-    failed: dict[str, str] = {}
-    names = _select(worker.source, config, failed)
+    worker = GradcheckWorker(config)
+    names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or DEFAULT_SCENES))
     if not names:
         raise UsageError("gradcheck", "at least one frame with vehicles", "none")
-    scenes = _check_all(worker, names, failed)
+    scenes, failed = _check_all(worker, names)
+    failed = unreadable | failed
     rows = worst(row for found in scenes.values() for row in found)
     passed = bool(rows) and all(row.passes(config.min_cosine, config.max_error) for row in rows)
     summary = {
@@ -436,7 +436,7 @@ def run(config: Gradcheck) -> int:
     if config.out:
         files.write_json(Path(config.out) / "gradcheck.json", summary)
     if config.json:
-        sys.stdout.write(json.dumps(summary) + "\n")
+        print_json(summary)
     else:
         console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
         _print(rows, config, console, len(scenes))
@@ -454,7 +454,7 @@ class _Task:
     parameter: Parameter | None
 
 
-class _Worker:
+class GradcheckWorker:
     """What one process needs: built once, used for many tasks. Raises UsageError or SceneError for bad input."""
 
     def __init__(self, config: Gradcheck) -> None:
@@ -480,76 +480,49 @@ class _Worker:
         check = self._current[1]
         return check.gradients(task.at) if task.parameter is None else check.differences(task.at, task.parameter)
 
-    def do_all(self, tasks: Sequence[_Task]) -> _Results:
-        """Several tasks, each with its result."""
-        return [(task, self.do(task)) for task in tasks]
+    def __call__(self, tasks: Sequence[_Task]) -> list[Gradients | Differences]:
+        """Several tasks."""
+        return [self.do(task) for task in tasks]
 
 
-_Results = list[tuple[_Task, Gradients | Differences]]
-
-
-def _in_process(config: Gradcheck) -> Callable[[list[_Task]], _Results]:
-    return _Worker(config).do_all
-
-
-def _check_all(worker: _Worker, names: Sequence[str], failed: dict[str, str]) -> dict[str, tuple[Row, ...]]:
-    """The rows of each scene; a frame that cannot be used goes to `failed` or ends the run."""
+def _check_all(worker: GradcheckWorker, names: Sequence[str]) -> tuple[dict[str, tuple[Row, ...]], dict[str, str]]:
+    """The rows of each scene, and why others have none."""
     parts = (None, *Parameter)
-    per_scene = {name: [_Task(name, at, part) for at in POINTS for part in parts] for name in names}
+    per_scene = [tuple(_Task(name, at, part) for at in POINTS for part in parts) for name in names]
     if len(names) >= processes(worker.config):
-        jobs = list(per_scene.values())
+        jobs = per_scene
     else:  # too few scenes to keep every process busy: each makes the scene ready for itself
-        jobs = [[task] for tasks in per_scene.values() for task in tasks]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        jobs = [(task,) for tasks in per_scene for task in tasks]
+    answers = ask(
+        jobs,
+        worker,
+        partial(GradcheckWorker, worker.config),
+        worker.config,
+        Bar("checking gradients"),
+        name=lambda tasks: tasks[0].identifier,
+        size=len,
+    )
     gradients: dict[tuple[str, Point], Gradients] = {}
     differences: dict[tuple[str, Point], dict[Parameter, Differences]] = {}
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task("checking gradients", total=len(names) * len(POINTS) * len(parts))
-        for job, outcome in outcomes(worker.do_all, partial(_in_process, worker.config), jobs, worker.config):
-            try:
-                results = outcome()
-            except SceneError as error:
-                if not worker.config.keep_going:
-                    raise
-                failed[job[0].identifier] = str(error)
-                results = []
-            for task, result in results:
-                key = (task.identifier, task.at)
-                if task.parameter is None:
-                    assert isinstance(result, dict)
-                    gradients[key] = result
-                else:
-                    assert isinstance(result, Differences)
-                    differences.setdefault(key, {})[task.parameter] = result
-            progress.advance(bar, len(job))
+    for tasks, results in answers.results.items():
+        for task, result in zip(tasks, results, strict=True):
+            key = (task.identifier, task.at)
+            if task.parameter is None:
+                assert isinstance(result, dict)
+                gradients[key] = result
+            else:
+                assert isinstance(result, Differences)
+                differences.setdefault(key, {})[task.parameter] = result
     scenes = {}
     for name in names:
-        if name in failed:
+        if name in answers.failed:
             continue
         rows = []
         for at in POINTS:
             found = differences[name, at]
             rows += rows_of(name, at, gradients[name, at], {p: found[p] for p in Parameter})
         scenes[name] = tuple(rows)
-    return scenes
-
-
-def _select(source: SceneSource, config: Gradcheck, failed: dict[str, str]) -> list[str]:
-    """The first frames with vehicles."""
-    names: list[str] = []
-    for identifier in source.identifiers():
-        if len(names) == (config.limit or DEFAULT_SCENES):
-            break
-        try:
-            usable = source.has_vehicles(identifier)
-        except SceneError as error:
-            if not config.keep_going:
-                raise
-            failed[identifier] = str(error)
-            continue
-        if usable:
-            names.append(identifier)
-    return names
+    return scenes, answers.failed
 
 
 def _detector(name: str, device: str) -> SqueezeDet:

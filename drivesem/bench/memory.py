@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from drivesem.attack.objective import Objective
-from drivesem.bench.probe import Found, Order
+from drivesem.bench.probe import ProbeOrder, Resident, probe
 from drivesem.bench.scenes import bench_scene
-from scene_ir import files
-from scene_ir.errors import FormatError
+from drivesem.bench.tables import Columns
 from scene_ir.io import save_scene
 
+TITLE = "Memory"
+COLUMNS: Columns = {
+    "sweep": ("against", "against"), "cars": ("cars", "cars"), "triangles": ("triangles a car", None),
+    "batch": ("batch", "batch"), "steps": ("steps", "steps"), "peak_mb": ("peak, MB", "peak MB"),
+    "detector_mb": ("detector alone, MB", "detector"), "above_mb": ("above it, MB", "above"),
+    "libraries_mb": ("of which libraries, MB", "libraries"), "rss_10": ("after 10 steps, MB", "at 10"),
+    "rss_100": ("after 100, MB", "at 100"), "rss_1000": ("after 1,000, MB", "at 1000"),
+    "slope_kb": ("growth, KB a step", "KB/step"),
+}  # fmt: skip
 METHOD = (
     "Each row is a process of its own that reads a scene from disk and attacks it; detector_mb is the peak of "
     "another process that runs nothing but the detector, forward and backward, on the same images. peak_mb is "
@@ -33,12 +37,12 @@ QUICK_STEPS, FULL_STEPS = 100, 1000
 _SWEEP_STEPS = 12
 """Steps of a row that is about cars or batch: the peak is reached in the first."""
 _BATCHES = (2, 4, 8)
-HAS_BATCHES = hasattr(Objective, "loss_and_grad_many")
 _KB = 1024.0
+_ASKER = "bench memory"
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MemoryRow:
     """What was measured; MB unless said otherwise. sweep: what this row is about, cars, batch or steps."""
 
     sweep: str
@@ -57,7 +61,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class MemoryCase:
     """One row to measure."""
 
     sweep: str
@@ -67,63 +71,50 @@ class Case:
     steps: int = _SWEEP_STEPS
 
 
-def cases(cars: Sequence[int], triangles: Sequence[int], quick: bool) -> list[Case]:
+def cases(cars: Sequence[int], triangles: Sequence[int], quick: bool) -> list[MemoryCase]:
     """Against cars; against batch, where attacks have one; and against steps, at the usual size."""
     usual, most = (8 if 8 in cars else max(cars)), max(triangles)
-    batches = (_BATCHES[:1] if quick else _BATCHES) if HAS_BATCHES else ()
+    batches = _BATCHES[:1] if quick else _BATCHES
     return [
-        *(Case("cars", n, most) for n in cars),
-        *(Case("batch", usual, most, batch=b) for b in batches),
-        Case("steps", usual, most, steps=QUICK_STEPS if quick else FULL_STEPS),
+        *(MemoryCase("cars", n, most) for n in cars),
+        *(MemoryCase("batch", usual, most, batch=b) for b in batches),
+        MemoryCase("steps", usual, most, steps=QUICK_STEPS if quick else FULL_STEPS),
     ]
 
 
-def measure(case_list: Sequence[Case], seed: int, detector: str) -> Iterator[Row]:
+def measure(case_list: Sequence[MemoryCase], seed: int, detector: str) -> Iterator[MemoryRow]:
     """One row a case. Raises FormatError where a process ends without a result."""
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         folder = Path(name)
-        alone: dict[int, Found] = {}
+        alone: dict[int, Resident] = {}
         for case in case_list:
             scene = folder / f"{case.cars}x{case.triangles}"
             if not scene.exists():
                 save_scene(bench_scene(case.cars, case.triangles, seed).scene, scene)
-            order = Order(str(scene), detector, case.batch, case.steps, torch.get_num_threads(), seed)
+            order = ProbeOrder(detector, torch.get_num_threads(), str(scene), case.batch, case.steps, seed)
             if case.batch not in alone:
-                alone[case.batch] = _run("detector", order, folder)
-            yield _row(case, _run("attack", order, folder), alone[case.batch])
+                alone[case.batch] = probe("detector", order, _ASKER)
+            yield _row(case, probe("attack", order, _ASKER), alone[case.batch])
 
 
-def _run(what: str, order: Order, folder: Path) -> Found:
-    """What a fresh process found out."""
-    answer = folder / "found.json"
-    answer.unlink(missing_ok=True)
-    words = [sys.executable, "-m", "drivesem.bench.probe", what, json.dumps(asdict(order)), str(answer)]
-    done = subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
-    if done.returncode != 0 or not answer.is_file():
-        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        raise FormatError(f"bench memory: process {what}", "a result", f"exit code {done.returncode}: {last}")
-    found = files.read_json(answer)
-    return Found(found["peak_kb"], found["libraries_kb"], tuple(found["rss_kb"]))
-
-
-def _row(case: Case, found: Found, alone: Found) -> Row:
+def _row(case: MemoryCase, attack: Resident, alone: Resident) -> MemoryRow:
     def after(step: int) -> float | None:
-        return round(found.rss_kb[step - 1] / _KB, 1) if len(found.rss_kb) >= step else None
+        return round(attack.rss_kb[step - 1] / _KB, 1) if len(attack.rss_kb) >= step else None
 
-    return Row(
+    return MemoryRow(
         sweep=case.sweep,
         cars=case.cars,
         triangles=case.triangles,
         batch=case.batch,
         steps=case.steps,
-        peak_mb=round(found.peak_kb / _KB, 1),
+        peak_mb=round(attack.peak_kb / _KB, 1),
         detector_mb=round(alone.peak_kb / _KB, 1),
-        above_mb=round((found.peak_kb - alone.peak_kb) / _KB, 1),
-        libraries_mb=round((found.libraries_kb - alone.libraries_kb) / _KB, 1),
+        above_mb=round((attack.peak_kb - alone.peak_kb) / _KB, 1),
+        libraries_mb=round((attack.libraries_kb - alone.libraries_kb) / _KB, 1),
         rss_10=after(10),
         rss_100=after(100),
         rss_1000=after(1000),
-        slope_kb=_slope(found.rss_kb) if case.sweep == "steps" else None,
+        slope_kb=_slope(attack.rss_kb) if case.sweep == "steps" else None,
     )
 
 

@@ -1,96 +1,115 @@
-"""The process that `bench memory` measures: `python -m drivesem.bench.probe detector|attack ORDER FILE`.
+"""The processes whose memory is measured: `python -m drivesem.bench.probe detector|attack ORDER FILE`.
 
-It imports only what it runs: what the detector alone does not need counts against the attack.
+Each imports only what it runs: what the detector alone does not need counts against the attack.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from detectors.base import Detector
 
 _DETECTOR_STEPS = 12
 """The detector's peak is reached in the first steps."""
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """What to run. scene: folder; detector: name or file; batch: images or thetas at once; threads; seed."""
+class ProbeOrder:
+    """What to run. detector: name or file; threads: of torch; scene: its folder, or height and width, px, of a
+    random image for the detector alone; batch: images or thetas at once; steps; seed.
+    """
 
-    scene: str
     detector: str
-    batch: int
-    steps: int
     threads: int
-    seed: int
+    scene: str | tuple[int, int]
+    batch: int = 1
+    steps: int = _DETECTOR_STEPS
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """Resident KB: the peak, what the imports left, and after each step."""
+class Resident:
+    """Resident KB: the peak, with the imports and with the detector loaded, and after each step."""
 
     peak_kb: int
     libraries_kb: int
-    rss_kb: tuple[int, ...]
+    loaded_kb: int
+    rss_kb: list[int]
 
 
-def resident_kb() -> int:
-    """Resident memory of this process now, KB."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+def probe(what: Literal["detector", "attack"], order: ProbeOrder, asker: str) -> Resident:
+    """What a fresh process found out. Raises FormatError, which names `asker`, where it ends without a result."""
+    from scene_ir import files
+    from scene_ir.errors import FormatError
+
+    with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as folder:
+        answer = Path(folder) / "resident.json"
+        words = [sys.executable, "-m", "drivesem.bench.probe", what, json.dumps(asdict(order)), str(answer)]
+        done = subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+        if done.returncode != 0 or not answer.is_file():
+            last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+            raise FormatError(f"{asker}: process {what}", "a result", f"exit code {done.returncode}: {last}")
+        return Resident(**files.read_json(answer))
 
 
-def peak_kb() -> int:
-    """The largest resident memory that this process has had, KB.
+def image_gradient(detector: Detector, images: Tensor) -> Tensor:
+    """Forward and backward: the gradient to images (B, 3, H, W) of the loss that attacks raise, for one object."""
+    import torch
 
-    Not `getrusage`, whose figure begins with that of the process that started this one.
-    """
-    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1])
-    return resident_kb()
+    from detectors.types import Targets
+
+    height, width = images.shape[2:]
+    box = images.new_tensor([[width / 4, height / 3, width / 3, height / 2]])
+    labels = torch.zeros(1, dtype=torch.int64, device=images.device)
+    leaf = images.detach().requires_grad_(True)
+    targets = [Targets(box, labels, labels > 0)] * len(images)
+    return torch.autograd.grad(detector.loss(detector(leaf), targets)["objectness"], leaf)[0]
 
 
-def detector_alone(order: Order) -> Found:
+def _detector_alone(order: ProbeOrder) -> Resident:
     """The detector's forward and backward on `batch` images, and nothing else of the project."""
     import torch
 
     from detectors.registry import load_detector
-    from detectors.types import Targets
     from scene_ir.files import read_image
 
     torch.set_num_threads(order.threads)
-    libraries = resident_kb()
+    libraries = _resident_kb()
     detector = load_detector(order.detector)
-    image = torch.from_numpy(read_image(Path(order.scene) / "photograph.png")).permute(2, 0, 1) / 255
+    if isinstance(order.scene, str):
+        image = torch.from_numpy(read_image(Path(order.scene) / "photograph.png")).permute(2, 0, 1) / 255
+    else:
+        image = torch.rand(3, *order.scene, generator=torch.Generator().manual_seed(order.seed))
     images = image[None].repeat(order.batch, 1, 1, 1).contiguous(memory_format=torch.channels_last)
-    box = torch.tensor([[100.0, 150.0, 200.0, 250.0]])
-    targets = [Targets(box, torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.bool))] * order.batch
-
-    def step() -> None:
-        leaf = images.detach().requires_grad_(True)
-        torch.autograd.grad(detector.loss(detector(leaf), targets)["objectness"], leaf)
-
-    return _watched(step, _DETECTOR_STEPS, libraries)
+    steps = min(order.steps, _DETECTOR_STEPS)
+    return _watched(lambda: image_gradient(detector, images), steps, libraries)
 
 
-def attack(order: Order) -> Found:
+def _attack(order: ProbeOrder) -> Resident:
     """Steps of an attack of combo 2: gradient, sign step, projection."""
     import torch
 
     from detectors.registry import load_detector
-    from drivesem.attack.feasible import FeasibleSet
+    from drivesem.attack.feasible.projection import FeasibleSet
     from drivesem.attack.objective import Objective
     from drivesem.attack.space import ParameterSpace, combo
     from scene_ir.compositor import Compositor
     from scene_ir.io import load_scene
 
     torch.set_num_threads(order.threads)
-    libraries = resident_kb()
-    scene = load_scene(Path(order.scene))
+    libraries = _resident_kb()
+    scene = load_scene(Path(str(order.scene)))
     space = ParameterSpace(scene, combo(2))
     objective = Objective(Compositor(scene), space, load_detector(order.detector))
     feasible = FeasibleSet(space)
@@ -111,12 +130,29 @@ def attack(order: Order) -> Found:
     return _watched(step, order.steps, libraries)
 
 
-def _watched(step: Callable[[], None], steps: int, libraries_kb: int) -> Found:
-    rss = []
+def _watched(step: Callable[[], object], steps: int, libraries_kb: int) -> Resident:
+    loaded, rss = _resident_kb(), []
     for _ in range(steps):
         step()
-        rss.append(resident_kb())
-    return Found(peak_kb(), libraries_kb, tuple(rss))
+        rss.append(_resident_kb())
+    return Resident(_peak_kb(), libraries_kb, loaded, rss)
+
+
+def _resident_kb() -> int:
+    """Resident memory of this process now, KB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def _peak_kb() -> int:
+    """The largest resident memory that this process has had, KB.
+
+    Not `getrusage`, whose figure begins with that of the process that started this one.
+    """
+    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1])
+    return _resident_kb()
 
 
 def main(words: list[str]) -> None:
@@ -124,8 +160,8 @@ def main(words: list[str]) -> None:
     from scene_ir.files import write_json
 
     what, order, path = words
-    run = {"detector": detector_alone, "attack": attack}[what]
-    write_json(Path(path), asdict(run(Order(**json.loads(order)))))
+    run: dict[str, Callable[[ProbeOrder], Any]] = {"detector": _detector_alone, "attack": _attack}
+    write_json(Path(path), asdict(run[what](ProbeOrder(**json.loads(order)))))
 
 
 if __name__ == "__main__":

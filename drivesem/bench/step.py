@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from detectors.base import Detector
 from detectors.types import Targets
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace, combo
 from drivesem.bench.scenes import BenchScene, bench_scene
+from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
 from scene_ir.compositor import Compositor, RenderSettings, scene_to
 
+TITLE, BESIDE_TITLE = (
+    "One attack step beside the detector alone",
+    "Beside it: full-frame parameters, and no level of detail",
+)
+COLUMNS: Columns = {
+    "cars": ("cars", "cars"), "triangles": ("triangles a car", "triangles"), "params": ("parameters", None),
+    "lod": ("level of detail", "detail"), "ratio": ("ratio", "ratio"), "ratio_iqr": ("IQR", "IQR"),
+    "step_ms": ("step, ms", "step ms"), "detector_ms": ("detector, ms", "detector"),
+    "render_forward_ms": ("render forward, ms", "forward"),
+    "render_backward_ms": ("render backward, ms", "backward"), "labels_ms": ("labels, ms", "labels"),
+    "project_ms": ("projection, ms", "project"), "pixels": ("pixels of the cars", None),
+    "repetitions": ("pairs", None),
+}  # fmt: skip
 METHOD = (
     "A step is Objective.loss_and_grad at a feasible theta other than 0 (scene at theta, render, labels, "
     "detector forward, loss, backward through all of it) and FeasibleSet.project of the theta that a sign "
@@ -39,11 +53,10 @@ _RESTART = 12
 _FEWEST, _MOST = 3, 200
 _WARM_UP = 1
 _LAYOUT_TRIES = 3
-_HAS_LOD = "lod" in {field.name for field in fields(RenderSettings)}
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class StepCase:
     """One row to measure. lod: level of detail on."""
 
     cars: int
@@ -53,7 +66,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StepRow:
     """What was measured: times in ms, medians. pixels: hit and crop pixels of the meshes; box_pixels of the boxes'
     union; repetitions: pairs of step and detector.
     """
@@ -77,20 +90,18 @@ class Row:
     repetitions: int
 
 
-def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[Case], list[Case]]:
+def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[StepCase], list[StepCase]]:
     """The sizes to measure, and what stands beside the one nearest to 8 cars of the most triangles: weather and
     foliage, and level of detail off."""
-    sizes = [Case(n, k) for n in cars for k in triangles]
+    sizes = [StepCase(n, k) for n in cars for k in triangles]
     usual = 8 if 8 in cars else max(cars)
-    beside = [Case(usual, max(triangles), (Parameter.WEATHER, Parameter.FOLIAGE))]
-    if _HAS_LOD:
-        beside.append(Case(usual, max(triangles), lod=False))
-    return sizes, beside
+    beside = [StepCase(usual, max(triangles), (Parameter.WEATHER, Parameter.FOLIAGE))]
+    return sizes, [*beside, StepCase(usual, max(triangles), lod=False)]
 
 
 def measure(
-    case_list: Sequence[Case], detector: Detector, seconds: float, seed: int, device: str
-) -> Iterator[Row]:
+    case_list: Sequence[StepCase], detector: Detector, seconds: float, seed: int, device: str
+) -> Iterator[StepRow]:
     """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow."""
     budget = Budget(seconds, len(case_list))
     clock = Clock(device)
@@ -109,8 +120,8 @@ def measure(
 
 
 def _row(
-    case: Case, bench: BenchScene, step: _Step, alone: Callable[[], None], clock: Clock, seconds: float
-) -> Row:
+    case: StepCase, bench: BenchScene, step: _Step, alone: Callable[[], None], clock: Clock, seconds: float
+) -> StepRow:
     pairs: list[tuple[float, float]] = []
     parts: list[tuple[float, ...]] = []
     # On a machine so busy that the seconds are gone, one pair a row has to do.
@@ -125,12 +136,12 @@ def _row(
             parts.append(step.parts(clock))
     ratio = Spread.of([whole / single for whole, single in pairs])
     medians = [Spread.of(part).median for part in zip(*parts, strict=True)]
-    return Row(
+    return StepRow(
         cars=case.cars,
         triangles=case.triangles,
         triangles_actual=bench.triangles_actual,
         params=",".join(case.params),
-        lod=case.lod and _HAS_LOD,
+        lod=case.lod,
         ratio=round(ratio.median, 4),
         ratio_iqr=round(ratio.iqr, 4),
         step_ms=round(Spread.of([p[0] for p in pairs]).median, 3),
@@ -149,11 +160,10 @@ def _row(
 class _Step:
     """An attack on one scene, step by step."""
 
-    def __init__(self, case: Case, bench: BenchScene, detector: Detector, seed: int, device: str) -> None:
+    def __init__(self, case: StepCase, bench: BenchScene, detector: Detector, seed: int, device: str) -> None:
         scene = scene_to(bench.scene, torch.float32, device)
-        settings = replace(RenderSettings(), **({"lod": case.lod} if _HAS_LOD else {}))
         self.space = ParameterSpace(scene, case.params)
-        self.compositor = Compositor(scene, settings)
+        self.compositor = Compositor(scene, RenderSettings(lod=case.lod))
         self.objective = Objective(self.compositor, self.space, detector, term=_TERM)
         self.feasible = FeasibleSet(self.space)
         self.detector = detector

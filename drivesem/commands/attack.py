@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from drivesem.report.answer import print_json
 from drivesem.run.attack import attack_run
 from drivesem.run.results import RunSummary
 from drivesem.settings.commands import Attack
@@ -18,7 +17,7 @@ def run(config: Attack) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     summary = attack_run(config)
     if config.json:
-        sys.stdout.write(json.dumps(summary.to_json()) + "\n")
+        print_json(summary.to_json())
     else:
         _print(summary, Console())
     return 0

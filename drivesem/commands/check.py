@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import sys
 from dataclasses import asdict
 
 from rich import box
@@ -14,6 +12,7 @@ from rich.table import Table
 from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
+from drivesem.report.answer import print_json
 from drivesem.settings.commands import Check
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
@@ -33,7 +32,7 @@ def run(config: Check) -> int:
         raise UsageError("--detector", "a detector", error) from error
     report = check_detector(detector, (height, width), seed=config.seed, device=config.device)
     if config.json:
-        sys.stdout.write(json.dumps({"detector_setting": config.detector, **asdict(report)}) + "\n")
+        print_json({"detector_setting": config.detector, **asdict(report)})
     else:
         _print(report, config, Console())
     return 1 if report.failed else 0

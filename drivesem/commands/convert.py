@@ -2,40 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from drivesem.data.frames import images_in, size_of_image
-from drivesem.data.kitti import label_folder, read_calib
-from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
-from drivesem.data.registry import images_beside, write_table
-from drivesem.run.labels import layout_of, read
+from drivesem.data.label_table import Written
+from drivesem.report.answer import print_json
+from drivesem.run.conversion import Conversion, convert
 from drivesem.settings.commands import Convert
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import class_map
-
-
-@dataclass(frozen=True, slots=True)
-class Conversion:
-    """to_format, from_format: layouts, None to look; scores: of detections, not labels. size_wh: of all images,
-    px, instead of a look at them in `images` or where the source has them; copy_images: into the new layout.
-    mapping: classes by name, None leaves one out.
-    """
-
-    to_format: str
-    from_format: str | None = None
-    scores: bool = False
-    size_wh: tuple[int, int] | None = None
-    images: Path | None = None
-    copy_images: bool = False
-    mapping: Mapping[str, str | None] = field(default_factory=dict)
 
 
 def run(config: Convert) -> int:
@@ -59,8 +37,8 @@ def run(config: Convert) -> int:
     )
     written = convert(Path(config.source), out, conversion)
     if config.json:
-        sys.stdout.write(json.dumps({"out": config.out, **asdict(written)}) + "\n")
-    sys.stderr.write(f"{sentence(written)}\n")
+        print_json({"out": config.out, **asdict(written)})
+    sys.stderr.write(f"{_sentence(written)}\n")
     return 0
 
 
@@ -73,7 +51,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def sentence(written: Written) -> str:
+def _sentence(written: Written) -> str:
     """What is lost and what was assumed, on one line."""
 
     def listed(counts: Mapping[str, int]) -> str:
@@ -82,60 +60,3 @@ def sentence(written: Written) -> str:
     parts = [f"lost: {listed(written.lost)}" if written.lost else "nothing lost"]
     parts += [f"assumed: {listed(written.assumed)}"] if written.assumed else []
     return f"{written.files} files; {'; '.join(parts)}"
-
-
-def convert(source: Path, out: Path, how: Conversion) -> Written:
-    """Write the labels or detections of `source` to `out` in another layout.
-
-    FormatError for what cannot be read, and for what the new layout cannot do without; UsageError where images are
-    to be copied and are not there.
-    """
-    layout = how.from_format or layout_of(source)
-    table = read(source, layout, scored=how.scores)
-    if how.mapping:
-        table = renamed(table, how.mapping)
-    found = images_in([how.images], table.frames) if how.images is not None else {}
-    if how.images is None and (how.copy_images or (not table.sizes_wh.all() and how.size_wh is None)):
-        found = images_beside(source, layout, table.frames)
-    if how.size_wh is not None:
-        table = replace(table, sizes_wh=np.tile(np.array(how.size_wh, np.int64), (len(table.frames), 1)))
-    elif not table.sizes_wh.all() and how.to_format in ("coco", "yolo"):
-        sizes = table.sizes_wh.copy()
-        for i, name in enumerate(table.frames):
-            if not sizes[i].all() and name in found:
-                sizes[i] = size_of_image(found[name])
-        table = replace(table, sizes_wh=sizes)
-    if layout == "kitti":
-        table = replace(table, cameras=_calibrations(source, table))
-    if how.copy_images and len(found) < len(table.frames):
-        raise UsageError("--copy-images", f"an image of each of {len(table.frames)} frames", len(found))
-    return write_table(table, out, how.to_format, found if how.copy_images else {})
-
-
-def renamed(table: LabelTable, mapping: Mapping[str, str | None]) -> LabelTable:
-    """Other names of classes; boxes of those that map to None are left out. UsageError for a name that is not
-    there.
-    """
-    unknown = sorted(set(mapping) - set(table.kinds))
-    if unknown:
-        raise UsageError("--map", f"some of {', '.join(table.kinds)}", unknown[0])
-    names = [mapping.get(kind, kind) for kind in table.kinds]
-    kinds = list(dict.fromkeys(name for name in names if name is not None))
-    left_out = len(kinds)
-    places = np.array([*(left_out if n is None else kinds.index(n) for n in names), REGION], np.int64)
-    kind = places[table.kind]
-    table = replace(table, kinds=tuple(kinds), kind=kind, kind_ids=None)
-    return table.rows(kind != left_out)
-
-
-def _calibrations(source: Path, table: LabelTable) -> dict[int, dict[str, Any]]:
-    """COCO's "camera" entries of the calibrations beside KITTI's labels, where there are any."""
-    folder = label_folder(source)
-    cameras: dict[int, dict[str, Any]] = {}
-    if folder is None or folder.name != "label_2":
-        return cameras
-    for i, name in enumerate(table.frames):
-        path = folder.parent / "calib" / f"{name}.txt"
-        if path.is_file():
-            cameras[i] = camera_entry(read_calib(path).projection)
-    return cameras

@@ -10,15 +10,14 @@ from typing import Any
 
 from rich.console import Console
 
-from drivesem.attack.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.scene_edits import moved, removed_rows
-from drivesem.commands.render import picture, picture_path
+from drivesem.attack.scene_edits import edited
+from drivesem.commands.render import picture_path
+from drivesem.scenes.scene import Scene, free_folder
 from drivesem.settings.commands import Edit
+from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene
-from scene_ir.removal import without_objects
 
 
 def run(config: Edit) -> int:
@@ -31,23 +30,20 @@ def run(config: Edit) -> int:
     save = None if config.save is None else _save_path(Path(config.save), folder)
     edit = frame_edit("edit", _changes(config))
     scene = load_scene(folder)
-    gone = removed_rows(scene, edit)
-    changed = moved(scene, edit)
-    notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in gone))
-    for note in notes:
+    result = edited(scene, edit)
+    for note in result.notes:
         sys.stderr.write(f"drivesem: {note}\n")
-    changed = without_objects(changed, gone)
     if save is not None:
-        save_scene(changed, save)
+        save_scene(result.scene, save)
     if out is not None:
-        files.write_png(out, picture(changed))
+        files.write_png(out, Scene(result.scene).render())
     seconds = round(time.perf_counter() - start, 3)
     written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
     if config.json:
-        found = {"scene": config.scene, **written, "objects": len(changed.objects), "notes": notes}
+        found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": result.notes}
         sys.stdout.write(json.dumps({**found, "seconds": seconds}) + "\n")
     else:
-        what = f"{len(changed.objects)} vehicles, {len(gone)} removed ({seconds:.1f} s)"
+        what = f"{len(result.scene.objects)} vehicles, {len(result.removed)} removed ({seconds:.1f} s)"
         Console().print(f"{' and '.join(written.values())}: {what}", soft_wrap=True)
     return 0
 
@@ -70,8 +66,6 @@ def _changes(config: Edit) -> dict[Any, Any]:
 
 def _save_path(path: Path, scene: Path) -> Path:
     """Where the changed scene goes. UsageError where that would destroy something else than a scene."""
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not (path / "scene.json").is_file()):
-        raise UsageError("--save", "a new folder, or one of a scene", path)
-    if path.resolve() in scene.resolve().parents:
+    if free_folder(path, "--save").resolve() in scene.resolve().parents:
         raise UsageError("--save", "a folder that does not hold the scene", path)
     return path

@@ -7,31 +7,26 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-import torch
 from rich.console import Console
-from torch import Tensor
 
+from drivesem.scenes.scene import load_scene
 from drivesem.settings.commands import Render
 from drivesem.settings.errors import UsageError
 from scene_ir import files
-from scene_ir.compositor import render
-from scene_ir.io import load_scene
-from scene_ir.types import SceneIR
 
 
 def run(config: Render) -> int:
     """Render a scene folder; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     out = picture_path(config.out, Path(config.scene) / "render.png")
-    scene = load_scene(Path(config.scene))
-    files.write_png(out, picture(scene))
+    scene = load_scene(config.scene)
+    files.write_png(out, scene.render())
     seconds = round(time.perf_counter() - start, 3)
     if config.json:
-        found = {"scene": config.scene, "out": str(out), "objects": len(scene.objects), "seconds": seconds}
+        found = {"scene": config.scene, "out": str(out), "objects": len(scene), "seconds": seconds}
         sys.stdout.write(json.dumps(found) + "\n")
     else:
-        Console().print(f"{out}: {len(scene.objects)} vehicles ({seconds:.1f} s)", soft_wrap=True)
+        Console().print(f"{out}: {len(scene)} vehicles ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 
@@ -43,15 +38,3 @@ def picture_path(given: str | None, default: Path) -> Path:
     if path.suffix.lower() != ".png" or path.is_dir():
         raise UsageError("--out", "a .png file", given)
     return path
-
-
-def picture(scene: SceneIR) -> np.ndarray:
-    """The scene as it stands, (H, W, 3) uint8 RGB."""
-    with torch.no_grad():
-        return as_bytes(render([scene])[0].image)
-
-
-def as_bytes(image: Tensor) -> np.ndarray:
-    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8."""
-    rounded = (image.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
-    return np.ascontiguousarray(rounded.permute(1, 2, 0).numpy())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,8 +12,8 @@ from typing import Any
 
 from rich.console import Console
 
-from drivesem.commands.confirm import confirm_run
 from drivesem.evaluation.resampling import DRAWS
+from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.plans import open_plans
 from drivesem.questions.confirm.report import Report as Confirmed
 from drivesem.questions.study import report, retrain, retrain_report, transfer
@@ -37,6 +36,7 @@ from scene_ir import files
 
 _PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
 _TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
+_WRITTEN = (*(_PICTURE, _FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
 _FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
 _FREE_IN_RETRAIN = (
@@ -72,22 +72,22 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     """Attacks side by side."""
     arms = arms_of(config, out)
     workers = workers_of(arms)
-    claim(out, config, _clear, _FREE)
+    claim(out, config, _WRITTEN, _FREE)
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
         open_plans(workers[0].config, None)
     ran = run_arms(arms, workers, out, console)
-    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out, console))
+    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out))
     write_largest(out / _LARGEST, largest(ran.runs, out))
     return found.to_json(), report.told(found), partial(write_plot, found=found)
 
 
-def _confirmed(config: Study, ran: Ran, out: Path, console: Console) -> dict[str, Confirmed]:
+def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmed]:
     """What the generator's pictures say of each arm that is no control, where that is asked."""
     if not config.confirm:
         return {}
     shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
     arms = [run.arm for run in ran.runs if run.arm.control is None]
-    return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)), console)[0] for arm in arms}
+    return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)))[0] for arm in arms}
 
 
 def _transfer(config: Study, out: Path, console: Console) -> _Found:
@@ -95,7 +95,7 @@ def _transfer(config: Study, out: Path, console: Console) -> _Found:
     arms = arms_of(config, out)
     workers = workers_of(arms)
     asked = transfer.detectors_asked(config, out)
-    claim(out, config, _clear, (*_FREE, "detectors", "sources"))
+    claim(out, config, _WRITTEN, (*_FREE, "detectors", "sources"))
     found = transfer.run(config, arms, workers, asked, out, console)
     return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
 
@@ -103,7 +103,7 @@ def _transfer(config: Study, out: Path, console: Console) -> _Found:
 def _retrain(config: Study, out: Path, console: Console) -> _Found:
     """Detectors trained on with counterexamples."""
     ready = retrain.prepare(config)
-    claim(out, config, _clear, _FREE_IN_RETRAIN)
+    claim(out, config, _WRITTEN, _FREE_IN_RETRAIN)
     found = retrain.run(config, ready, out, console)
     return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
 
@@ -125,12 +125,3 @@ def _findings(config: Study, ran: Ran) -> Findings:
     first = ran.runs[0]
     beside = {one.arm.name: against(first, config.steps, one, draws, config.seed) for one in ran.runs}
     return Findings(config, draws, ran, rows, curves, beside, config.steps)
-
-
-def _clear(out: Path) -> None:
-    """Remove what an earlier run wrote, and nothing else."""
-    for name in (_PICTURE, _FIGURES, _LARGEST, *_TABLES):
-        (out / name).unlink(missing_ok=True)
-    for name in (ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES):
-        if (out / name).is_dir():
-            shutil.rmtree(out / name)

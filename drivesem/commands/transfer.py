@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -19,7 +18,7 @@ from drivesem.run.folder import claim
 from drivesem.settings.commands import Transfer
 from scene_ir import files
 
-_WRITTEN = ("transfer.json", "transfer.md", "transfer.csv", "transfer.png")
+_WRITTEN = ("transfer.json", "transfer.md", "transfer.csv", "transfer.png", DETECTIONS)
 
 
 def run(config: Transfer) -> int:
@@ -29,7 +28,7 @@ def run(config: Transfer) -> int:
     out = Path(config.out) if config.out else runs[0].folder / "transfer"
     detectors = detectors_of(specs, config, out)
     # Detections are kept by content, so that no setting of an earlier call is in the way.
-    claim(out, config, _clear, presentation=[field.name for field in fields(config)])
+    claim(out, config, _WRITTEN, presentation=[field.name for field in fields(config)])
     console = Console(stderr=True)
     rows, failed = rows_of(runs, detectors, config, console)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
@@ -43,11 +42,3 @@ def run(config: Transfer) -> int:
         console.print(f"{path} could not be used: {reason}", soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True)
     return 0
-
-
-def _clear(out: Path) -> None:
-    """Remove what an earlier call wrote, and nothing else."""
-    for name in _WRITTEN:
-        (out / name).unlink(missing_ok=True)
-    if (out / DETECTIONS).is_dir():
-        shutil.rmtree(out / DETECTIONS)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import sys
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,12 @@ from scene_ir import files
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """One table: its title, its columns, and rows of text."""
+    """One table: its title, its columns, and rows of text. looks: how a terminal shows it, as `table` takes it."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    looks: Mapping[str, Any] = field(default_factory=dict)
 
     def markdown(self, words: Collection[str]) -> list[str]:
         """Lines: a heading, and the table. words: columns of words; the others hold numbers."""
@@ -52,6 +55,21 @@ def publish(
     people = Console()
     people.print(sheet.table(words))
     people.print(note, soft_wrap=True)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:
+    """Rows of the same columns as CSV, with a heading."""
+    columns = list(rows[0])
+    return csv_table(columns, ([row.get(name) for name in columns] for row in rows), line_end)
+
+
+def csv_table(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: str = "\n") -> str:
+    """Cells below a heading as CSV."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator=line_end)
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return buffer.getvalue()
 
 
 def percent(value: float | None) -> str:

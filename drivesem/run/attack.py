@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.registry import ONNX, load_detector, load_predictor
@@ -35,14 +31,14 @@ from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
 from drivesem.attack.objective import OF_DETECTIONS
 from drivesem.attack.space import Parameter, combo, parse_params
-from drivesem.run.folder import claim
-from drivesem.run.frame import RESULT, FrameSettings, attack_frame
+from drivesem.run.ask import Bar, ask
+from drivesem.run.folder import FRAMES, claim
+from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
-from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
-from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
+from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, Common
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -50,6 +46,7 @@ from scene_ir.compositor import RenderSettings
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.types import SceneIR
 
+WRITTEN = ("metrics.json", "manifest.json", "report.html", FRAMES)
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -72,7 +69,7 @@ def attack_run(config: Attack) -> RunSummary:
     check_device(config.device)
     worker = Worker.of(config)
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
-    claim(out, config, _clear)
+    claim(out, config, WRITTEN)
     return _attacked(worker, select_frames(worker.source, config), out, start)
 
 
@@ -81,7 +78,7 @@ def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary
     already stay. Raises as `run`.
     """
     start = time.perf_counter()
-    claim(out, worker.config, _clear)
+    claim(out, worker.config, WRITTEN)
     return _attacked(worker, (list(names), 0, {}), out, start)
 
 
@@ -91,10 +88,13 @@ def _attacked(
     """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames."""
     names, without_vehicles, failed = selected
     config = worker.config
-    todo = [name for name in names if not (out / "frames" / name / RESULT).is_file()]
-    empty = _attack_all(worker, todo, out, failed, Console(stderr=True))
+    todo = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
+    work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
+    answers = ask(todo, work, build, config, Bar("attacking frames"))
+    failed = failed | answers.failed
+    empty = {name for name, result in answers.results.items() if result is None}
     done = [name for name in names if name not in failed and name not in empty]
-    results = [load_frame(out / "frames" / name / RESULT) for name in done]
+    results = [load_frame(out / FRAMES / name / RESULT) for name in done]
     summary = _summary(
         config, worker.params, worker.detector, results, without_vehicles + len(empty), failed, out, start
     )
@@ -128,23 +128,34 @@ class Worker:
     detector: Predictor
 
     @classmethod
-    def of(cls, config: Attack) -> Worker:
-        """Raises UsageError for a detector that cannot be used, SceneError for a source that cannot be read."""
+    def of(cls, config: Attack, detector: Predictor | None = None) -> Worker:
+        """detector: by default the one that the settings name. Raises UsageError for a detector that cannot be
+        used, SceneError for a source that cannot be read.
+        """
         config = _settled(config)
         source, method = open_source(config), attack_method(config)
-        return cls(config, _params(config), method, source, _detector(config, method.needs_gradient))
+        detector = _load(config) if detector is None else detector
+        _check_detector(config, detector, method.needs_gradient)
+        return cls(config, _params(config), method, source, detector)
 
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""
         config = _settled(config)
         return replace(self, config=config, params=_params(config), method=attack_method(config))
 
-    def attack(self, identifier: str, out: Path) -> FrameResult:
-        """One frame, from the source to its folder."""
-        return self.attack_scene(identifier, self.source.scene(identifier), out)
+    def attack(self, identifier: str, out: Path) -> FrameResult | None:
+        """One frame, from the source to its folder; None where it has no vehicle to attack."""
+        try:
+            return self.attack_scene(identifier, self.source.scene(identifier), out)
+        except NoVehicleError:
+            return None
 
     def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
-        """One frame that has been taken apart. Raises NoVehicleError where it has none."""
+        """One frame that has been taken apart, to its folder. Raises NoVehicleError where it has no vehicle."""
+        return write_frame(self.search(identifier, scene), out / FRAMES / identifier)
+
+    def search(self, identifier: str, scene: SceneIR) -> AttackedScene:
+        """One frame that has been taken apart, in memory. Raises NoVehicleError where it has no vehicle."""
         if len(scene.objects) == 0:
             raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
         config = self.config
@@ -164,7 +175,7 @@ class Worker:
             aim=aim,
         )
         try:
-            return attack_frame(identifier, scene, self.detector, settings, out / "frames" / identifier)
+            return attack_scene(identifier, scene, self.detector, settings)
         except (RangeError, ShapeError) as error:
             # A loss or gradient that is no number says where in the scene, and not in which.
             raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
@@ -208,7 +219,7 @@ def _from_theta0(config: Attack) -> AttackMethod:
 
 def _placebo(run: Path, identifier: str) -> Placebo:
     """An edit as large as what a run did to the frame. Raises FormatError where the run has no such frame."""
-    return Placebo(tuple(c.value for c in load_frame(run / "frames" / identifier / RESULT).theta))
+    return Placebo(tuple(c.value for c in load_frame(run / FRAMES / identifier / RESULT).theta))
 
 
 def _reach(config: Attack) -> int | None:
@@ -216,56 +227,37 @@ def _reach(config: Attack) -> int | None:
     return config.steps if config.range == "steps" else None
 
 
-def _detector(config: Attack, needs_gradient: bool) -> Predictor:
-    """The detector under attack. Raises UsageError where it is none, knows no cars, or lacks a needed gradient."""
+def _load(config: Attack) -> Predictor:
+    """The detector under attack. Raises UsageError where it is none."""
     try:
         if config.precision == "float32":
-            detector = load_predictor(config.detector, config.device, config.tiles)
-        else:
-            detector = load_detector(config.detector, config.device, getattr(torch, config.precision))
+            return load_predictor(config.detector, config.device, config.tiles)
+        return load_detector(config.detector, config.device, getattr(torch, config.precision))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+
+
+def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -> None:
+    """Raises UsageError where the detector knows no cars, or lacks a gradient that the settings need."""
+    try:
         JudgedClasses.of(detector)
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
     if isinstance(detector, Detector):
-        return detector
+        return
     if needs_gradient:
         expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
         raise UsageError("--method", expected, config.method)
     if config.objective not in OF_DETECTIONS:
         expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"
         raise UsageError("--objective", expected, config.objective)
-    return detector
 
 
-def _in_process(config: Attack, out: Path) -> Callable[[str], FrameResult]:
+def _attacker(config: Attack, out: Path) -> Callable[[str], FrameResult | None]:
     return partial(Worker.of(config).attack, out=out)
 
 
-def _attack_all(
-    worker: Worker, todo: Sequence[str], out: Path, failed: dict[str, str], console: Console
-) -> set[str]:
-    """Attack the frames of `todo`, in this process or in several; a bad frame goes to `failed` or ends the run.
-    Those without a vehicle are returned.
-    """
-    empty: set[str] = set()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not todo) as progress:
-        task = progress.add_task("attacking frames", total=len(todo))
-        build = partial(_in_process, worker.config, out)
-        for identifier, outcome in outcomes(partial(worker.attack, out=out), build, todo, worker.config):
-            try:
-                outcome()
-            except NoVehicleError:
-                empty.add(identifier)
-            except SceneError as error:
-                if not worker.config.keep_going:
-                    raise
-                failed[identifier] = str(error)
-            progress.advance(task)
-    return empty
-
-
-def select_frames(source: SceneSource, config: Attack) -> tuple[list[str], int, dict[str, str]]:
+def select_frames(source: SceneSource, config: Common) -> tuple[list[str], int, dict[str, str]]:
     """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
     names: list[str] = []
     failed: dict[str, str] = {}
@@ -290,14 +282,6 @@ def select_frames(source: SceneSource, config: Attack) -> tuple[list[str], int, 
 def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
     method = "" if config.method == Attack().method else f"-{config.method}"
     return f"{config.dataset}-{'-'.join(params)}{method}-seed{config.seed}"
-
-
-def _clear(out: Path) -> None:
-    """Remove what an earlier run wrote, and nothing else."""
-    for name in ("metrics.json", "manifest.json", "report.html"):
-        (out / name).unlink(missing_ok=True)
-    if (out / "frames").is_dir():
-        shutil.rmtree(out / "frames")
 
 
 def _summary(
@@ -335,9 +319,5 @@ def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]
     return {
         "versions": {package: importlib.metadata.version(package) for package in packages},
         "seed": config.seed,
-        "frames": {name: {part: _sha256(out / "frames" / name / part) for part in hashed} for name in names},
+        "frames": {name: {part: files.digest(out / FRAMES / name / part) for part in hashed} for name in names},
     }
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(files.read_bytes(path)).hexdigest()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -40,6 +42,50 @@ class Run:
     method: str
     params: str
     frames: tuple[Frame, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One flat dict a frame, for `pandas.DataFrame`."""
+        return [_row(frame) for frame in self.frames]
+
+    def _repr_html_(self) -> str:
+        """A table of the frames, for a notebook."""
+        rows = self.rows()
+        lines = [list(rows[0]), *(["" if v is None else str(v) for v in row.values()] for row in rows)]
+        head, *body = ("".join(f"<td>{escape(cell)}</td>" for cell in line) for line in lines)
+        table = "".join(f"<tr>{line}</tr>" for line in (head, *body))
+        caption = escape(f"{self.name}: {self.method} on {self.detector}, {self.params}")
+        return f"<table><caption>{caption}</caption><tbody>{table}</tbody></table>"
+
+
+def _row(frame: Frame) -> dict[str, Any]:
+    result = frame.result
+    kinds = [failure.kind for failure in result.failures]
+    return {
+        "frame": result.identifier,
+        "objects": result.objects,
+        "success_moved": result.success_moved,
+        "success_paper": result.success_paper,
+        "lost": kinds.count("lost"),
+        "phantoms": kinds.count("phantom"),
+        "feasible": result.feasible,
+        "queries": result.queries,
+        "loss_first": result.loss_trace[0] if result.loss_trace else None,
+        "loss_best": max(result.loss_trace, default=None),
+        "identity_psnr_db": result.identity_psnr_db,
+        "seconds": result.seconds,
+        "picture": str(frame.pictures["attacked"]),
+    }
+
+
+def load_run(folder: str | Path, limit: int | None = None) -> Run:
+    """A finished run of `drivesem attack`; limit: its first frames only.
+
+        run = ds.load_run("runs/a")
+        pandas.DataFrame(run.rows())
+
+    Raises UsageError for a folder that holds no finished run, FormatError naming a file that is damaged.
+    """
+    return load_runs([str(folder)], limit, "folder")[0]
 
 
 def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "--run") -> list[Run]:

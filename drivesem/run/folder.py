@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import shutil
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any
@@ -20,14 +21,15 @@ from scene_ir import files
 
 CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
+FRAMES = "frames"
+"""Folder of the frames in a run's folder, and of what a question keeps of each."""
 PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
 """Settings that change no frame's result: a run may be continued with others."""
 
 
-def claim(
-    out: Path, config: Common, clear: Callable[[Path], None], presentation: Collection[str] = PRESENTATION
-) -> None:
-    """Make `out` this run's folder, and hold it. clear: removes what an earlier run wrote, for --no-resume.
+def claim(out: Path, config: Common, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
+    """Make `out` this run's folder, and hold it. written: names of the files and folders in it that an earlier run
+    wrote, which --no-resume removes, and nothing else.
 
     Raises UsageError where `out` is a file, holds other files, a run whose settings were others, or what another
     process is writing.
@@ -42,8 +44,16 @@ def claim(
         if config.resume:
             _check_settings(path, config, presentation)
         else:
-            clear(out)
+            _remove(out / name for name in written)
     files.write_text(path, to_yaml(config))
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def attack_of(run: Path) -> Attack:

@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import LabelMode, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.base import AttackResult
@@ -26,7 +25,7 @@ from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
-from scene_ir.io import load_scene, save_scene
+from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.types import SceneIR
 
 RESULT = "result.json"
@@ -51,10 +50,23 @@ class FrameSettings:
     aim: Aim = EVERYTHING
 
 
-def attack_frame(
-    identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings, folder: Path
-) -> FrameResult:
-    """Attack one scene and write its folder, whole or not at all. Returns what `folder / RESULT` holds.
+@dataclass(frozen=True, slots=True)
+class AttackedScene:
+    """What an attack on one scene found, in memory. search: what the attack handed back; rendered: the scene at
+    its theta, judged; benign: detections on the photograph; seconds: the search took.
+    """
+
+    identifier: str
+    objective: Objective
+    search: AttackResult
+    rendered: Rendered
+    benign: Detections
+    violated_at_start: tuple[str, ...]
+    seconds: float
+
+
+def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> AttackedScene:
+    """Attack one scene. Nothing is written.
 
     Raises SceneError where the scene cannot be used, or a loss or gradient is not finite; DetectorError where the
     detector knows no cars.
@@ -72,58 +84,66 @@ def attack_frame(
         aim=settings.aim,
     )
     feasible = FeasibleSet(space)
-    attacked = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
-    rendered = objective.evaluate(attacked.theta)
-    benign = objective.detect(scene.photograph)
+    search = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
+    return AttackedScene(
+        identifier=identifier,
+        objective=objective,
+        search=search,
+        rendered=objective.evaluate(search.theta),
+        benign=objective.detect(scene.photograph),
+        violated_at_start=feasible.violated_at_start,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:
+    """Write a frame's folder, whole or not at all. Returns what `folder / RESULT` holds: the independent check
+    reads the scene back from disk.
+    """
+    start = time.perf_counter()
     with files.whole_folder(folder) as part:
-        save_scene(rendered.scene, part / "scene")
-        saved = load_scene(part / "scene")
-        result = _result(
-            identifier, objective, attacked, rendered, benign, tuple(check_scene(saved.as_photographed(), saved))
-        )
-        seconds = round(time.perf_counter() - start, 3)
-        result = replace(result, seconds=seconds, violated_at_start=feasible.violated_at_start)
-        _write(part, scene, objective, rendered, result)
+        save_scene(attacked.rendered.scene, part / "scene")
+        result = frame_result(attacked, load_scene(part / "scene"))
+        result = replace(result, seconds=round(attacked.seconds + time.perf_counter() - start, 3))
+        _write(part, attacked, result)
     return result
 
 
-def _result(
-    identifier: str,
-    objective: Objective,
-    attacked: AttackResult,
-    rendered: Rendered,
-    benign: Detections,
-    violations: tuple[str, ...],
-) -> FrameResult:
+def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
+    """The record of an attacked scene. perturbed: the counterexample as the independent check is to see it."""
+    objective, search, rendered = attacked.objective, attacked.search, attacked.rendered
     names = objective.judged.names
     scene = objective.space.scene
     moved = rendered.moved.targets
     return FrameResult(
-        identifier=identifier,
+        identifier=attacked.identifier,
         objects=len(scene.objects),
-        queries=attacked.queries,
-        loss_trace=attacked.loss_trace,
+        queries=search.queries,
+        loss_trace=search.loss_trace,
         theta=tuple(
             Coordinate(name=name, **facts)  # pyright: ignore[reportArgumentType]
-            for name, facts in objective.space.theta_by_name(attacked.theta).items()
+            for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
-        active_constraints=attacked.active_constraints,
-        violations=violations,
+        active_constraints=search.active_constraints,
+        violations=tuple(check_scene(perturbed.as_photographed(), perturbed)),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
-        detections_benign=detection_records(benign, names),
+        detections_benign=detection_records(attacked.benign, names),
         detections_rerendered=detection_records(objective.benign.detections, names),
         detections_attacked=detection_records(rendered.detections, names),
         failures=failure_records(objective, rendered),
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
-        success_paper=attacked.success_paper,
-        success_moved=attacked.success_moved,
+        success_paper=search.success_paper,
+        success_moved=search.success_moved,
         identity_psnr_db=_psnr_in_boxes(scene, objective.benign.render.image),
-        seconds=0.0,
+        seconds=round(attacked.seconds, 3),
+        violated_at_start=attacked.violated_at_start,
     )
 
 
-def _write(part: Path, scene: SceneIR, objective: Objective, rendered: Rendered, result: FrameResult) -> None:
+def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
+    objective, rendered = attacked.objective, attacked.rendered
+    scene = objective.space.scene
     before, after = to_uint8(scene.photograph), to_uint8(rendered.render.image)
     files.write_png(part / "benign.png", before)
     files.write_png(part / "rerender.png", to_uint8(objective.benign.render.image))
@@ -144,11 +164,6 @@ def _write(part: Path, scene: SceneIR, objective: Objective, rendered: Rendered,
         },
     )
     files.write_text(part / RESULT, dump_frame(result))
-
-
-def to_uint8(image: Tensor) -> np.ndarray:
-    """An image (3, H, W) in [0, 1] as (H, W, 3) uint8, rounded to nearest."""
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
 
 def failure_records(objective: Objective, rendered: Rendered) -> tuple[Failure, ...]:

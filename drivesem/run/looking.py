@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
@@ -44,6 +45,17 @@ class Order:
         return load_predictor(self.detector, self.device, self.tiles)
 
 
+def as_picture(image: np.ndarray, device: str) -> Tensor:
+    """An image (H, W, 3) uint8 as (3, H, W) in [0, 1]."""
+    return torch.from_numpy(image).permute(2, 0, 1).to(device) / 255
+
+
+def detections_in(predictor: Predictor, picture: Tensor) -> Detections:
+    """What is found in a picture (3, H, W) in [0, 1]: labels among the judged classes, on the CPU."""
+    found = JudgedClasses.of(predictor).detections(predict(predictor, picture[None])[0])
+    return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
+
+
 class Memory:
     """One detector's detections, a file for each picture. Pictures with the same bytes share one."""
 
@@ -72,7 +84,7 @@ class Memory:
 
     def place(self, picture: Path) -> Path:
         """The file of a picture's detections: that of its bytes."""
-        return self._folder / f"{hashlib.sha256(files.read_bytes(picture)).hexdigest()}.json"
+        return self._folder / f"{files.digest(picture)}.json"
 
 
 def fingerprint(order: Order, predictor: Predictor) -> str:
@@ -113,9 +125,7 @@ def look(
 
 
 def _look(picture: Path, predictor: Predictor, memory: Memory, device: str) -> None:
-    image = torch.from_numpy(files.read_image(picture)).permute(2, 0, 1).to(device) / 255
-    found = JudgedClasses.of(predictor).detections(predict(predictor, image[None])[0])
-    memory.keep(picture, Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu()))
+    memory.keep(picture, detections_in(predictor, as_picture(files.read_image(picture), device)))
 
 
 def _in_process(order: Order) -> Callable[[Path], None]:

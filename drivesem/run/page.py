@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +19,17 @@ from drivesem.report.html import render_report
 from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
-from drivesem.run.folder import attack_of
+from drivesem.run.folder import CONFIG, attack_of
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, tally
-from drivesem.settings.commands import COMBO_NUMBERS, GRADIENT_FREE, Attack
+from drivesem.settings.commands import COMBO_NUMBERS, GRADIENT_FREE, Attack, Report
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import command_line
 from scene_ir import files
 from scene_ir.errors import FormatError
 
+PAGE = "report.html"
+_STUDY, _ARMS = "study.json", "arms"
 PICTURES = 200
 """Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
 _NOT_TOLD = ("out", "json", "resume", "workers")
@@ -38,9 +40,69 @@ _MOST_LINES = 7
 """Of a chart: as many as there are colours."""
 
 
+def report_runs(config: Report) -> dict[str, Any]:
+    """Write the page of runs, or of the finished arms of studies: the JSON's form. Raises UsageError or SceneError
+    for bad input.
+    """
+    folders: list[str] = []
+    charts: list[Chart] = []
+    for given in config.runs:
+        folders += [str(folder) for folder in _runs_of(Path(given))]
+        if (Path(given) / _STUDY).is_file():
+            charts += query_curves(Path(given))
+    # In the folder that was given, or where the command is called.
+    out = Path(config.out or (Path(config.runs[0]) / PAGE if len(config.runs) == 1 else PAGE))
+    if out.is_dir():
+        raise UsageError("--out", "an HTML file", f"the folder {out}")
+    shown, left_out = load_shown(folders)
+    size = write_report(out, shown, config.frames, left_out, charts)
+    return _data(out, size, shown, left_out)
+
+
+def _runs_of(folder: Path) -> list[Path]:
+    """A run itself, or the finished arms of a study. Raises UsageError where it is neither."""
+    if not folder.is_dir():
+        raise UsageError("RUN", "a folder of drivesem attack or drivesem study", folder)
+    if not (folder / _ARMS).is_dir():
+        return [folder]
+    arms = [
+        arm for arm in sorted((folder / _ARMS).iterdir()) if (arm / CONFIG).is_file() and (arm / METRICS).is_file()
+    ]
+    if not arms:
+        raise UsageError("RUN", "a study with a finished arm", folder)
+    return arms
+
+
+def _data(out: Path, size: int, shown: list[ShownRun], left_out: int) -> dict[str, Any]:
+    """What `--json` prints: fractions of 1."""
+    rows = []
+    for one in shown:
+        summary = one.summary.to_json()
+        del summary["out"], summary["seconds"]
+        rows.append(
+            {
+                "name": one.name,
+                "run": str(one.folder),
+                "method": one.method,
+                **summary,
+                "paper": asdict(one.paper) if one.paper else None,
+            }
+        )
+    frames = [
+        {
+            "frame": results[0].identifier,
+            "failures": {
+                one.name: [f.kind for f in result.failures] for one, result in zip(shown, results, strict=True)
+            },
+        }
+        for results in zip(*(one.frames for one in shown), strict=True)
+    ]
+    return {"out": str(out), "bytes": size, "frames_left_out": left_out, "runs": rows, "frames": frames}
+
+
 def write_run(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> None:
     """`report.html` of one run in its folder."""
-    write_report(out / "report.html", [_shown(out.name, out, config, summary, results)])
+    write_report(out / PAGE, [_shown(out.name, out, config, summary, results)])
 
 
 def write_report(
@@ -115,7 +177,7 @@ def precision_recall(runs: Sequence[ShownRun]) -> list[Chart]:
 
 def query_curves(study: Path) -> list[Chart]:
     """Frames broken after so many queries, where a study has these curves. Raises FormatError."""
-    found = files.read_json(study / "study.json")
+    found = files.read_json(study / _STUDY)
     points = found.get("curves", []) if isinstance(found, dict) else []
     if not points:
         return []
@@ -124,7 +186,7 @@ def query_curves(study: Path) -> list[Chart]:
         lines = [_queries(name, points) for name in sorted({point["name"] for point in points})]
         most = max(int(point["queries"]) for point in points)
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(str(study / "study.json"), "curves of a study", error) from error
+        raise FormatError(str(study / _STUDY), "curves of a study", error) from error
     note = "A query is one gradient, or one judged render."
     banded = [line.name for line in lines[:_MOST_LINES] if line.band]
     if banded:

@@ -28,6 +28,7 @@ from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
+from scene_ir.io import to_tensor
 from scene_ir.types import Camera, Frame, Labels
 
 DEFAULT_FOCAL = 0.58
@@ -88,9 +89,7 @@ def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
     """
     exif, width, height = _header(image_path)
     if focal_px is not None:
-        if not (math.isfinite(focal_px) and focal_px > 0):
-            raise RangeError("focal", "positive px", focal_px)
-        return Focal(float(focal_px), "given")
+        return Focal(_checked(focal_px), "given")
     longer = max(width, height)
     told = exif.get_ifd(_EXIF)
     film = _positive(told.get(_FOCAL_35))
@@ -101,6 +100,18 @@ def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
     if unit and length and density:
         return Focal(length / unit * density, "EXIF")
     return Focal(DEFAULT_FOCAL * longer, "default")
+
+
+def camera_for(height: int, width: int, focal_px: float | None = None) -> Camera:
+    """The camera of pixels that nothing is told of: 0.58 of the longer side where no focal length is given."""
+    focal = DEFAULT_FOCAL * max(width, height) if focal_px is None else _checked(focal_px)
+    return pinhole(height, width, focal)
+
+
+def _checked(focal_px: float) -> float:
+    if not (math.isfinite(focal_px) and focal_px > 0):
+        raise RangeError("focal", "positive px", focal_px)
+    return float(focal_px)
 
 
 def _positive(value: Any) -> float:
@@ -134,7 +145,7 @@ def photograph(path: Path, focal_px: float | None = None) -> Frame:
     """A photograph, upright, with its camera, without labels. FormatError naming the file; RangeError."""
     focal = focal_of(path, focal_px)
     pixels = np.rot90(files.read_image(path), _turns(_header(path)[0]))
-    image = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
+    image = to_tensor(pixels)
     told = f"{focal.length_px:.1f} px, {focal.source}"
     provenance = {"dataset": "photograph", "image": path.name, "focal": told}
     return Frame(path.stem, image, pinhole(image.shape[1], image.shape[2], focal.length_px), provenance=provenance)

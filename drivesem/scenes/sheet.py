@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import torch
 
-from drivesem.commands.render import as_bytes
 from drivesem.report.drawing import (
     MARGIN_PX,
     PAPER,
@@ -25,6 +24,7 @@ from drivesem.report.drawing import (
     write_text,
 )
 from scene_ir.compositor import Compositor
+from scene_ir.io import to_uint8
 from scene_ir.raster import verbs
 from scene_ir.surfaces import rotate
 from scene_ir.types import Crop, SceneIR
@@ -51,7 +51,7 @@ def scene_sheet(scene: SceneIR, title: str) -> np.ndarray:
         compositor = Compositor(still)
         shown = compositor.render(still)
         meshes = _Meshes(still, compositor)
-    photograph, again = as_bytes(still.photograph), as_bytes(shown.image)
+    photograph, again = to_uint8(still.photograph), to_uint8(shown.image)
     off = np.abs(again.astype(int) - photograph)
     count = len(scene.objects)
     kinds = ", ".join(name.removesuffix("_map") for name in MAPS)
@@ -62,7 +62,7 @@ def scene_sheet(scene: SceneIR, title: str) -> np.ndarray:
         ("depth behind the vehicles (log, near is bright)", depth_colours(still.depth.cpu().numpy())),
         (f"maps: {kinds}", _maps(still)),
         ("shadows: what is left of the light", _shadows(still)),
-        ("background", as_bytes(still.background)),
+        ("background", to_uint8(still.background)),
         ("re-render, nothing perturbed", again),
         (f"difference x {GAIN}: {_difference(off)}", np.minimum(off * GAIN, 255).astype(np.uint8)),
     )
@@ -187,7 +187,7 @@ def _normals(meshes: _Meshes, photograph: np.ndarray) -> np.ndarray:
 def _maps(scene: SceneIR) -> np.ndarray:
     """The maps of the surroundings, each in its colour, over the background in grey: it is what they tell of."""
     canvas = (
-        cv2.cvtColor(as_bytes(scene.background), cv2.COLOR_RGB2GRAY)[..., None]
+        cv2.cvtColor(to_uint8(scene.background), cv2.COLOR_RGB2GRAY)[..., None]
         .repeat(3, axis=2)
         .astype(np.float32)
     )

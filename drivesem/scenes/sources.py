@@ -112,26 +112,33 @@ class PlainPhotograph:
         return label_free(frame, detect(frame))
 
 
-def _settings(config: Attack | Derender) -> DerenderSettings:
-    """How frames are to be taken apart. Raises FormatError for a folder of meshes or a segmenter that cannot be
-    read."""
+def derender_settings(
+    fit: bool, meshes: str | Path | None = None, segmenter: str | Path | None = None
+) -> DerenderSettings:
+    """How frames are to be taken apart. meshes: a folder; segmenter: an ONNX file. Raises FormatError for one that
+    cannot be read.
+    """
     from scene_ir.derender.derender import DerenderSettings
     from scene_ir.derender.silhouette import OwnMesh
 
-    settings = DerenderSettings(fit=config.fit)
-    if not isinstance(config, Derender):
-        return settings
-    if config.segmenter is not None:
+    settings = DerenderSettings(fit=fit)
+    if segmenter is not None:
         from drivesem.scenes.segmenter import OnnxSegmenter
 
-        settings = replace(settings, segmenter=OnnxSegmenter(Path(config.segmenter)))
-    if config.meshes is not None:
+        settings = replace(settings, segmenter=OnnxSegmenter(Path(segmenter)))
+    if meshes is not None:
         from drivesem.synth.assets import meshes_in
         from scene_ir.meshes.lod import simplify
 
-        own = (OwnMesh(simplify(v.mesh, _MOST_FACES), v.kind, v.size_lhw) for v in meshes_in(config.meshes))
+        own = (OwnMesh(simplify(v.mesh, _MOST_FACES), v.kind, v.size_lhw) for v in meshes_in(str(meshes)))
         settings = replace(settings, meshes=tuple(own))
     return settings
+
+
+def _settings(config: Attack | Derender) -> DerenderSettings:
+    if isinstance(config, Derender):
+        return derender_settings(config.fit, config.meshes, config.segmenter)
+    return derender_settings(config.fit)
 
 
 def open_source(config: Attack | Derender) -> SceneSource:

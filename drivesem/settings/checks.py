@@ -52,15 +52,8 @@ def validate(config: Command) -> None:
             raise UsageError("RUN", "folders of drivesem attack", "none")
         if config.frames is not None and config.frames < 1:
             raise UsageError("--frames", "at least 1", config.frames)
-    if isinstance(config, Attack | Study | Derender | Gradcheck | Bench):
-        if config.dataset not in DATASETS:
-            raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(config.dataset))
-        if config.dataset != DEMO and config.root is None:
-            raise UsageError("--root", f"the folder of data set {config.dataset!r}", "nothing")
-        if config.dataset == DEMO and config.root is not None:
-            raise UsageError(
-                "--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", config.root
-            )
+    if isinstance(config, Attack | Study | Derender | Gradcheck):
+        check_dataset(config.dataset, config.root)
     if isinstance(config, Derender):
         if config.photo is not None and config.dataset != DEMO:
             raise UsageError("PHOTO", "no --dataset beside it", f"--dataset {config.dataset}")
@@ -176,13 +169,8 @@ def validate(config: Command) -> None:
     if isinstance(config, Bench):
         numbers("--cars", config.cars)
         numbers("--triangles", config.triangles, least=4)
-        fewest = 10 if config.what == "synth" else 1
-        if config.frames is not None and config.frames < fewest:
-            raise UsageError("--frames", f"at least {fewest}", config.frames)
         if config.threads is not None and config.threads < 1:
             raise UsageError("--threads", "at least 1", config.threads)
-        if config.scenes is not None and config.dataset != DEMO:
-            raise UsageError("--scenes", "no --dataset beside it", f"--dataset {config.dataset}")
     if isinstance(config, Eval):
         _validate_eval(config)
     if isinstance(config, Anchors):
@@ -196,6 +184,16 @@ def validate(config: Command) -> None:
         _validate_train(config)
     if isinstance(config, Retrain):
         _validate_retrain(config)
+
+
+def check_dataset(dataset: str, root: str | None) -> None:
+    """Raise UsageError for an unknown data set, or for a folder that is missing or not asked for."""
+    if dataset not in DATASETS:
+        raise UsageError("--dataset", f"one of {', '.join(DATASETS)}", repr(dataset))
+    if dataset != DEMO and root is None:
+        raise UsageError("--root", f"the folder of data set {dataset!r}", "nothing")
+    if dataset == DEMO and root is not None:
+        raise UsageError("--root", "no folder for data set 'demo' (did you mean --dataset kitti?)", root)
 
 
 def _validate_method(config: Attack) -> None:

@@ -492,41 +492,21 @@ class Synth(Common):
 
 @dataclass(frozen=True)
 class Bench(Common):
-    """Measure: one attack step, the renderer, memory, the scene generator, de-rendering, detectors, evaluation."""
+    """Measure: one attack step, the renderer, memory, detectors."""
 
-    what: tyro.conf.Positional[
-        Literal["step", "render", "memory", "synth", "derender", "found", "label-free", "detector", "eval"]
-    ] = "step"
-    """step: a whole attack step beside the detector alone; render: the renderer, beside others; memory: peak
-    memory above the detector's own; synth: the scene generator; derender: de-rendered generated frames beside the
-    generator's truth; found: whether a detector finds removed cars again, and moved ones where they are;
-    label-free: vehicles of photographs whose labels are hidden, beside those labels; detector: forward, backward
-    and decoding of each detector; eval: drivesem eval of many frames beside pycocotools."""
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector"]] = "step"
+    """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
+    memory above the detector's own; detector: forward, backward and decoding of each detector."""
     quick: Flag = False
     """Fewer repetitions: some 50 s."""
     cars: str = "1,4,8,16"
     """How many cars, 1 to 16, with commas."""
     triangles: str = "2000,5000"
     """Triangles a car, with commas."""
-    frames: int | None = None
-    """Frames that bench synth makes in each row, by default 200, with --quick 40; that bench derender takes apart,
-    by default 100, with --quick 12; that bench label-free looks at, by default 60, with --quick 12; or that bench
-    eval counts, by default 20,000, with --quick 1,000."""
-    ablate: Flag = False
-    """Bench derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: int | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one; bench found also takes onnx:FILE, a detector that
-    was trained elsewhere."""
-    dataset: str = DEMO
-    """Bench found, label-free: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
-    root: str | None = None
-    """Bench found, label-free: folder of the data set, such as KITTI's with training/image_2, label_2, calib."""
-    scenes: str | None = None
-    """Bench found: a folder of scenes that drivesem derender wrote, instead of a data set."""
-    tiles: Literal["auto", "off"] = "auto"
-    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+    """Name of a shipped detector, or a .safetensors file of one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 

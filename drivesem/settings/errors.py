@@ -7,9 +7,11 @@ class UsageError(ValueError):
     """A setting that cannot be. The message is one line: setting, expected, found."""
 
     def __init__(self, field: str, expected: str, actual: object) -> None:
-        self._parts = (field, expected, str(actual))
+        self.field = field
+        self.expected = expected
+        self.actual = str(actual)
         super().__init__(f"{field}: expected {expected}, found {actual}")
 
     def __reduce__(self) -> tuple[type[UsageError], tuple[str, str, str]]:
         """As processes hand errors to one another."""
-        return type(self), self._parts
+        return type(self), (self.field, self.expected, self.actual)

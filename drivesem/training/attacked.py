@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 
-from detectors.base import Predictor, predict
+from detectors.base import Predictor
 from detectors.training import Sample
 from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import HEADLINE, JudgedClasses
@@ -19,6 +18,7 @@ from drivesem.attack.labels import LabelMode
 from drivesem.data import kitti
 from drivesem.evaluation.coco import ClassScores, evaluate
 from drivesem.run.frame import RESULT, as_targets
+from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
@@ -80,13 +80,7 @@ def frames_of(run: Path) -> list[AttackedFrame]:
 
 def look(detector: Predictor, frames: Sequence[AttackedFrame], stage: Stage, device: str) -> list[Detections]:
     """What a detector finds in pictures of a stage: labels among the judged classes, on the CPU."""
-    judged = JudgedClasses.of(detector)
-    found = []
-    for frame in frames:
-        image = torch.from_numpy(np.array(frame.image(stage))).permute(2, 0, 1)[None].float() / 255
-        one = judged.detections(predict(detector, image.to(device))[0])
-        found.append(Detections(one.boxes_xyxy.cpu(), one.labels.cpu(), one.scores.cpu()))
-    return found
+    return [detections_in(detector, as_picture(np.array(frame.image(stage)), device)) for frame in frames]
 
 
 def figures(

@@ -14,10 +14,10 @@ from detectors.training import Sample
 from detectors.types import Targets
 from drivesem.attack.labels import Difficulty
 from drivesem.data.registry import Dataset
-from drivesem.run.frame import to_uint8
 from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 PIXELS, INDEX = "pixels.u8", "index.json"

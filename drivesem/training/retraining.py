@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from detectors.augment import AugmentSettings
 from detectors.base import Detector, DetectorError
@@ -17,6 +15,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import Sample, TrainingSettings, train
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
+from drivesem.report.progress import training_bar
 from drivesem.settings.commands import Retrain
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import interval, size_hw
@@ -69,8 +68,7 @@ def train_on(config: Retrain, detector: Detector, frames: Sequence[Sample], out:
     if isinstance(detector, SqueezeDet):
         detector.trained_by = config.loss
     detector.requires_grad_(True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with training_bar(console) as bar:
         task = bar.add_task("retraining", total=config.steps)
 
         def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
@@ -85,7 +83,7 @@ def train_on(config: Retrain, detector: Detector, frames: Sequence[Sample], out:
 
 def forget_other_weights(run: Path, weights: Path, stamp: Path) -> None:
     """Remove a run that was against other weights than those that are there now. stamp: a file that says which."""
-    digest = hashlib.sha256(files.read_bytes(weights)).hexdigest()
+    digest = files.digest(weights)
     if run.is_dir() and (not stamp.is_file() or files.read_text(stamp) != digest):
         shutil.rmtree(run)
     files.write_text(stamp, digest)

@@ -9,17 +9,17 @@ import numpy as np
 import torch
 
 from detectors.training import Sample
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.data import kitti
-from drivesem.run.frame import to_uint8
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
 from scene_ir.compositor import Compositor
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import SceneError
+from scene_ir.io import to_uint8
 from scene_ir.types import Frame, Labels
 
 VARIANTS = 4

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("scene_ir", "detectors", "drivesem")
 COMMAND_TABLE = ROOT / "drivesem" / "cli.py"
 """Loads a command's module by the command's name."""
+DOOR = ROOT / "drivesem" / "__init__.py"
+"""Loads what a name stands for when it is asked for: its modules are the dotted texts in it."""
 TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
@@ -41,6 +44,9 @@ class Rule:
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
 _JOINED = ("drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
+_BELOW_RUN = ("attack", "scenes", "data", "evaluation", "report", "settings")
+MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
+"""Questions that are made of others."""
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "trimesh", "warp")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
@@ -57,6 +63,12 @@ RULES = (
         ("detectors.types", "detectors.boxes"),
         ("torch", "numpy", "pycocotools", "faster_coco_eval"),
         never=("scene_ir", "drivesem.attack"),
+    ),
+    Rule("drivesem.run", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_RUN)), None),
+    Rule(
+        "drivesem.questions",
+        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run", "synth", "training"))),
+        None,
     ),
     Rule(
         "drivesem.report",
@@ -115,8 +127,12 @@ def imports(path: Path, source: str | None = None) -> Iterator[Import]:
             if path == COMMAND_TABLE and not isinstance(name, ast.Constant):
                 yield Import(path, node.lineno, "drivesem.commands", False)
                 continue
+            if path == DOOR and not isinstance(name, ast.Constant):
+                continue
             assert isinstance(name, ast.Constant), f"{path}:{node.lineno}: an import that cannot be read"
             yield Import(path, node.lineno, str(name.value), False)
+        elif path == DOOR and isinstance(node, ast.Constant) and under(str(node.value), PACKAGES):
+            yield Import(path, node.lineno, str(node.value), False)
 
 
 @functools.cache
@@ -163,13 +179,15 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
         ("detectors/training.py", "from rich.progress import Progress"),
         ("drivesem/attack/methods/base.py", "from drivesem.attack import objective"),
         ("drivesem/attack/methods/base.py", "from detectors import types"),
-        ("drivesem/attack/feasible.py", "from scene_ir import compositor"),
-        ("drivesem/attack/feasibility_check.py", "from drivesem.attack.feasible import project"),
+        ("drivesem/attack/feasible/sight.py", "from scene_ir import compositor"),
+        ("drivesem/attack/feasibility_check.py", "from drivesem.attack.feasible.projection import FeasibleSet"),
         ("drivesem/evaluation/coco.py", "from scene_ir.types import Labels"),
         (
             "drivesem/evaluation/coco.py",
             "import importlib\nimportlib.import_module('drivesem.attack.labels')",
         ),
+        ("drivesem/run/attack.py", "def f():\n    from drivesem.questions.verify import frame"),
+        ("drivesem/questions/verify/frame.py", "from drivesem.commands import verify"),
         ("drivesem/report/page.py", "import torch"),
         ("drivesem/report/page.py", "from scene_ir import compositor"),
     ],
@@ -196,6 +214,43 @@ def test_the_rules_let_through_what_they_allow(file: str, source: str) -> None:
     found = list(imports(ROOT / file, source))
     assert found
     assert not [f for rule in RULES for f in found if under(f.importer, (rule.package,)) and breaks(rule, f)]
+
+
+def test_only_the_command_table_imports_commands_and_only_commands_import_benchmarks() -> None:
+    front = ("drivesem.cli", "drivesem.commands", "drivesem.bench")
+    broken = [
+        str(found)
+        for found in every_import()
+        if under(found.name, ("drivesem.commands", "drivesem.bench")) and not under(found.importer, front)
+    ]
+    assert not broken, "\n".join(broken)
+
+
+def test_questions_do_not_import_each_other() -> None:
+    rooms = ("drivesem.questions",)
+    broken = []
+    for found in every_import():
+        if under(found.importer, rooms) and under(found.name, rooms):
+            asking, asked = (name.split(".")[2] for name in (found.importer, found.name))
+            if asking != asked and asked not in MADE_OF.get(asking, ()):
+                broken.append(str(found))
+    assert not broken, "\n".join(broken)
+
+
+def test_no_import_circle() -> None:
+    """Imports inside functions count too: what needs them to be there is a circle as well."""
+    names = {Import(path, 0, "", at_top=True).importer for path in modules()}
+    needs: dict[str, set[str]] = {name: set() for name in names}
+    for found in every_import():
+        name = found.name
+        while name and name not in names:
+            name = name.rpartition(".")[0]
+        if name and name != found.importer:
+            needs[found.importer].add(name)
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as circle:
+        pytest.fail(" imports ".join(reversed(circle.args[1])))
 
 
 def test_libraries_that_may_be_missing_are_imported_where_used() -> None:

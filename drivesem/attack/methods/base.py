@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from drivesem.attack.feasible import Projected
+    from drivesem.attack.feasible.projection import Projected
 
 
 LOOKED_AT = 5

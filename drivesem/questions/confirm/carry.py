@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.attack.edits import FrameEdit, ObjectEdit
 from drivesem.questions.confirm.plans import Planned
+from drivesem.settings.edits import FrameEdit, ObjectEdit
 from drivesem.synth.frames import yaw_in_camera
 from drivesem.synth.layout import Actor
 from drivesem.synth.view import View

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from detectors.base import Predictor, predict
-from detectors.types import CLASSES, Detections
+from detectors.base import Predictor
+from detectors.types import CLASSES
 from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.confirm.carry import carried
 from drivesem.questions.confirm.judge import exact_labels, findings, stands
@@ -22,6 +19,7 @@ from drivesem.questions.confirm.results import Confirmed, dump
 from drivesem.questions.confirm.sheet import sheet_of
 from drivesem.run.finished import Frame
 from drivesem.run.frame import RESULT, detection_records, target_records
+from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import BoxRecord
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, render_frame
@@ -34,26 +32,11 @@ _ROUNDING = 1
 """Levels of 255 by which the same picture may differ from one processor to another."""
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """How the detector is asked. t_star: score from which a detection counts."""
-
-    device: str
-    t_star: float
-
-    @torch.no_grad()
-    def detect(self, detector: Predictor, image: np.ndarray) -> Detections:
-        """What it finds in a picture (H, W, 3) uint8, of judged classes, on the CPU."""
-        picture = torch.from_numpy(image).permute(2, 0, 1).to(self.device) / 255
-        found = JudgedClasses.of(detector).detections(predict(detector, picture[None])[0])
-        return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
-
-
 def confirm_frame(
-    frame: Frame, source: Path, plans: Plans, detector: Predictor, ask: Asked, folder: Path
+    frame: Frame, source: Path, plans: Plans, detector: Predictor, device: str, t_star: float, folder: Path
 ) -> Confirmed:
     """Draw one frame of a run again and write `folder`, whole or not at all. source: the frame's folder in the
-    run.
+    run; t_star: score from which a detection counts.
 
     Raises FormatError where the plan is not that of the frame, as its picture without the change tells.
     """
@@ -67,13 +50,13 @@ def confirm_frame(
     change = carried(still, changed, planned)
     after = _rendered(apply_edit(planned.plan, change.edit, f"frame {identifier}"))
     exact = exact_labels(before, after)
-    seen = [ask.detect(detector, image) for image in (before.image, after.image)]
-    found = findings(frame.result, planned.tracks, exact, seen, JudgedClasses.of(detector), ask.t_star)
+    seen = [detections_in(detector, as_picture(image, device)) for image in (before.image, after.image)]
+    found = findings(frame.result, planned.tracks, exact, seen, JudgedClasses.of(detector), t_star)
     targets = [target_records(t, CLASSES, len(exact.tracks)) for t in (exact.benign, exact.changed)]
     names = JudgedClasses.of(detector).names
     result = Confirmed(
         identifier=identifier,
-        source=fingerprint(source),
+        source=files.digest(source / RESULT),
         compositor=found[0],
         generator=found[1],
         stands=stands(frame.result, planned.tracks, exact, before, after),
@@ -86,14 +69,9 @@ def confirm_frame(
     )
     with files.whole_folder(folder) as part:
         files.write_png(part / PICTURE, after.image)
-        files.write_png(part / SHEET, sheet_of(frame, result, after.image, ask.t_star))
+        files.write_png(part / SHEET, sheet_of(frame, result, after.image, t_star))
         files.write_text(part / RESULT, dump(result))
     return result
-
-
-def fingerprint(source: Path) -> str:
-    """Of a frame's result in the run: another result is another frame."""
-    return hashlib.sha256(files.read_bytes(source / RESULT)).hexdigest()
 
 
 def _rendered(plan: Plan) -> SynthFrame:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
 
 from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE, JudgedClasses
 from drivesem.evaluation import coco
 from drivesem.evaluation.resampling import wilson
 from drivesem.questions.confirm.results import Confirmed
+from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-from scene_ir import files
 
 SURVIVE, SAME, LOST, PHANTOMS, NEW = (
     "frames",
@@ -168,27 +164,20 @@ def notes(report: Report) -> list[str]:
     return told
 
 
-def print_report(report: Report, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in sheets(report):
-        console.print(sheet.table(sheet.columns[:1]))
-    for note in notes(report):
-        console.print(note, soft_wrap=True)
-
-
-def write_report(out: Path, report: Report, found: Sequence[Confirmed]) -> None:
-    """confirm.md and confirm.csv, a line a frame."""
-    lines = ["# The second renderer", ""]
-    for sheet in sheets(report):
-        lines += [*sheet.markdown(sheet.columns[:1]), ""]
-    lines += [f"{note}\n" for note in notes(report)]
-    files.write_text(out / "confirm.md", "\n".join(lines))
-    buffer = io.StringIO()
-    rows = [_row(one) for one in found]
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    files.write_text(out / "confirm.csv", buffer.getvalue())
+def answer_of(
+    out: Path, report: Report, confirmed: Sequence[Confirmed], facts: Mapping[str, Any], failed: Mapping[str, str]
+) -> Answer:
+    """confirm.json (with `facts` in front), confirm.md, and confirm.csv, a line a frame."""
+    return Answer(
+        out=out,
+        name="confirm",
+        heading="The second renderer",
+        data={**facts, **report.to_json(), "frames_failed": failed},
+        tables={"confirm": [_row(frame) for frame in confirmed]},
+        sheets=sheets(report),
+        notes=notes(report),
+        failed={f"frame {name}": reason for name, reason in failed.items()},
+    )
 
 
 def _row(one: Confirmed) -> dict[str, Any]:

@@ -1,20 +1,17 @@
-"""`drivesem eval --detector`: a detector's precision and recall on a data set's photographs."""
+"""A detector's precision and recall on a data set's photographs."""
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from detectors.base import DetectorError, Predictor, predict
+from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from detectors.types import Detections, Targets
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
@@ -24,20 +21,31 @@ from drivesem.evaluation import coco
 from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.mistakes import marked
+from drivesem.report.progress import progress_bar
 from drivesem.report.tables import percent
-from drivesem.run.frame import to_uint8
+from drivesem.run.looking import detections_in
 from drivesem.settings.commands import Eval
-from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from drivesem.training.targets import judged_targets, suited
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 
-def run(config: Eval) -> int:
-    """Run the detector over the frames, count, report; exit code 0. UsageError or SceneError for bad input."""
-    check_device(config.device)
+@dataclass(frozen=True, slots=True)
+class DetectorFigures:
+    """What a detector sees of a data set. data: the JSON; intervals: of the headline's class."""
+
+    data: dict[str, Any]
+    per_class: Mapping[str, coco.ClassScores]
+    intervals: Sequence[Interval]
+
+
+def evaluate_detector(config: Eval) -> DetectorFigures:
+    """Run the detector over the frames, count, and write what is asked for. UsageError or SceneError for bad
+    input.
+    """
     dataset = open_dataset(config.dataset, Path(config.root or ""))
     detector = _detector(config)
     names = dataset.identifiers[: config.limit]
@@ -65,10 +73,7 @@ def run(config: Eval) -> int:
     if config.out is not None:
         _write(Path(config.out), data, names, found, judged)
         _draw(config, dataset, names, outcome, t_star)
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    _print(scores.per_class, data, spread, Console(stderr=True))
-    return 0
+    return DetectorFigures(data, scores.per_class, spread)
 
 
 def _draw(config: Eval, dataset: Dataset, names: Sequence[str], outcome: Outcome, t_star: float) -> None:
@@ -96,14 +101,12 @@ def _look(
     judged = JudgedClasses.of(detector)
     found: list[Detections] = []
     labels: list[Labels] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with progress_bar(Console(stderr=True), stays=False) as progress:
         for name in progress.track(names, description="frames"):
             frame = dataset.frame(name)
             if frame.labels is None:
                 raise FormatError(f"frame {name}", "labels", "none")
-            seen = judged.detections(predict(detector, frame.photograph[None].to(config.device))[0])
-            found.append(Detections(seen.boxes_xyxy.cpu(), seen.labels.cpu(), seen.scores.cpu()))
+            found.append(detections_in(detector, frame.photograph.to(config.device)))
             labels.append(frame.labels)
     limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
     return found, [judged_targets(one, limits, judged.names) for one in labels]
@@ -135,22 +138,19 @@ def _write(
         write_labels(path, labels, one.scores[kept])
 
 
-def _print(
-    per_class: Mapping[str, coco.ClassScores],
-    data: Mapping[str, Any],
-    spread: Sequence[Interval],
-    console: Console,
-) -> None:
+def print_figures(figures: DetectorFigures, console: Console) -> None:
+    """The table, the intervals, and who was judged."""
+    data = figures.data
     table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
     table.add_column("class")
     for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*", "objects"):
         table.add_column(title, justify="right")
-    for name, scores in per_class.items():
+    for name, scores in figures.per_class.items():
         row = asdict(scores)
         cells = [percent(row[key]) for key in ("ap50", "ap70", "ap", "recall", "recall_at_t_star")]
         table.add_row(name, *cells, str(scores.objects))
     console.print(table)
-    for one in spread:
+    for one in figures.intervals:
         if one.low is not None and one.high is not None:
             bounds = f"{percent(one.low)} to {percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
             console.print(f"{HEADLINE} {one.name} {percent(one.value)}, {bounds}", soft_wrap=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +11,7 @@ from rich.console import Console
 from drivesem.evaluation.coco import STATS
 from drivesem.evaluation.results import Result
 from drivesem.report.plots import write_bars, write_curves
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, csv_table, percent
 from scene_ir import files
 
 _COCO_WORDS = (
@@ -132,9 +130,10 @@ def write_report(out: Path, result: Result) -> None:
     """metrics.json, one CSV a table, curves.csv, report.md and PNGs in `out`."""
     files.write_json(out / "metrics.json", result.to_json())
     for sheet in sheets(result):
-        files.write_text(out / f"{_file_name(sheet.title)}.csv", _csv(sheet.columns, sheet.rows))
+        cells = [["" if cell == "-" else cell for cell in row] for row in sheet.rows]
+        files.write_text(out / f"{_file_name(sheet.title)}.csv", csv_table(sheet.columns, cells))
     rows = [(name, *(f"{value:.6f}" for value in row)) for name, curve in result.curves.items() for row in curve]
-    files.write_text(out / "curves.csv", _csv(("class", "recall", "precision", "score"), rows))
+    files.write_text(out / "curves.csv", csv_table(("class", "recall", "precision", "score"), rows))
     pictures = _pictures(out, result)
     files.write_text(out / "report.md", _markdown(result, pictures))
 
@@ -142,14 +141,6 @@ def write_report(out: Path, result: Result) -> None:
 def _file_name(title: str) -> str:
     """The first words of a title: "KITTI 2D, %" is kitti-2d."""
     return re.sub(r"[^a-z0-9]+", "-", re.split(r"[,;]", title)[0].lower()).strip("-")
-
-
-def _csv(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([["" if cell == "-" else cell for cell in row] for row in rows])
-    return buffer.getvalue()
 
 
 def _pictures(out: Path, result: Result) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 import zlib
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
 from drivesem.attack.aims import Aim
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Parameter, ParameterSpace
@@ -36,13 +35,13 @@ from drivesem.questions.explain.results import (
 )
 from drivesem.questions.explain.shapley import MOST_EXACT, Flags, Floats, shapley
 from drivesem.report import pictures
-from drivesem.run.frame import RESULT, detection_records, failure_records, target_records, to_uint8
+from drivesem.run.frame import RESULT, detection_records, failure_records, target_records
 from drivesem.run.results import Coordinate, FrameResult, load_frame
 from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 
 KINDS: tuple[Kind, ...] = ("parameter", "object")
 
@@ -99,11 +98,6 @@ class Judge:
         return self._problem.score(theta)
 
 
-def digest(folder: Path) -> str:
-    """Of the result in a frame's folder of a run: differs where the run was made anew."""
-    return hashlib.sha256(files.read_bytes(folder / RESULT)).hexdigest()
-
-
 def explain_frame(
     folder: Path,
     attack: Attack,
@@ -138,7 +132,7 @@ def explain_frame(
     views = _views(objective, theta)
     explanation = Explanation(
         identifier=result.identifier,
-        source=digest(folder),
+        source=files.digest(folder / RESULT),
         objects=result.objects,
         benign=judge.outcome(theta, ~everything),
         found=found,

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.resampling import Figure, Interval, Recalled, intervals
 from drivesem.questions.explain.players import Size
 from drivesem.questions.explain.plots import write_means
 from drivesem.questions.explain.results import Contribution, Explanation, Outcome
+from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from scene_ir import files
 
 _NEEDED = "needs"
 _WORDS = ("parameter", "frame", _NEEDED)
 """Columns of words; the others hold numbers."""
+_LOOKS: dict[str, Any] = {"unbroken": _WORDS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +85,13 @@ def sheets(explanations: Sequence[Explanation], rows: Sequence[Mean]) -> list[Sh
             f"by parameter, frames: {len(explanations)}",
             ("parameter", "loss", "failing, %", "gradient, %", "alone", "without", "needed", "found", "enough"),
             by_parameter,
+            _LOOKS,
         ),
         Sheet(
             "how little is enough",
             ("frame", "loss", "fails", "signs", "size", "enough", "left, %", _NEEDED, "cars", "still", "most by"),
             by_frame,
+            _LOOKS,
         ),
     ]
 
@@ -126,32 +127,55 @@ def notes(draws: int) -> list[str]:
     ]
 
 
-def print_tables(explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in sheets(explanations, rows):
-        console.print(sheet.table(_WORDS, unbroken=_WORDS, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)))
-    for note in notes(draws):
-        console.print(note, soft_wrap=True)
-
-
-def write_report(out: Path, explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int) -> None:
-    """explain.md, explain.csv and explain.png."""
-    flat = [line for e in explanations for line in _flat(e)]
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(flat[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    files.write_text(out / "explain.csv", buffer.getvalue())
-    lines = ["# Why it fails", "", "![](explain.png)", ""]
-    for sheet in sheets(explanations, rows):
-        lines += _markdown(sheet)
-    lines += [f"{note}\n" for note in notes(draws)]
+def answer_of(
+    out: Path, explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, facts: Mapping[str, Any]
+) -> Answer:
+    """explain.json (with `facts` in front), explain.md, explain.csv and explain.png."""
+    appendix: list[str] = []
     for e in explanations:
-        lines += _markdown(what_if(e))
+        sheet = what_if(e)
+        appendix += [*sheet.markdown(sheet.columns), ""]
         pictures = ("shapley", *(("sensitivity",) if e.sensitivity else ()), "minimal_overlay")
-        lines += [f"![](frames/{e.identifier}/{name}.png)\n" for name in pictures]
-    files.write_text(out / "explain.md", "\n".join(lines))
-    write_means(out / "explain.png", [r.loss for r in rows], [r.fails for r in rows], len(explanations))
+        appendix += [f"![](frames/{e.identifier}/{name}.png)\n" for name in pictures]
+    tables = sheets(explanations, rows)
+    return Answer(
+        out=out,
+        name="explain",
+        heading="Why it fails",
+        data={**facts, "rows": [row.to_json() for row in rows], "explained": [_brief(e) for e in explanations]},
+        tables={"explain": [line for e in explanations for line in _flat(e)]},
+        sheets=tables,
+        notes=notes(draws),
+        words=[name for sheet in tables for name in sheet.columns],
+        printed_words=_WORDS,
+        appendix=appendix,
+        picture=partial(
+            write_means,
+            loss=[row.loss for row in rows],
+            fails=[row.fails for row in rows],
+            frames=len(explanations),
+        ),
+        failed={f"frame {name}": reason for name, reason in facts["frames_failed"].items()},
+        failure="could not be explained",
+    )
+
+
+def _brief(explanation: Explanation) -> dict[str, Any]:
+    """A frame in the summary; the rest is in its own folder."""
+    least = explanation.least
+    return {
+        "frame": explanation.identifier,
+        "loss_benign": explanation.benign.loss,
+        "loss_found": explanation.found.loss,
+        "sign_changes": least.sign_changes,
+        "size_found": least.norm_found,
+        "size_least": least.norm,
+        "left": least.left,
+        "parameters": list(least.parameters),
+        "objects": list(least.objects),
+        "feasible": not least.violations,
+        "renders": explanation.renders,
+    }
 
 
 def _flat(explanation: Explanation) -> list[dict[str, Any]]:
@@ -270,12 +294,3 @@ def _bounded(one: Interval, factor: float, digits: int) -> str:
 
 def _measure(value: float, unit: str) -> str:
     return f"{value:.3g}" if unit == "code" else f"{value:.3g} {unit}"
-
-
-def _markdown(sheet: Sheet) -> list[str]:
-    lines = [f"## {sheet.title}", "", _line(sheet.columns), _line(("---",) * len(sheet.columns))]
-    return [*lines, *map(_line, sheet.rows), ""]
-
-
-def _line(parts: Sequence[str]) -> str:
-    return "| " + " | ".join(part.replace("|", "\\|") for part in parts) + " |"

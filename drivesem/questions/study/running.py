@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.study.arms import Arm
-from drivesem.run.attack import Worker, attack_frames, select_frames
+from drivesem.run.attack import WRITTEN, Worker, attack_frames, select_frames
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult, RunSummary, load_frame
@@ -58,7 +57,7 @@ def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console:
     names, without, failed = select_frames(first.source, first.config)
     folders = [out / ARMS / arm.folder for arm in arms]
     for worker, folder in zip(workers, folders, strict=True):
-        claim(folder, worker.config, shutil.rmtree, _FREE)
+        claim(folder, worker.config, WRITTEN, _FREE)
     todo = [name for name in names if not all(_done(folder, name) for folder in folders)]
     empty: set[str] = set()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from detectors.base import Predictor, predict
+from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import Aim
 from drivesem.attack.judging import JudgedClasses
@@ -22,12 +21,13 @@ from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.questions.verify.change import check_change, check_feasibility
 from drivesem.questions.verify.differences import Difference, Tally
-from drivesem.run.frame import RESULT, as_targets, detection_records, target_records, to_uint8
+from drivesem.run.frame import RESULT, as_targets, detection_records, target_records
+from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import BoxRecord, FrameResult, load_frame
 from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import Labels, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"
@@ -96,7 +96,7 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     base = perturbed.as_photographed()
     tally = Tally()
     for name, expected in given.hashes.get(identifier, {}).items():
-        found = hashlib.sha256(files.read_bytes(folder / name)).hexdigest()
+        found = files.digest(folder / name)
         tally.same("files", name, expected, found)
     check_change(tally, folder, result, base, perturbed, given.params, given.budget)
     check_feasibility(tally, result, base, perturbed, given.budget)
@@ -104,7 +104,10 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
         levels, labels = _render(tally, pictures, base, perturbed, given.backend)
-        seen = {name: _detect(given, image) for name, image in pictures.items()}
+        seen = {
+            name: detections_in(given.detector, as_picture(image, given.device))
+            for name, image in pictures.items()
+        }
     names = JudgedClasses.of(given.detector).names
     for name, field in _DETECTIONS.items():
         _compare_boxes(tally, "detections", field, getattr(result, field), detection_records(seen[name], names))
@@ -135,13 +138,6 @@ def _render(
         tally.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
     labeller = Labeller(base, before)
     return levels, {"paper": labeller.paper(), "moved": labeller.moved(perturbed, after)}
-
-
-def _detect(given: Given, image: np.ndarray) -> Detections:
-    """What the detector finds in a picture (H, W, 3) uint8, of judged classes, on the CPU."""
-    picture = torch.from_numpy(image).permute(2, 0, 1).to(given.device) / 255
-    found = JudgedClasses.of(given.detector).detections(predict(given.detector, picture[None])[0])
-    return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
 
 
 def _judge(

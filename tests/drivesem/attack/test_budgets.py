@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.attack.budgets import budget_of, written
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, RangeError

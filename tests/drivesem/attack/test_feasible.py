@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 
 import drivesem.attack.feasibility_check
 from drivesem.attack.feasibility_check import _Car, _collisions, check_scene, overlap_area
-from drivesem.attack.feasible import FeasibleSet, Limits, _Cars, _gap, _overlap, project, violations
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.feasible.cars import Cars
+from drivesem.attack.feasible.collisions import gap_between, shared_ground
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import COMBOS, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
@@ -43,7 +46,7 @@ def test_projection_is_deterministic(street):
     scene = street(positions_xz=CROWDED)
     space = ParameterSpace(scene, COMBOS[2])
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(1)) * 10 * space.step
-    assert torch.equal(project(space, scene, theta).theta, project(space, scene, theta).theta)
+    assert torch.equal(FeasibleSet(space).project(theta).theta, FeasibleSet(space).project(theta).theta)
 
 
 def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(street):
@@ -51,10 +54,10 @@ def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(st
     strained = torch.randn(4, 64, 3, generator=torch.Generator().manual_seed(2)) * 0.2
     scene = scene.with_objects(ffd=strained)
     space = ParameterSpace(scene, COMBOS[2])
-    result = project(space, scene, space.theta0)
+    result = FeasibleSet(space).project(space.theta0)
     assert torch.equal(result.theta, space.theta0)
     assert result.active == ()
-    assert violations(space, scene, space.theta0) == ()
+    assert FeasibleSet(space).violations(space.theta0) == ()
     assert check_scene(scene, space.apply(scene, space.theta0)) == []
 
 
@@ -89,7 +92,7 @@ def test_a_feasible_theta_is_returned_to_the_bit(street):
     scene = street()
     space = ParameterSpace(scene, ("translate", "rotate"))
     theta = 3 * space.step
-    assert torch.equal(project(space, scene, theta).theta, theta)
+    assert torch.equal(FeasibleSet(space).project(theta).theta, theta)
 
 
 def test_bounds_are_named(street):
@@ -97,17 +100,17 @@ def test_bounds_are_named(street):
     space = ParameterSpace(scene, ("rotate",))
     theta = space.theta0.clone()
     theta[2] = 1.0
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     assert float(result.theta[2]) == pytest.approx(0.35)
     assert result.active == ("objects[2].yaw: bounds",)
-    assert violations(space, scene, theta) == ("objects[2].yaw: bounds",)
+    assert FeasibleSet(space).violations(theta) == ("objects[2].yaw: bounds",)
 
 
 def test_strain_and_the_lowest_layer(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(4)) * 0.15
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     offsets = ffd.from_symmetric(result.theta.reshape(4, 96)).double()
     assert float(offsets.reshape(4, 4, 4, 4, 3)[:, :, -1, :, 1].abs().max()) == 0
     axis = torch.linspace(0, 1, 9, dtype=torch.float64)
@@ -126,8 +129,8 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
     space = ParameterSpace(scene, ("translate",))
     theta = space.theta0.clone()
     theta[0], theta[2], theta[4] = 0.25, -0.25, 0.2  # 1.05 m each, with 0.8 m between them; the third is free
-    assert _names(violations(space, scene, theta)) == {"collision"}
-    result = project(space, scene, theta)
+    assert _names(FeasibleSet(space).violations(theta)) == {"collision"}
+    result = FeasibleSet(space).project(theta)
     moved = space.apply(scene, result.theta).objects.translation
     gap = float(moved[1, 2] - moved[0, 2]) - 4.2
     assert 0.04 < gap < 0.4
@@ -138,7 +141,7 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
 def test_a_kerb_stops_the_car_across_but_not_along(street):
     scene = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
     space = ParameterSpace(scene, ("translate",))
-    result = project(space, scene, torch.tensor([0.2, 0.25]))
+    result = FeasibleSet(space).project(torch.tensor([0.2, 0.25]))
     assert result.active == ("objects[0]: road",)
     assert float(result.theta[0]) == pytest.approx(0.2)
     assert 0 < float(result.theta[1]) < 0.12
@@ -147,18 +150,18 @@ def test_a_kerb_stops_the_car_across_but_not_along(street):
 def test_a_car_beside_the_road_may_go_anywhere(street):
     scene = street(positions_xz=((8.0, 14.0),), road_edge_x_m=3.0)
     space = ParameterSpace(scene, ("translate",))
-    assert project(space, scene, torch.tensor([0.25, 0.25])).active == ()
+    assert FeasibleSet(space).project(torch.tensor([0.25, 0.25])).active == ()
 
 
 def test_a_car_stays_in_the_picture(street):
     scene = street(positions_xz=((6.9, 9.0),), yaw=0.0)
     space = ParameterSpace(scene, ("translate",))
     theta = torch.tensor([0.25, 0.0])
-    assert _names(violations(space, scene, theta)) == {"frame"}
+    assert _names(FeasibleSet(space).violations(theta)) == {"frame"}
     assert check_scene(scene, space.apply(scene, theta)) != []
-    result = project(space, scene, theta)
+    result = FeasibleSet(space).project(theta)
     assert 0 < float(result.theta[0]) < 0.25
-    assert violations(space, scene, result.theta) == ()
+    assert FeasibleSet(space).violations(result.theta) == ()
 
 
 def test_a_car_is_not_hidden_behind_another(street):
@@ -166,9 +169,9 @@ def test_a_car_is_not_hidden_behind_another(street):
     scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
     space = ParameterSpace(scene, ("translate",))
     theta = torch.tensor([0.0, -0.2, 0.0, 0.25])  # across is towards -x: both move to one another in the picture
-    assert "visibility" in _names(violations(space, scene, theta))
-    result = project(space, scene, theta)
-    assert violations(space, scene, result.theta) == ()
+    assert "visibility" in _names(FeasibleSet(space).violations(theta))
+    result = FeasibleSet(space).project(theta)
+    assert FeasibleSet(space).violations(result.theta) == ()
     assert "visibility" in _names(result.active)
     assert float(result.theta.abs().max()) > 0.02
 
@@ -179,8 +182,8 @@ def test_a_growing_mesh_does_not_reach_into_a_neighbour(street):
     wide = torch.zeros(2, 4, 4, 2, 3)
     wide[..., 2] = -0.09  # the half at z < 0 goes outwards, and the other with it
     theta = wide.reshape(-1)
-    assert _names(violations(space, scene, theta)) == {"collision"}
-    result = project(space, scene, theta)
+    assert _names(FeasibleSet(space).violations(theta)) == {"collision"}
+    result = FeasibleSet(space).project(theta)
     assert check_scene(scene, space.apply(scene, result.theta)) == []
     assert float(result.theta.abs().max()) > 0.005
 
@@ -193,14 +196,12 @@ def test_errors_name_what_is_wrong(street):
         feasible.project(torch.zeros(3))
     with pytest.raises(RangeError, match=r"objects\[1\]\.yaw: expected a finite value"):
         feasible.project(torch.tensor([0.0, math.inf, 0.0, 0.0]))
-    with pytest.raises(RangeError, match="scene"):
-        project(space, street(), space.theta0)
 
 
 def test_a_scene_without_cars_is_projected_onto_its_bounds(street):
     scene = street(positions_xz=())
     space = ParameterSpace(scene, ("weather", "translate"))
-    result = project(space, scene, torch.tensor([2.0, -1.0, 0.5, 0.0]))
+    result = FeasibleSet(space).project(torch.tensor([2.0, -1.0, 0.5, 0.0]))
     assert result.theta.tolist() == [1.0, 0.0, 0.5, 0.0]
     assert check_scene(scene, space.apply(scene, result.theta)) == []
 
@@ -209,8 +210,8 @@ def test_limits_are_settings(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
     theta = 0.1 * torch.randn(space.dim, generator=torch.Generator().manual_seed(4))
-    loose = project(space, scene, theta, Limits(strain=(0.5, 2.0)))
-    tight = project(space, scene, theta, Limits(strain=(0.95, 1.05)))
+    loose = FeasibleSet(space, Limits(strain=(0.5, 2.0))).project(theta)
+    tight = FeasibleSet(space, Limits(strain=(0.95, 1.05))).project(theta)
     assert float(tight.theta.norm()) < 0.5 * float(loose.theta.norm())
 
 
@@ -318,11 +319,11 @@ def test_both_ways_agree_on_gap_and_overlap(seed):
     yaw = draw.uniform(-3, 3, 2)
     cos, sin = np.cos(yaw), np.sin(yaw)
     low, size, at = draw.uniform(-3, 0, (2, 3)), draw.uniform(1, 5, (2, 3)), draw.uniform(-2.5, 2.5, (2, 3))
-    cars = _Cars.of(low, low + size, yaw, at)
+    cars = Cars.of(low, low + size, yaw, at)
     corners = np.array([[1, 0], [1, 1], [0, 1], [0, 0]]) * size[:, None, ::2] + low[:, None, ::2]
     rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
     footprints = corners @ rotation + at[:, None, ::2]
-    gap, area = _gap(cars, np.arange(2)), _overlap(cars, np.array([0, 1]), np.array([1, 0]))
+    gap, area = gap_between(cars, np.arange(2)), shared_ground(cars, np.array([0, 1]), np.array([1, 0]))
 
     def ccw(p):
         x, z = p.T

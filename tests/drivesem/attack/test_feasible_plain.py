@@ -9,7 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivesem.attack.feasibility_check import overlap_area
-from drivesem.attack.feasible import FeasibleSet, Limits, _surface_points
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.feasible.surfaces import surface_points
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.geometry import place, to_clip, yaw_matrix
@@ -25,7 +27,7 @@ class PlainCar:
     def __init__(self, scene, i):
         objects, camera = scene.objects, scene.camera
         mesh = scene.meshes[int(objects.mesh_index[i])]
-        unit = torch.from_numpy(_surface_points(mesh))
+        unit = torch.from_numpy(surface_points(mesh))
         self.size = objects.size_lhw[i].double()
         self.yaw, self.translation = objects.yaw[i].double(), objects.translation[i].double()
         local = ffd.deform(unit, ffd.lattice_weights(unit), objects.ffd[i].double()) * self.size

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import Reach, check_reach, check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 
 

@@ -7,7 +7,7 @@ from detectors.base import Detector, RawPredictions
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.methods.sampling import Sampling
 from drivesem.attack.methods.si_fgsm import SiFGSM

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.bench import detector, detector_probe, memory, tables
+from drivesem.bench import detector, memory, probe
 from drivesem.bench.timing import Clock
 from drivesem.cli import main
 from drivesem.commands import bench
@@ -25,7 +25,7 @@ def _one_thread_more_or_less_stays_here() -> Iterator[None]:
 
 def test_both_gives_the_gradient_to_the_image() -> None:
     found, image = load_detector("squeezedet"), torch.rand(1, 3, 64, 96)
-    gradient = detector_probe.both(found, image)
+    gradient = probe.image_gradient(found, image)
     assert gradient.shape == image.shape
     assert float(gradient.abs().sum()) > 0
     assert not image.requires_grad
@@ -71,7 +71,7 @@ def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
         # At least the first convolution's output: 64 channels, a quarter of the pixels, 4 bytes each.
         assert row["peak_mb"] > 64 * 32 * 48 * 4 / 2**20
     text = (tmp_path / "all.md").read_text()
-    assert f"### {tables.TITLES['detector']}" in text
+    assert f"### {detector.TITLE}" in text
     assert "| forward and backward, ms |" in text
     assert "`drivesem bench detector --quick --threads 1`" in text
 

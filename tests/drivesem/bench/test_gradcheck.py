@@ -219,7 +219,7 @@ def test_exit_code(
     factor: float, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = _rows(factor * _gradient(), _gradient()).values()
-    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: {"street": tuple(rows)})
+    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
     assert main(["gradcheck", "--json"]) == code
     assert json.loads(capsys.readouterr().out)["passed"] is (code == 0)
 
@@ -228,7 +228,7 @@ def test_exit_code(
 def test_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     still = np.zeros((OUTPUTS, COUNT))
     rows = [*_rows(1.2 * _gradient(), _gradient()).values(), *_rows(still, still).values()]
-    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: {"street": tuple(rows)})
+    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
     monkeypatch.setattr(gradcheck, "worst", tuple)
     assert main(["gradcheck", "--max-error", "0.1"]) == 1
     out = capsys.readouterr().out

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from drivesem.bench import tables
+from drivesem.bench import memory, step, tables
 from scene_ir.errors import FormatError
 
 
@@ -21,8 +21,18 @@ def _result(what: str, **row: Any) -> dict[str, Any]:
     }
 
 
+def _sections(result: dict[str, Any]) -> list[tables.Section]:
+    columns = {"step": step.COLUMNS, "memory": memory.COLUMNS}[result["what"]]
+    return [tables.Section("A title", columns, result["rows"])]
+
+
+def _rewrite(path: Path, result: dict[str, Any]) -> None:
+    tables.rewrite(path, result, _sections(result))
+
+
 def test_columns_without_a_value_are_left_out() -> None:
-    text = tables.markdown(_result("step", ratio=1.175, ratio_iqr=0.01, lod=True))
+    result = _result("step", ratio=1.175, ratio_iqr=0.01, lod=True)
+    text = tables.markdown(result, _sections(result))
     lines = text.splitlines()
     assert "| cars | triangles a car | level of detail | ratio | IQR |" in lines
     assert "| 8 | 5,000 | on | 1.18 | 0.01 |" in lines
@@ -32,10 +42,10 @@ def test_columns_without_a_value_are_left_out() -> None:
 
 def test_only_the_own_section_is_written_anew(tmp_path: Path) -> None:
     path = tmp_path / "benchmarks.md"
-    tables.rewrite(path, _result("step", ratio=1.5))
-    tables.rewrite(path, _result("memory", peak_mb=700.0))
+    _rewrite(path, _result("step", ratio=1.5))
+    _rewrite(path, _result("memory", peak_mb=700.0))
     path.write_text(path.read_text() + "\nWritten by hand.\n")
-    tables.rewrite(path, _result("step", ratio=1.1))
+    _rewrite(path, _result("step", ratio=1.1))
     text = path.read_text()
     assert text.startswith("# Benchmarks\n")
     assert text.count("bench step: begin") == text.count("bench memory: begin") == 1
@@ -49,9 +59,9 @@ def test_a_section_without_an_end(tmp_path: Path) -> None:
     path = tmp_path / "benchmarks.md"
     path.write_text("<!-- bench step: begin -->\n")
     with pytest.raises(FormatError, match=r"bench step: end"):
-        tables.rewrite(path, _result("step"))
+        _rewrite(path, _result("step"))
 
 
 def test_a_terminal_shows_every_row() -> None:
-    (section,) = tables.sections(_result("step", ratio=1.5))
+    (section,) = _sections(_result("step", ratio=1.5))
     assert tables.terminal(section).row_count == 1

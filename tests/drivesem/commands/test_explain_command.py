@@ -19,7 +19,7 @@ from detectors.base import Detector
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
-from drivesem.commands import explain as explain_command
+from drivesem.questions.explain import asking as explain_asking
 from drivesem.questions.explain import frame as explaining
 from drivesem.questions.explain.results import read_explanation
 from drivesem.run import attack as run_attack
@@ -183,7 +183,7 @@ def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     assert [f.kind for f in least.failures] == ["phantom"]
     # judged anew from what was written
     frame = explained / "frames" / "demo-000"
-    result, attack = load_frame(frame / "result.json"), folder.attack_of(explained)
+    result, attack = load_frame(frame / "result.json"), run_folder.attack_of(explained)
     objective, theta = explaining.rebuild(result, frame, attack, ("translate", "rotate"), Jumpy())
     names = [objective.space.name(i) for i in range(objective.space.dim)]
     small = torch.zeros_like(theta)
@@ -217,8 +217,8 @@ def test_a_second_call_explains_nothing_twice(
     first = explain("--run", run)
     assert json.loads((run / "explain" / "explain.json").read_text()) == first
     looks: list[str] = []
-    real = explain_command.explain_frame
-    monkeypatch.setattr(explain_command, "explain_frame", lambda *w: looks.append("") or real(*w))
+    real = explain_asking.explain_frame
+    monkeypatch.setattr(explain_asking, "explain_frame", lambda *w: looks.append("") or real(*w))
     assert explain("--run", run) == first
     assert not looks
     result = run / "frames" / "demo-000" / "result.json"

@@ -14,13 +14,13 @@ import pytest
 import torch
 import trimesh
 
-from drivesem.attack.edits import read_frame_edit
 from drivesem.cli import main, parse
 from drivesem.data.registry import DATASETS as READERS
 from drivesem.data.registry import open_dataset
 from drivesem.run.lock import LOCK
 from drivesem.scenes.sheet import GAIN, PANEL_PX, scene_sheet
 from drivesem.settings.commands import DATASETS, DEMO, Derender, Edit, Render
+from drivesem.settings.edits import read_frame_edit
 from scene_ir import files
 from scene_ir.derender.silhouette import extent, placed, silhouettes
 from scene_ir.errors import RangeError

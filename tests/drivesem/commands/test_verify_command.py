@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from detectors.types import CLASSES, Detections
-from drivesem.attack.feasible import FeasibleSet
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import ParameterSpace
 from drivesem.cli import main
 from drivesem.questions.verify.differences import CHECKS

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.kitti import evaluate
-from drivesem.evaluation.resampling import Averaged, Figure, Recalled, Sampled, differences, intervals
+from drivesem.evaluation.resampling import Averaged, Figure, Recalled, Sampled, differences, intervals, wilson
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
@@ -97,3 +98,20 @@ def test_figures_without_objects():
     assert (one.value, one.low, one.high) == (None, None, None)
     (pair,) = differences([empty], [empty], 3, 10, np.random.default_rng(0))
     assert pair.p is None
+
+
+@pytest.mark.parametrize(("hits", "count", "low", "high"), [(5, 10, 0.2366, 0.7634), (0, 30, 0.0, 0.1135)])
+def test_wilson_by_hand(hits: int, count: int, low: float, high: float) -> None:
+    assert wilson(hits, count) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 1), (1, 1), (3, 7), (29, 30), (400, 1000)])
+def test_wilson_is_scipys(hits: int, count: int) -> None:
+    expected = binomtest(hits, count).proportion_ci(method="wilson")
+    assert wilson(hits, count) == pytest.approx((expected.low, expected.high), abs=1e-6)
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 0), (-1, 3), (4, 3)])
+def test_wilson_of_what_is_no_share(hits: int, count: int) -> None:
+    with pytest.raises(ValueError, match="share"):
+        wilson(hits, count)

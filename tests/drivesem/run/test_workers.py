@@ -104,7 +104,8 @@ def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None
     said = found(keep_going=True)
     assert (said[3], said[4]) == (4, 3)
     assert re.fullmatch(
-        r"drivesem: expected no defect of its own, found ZeroDivisionError at test_workers.py:\d+: .*", str(said[0])
+        r"drivesem: expected no defect of its own, found ZeroDivisionError at test_workers.py:\d+: .*",
+        str(said[0]),
     )
     with pytest.raises(ZeroDivisionError):
         found(keep_going=False)

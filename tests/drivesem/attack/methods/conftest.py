@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
 
 GROUPS = (Group("near", slice(0, 2)), Group("wide", slice(2, 5)), Group("code", slice(5, 6)))

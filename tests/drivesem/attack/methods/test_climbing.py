@@ -9,7 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import LOOKED_AT, Attack, Group, Problem, Proposals, Score
 from drivesem.attack.methods.fgsm import FGSM

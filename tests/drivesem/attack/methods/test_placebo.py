@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
 from drivesem.attack.methods.placebo import Placebo
 from scene_ir.errors import ShapeError

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.scouted import Scouted

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.cma_es import CMAES
 from drivesem.attack.methods.fgsm import FGSM

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from scene_ir.errors import RangeError

@@ -11,7 +11,7 @@ import pytest
 from detectors.types import CLASSES
 from drivesem.evaluation.resampling import wilson
 from drivesem.questions.confirm.judge import Finding, Stand
-from drivesem.questions.confirm.report import Share, summarise, write_report
+from drivesem.questions.confirm.report import Share, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, dump, load
 from drivesem.run.results import BoxRecord, FrameResult
 from scene_ir.errors import FormatError
@@ -111,7 +111,7 @@ def test_without_a_failure_there_is_no_share() -> None:
 
 def test_files(tmp_path: Path) -> None:
     report = summarise(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
-    write_report(tmp_path, report, FRAMES)
+    answer_of(tmp_path, report, FRAMES, {}, {}).write()
     rows = list(csv.DictReader((tmp_path / "confirm.csv").read_text().splitlines()))
     assert [row["survives"] for row in rows] == ["True", "True", "False", "False", "False", "True"]
     assert (rows[0]["lost_both"], rows[0]["phantoms_compositor"], rows[0]["box_iou"]) == ("1", "1", "0.9")

@@ -11,7 +11,7 @@ import pytest
 
 from drivesem.questions.explain.players import Size
 from drivesem.questions.explain.plots import write_waterfalls
-from drivesem.questions.explain.report import means, sheets, what_if, write_report
+from drivesem.questions.explain.report import answer_of, means, sheets, what_if
 from drivesem.questions.explain.results import (
     Contribution,
     Explanation,
@@ -138,7 +138,7 @@ def test_tables() -> None:
 
 def test_files(tmp_path: Path) -> None:
     frames = [explanation("a"), explanation("b", 1.5)]
-    write_report(tmp_path, frames, means(frames, 20, 0), 20)
+    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}}).write()
     rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
     assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")

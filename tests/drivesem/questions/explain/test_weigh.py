@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.feasible import Projected
+from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
 from drivesem.questions.explain.frame import Judge, weigh
 from drivesem.questions.explain.players import Player

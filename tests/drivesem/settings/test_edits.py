@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from drivesem.attack.edits import (
+from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.scene_edits import edited, moved
+from drivesem.attack.space import ParameterSpace, Perturbation
+from drivesem.settings.edits import (
     ALL,
     WEATHER_NAMES,
     WEATHERS,
@@ -21,9 +24,6 @@ from drivesem.attack.edits import (
     parse_setting,
     read_frame_edit,
 )
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.scene_edits import moved, removed_rows
-from drivesem.attack.space import ParameterSpace, Perturbation
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
 from scene_ir.types import SceneIR
@@ -211,10 +211,10 @@ def test_no_change_keeps_every_bit(street: Street) -> None:
 
 def test_removal_names_rows(street: Street) -> None:
     scene = street()
-    assert removed_rows(scene, edit_of("objects[2].remove=true")) == [2]
-    assert removed_rows(scene, edit_of("objects[all].remove=true")) == [0, 1, 2, 3]
+    assert edited(scene, edit_of("objects[2].remove=true")).removed == (2,)
+    assert edited(scene, edit_of("objects[all].remove=true")).removed == (0, 1, 2, 3)
     with pytest.raises(RangeError, match=r"objects\[4\]: expected a row from 0 to 3, found 4"):
-        removed_rows(scene, edit_of("objects[4].remove=true"))
+        edited(scene, edit_of("objects[4].remove=true"))
 
 
 def test_places_that_vehicles_should_not_have(street: Street) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from detectors.base import Predictor, predict
 from detectors.boxes import ioa_matrix, iou_matrix
 from detectors.types import CLASSES, Detections
-from drivesem.commands.render import as_bytes
+from scene_ir.io import to_uint8
 from scene_ir.types import Category
 
 Picture = NDArray[np.uint8]
@@ -93,7 +93,7 @@ class Eye:
 
     def look(self, image: Tensor, boxes_xyxy: Tensor) -> View:
         """image (3, H, W) in [0, 1]; boxes (N, 4) px of the objects in it."""
-        picture = as_bytes(image)
+        picture = to_uint8(image)
         given = torch.from_numpy(picture.transpose(2, 0, 1).copy()).float() / 255
         found = predict(self._predictor, given[None])[0]
         view = View(picture, boxes_xyxy, found, self._predictor.classes, [])

@@ -27,7 +27,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.questions.realism.closeness import EXACT_DB, PERCEPTUAL, Perception, Picture, Strip, psnr, sheet
+from drivesem.bench.tables import Columns
+from drivesem.questions.realism.closeness import PERCEPTUAL, Perception, Picture
 from drivesem.synth.demo import take_apart
 from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
@@ -41,9 +42,15 @@ from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
 from scene_ir.sources import solve_sources
 from scene_ir.types import Crop, Frame, Labels, SceneIR
+from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
 
 Mask = NDArray[np.bool_]
 
+TITLE = "De-rendering beside the generator's truth"
+COLUMNS: Columns = {
+    "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
+    "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
+}  # fmt: skip
 METHOD = (
     "Frames of the generator's held-out pools, clear and mixed weather in turn, each with a vehicle that can be "
     "moved. derender sees RGB, camera and labels whose 3D boxes are off by 0.2 m on the ground, 5 degrees and 5 % "
@@ -154,7 +161,7 @@ class Edited:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DerenderRow:
     """What was found of one frame. identity_db: in the objects' boxes; exact: whether all pixels that no matte and
     no shadow reaches are the photograph's. shadow_iou, sun_deg: see `shadows`; no sun but under a clear sky.
     withheld: shapes where no vehicle's own kind of template may be chosen. ablations: PSNR of move and removal
@@ -195,7 +202,7 @@ class Task:
 
 def measure(
     frames: int, seed: int, workers: int, ablate: bool = False, sheets: Path | None = None
-) -> Iterator[Row]:
+) -> Iterator[DerenderRow]:
     """One row a frame, in order. sheets: a folder that gets the worst and some typical frames as pictures.
 
     Raises RangeError for no frames or no processes.
@@ -214,7 +221,7 @@ def measure(
             _keep_sheets(found, folder, sheets)
 
 
-def _in_processes(tasks: Sequence[Task], workers: int) -> Iterator[Row]:
+def _in_processes(tasks: Sequence[Task], workers: int) -> Iterator[DerenderRow]:
     if workers == 1:
         yield from map(work, tasks)
         return
@@ -233,7 +240,7 @@ def _perception() -> Perception:
     return Perception()
 
 
-def work(task: Task) -> Row:
+def work(task: Task) -> DerenderRow:
     """Make a frame, de-render it, judge the scene."""
     case = make_case(task.seed, task.index)
     rng = np.random.default_rng([_STREAM, task.seed, task.index, 1])
@@ -415,7 +422,7 @@ def share_of(frame: SynthFrame, track: int) -> NDArray[np.float32]:
 
 def judge(
     case: Case, scene: SceneIR, tracks: Sequence[int], labels: Labels | None = None, index: int = 0
-) -> tuple[Row, list[Strip]]:
+) -> tuple[DerenderRow, list[Strip]]:
     """Hold a scene against the truth. tracks: of its objects; labels: that it was made from, if any.
 
     -> what was found (no time, no memory), and strips to look at.
@@ -433,7 +440,7 @@ def judge(
     removed = _edited(cleared, before.image, empty.image, hole)
     shade, sun = shadows(scene, before, empty, gone)
     truth = next(t for t in before.truths if t.actor.track == move.track)
-    row = Row(
+    row = DerenderRow(
         index=index,
         weather=str(before.manifest["weather"]),
         road=str(before.manifest["road"]),
@@ -791,7 +798,7 @@ def _figures(case: Case, scene: SceneIR, tracks: Sequence[int], empty: SynthFram
     }
 
 
-def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[DerenderRow]) -> list[dict[str, Any]]:
     """A line a figure: median, tail (10th percentile, or 90th where less is better), count, goal where there is
     one."""
     shapes = [s for row in rows for s in row.shapes]
@@ -850,7 +857,7 @@ def _line(
     }
 
 
-def _keep_sheets(rows: Sequence[Row], made: Path, kept: Path) -> None:
+def _keep_sheets(rows: Sequence[DerenderRow], made: Path, kept: Path) -> None:
     """The worst sheets by the move's PSNR, and those next to its median."""
     order = sorted(rows, key=lambda row: row.move.psnr_db)
     worst = order[:_WORST]

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from detectors.boxes import iou_matrix
 from detectors.types import Detections
-from drivesem.bench.sights import CAR, VEHICLES, Picture, View
 from drivesem.report.drawing import PAPER, TEXT_PX, text_extent, write_text
+from tools.bench.sights import CAR, VEHICLES, Picture, View
 
 _TRUE, _GIVEN, _OTHER = (0, 158, 115), (240, 228, 66), (213, 94, 0)
 """Colours of Okabe and Ito: the object's box, cars, and vehicles of other classes that were found."""

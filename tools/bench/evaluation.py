@@ -17,10 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.bench.tables import Columns
 from drivesem.evaluation.coco import fastest_engine
 from scene_ir import files
 from scene_ir.errors import FormatError
 
+TITLE = "Evaluation of many frames"
+COLUMNS: Columns = {
+    "protocol": ("protocol", "protocol"), "engine": ("counted by", "counted by"),
+    "frames": ("frames", "frames"), "detections": ("detections", "detections"),
+    "seconds": ("seconds", "seconds"), "ratio": ("ratio", "ratio"),
+}  # fmt: skip
 METHOD = (
     "Random frames of 5 objects (Car, Pedestrian or Cyclist; a tenth DontCare) and 20 detections: three around "
     "each object and five elsewhere. pycocotools alone: its classes in this process, once they are loaded: "
@@ -37,7 +44,7 @@ _START = "import sys; from drivesem.cli import main; sys.exit(main())"
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class EvaluationRow:
     """One way from files to figures. seconds: wall time; ratio: these over pycocotools' own."""
 
     protocol: str
@@ -48,7 +55,7 @@ class Row:
     ratio: float
 
 
-def measure(frames: int, seed: int) -> Iterator[Row]:
+def measure(frames: int, seed: int) -> Iterator[EvaluationRow]:
     """pycocotools alone, then `drivesem eval` by COCO's protocol and by KITTI's.
 
     Raises FormatError where the command fails.
@@ -57,14 +64,14 @@ def measure(frames: int, seed: int) -> Iterator[Row]:
         folder = Path(name)
         detections = _write(folder, frames, seed)
         alone = _pycocotools(folder / "truth.json", folder / "found.json")
-        yield Row("coco", "pycocotools alone", frames, detections, round(alone, 2), 1.0)
+        yield EvaluationRow("coco", "pycocotools alone", frames, detections, round(alone, 2), 1.0)
         told = {"coco": fastest_engine(), "kitti": "drivesem"}
         places = {"coco": ("truth.json", "found.json"), "kitti": ("label_2", "found")}
         for protocol, (gt, pred) in places.items():
             words = ["--gt", str(folder / gt), "--pred", str(folder / pred), "--protocol", protocol]
             seconds = _command(words)
             ratio = round(seconds / alone, 3)
-            yield Row(protocol, told[protocol], frames, detections, round(seconds, 2), ratio)
+            yield EvaluationRow(protocol, told[protocol], frames, detections, round(seconds, 2), ratio)
 
 
 def _write(folder: Path, frames: int, seed: int) -> int:

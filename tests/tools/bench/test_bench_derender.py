@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.bench import derender as bench
-from drivesem.bench.derender import Case, Edited, Row, Shape
-from drivesem.cli import main
 from drivesem.synth.frames import SynthFrame
 from drivesem.synth.layout import Strip as Kerb
 from drivesem.synth.soup import Material
@@ -20,6 +17,9 @@ from scene_ir import files
 from scene_ir.compositor import Compositor
 from scene_ir.errors import RangeError
 from scene_ir.types import SceneIR
+from tools.bench import derender as bench
+from tools.bench.__main__ import main
+from tools.bench.derender import Case, DerenderRow, Edited, Shape
 
 
 @pytest.fixture(scope="module")
@@ -190,10 +190,10 @@ def test_the_region_is_what_changes(case: Case) -> None:
     assert apart[~whole].max() <= 2
 
 
-def _row(index: int, move_db: float, **changes: Any) -> Row:
+def _row(index: int, move_db: float, **changes: Any) -> DerenderRow:
     edited = Edited(move_db, 15.0, 0.1 * index, 0.9, 1000, {"seen": move_db}, {"seen": 1.0})
     shape = Shape(1, "sedan", 60.0, 1.0, 0.8, 0.9 + 0.01 * index, 0.9)
-    row = Row(
+    row = DerenderRow(
         index, "sun", "city", 3, (shape,), "sedan", (0.5, 0.0), 10.0, 0.1, edited, edited, 99.0, True,
         1.0 + index, 1.0, None,
     )  # fmt: skip
@@ -242,7 +242,7 @@ def test_the_worst_and_typical_sheets_are_kept(tmp_path: Path) -> None:
 def test_bad_input_is_one_line_and_exit_code_2(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["bench", "derender", *words]) == 2
+    assert main(["derender", *words]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
@@ -258,7 +258,7 @@ def test_no_street_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["bench", "derender", "--frames", "2", "--workers", "2", "--ablate", "--json"]
+    words = ["derender", "--frames", "2", "--workers", "2", "--ablate", "--json"]
     assert main([*words, "--out", str(tmp_path), "--markdown", str(tmp_path / "all.md")]) == 0
     result = json.loads(capsys.readouterr().out)
     assert [row["index"] for row in result["rows"]] == [0, 1]
@@ -270,7 +270,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None
         assert all(0 <= s["mesh_iou"] <= 1 for s in row["shapes"])
         assert all(s["height_px"] >= 40 and s["visible"] >= 0.7 for s in row["shapes"])
         assert set(row["ablations"]) in (set(), set(bench.ABLATIONS))
-    assert result["command"] == "drivesem bench derender --ablate --frames 2 --workers 2"
+    assert result["command"] == "python -m tools.bench derender --workers 2 --frames 2 --ablate"
     assert {line["measure"] for line in result["summary"]} >= {"move, PSNR, dB", "remove, PSNR, dB"}
     assert json.loads((tmp_path / "derender.json").read_text()) == result
     assert "SqueezeDet backbone" in (tmp_path / "all.md").read_text()

@@ -9,11 +9,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from drivesem.bench import label_free as bench
-from drivesem.bench.label_free import Error, FrameRows, VehicleRow
-from drivesem.cli import main
-from drivesem.settings.commands import Bench
 from scene_ir.types import Camera, Labels
+from tools.bench import label_free as bench
+from tools.bench.__main__ import main
+from tools.bench.label_free import Error, FrameRows, VehicleRow
+from tools.bench.settings import BenchTool
 
 CAMERA = Camera(torch.tensor([[720.0, 0, 620.0], [0, 720.0, 180.0], [0, 0, 1.0]]), 375, 1242)
 
@@ -67,8 +67,8 @@ def test_summary_keeps_both_stages_apart() -> None:
 
 
 def test_frames_by_name() -> None:
-    assert bench.names(Bench(what="label-free", frames=2)) == ["000", "001"]
-    assert len(bench.names(Bench(what="label-free", quick=True))) == bench.QUICK_FRAMES
+    assert bench.names(BenchTool(what="label-free", frames=2)) == ["000", "001"]
+    assert len(bench.names(BenchTool(what="label-free", quick=True))) == bench.QUICK_FRAMES
 
 
 def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,7 +76,7 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str
         (["--dataset", "kitti", "--root", "nowhere"], "nowhere"),
         (["--device", "meta"], "--device: expected cpu"),
     ):
-        assert main(["bench", "label-free", *words]) == 2
+        assert main(["label-free", *words]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         assert message in said
@@ -84,10 +84,10 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str
 
 @pytest.mark.slow
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "label-free", "--frames", "2", "--workers", "1", "--json"]) == 0
+    assert main(["label-free", "--frames", "2", "--workers", "1", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["frames"] == 2
-    assert result["command"] == "drivesem bench label-free --frames 2 --workers 1"
+    assert result["command"] == "python -m tools.bench label-free --workers 1 --frames 2"
     for row in result["rows"]:
         assert 0 <= row["before"]["yaw_deg"] <= 180
         assert row["height_px"] >= bench.LEAST_HEIGHT_PX

@@ -20,23 +20,31 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.registry import load_predictor
-from drivesem.attack.edits import FrameEdit, ObjectEdit
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, MovedLabels
 from drivesem.attack.scene_edits import moved
-from drivesem.bench.found_sheet import failure_sheet
-from drivesem.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
+from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Bench, Derender
+from drivesem.settings.commands import Derender
+from drivesem.settings.edits import FrameEdit, ObjectEdit
 from scene_ir import files
 from scene_ir.compositor import Compositor, render
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
 from scene_ir.removal import without_objects
 from scene_ir.types import Category, SceneIR
+from tools.bench.found_sheet import failure_sheet
+from tools.bench.settings import BenchTool
+from tools.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
 
+TITLE = "Cars that a detector finds, removed and moved"
+COLUMNS: Columns = {
+    "which": ("cars", "cars"), "measure": ("figure", "figure"), "cars": ("count", "count"),
+    "found": ("found", "found"), "share": ("share", "share"), "low": ("from", "from"), "high": ("to", "to"),
+    "goal": ("goal", "goal"),
+}  # fmt: skip
 METHOD = (
     "Cars (KITTI's Car and Van) that became objects. Found: a detection of class Car with a score above 0.3 and "
     "an IoU of at least 0.5 with the box, each detection for one car only. Removed: of the cars found in the "
@@ -81,33 +89,33 @@ class CarRow:
     together: Sight | None
 
 
-def measure(config: Bench, sheets: Path | None = None) -> Iterator[tuple[str, list[CarRow]]]:
+def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str, list[CarRow]]]:
     """Frame by frame, in the order in which they are done: its identifier and its cars.
 
     config: dataset, root, scenes, detector, tiles, limit, seed, workers. sheets: a folder that gets a picture
     of each failure. Raises DetectorError, SceneError or UsageError for bad input.
     """
-    judge = _Judge(config, sheets)
+    judge = _FoundJudge(config, sheets)
     names = judge.names()
     for name, outcome in outcomes(judge.frame, partial(_in_process, config, sheets), names, config):
         yield name, outcome()
 
 
-def count(config: Bench) -> int:
+def count(config: BenchTool) -> int:
     """How many frames `measure` goes through."""
     return len(_names(config))
 
 
-def _in_process(config: Bench, sheets: Path | None) -> Callable[[str], list[CarRow]]:
-    return _Judge(config, sheets).frame
+def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[CarRow]]:
+    return _FoundJudge(config, sheets).frame
 
 
-def _source(config: Bench) -> SceneSource:
+def _source(config: BenchTool) -> SceneSource:
     asked = Derender(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
-def _names(config: Bench) -> list[str]:
+def _names(config: BenchTool) -> list[str]:
     return list(_source(config).identifiers())[: config.limit]
 
 
@@ -130,10 +138,10 @@ class _Folder:
         return load_scene(self._folder / identifier)
 
 
-class _Judge:
+class _FoundJudge:
     """What one process needs: built once, used for many frames."""
 
-    def __init__(self, config: Bench, sheets: Path | None) -> None:
+    def __init__(self, config: BenchTool, sheets: Path | None) -> None:
         self._config = config
         self._source = _source(config)
         self._sheets = sheets

@@ -32,7 +32,7 @@ class UnavailableError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class RenderTask:
     """What to draw. colours (V, 3): random ones, one a vertex; weight (H, W, 3): the gradient that comes in."""
 
     placed: Placed
@@ -65,7 +65,7 @@ class Renderer:
     hits: Callable[[Any], int]
 
 
-def own_verbs(task: Task, backend: verbs.Backend = "warp") -> Renderer:
+def own_verbs(task: RenderTask, backend: verbs.Backend = "warp") -> Renderer:
     """The project's four verbs at the job that the others have."""
     placed, camera = task.placed, task.camera
     leaf = placed.clip.detach().clone().requires_grad_(True)
@@ -88,7 +88,7 @@ def own_verbs(task: Task, backend: verbs.Backend = "warp") -> Renderer:
     return Renderer(shows, forward, backward, lambda drawn: int((drawn[1] >= 0).sum()))
 
 
-def pyrender(task: Task) -> Renderer:
+def pyrender(task: RenderTask) -> Renderer:
     """OpenGL through pyrender."""
     os.environ.setdefault("PYOPENGL_PLATFORM", _PLATFORM)
     library = _load(lambda: importlib.import_module("pyrender"))
@@ -111,7 +111,7 @@ def pyrender(task: Task) -> Renderer:
     return Renderer("vertex colours", forward, None, lambda drawn: int((drawn[1] > 0).sum()))
 
 
-def open3d(task: Task) -> Renderer:
+def open3d(task: RenderTask) -> Renderer:
     """Ray casting by Open3D (Embree)."""
     library = _load(lambda: importlib.import_module("open3d"))
     points, faces = task.relative, task.faces
@@ -127,7 +127,7 @@ def open3d(task: Task) -> Renderer:
     return Renderer("depth", forward, None, lambda depth: int(np.isfinite(depth).sum()))
 
 
-def pytorch3d(task: Task) -> Renderer:
+def pytorch3d(task: RenderTask) -> Renderer:
     """PyTorch3D's rasteriser, one face a pixel, without blur."""
     structures = _load(lambda: importlib.import_module("pytorch3d.structures"))
     cameras = _load(lambda: importlib.import_module("pytorch3d.renderer.cameras"))
@@ -159,7 +159,7 @@ def pytorch3d(task: Task) -> Renderer:
     )
 
 
-def nvdiffrast(task: Task) -> Renderer:
+def nvdiffrast(task: RenderTask) -> Renderer:
     """nvdiffrast's rasterise, interpolate and antialias; needs CUDA."""
     library = _load(lambda: importlib.import_module("nvdiffrast.torch"))
     if task.placed.points.device.type != "cuda":
@@ -187,7 +187,7 @@ def nvdiffrast(task: Task) -> Renderer:
     )
 
 
-def mitsuba(task: Task) -> Renderer:
+def mitsuba(task: RenderTask) -> Renderer:
     """Mitsuba 3's projective integrator: direct light of a constant sky, gradients through silhouettes."""
     library = _load(lambda: importlib.import_module("mitsuba"))
     jit = _load(lambda: importlib.import_module("drjit"))
@@ -249,7 +249,7 @@ def mitsuba(task: Task) -> Renderer:
     return Renderer(shows, forward, backward, lambda image: int((np.array(image)[..., 0] < 0.75).sum()))
 
 
-RIVALS: dict[str, Callable[[Task], Renderer]] = {
+RENDERERS: dict[str, Callable[[RenderTask], Renderer]] = {
     "pyrender": pyrender,
     "open3d": open3d,
     "pytorch3d": pytorch3d,

@@ -12,9 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
+from drivesem.bench.tables import Columns
 from drivesem.synth.variations import MIXED
 from drivesem.synth.write import Order, in_processes, synthesise
 
+TITLE = "The scene generator"
+COLUMNS: Columns = {
+    "layout": ("layout", "layout"), "workers": ("processes", "processes"), "frames": ("frames", "frames"),
+    "frames_per_second": ("frames a second", "frames/s"), "start_s": ("start, s", "start s"),
+    "peak_rss_mb": ("peak of all processes, MB", "peak MB"), "growth_kb": ("growth, KB a frame", "KB/frame"),
+}  # fmt: skip
 METHOD = (
     "Each row writes a data set with all its files to a temporary folder, with single-threaded processes; KITTI's "
     "layout with depth and instance images too. frames_per_second counts from the moment when each process has "
@@ -28,7 +35,7 @@ _KB = 1024.0
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class SynthRow:
     """What was measured."""
 
     layout: str
@@ -40,14 +47,14 @@ class Row:
     growth_kb: float
 
 
-def measure(frames: int, seed: int, workers: int) -> Iterator[Row]:
+def measure(frames: int, seed: int, workers: int) -> Iterator[SynthRow]:
     """A row for Virtual KITTI 2's layout with `workers` processes, one with a single one, one for KITTI's
     layout."""
     for layout, count in dict.fromkeys((("vkitti2", workers), ("vkitti2", 1), ("kitti", workers))):
         yield _row(layout, count, frames, seed)
 
 
-def _row(layout: str, workers: int, frames: int, seed: int) -> Row:
+def _row(layout: str, workers: int, frames: int, seed: int) -> SynthRow:
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         clone = layout == "vkitti2"
         order = Order(
@@ -63,7 +70,7 @@ def _row(layout: str, workers: int, frames: int, seed: int) -> Row:
             # A single process is a child too, so that what this one has loaded does not count.
             done = [time.perf_counter() - start for _ in synthesise(order, in_processes(workers, apart=True))]
     warm = min(2 * workers, frames - 1)
-    return Row(
+    return SynthRow(
         layout=layout,
         workers=workers,
         frames=frames,

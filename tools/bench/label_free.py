@@ -16,11 +16,18 @@ import torch
 from torch import Tensor
 
 from detectors.boxes import iou_matrix
+from drivesem.bench.tables import Columns
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import DEMO, Bench
+from drivesem.settings.commands import DEMO
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
 from scene_ir.types import Camera, Frame, Labels
+from tools.bench.settings import BenchTool
 
+TITLE = "Photographs without labels, beside labels that were hidden"
+COLUMNS: Columns = {
+    "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
+    "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
+}  # fmt: skip
 METHOD = (
     "Photographs and their cameras, labels hidden. The shipped detector finds vehicles at its t*, the shipped "
     "network places them, the fit moves them; generated frames are of the generator's held-out pools. A vehicle "
@@ -65,7 +72,7 @@ class FrameRows:
     rows: tuple[VehicleRow, ...]
 
 
-def names(config: Bench) -> list[str]:
+def names(config: BenchTool) -> list[str]:
     """The frames that are measured. Raises SceneError for a data set that cannot be read."""
     if config.dataset == DEMO:
         count = config.frames or (QUICK_FRAMES if config.quick else FULL_FRAMES)
@@ -75,21 +82,23 @@ def names(config: Bench) -> list[str]:
     return list(open_dataset(config.dataset, Path(config.root or "")).identifiers)[: config.limit or config.frames]
 
 
-def measure(config: Bench) -> Iterator[tuple[str, FrameRows]]:
+def measure(config: BenchTool) -> Iterator[tuple[str, FrameRows]]:
     """Frame by frame, in the order in which they are done. config: dataset, root, frames, seed, workers. Raises
     SceneError for a frame that cannot be used."""
-    for name, outcome in outcomes(_Judge(config).frame, partial(_in_process, config), names(config), config):
+    for name, outcome in outcomes(
+        _LabelFreeJudge(config).frame, partial(_in_process, config), names(config), config
+    ):
         yield name, outcome()
 
 
-def _in_process(config: Bench) -> Callable[[str], FrameRows]:
-    return _Judge(config).frame
+def _in_process(config: BenchTool) -> Callable[[str], FrameRows]:
+    return _LabelFreeJudge(config).frame
 
 
-class _Judge:
+class _LabelFreeJudge:
     """What one process needs: built once, used for many frames."""
 
-    def __init__(self, config: Bench) -> None:
+    def __init__(self, config: BenchTool) -> None:
         self._config = config
 
     def frame(self, name: str) -> FrameRows:

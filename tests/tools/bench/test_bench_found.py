@@ -1,4 +1,4 @@
-"""Found again, or elsewhere: what `drivesem bench found` counts, with detectors that see what they are told."""
+"""Found again, or elsewhere: what bench found counts, with detectors that see what they are told."""
 
 import json
 from collections import Counter
@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.stats import binomtest
 from torch import Tensor
 
 from detectors.types import Detections
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller
-from drivesem.bench import found
-from drivesem.bench.sights import SCORE, Sight, View, assign
-from drivesem.cli import main
-from scene_ir.errors import FormatError, RangeError
+from drivesem.evaluation.resampling import wilson
+from scene_ir.errors import FormatError
 from scene_ir.io import save_scene
 from scene_ir.types import SceneIR
+from tools.bench import found
+from tools.bench.__main__ import main
+from tools.bench.sights import SCORE, Sight, View, assign
 
 CLASSES = ("person", "Car", "truck")
 PERSON, CAR, TRUCK = range(3)
@@ -74,23 +74,6 @@ def test_each_detection_is_one_cars_only() -> None:
     two = assign(boxes, detections([((1.5, 0, 11.5, 10), CAR, 0.6), ((0, 0, 11, 10), CAR, 0.5)]))
     assert [sight.score for sight in two] == [0.5, 0.6, 0.0]
     assert assign(boxes[:0], detections([])) == []
-
-
-@pytest.mark.parametrize(("hits", "count", "low", "high"), [(5, 10, 0.2366, 0.7634), (0, 30, 0.0, 0.1135)])
-def test_wilson_by_hand(hits: int, count: int, low: float, high: float) -> None:
-    assert found.wilson(hits, count) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))
-
-
-@pytest.mark.parametrize(("hits", "count"), [(0, 1), (1, 1), (3, 7), (29, 30), (400, 1000)])
-def test_wilson_is_scipys(hits: int, count: int) -> None:
-    expected = binomtest(hits, count).proportion_ci(method="wilson")
-    assert found.wilson(hits, count) == pytest.approx((expected.low, expected.high), abs=1e-6)
-
-
-@pytest.mark.parametrize(("hits", "count"), [(0, 0), (-1, 3), (4, 3)])
-def test_wilson_of_what_is_no_share(hits: int, count: int) -> None:
-    with pytest.raises(RangeError, match="share"):
-        found.wilson(hits, count)
 
 
 def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> None:
@@ -154,7 +137,7 @@ def test_what_is_counted(street: Callable[..., SceneIR]) -> None:
         "moved all together, as often": (3, 3),
     }
     removed = lines["all", "removed, found again"]
-    assert (removed["low"], removed["high"]) == tuple(round(v, 4) for v in found.wilson(1, 3))
+    assert (removed["low"], removed["high"]) == tuple(round(v, 4) for v in wilson(1, 3))
 
 
 def test_small_and_hidden_cars_are_beside(street: Callable[..., SceneIR]) -> None:
@@ -206,7 +189,7 @@ def test_the_command_reads_scenes_and_draws_failures(
     out = tmp_path / "out"
     (out / "found").mkdir(parents=True)
     (out / "found" / "removed-09-old-1.png").write_bytes(b"of an earlier run")
-    words = ["bench", "found", "--scenes", str(tmp_path / "scenes"), "--workers", "1", "--out", str(out)]
+    words = ["found", "--scenes", str(tmp_path / "scenes"), "--workers", "1", "--out", str(out)]
     assert main([*words, "--json"]) == 0
     captured = capsys.readouterr()
     result: dict[str, Any] = json.loads(captured.out)
@@ -239,7 +222,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 ) -> None:
     (tmp_path / "EMPTY").mkdir()
     given = [str(tmp_path / "EMPTY") if word == "EMPTY" else word for word in words]
-    assert main(["bench", "found", *given]) == 2
+    assert main(["found", *given]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
@@ -248,10 +231,10 @@ def test_bad_input_is_one_line_and_exit_code_2(
 
 @pytest.mark.slow
 def test_the_embedded_frames(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["bench", "found", "--limit", "1", "--workers", "1", "--json"]
+    words = ["found", "--limit", "1", "--workers", "1", "--json"]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     lines = {(line["which"], line["measure"]): line for line in result["summary"]}
     assert lines["all", "in the photograph"]["found"] > 0
     assert lines["all", "removed, found again"]["found"] == 0
-    assert result["command"] == "drivesem bench found --workers 1 --limit 1"
+    assert result["command"] == "python -m tools.bench found --limit 1 --workers 1"

@@ -1,4 +1,4 @@
-"""`drivesem bench eval`: the same frames in both layouts, and the whole command timed."""
+"""`python -m tools.bench eval`: the same frames in both layouts, and the whole command timed."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.bench import evaluation, tables
-from drivesem.cli import main
 from drivesem.data.registry import read_table
 from scene_ir.errors import FormatError
+from tools.bench import evaluation
+from tools.bench.__main__ import main
 
 _FRAMES = 5
 
@@ -27,7 +27,7 @@ def test_both_layouts_hold_the_same_boxes(tmp_path: Path) -> None:
 
 
 def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["bench", "eval", "--frames", str(_FRAMES), "--json", "--markdown", str(tmp_path / "all.md")]
+    words = ["eval", "--frames", str(_FRAMES), "--json", "--markdown", str(tmp_path / "all.md")]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     alone, coco, kitti = result["rows"]
@@ -37,8 +37,8 @@ def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         assert (row["frames"], row["detections"]) == (_FRAMES, 20 * _FRAMES)
         assert row["seconds"] > alone["seconds"]  # a process, which starts and reads
     text = (tmp_path / "all.md").read_text()
-    assert f"### {tables.TITLES['eval']}" in text
-    assert f"`drivesem bench eval --frames {_FRAMES}`" in text
+    assert f"### {evaluation.TITLE}" in text
+    assert f"`python -m tools.bench eval --frames {_FRAMES}`" in text
 
 
 def test_a_command_that_fails_is_told() -> None:

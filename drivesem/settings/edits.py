@@ -106,16 +106,16 @@ def read_frame_edit(path: Path) -> dict[str, Any]:
     return content
 
 
-def parse_setting(text: str) -> dict[str, Any]:
+def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
     """`objects[2].translate=0.5m,0m`, `weather=fog`, `foliage.hue=0.5`: the same as nested mappings, checked.
 
-    FormatError naming the setting.
+    FormatError naming `setting`, which is where the text was given.
     """
     place, equals, value = (part.strip() for part in text.partition("="))
     match = _PLACE.fullmatch(place)
     if not equals or not value or match is None:
         raise FormatError(
-            f"--set {text}",
+            f"{setting} {text}",
             f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=... or foliage.CODE=...",
             "no value" if match is not None else "an unknown parameter",
         )
@@ -128,7 +128,7 @@ def parse_setting(text: str) -> dict[str, Any]:
     else:
         number: int | str = int(row) if row.isascii() and row.isdigit() else row
         found = {"objects": {number: {parameter: _listed(parameter, value)}}}
-    frame_edit(f"--set {text}", found)
+    frame_edit(f"{setting} {text}", found)
     return found
 
 
@@ -217,8 +217,8 @@ def mapping_of(where: str, value: Any, known: Sequence[str] | None = None) -> di
     return value
 
 
-def _list(where: str, value: Any, length: int) -> list[Any]:
-    if not isinstance(value, list) or len(value) != length:
+def _list(where: str, value: Any, length: int) -> Sequence[Any]:
+    if not isinstance(value, list | tuple) or len(value) != length:
         raise FormatError(where, f"a list of {length}", repr(value))
     return value
 

@@ -1,0 +1,68 @@
+"""Counterexamples of a run on generated frames, drawn again by the generator, frame by frame."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from drivesem.attack.judging import JudgedClasses
+from drivesem.questions.confirm.frame import confirm_frame
+from drivesem.questions.confirm.plans import open_plans
+from drivesem.questions.confirm.report import Report, answer_of, summarise
+from drivesem.questions.confirm.results import Confirmed, load
+from drivesem.report.answer import Answer
+from drivesem.run.ask import Bar, KeptFrames
+from drivesem.run.finished import METRICS, Run, load_runs
+from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of
+from drivesem.run.frame import RESULT
+from drivesem.settings.commands import Confirm
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+
+_WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)
+
+
+def confirm_run(config: Confirm) -> tuple[Report, Answer]:
+    """Confirm a run's frames, or go on with it, and write what is said of them: the figures, and all of it. Raises
+    UsageError or SceneError for bad input.
+    """
+    (run,) = load_runs([config.run or ""], config.limit)
+    out = Path(config.out) if config.out else run.folder / "confirm"
+    build = partial(ConfirmWorker, config, run, out)
+    worker = build()
+    # Frames are kept by the result they belong to, so that another name of the run's folder is not in the way.
+    claim(out, config, _WRITTEN, (*PRESENTATION, "run", "root", "seed"))
+    frames = KeptFrames(run, out, RESULT, load)
+    names = [frame.result.identifier for frame in run.frames]
+    confirmed, failed = frames.ask(names, worker, build, config, Bar("drawing frames again", stays=False))
+    if not confirmed:
+        raise UsageError("--run", "a run with frames that can be used", run.folder)
+    results = [frame.result for frame in run.frames if frame.result.identifier not in failed]
+    report = summarise(confirmed, results, JudgedClasses.of(worker.detector).names, worker.t_star)
+    facts = {
+        "run": str(run.folder),
+        "detector": run.detector,
+        "params": run.params,
+        "t_star": worker.t_star,
+    }
+    answer = answer_of(out, report, confirmed, facts, failed)
+    answer.write()
+    return report, answer
+
+
+class ConfirmWorker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Confirm, run: Run, out: Path) -> None:
+        attack = attack_of(run.folder)
+        self.run, self.out = run, out
+        self.frames = {frame.result.identifier: frame for frame in run.frames}
+        self.plans = open_plans(attack, config.root)
+        self.detector = detector_of(attack, config.device)
+        self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
+
+    def __call__(self, name: str) -> Confirmed:
+        """One frame of the run, into its folder."""
+        source, folder = self.run.folder / FRAMES / name, self.out / FRAMES / name
+        frame = self.frames[name]
+        return confirm_frame(frame, source, self.plans, self.detector, self.device, self.t_star, folder)

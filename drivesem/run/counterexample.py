@@ -1,0 +1,191 @@
+"""A counterexample as a notebook holds it: one scene attacked in memory, by the way that `drivesem attack` goes.
+
+>>> import drivesem as ds
+>>> found = ds.attack(ds.demo_scene(0), "squeezedet", params="translate,rotate", steps=2)
+>>> found.picture.shape, found.feasible
+((376, 1241, 3), True)
+>>> sorted(found.theta)[0]
+'objects[0].rotate'
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from html import escape
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from detectors.base import Predictor
+from drivesem.report import pictures
+from drivesem.run.attack import Worker
+from drivesem.run.frame import AttackedScene, frame_result, write_frame
+from drivesem.run.results import Failure, FrameResult
+from drivesem.scenes.scene import Scene, png
+from drivesem.settings.checks import validate
+from drivesem.settings.commands import Attack
+from drivesem.settings.devices import check_device
+from drivesem.settings.errors import UsageError
+from scene_ir.io import to_uint8
+from scene_ir.types import SceneIR
+
+
+class AttackOptions(TypedDict, total=False):
+    """The options of `drivesem attack` that make sense for one scene, with the same meaning and defaults."""
+
+    combo: int
+    params: str
+    method: Literal["si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es"]
+    steps: int
+    queries: int
+    step_form: Literal["raw", "l2"]
+    rate: float
+    momentum: float
+    norm: Literal[1, 2]
+    restarts: int
+    scouts: int
+    budget: str
+    range: Literal["bounds", "steps"]
+    early_stop: bool
+    objective_labels: Literal["moved", "paper"]
+    objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"]
+    target_objects: str
+    target_classes: str
+    backend: Literal["warp", "reference"]
+    precision: Literal["float32", "bfloat16", "float16"]
+    t_star: float
+    tiles: Literal["auto", "off"]
+    device: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Counterexample:
+    """What an attack made of a scene. scene: the changed one; result: all that `drivesem attack` records of a
+    frame. A notebook shows the pictures before and after, and what fails.
+    """
+
+    scene: Scene
+    result: FrameResult
+    attacked: AttackedScene
+
+    @property
+    def picture(self) -> NDArray[np.uint8]:
+        """The picture that was judged, (H, W, 3) RGB."""
+        return to_uint8(self.tensor)
+
+    @property
+    def tensor(self) -> Tensor:
+        """The picture that was judged, (3, H, W) RGB in [0, 1], before rounding to 8 bits."""
+        return self.attacked.rendered.render.image.detach().cpu()
+
+    @property
+    def photograph(self) -> NDArray[np.uint8]:
+        """The photograph before the change, (H, W, 3) RGB."""
+        return self.scene.photograph
+
+    @property
+    def theta(self) -> dict[str, float]:
+        """What was changed, by name, such as objects[3].yaw; `rows` has units and bounds."""
+        return {coordinate.name: coordinate.value for coordinate in self.result.theta}
+
+    @property
+    def failures(self) -> tuple[Failure, ...]:
+        """What the detector got right before the change and gets wrong after it, by labels that moved along."""
+        return self.result.failures
+
+    @property
+    def success(self) -> bool:
+        """Whether the attack broke the detector, by labels that moved along."""
+        return self.result.success_moved
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the independent check found the change possible."""
+        return self.result.feasible
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Theta as flat dicts, for `pandas.DataFrame`: name, unit, value, lower, upper, display."""
+        return [asdict(coordinate) for coordinate in self.result.theta]
+
+    def save(self, folder: str | Path) -> None:
+        """Write the folder that `drivesem attack` writes of a frame; in place of an earlier one."""
+        path = Path(folder)
+        if path.is_file() or (path.is_dir() and any(path.iterdir()) and not (path / "theta.json").is_file()):
+            raise UsageError("folder", "a new folder, or one of a counterexample", folder)
+        write_frame(self.attacked, path)
+
+    def _repr_html_(self) -> str:
+        result, t_star = self.result, self.attacked.objective.t_star
+        marked = pictures.overlay(
+            self.picture, result.targets_moved, result.detections_attacked, result.failures, t_star
+        )
+        before = pictures.overlay(self.photograph, result.targets_benign, result.detections_benign, (), t_star)
+        shown = "".join(
+            f'<figure style="margin:0;flex:1"><img alt="{name}" style="width:100%" src="data:image/png;base64,'
+            f'{base64.b64encode(png(picture)).decode("ascii")}"/><figcaption>{name}</figcaption></figure>'
+            for name, picture in (("before", before), ("after", marked))
+        )
+        lines = "".join(f"<li>{escape(_told(failure))}</li>" for failure in result.failures)
+        lines = lines or "<li>nothing fails</li>"
+        feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
+        head = f"{self.scene.name}: {feasible}, {result.queries} queries"
+        return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{shown}</div><ul>{lines}</ul></div>'
+
+
+def _told(failure: Failure) -> str:
+    place = ", ".join(f"{value:.0f}" for value in failure.xyxy)
+    which = "" if failure.index is None else f" objects[{failure.index}]"
+    score = "" if failure.score is None else f", score {failure.score:.2f}"
+    return f"{failure.kind} {failure.label}{which} at {place} px{score}"
+
+
+def attack(
+    scene: Scene | SceneIR, detector: str | Predictor = "squeezedet", **options: Unpack[AttackOptions]
+) -> Counterexample:
+    """Change a scene, within what is feasible, until a detector gets it wrong.
+
+        found = ds.attack(scene, "squeezedet", params="translate,rotate,mesh")
+        found.picture, found.theta, found.failures
+
+    detector: a name or file as of `drivesem attack --detector`, or a detector that is loaded (`ds.load_detector`).
+    options: those of `drivesem attack`, with underscores. The same scene, settings and number of torch threads
+    give the command's theta and picture. Raises UsageError naming the argument, SceneError or DetectorError.
+    """
+    _check(options)
+    named = detector if isinstance(detector, str) else detector.name
+    held = scene if isinstance(scene, Scene) else Scene(scene)
+    try:
+        config = Attack(detector=named, **options)
+        validate(config)
+        check_device(config.device)
+        worker = Worker.of(config, None if isinstance(detector, str) else detector)
+    except UsageError as error:
+        raise UsageError(_argument(error.field), _argument(error.expected), error.actual) from error
+    attacked = worker.search(held.name, held.ir)
+    changed = attacked.rendered.scene
+    return Counterexample(replace(held, ir=changed, notes=()), frame_result(attacked, changed), attacked)
+
+
+def _check(options: Mapping[str, Any]) -> None:
+    """Raise UsageError for an option that is none, or a value of another type."""
+    kinds = get_type_hints(AttackOptions)
+    for name, value in options.items():
+        if name not in kinds:
+            raise UsageError("attack", f"options among {', '.join(kinds)}", name)
+        choices = get_args(kinds[name])
+        if choices and value not in choices:
+            raise UsageError(name, f"one of {', '.join(map(str, choices))}", repr(value))
+        if not choices and not (isinstance(value, kinds[name]) or (kinds[name] is float and type(value) is int)):
+            raise UsageError(name, f"a value of type {kinds[name].__name__}", repr(value))
+
+
+def _argument(text: str) -> str:
+    """`--t-star` as Python writes it: t_star."""
+    return re.sub(r"--([a-z][a-z-]*)", lambda flag: flag[1].replace("-", "_"), text)

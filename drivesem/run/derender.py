@@ -1,0 +1,86 @@
+"""Frames of a data set, or one photograph, taken apart: a scene folder for each, resumable."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from drivesem.run.ask import Bar, ask
+from drivesem.run.folder import PRESENTATION, claim
+from drivesem.scenes.sheet import write_scene_sheet
+from drivesem.scenes.sources import SceneSource, open_source
+from drivesem.settings.commands import Derender
+from scene_ir.io import count_objects, load_scene, save_scene
+
+RECORD, SHEET = "scene.json", "sheet.jpg"
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """One frame taken apart. objects: vehicles in its scene; seconds: to take it apart and write it, None where an
+    earlier run did.
+    """
+
+    objects: int
+    seconds: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Derendered:
+    """All frames: in order those that were taken apart, and why others could not be."""
+
+    out: Path
+    frames: dict[str, Taken]
+    failed: dict[str, str]
+    seconds: float
+
+
+class DerenderWorker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Derender, out: Path) -> None:
+        self.config, self.out = config, out
+        self.source: SceneSource = open_source(config)
+
+    def __call__(self, identifier: str) -> Taken:
+        """One frame, from the source to its folder. Raises SceneError for a frame that cannot be used."""
+        start = time.perf_counter()
+        folder = self.out / identifier
+        if self.config.resume and (folder / RECORD).is_file():
+            scene, seconds = load_scene(folder), None
+        else:
+            scene = self.source.scene(identifier)
+            save_scene(scene, folder)
+            seconds = round(time.perf_counter() - start, 3)
+        if self.config.sheet and not (folder / SHEET).is_file():
+            write_scene_sheet(folder / SHEET, scene, identifier)
+        return Taken(len(scene.objects), seconds)
+
+
+def derender_run(config: Derender, begin: Callable[[SceneSource], None]) -> Derendered:
+    """Take apart the frames that are not there yet. begin: is told the source, before the first frame. Raises
+    UsageError or SceneError for bad input.
+    """
+    start = time.perf_counter()
+    config = replace(config, fit=config.fit and not config.fast, fast=False)
+    out = Path(config.out or f"scenes/{config.dataset if config.photo is None else Path(config.photo).stem}")
+    build = partial(DerenderWorker, config, out)
+    worker = build()
+    scenes = (name for name in worker.source.identifiers() if (out / name / RECORD).is_file())
+    claim(out, config, scenes, (*PRESENTATION, "sheet"))
+    names = list(islice(worker.source.identifiers(), config.limit))
+    done: dict[str, Taken] = {}
+    for name in names:
+        whole = config.resume and (out / name / RECORD).is_file()
+        if whole and (not config.sheet or (out / name / SHEET).is_file()):
+            done[name] = Taken(count_objects(out / name), None)
+    begin(worker.source)
+    todo = [name for name in names if name not in done]
+    answers = ask(todo, worker, build, config, Bar("taking frames apart", remaining=True))
+    done |= answers.results
+    frames = {name: done[name] for name in names if name in done}
+    return Derendered(out, frames, dict(sorted(answers.failed.items())), round(time.perf_counter() - start, 3))

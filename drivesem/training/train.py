@@ -1,0 +1,324 @@
+"""A training run: a detector from frames, with its curves, its best weights and their model card; resumable."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import distributed
+
+from detectors.augment import AugmentSettings
+from detectors.base import Detector
+from detectors.registry import read_weights
+from detectors.squeezedet import SqueezeDet
+from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
+from drivesem.data.joined import open_folders
+from drivesem.report.progress import training_bar
+from drivesem.run.folder import claim
+from drivesem.settings.commands import SYNTH, Train, processes
+from drivesem.settings.devices import check_device
+from drivesem.settings.errors import UsageError
+from drivesem.settings.text import command_line
+from drivesem.settings.values import interval, numbers, size_hw
+from drivesem.training import keeper
+from drivesem.training.card import Recipe
+from drivesem.training.frames import FrameStore
+from drivesem.training.keeper import HeldOut, Keeper
+from drivesem.training.semantic import SemanticFrames
+from drivesem.training.start import architecture, begin, set_dropout
+from scene_ir import files
+
+CACHES = "cache"
+"""Folder of decoded frames in the run's folder."""
+SEMANTIC = "semantic"
+"""Folder of perturbed frames in the run's folder."""
+_WRITTEN = (
+    *(CHECKPOINT, LOG, keeper.EVALUATIONS, keeper.BEST, keeper.CURVES),
+    *(CACHES, SEMANTIC, "tensorboard"),
+)
+_FREE = (
+    *("out", "workers", "keep_going", "resume", "json", "device", "loaders"),
+    *("minutes", "checkpoint_every", "evaluate_every", "thin", "note", "also", "weights"),
+)
+"""Settings that a run may change on the way."""
+_NOT_IN_COMMAND = ("out", "weights", "json", "resume", "workers", "loaders", "note", "limit")
+"""Settings that a card's command need not repeat."""
+
+
+class Pace:
+    """Steps, and seconds by the clock and of the processor that they took, without what is done `beside` them."""
+
+    def __init__(self, batch: int) -> None:
+        self.steps, self.batch = 0, batch
+        self._clock, self._processor = time.perf_counter(), time.process_time()
+        self._ended = self._clock, self._processor
+
+    def count(self) -> None:
+        """A step is done."""
+        self.steps += 1
+        self._ended = time.perf_counter(), time.process_time()
+
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """What is done inside is no step."""
+        clock, processor = time.perf_counter(), time.process_time()
+        yield
+        self._clock += time.perf_counter() - clock
+        self._processor += time.process_time() - processor
+        self._ended = time.perf_counter(), time.process_time()
+
+    @property
+    def images_a_second(self) -> float:
+        seconds = self._ended[0] - self._clock
+        return self.steps * self.batch / seconds if seconds > 0 else 0.0
+
+    @property
+    def processor_seconds_an_image(self) -> float:
+        return (self._ended[1] - self._processor) / max(self.steps * self.batch, 1)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of a run. data: the JSON; pace: of the steps that were taken now."""
+
+    data: dict[str, Any]
+    pace: Pace
+
+
+def train_run(config: Train) -> Trained | None:
+    """Train or go on training; None in all processes but the first. Raises UsageError or SceneError for bad
+    input.
+    """
+    with _processes(config) as (rank, device):
+        console = Console(stderr=True, quiet=rank > 0)
+        settings = _settings(config)
+        detector = architecture(config.detector)
+        start = _begin(config, detector)  # before the folder is made: bad settings leave nothing behind
+        out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
+        if rank == 0:
+            claim(out, config, _WRITTEN, _FREE)
+        frames, held_out = _data(config, out, detector, rank, console)
+        if config.anchors == "kmeans":
+            detector = _with_own_anchors(config, frames)
+            start = _begin(config, detector)
+        detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        weights = Path(config.weights or out / f"{config.detector}.safetensors")
+        tell = partial(console.print, soft_wrap=True)
+        judge = Keeper(out, weights, _recipe(config, frames, start), held_out, device, tell)
+        shown: Sequence[Sample] = frames
+        if config.semantic:
+            shown = SemanticFrames(frames, out / SEMANTIC, config.semantic, config.seed)
+        pace = Pace(config.batch)
+
+        def evaluate(detector: Detector, step: int) -> None:
+            with pace.beside():
+                judge(detector, step)
+
+        with _shown(pace, out, console) as progress:
+            try:
+                train(detector, shown, settings, out, evaluate, progress=progress, loaders=config.loaders)
+            except FloatingPointError as error:
+                raise UsageError("--rate", "one at which the loss stays finite", error) from error
+        return _trained(config, out, weights, len(frames), pace) if rank == 0 else None
+
+
+def _settings(config: Train) -> TrainingSettings:
+    return TrainingSettings(
+        steps=config.steps,
+        minutes=config.minutes,
+        batch=config.batch,
+        optimiser=config.optimiser,
+        momentum=config.momentum,
+        rate=config.rate,
+        backbone_rate=config.backbone_rate,
+        weight_decay=config.weight_decay,
+        warmup_steps=config.warmup,
+        warmup_power=config.warmup_power,
+        drops=tuple(numbers("--drops", config.drops)) if config.drops else (),
+        drop_factor=config.drop_factor,
+        clip_norm=config.clip,
+        average_decay=config.average,
+        precision=config.precision,
+        seed=config.seed,
+        checkpoint_every=config.checkpoint_every,
+        evaluate_every=config.evaluate_every,
+        augment=AugmentSettings(
+            window_hw=size_hw("--window", config.window), scale=interval("--scale", config.scale)
+        ),
+    )
+
+
+def _begin(config: Train, detector: Detector) -> str:
+    """Give the detector its first weights and settings; a sentence about where they come from."""
+    start = begin(detector, config.start, config.seed)
+    set_dropout(detector, config.dropout)
+    if isinstance(detector, SqueezeDet):
+        detector.trained_by = config.loss
+    elif config.loss != "published":
+        raise UsageError("--loss", f"published with --detector {config.detector}", config.loss)
+    return start
+
+
+def _with_own_anchors(config: Train, frames: FrameStore) -> Detector:
+    try:
+        anchors = frames.anchors(config.seed)
+    except ValueError as error:
+        raise UsageError("--anchors", "more different boxes for kmeans", error) from error
+    return architecture(config.detector, anchors)
+
+
+def _data(
+    config: Train, out: Path, detector: Detector, rank: int, console: Console
+) -> tuple[FrameStore, HeldOut | None]:
+    """The frames to train on and to judge by, decoded by the first process and read by the others."""
+    if rank > 0:
+        distributed.barrier()
+    name, root, held_out = _folders(config, out, rank, console)
+    frames = _store(config, name, root, out / CACHES / "train", detector, console)
+    if frames.objects() == 0:
+        raise UsageError(str(root), f"frames with objects of {', '.join(detector.classes)}", "none")
+    judged = None
+    if held_out is not None:
+        store = _store(config, name, held_out, out / CACHES / "held_out", detector, console, whole=True)
+        also = None
+        if config.also is not None:
+            also = _store(config, "kitti", Path(config.also), out / CACHES / "also", detector, console, whole=True)
+        judged = HeldOut(store, config.thin, also)
+    if rank == 0 and distributed.is_initialized():
+        distributed.barrier()
+    return frames, judged
+
+
+def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
+    """Layout, folder to train on, folder to judge by."""
+    if config.dataset != SYNTH:
+        return config.dataset, Path(config.root or ""), Path(config.held_out) if config.held_out else None
+    from drivesem.synth.write import Order, in_processes, synthesise
+
+    root, held_out = out / "frames" / "train", out / "frames" / "held_out"
+    orders = [Order(root, config.frames, config.seed)]
+    if config.held_out_frames:
+        orders.append(Order(held_out, config.held_out_frames, config.seed, split="heldout"))
+    if rank == 0:
+        for order in orders:
+            done = synthesise(order, in_processes(min(processes(config), order.frames)))
+            with training_bar(console) as bar:
+                for _ in bar.track(done, total=order.frames, description="making frames"):
+                    pass
+    return "kitti", root, held_out if config.held_out_frames else None
+
+
+def _store(
+    config: Train, name: str, root: Path, cache: Path, detector: Detector, console: Console, whole: bool = False
+) -> FrameStore:
+    dataset = open_folders(name, str(root))
+    names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
+    if not names:
+        raise UsageError(str(root), "at least one frame", "none")
+    with training_bar(console) as bar:
+        task = bar.add_task(f"reading {root.name}", total=len(names))
+        return FrameStore(dataset, names, cache, detector.classes, lambda: bar.advance(task))
+
+
+def _recipe(config: Train, frames: FrameStore, start: str) -> Recipe:
+    threads = torch.get_num_threads()
+    machine = f"{threads} CPU thread{'s' if threads > 1 else ''}"
+    if config.device != "cpu" and torch.cuda.is_available():
+        machine = torch.cuda.get_device_name()
+    source = "the project's own generator" if config.dataset == SYNTH else f"layout {config.dataset}"
+    folders = "" if config.root is None else f" (`{_names(config.root).replace(',', '`, `')}`)"
+    return Recipe(
+        data=f"{len(frames):,} frames of {source}{folders}.",
+        start=start,
+        batch=config.batch,
+        seed=config.seed,
+        machine=machine,
+        commands=(command_line("train", _portable(config), _NOT_IN_COMMAND),),
+        by_clock=config.minutes > 0,
+        note=config.note,
+    )
+
+
+def _portable(config: Train) -> Train:
+    """The configuration with folders and files by their names, not where they lay on this machine."""
+    names = {key: getattr(config, key) for key in ("root", "held_out", "also", "start")}
+    return replace(config, **{key: _names(value) for key, value in names.items() if value is not None})
+
+
+def _names(folders: str) -> str:
+    """The last parts of paths with commas between."""
+    return ",".join(Path(part).name for part in folders.split(",") if part)
+
+
+@contextmanager
+def _processes(config: Train) -> Iterator[tuple[int, str]]:
+    """This process's number and its device; a process group where torchrun started several."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        check_device(config.device)
+        yield 0, config.device
+        return
+    device = config.device
+    if device == "cuda":
+        device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
+        torch.cuda.set_device(device)
+    check_device(device)
+    distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+    try:
+        yield distributed.get_rank(), device
+    finally:
+        distributed.destroy_process_group()
+
+
+@contextmanager
+def _shown(pace: Pace, out: Path, console: Console) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+    """A bar with the loss and the speed, and TensorBoard's events where it is installed."""
+    writer = _tensorboard(out)
+    with training_bar(console) as bar:
+        task = bar.add_task("training", total=None)
+
+        def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
+            pace.count()
+            told = f"loss {row['total']:.3f}, {pace.images_a_second:.1f} images/s"
+            bar.update(task, completed=done, total=steps, description=told)
+            if writer is not None:
+                for name, value in row.items():
+                    writer.add_scalar(name, value, done)
+
+        try:
+            yield progress
+        finally:
+            if writer is not None:
+                writer.close()
+
+
+def _tensorboard(out: Path) -> Any:
+    """A writer of TensorBoard's events; None where TensorBoard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ModuleNotFoundError:
+        return None
+    return SummaryWriter(str(out / "tensorboard"))
+
+
+def _trained(config: Train, out: Path, weights: Path, frames: int, pace: Pace) -> Trained:
+    data = {
+        "out": str(out),
+        "weights": str(weights),
+        "detector": config.detector,
+        "dataset": config.dataset,
+        "frames": frames,
+        "steps": int(read_weights(out / CHECKPOINT)[0]["step"]),
+        "steps_now": pace.steps,
+        "images_a_second": round(pace.images_a_second, 2),
+        "processor_seconds_an_image": round(pace.processor_seconds_an_image, 4),
+        "best": files.read_json(out / keeper.BEST) if (out / keeper.BEST).is_file() else None,
+    }
+    return Trained(data, pace)

@@ -1,0 +1,138 @@
+"""Benchmarks for maintainers: `python -m tools.bench NAME [options]`, from the repository's root.
+
+Each prints its tables, with method, machine and versions, and writes its section of docs/benchmarks.md with
+`--markdown`, as `drivesem bench` does.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from detectors.base import DetectorError
+from drivesem.bench import memory, render
+from drivesem.bench.scenes import MOST_CARS
+from drivesem.bench.session import Measured, conduct, targets_of, watched
+from drivesem.bench.tables import Section
+from drivesem.settings.commands import processes
+from drivesem.settings.errors import UsageError
+from drivesem.settings.values import numbers
+from scene_ir.errors import SceneError
+from tools.bench import derender, evaluation, found, label_free, rivals, synth
+from tools.bench.settings import BenchTool, check
+
+_PROGRAM = "python -m tools.bench"
+_RIVAL_SECONDS = (16.0, 180.0)
+"""Seconds for measuring renderers, with --quick and without; imports and scenes take some more."""
+_EXIT_BAD_INPUT = 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns the exit code: 0 done, 2 bad input, which one line tells."""
+    config = tyro.cli(BenchTool, prog=_PROGRAM, args=argv)
+    try:
+        return run(config)
+    except (UsageError, SceneError, DetectorError, OSError) as error:
+        sys.stderr.write(f"{_PROGRAM}: {' '.join(str(error).split())}\n")
+        return _EXIT_BAD_INPUT
+
+
+def run(config: BenchTool) -> int:
+    """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
+    check(config)
+    measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
+        "derender": _derender,
+        "found": _found,
+        "label-free": _label_free,
+        "synth": _synth,
+        "rivals": _rivals,
+        "eval": _eval,
+    }
+    return conduct(config, _PROGRAM, measure[config.what])
+
+
+def _derender(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = _frames(config, derender)
+    measured = derender.measure(frames, config.seed, processes(config), config.ablate, _sheets(config))
+    rows = list(watched(measured, frames, console))
+    fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
+    return _measured(derender, fields)
+
+
+def _found(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    sheets = _sheets(config)
+    try:
+        frames = dict(watched(found.measure(config, sheets), found.count(config), console))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    rows = [car for name in sorted(frames) for car in frames[name]]
+    if sheets is not None:
+        found.rank_sheets(rows, sheets)
+    fields = {"frames": len(frames), "rows": [asdict(row) for row in rows], "summary": found.summary(rows)}
+    return _measured(found, fields)
+
+
+def _label_free(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = dict(watched(label_free.measure(config), len(label_free.names(config)), console))
+    ordered = [frames[name] for name in sorted(frames)]
+    rows = [asdict(row) for frame in ordered for row in frame.rows]
+    fields = {"frames": len(frames), "rows": rows, "summary": label_free.summary(ordered)}
+    return _measured(label_free, fields)
+
+
+def _synth(config: BenchTool, console: Console) -> Measured:
+    if not memory.supported():
+        raise UsageError("bench synth", "a system with /proc", sys.platform)
+    _on_cpu(config)
+    rows = list(watched(synth.measure(_frames(config, synth), config.seed, processes(config)), 3, console))
+    first = {"frames_per_second": rows[0].frames_per_second, "peak_rss_mb": rows[0].peak_rss_mb}
+    return _measured(synth, {**first, "rows": [asdict(row) for row in rows]})
+
+
+def _rivals(config: BenchTool, console: Console) -> Measured:
+    cars = numbers("--cars", config.cars)
+    if max(cars) > MOST_CARS:
+        raise UsageError("--cars", f"at most {MOST_CARS}", max(cars))
+    sizes = render.sizes(cars, numbers("--triangles", config.triangles))
+    measured = rivals.measure(sizes, _RIVAL_SECONDS[0 if config.quick else 1], config.seed, config.device)
+    return _measured(rivals, {"rows": [asdict(row) for row in watched(measured, 2 * len(sizes), console)]})
+
+
+def _eval(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    rows = watched(evaluation.measure(_frames(config, evaluation), config.seed), 3, console)
+    return _measured(evaluation, {"rows": [asdict(row) for row in rows]})
+
+
+def _measured(benchmark: Any, fields: dict[str, Any]) -> Measured:
+    """What a benchmark, one of the modules here, found; its table shows the summary, where there is one."""
+    rows = fields.get("summary", fields["rows"])
+    return Measured({**fields, "method": benchmark.METHOD}, [Section(benchmark.TITLE, benchmark.COLUMNS, rows)])
+
+
+def _on_cpu(config: BenchTool) -> None:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu", config.device)
+
+
+def _frames(config: BenchTool, benchmark: Any) -> int:
+    return config.frames or (benchmark.QUICK_FRAMES if config.quick else benchmark.FULL_FRAMES)
+
+
+def _sheets(config: BenchTool) -> Path | None:
+    """The folder for pictures, beside the results."""
+    targets = targets_of(config)
+    return None if targets is None else targets[0].with_suffix("")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
