@@ -481,11 +481,11 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
     frames = [_identifier(row) for row in told.images.rows]
     if len(set(frames)) != len(frames):
         frames = [str(i) for i in told.image_ids.tolist()]
-    sizes = [(row.get("width") or 0, row.get("height") or 0) for row in told.images.rows]
+    sizes_wh = np.stack([told.images.column(key, 0.0) for key in ("width", "height")], axis=1)
     table = told.annotations.table(frames, told.kinds, told.category_ids, told.frame, told.kind, scored)
     return replace(
         _merged_regions(table.rows(np.argsort(table.frame, kind="stable"))),
-        sizes_wh=np.array(sizes, np.int64).reshape(-1, 2),
+        sizes_wh=sizes_wh.astype(np.int64),
         image_ids=told.image_ids,
         cameras={i: row["camera"] for i, row in enumerate(told.images.rows) if "camera" in row},
     )
