@@ -1,15 +1,21 @@
 """The second opinion: are two scenes, as they lie on disk, a feasible change of one another?
 
 Shares no code with `drivesem.attack.feasible`: it sees no theta, only the scenes, and measures them in other ways
-(polygon clipping, finite differences, all vertices of the meshes). Its tolerances are wider by what the two ways
-may differ.
+(polygon clipping, finite differences, all vertices of the meshes, rays cast at them by Open3D). Its tolerances are
+wider by what the two ways may differ.
+
+Open3D needs libusb and loads slowly: it is imported when the first scene is checked, and where it cannot be, the
+meshes' convex outlines stand for the meshes. `judge_at_hand` says which of the two it is here.
 """
 
 from __future__ import annotations
 
+import functools
+import importlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -18,6 +24,8 @@ from numpy.typing import NDArray
 from scene_ir.types import SceneIR
 
 Array = NDArray[np.float64]
+JudgeName = Literal["open3d", "outlines"]
+"""What tells whether cars show and whether their meshes meet: rays at the meshes, or their convex outlines."""
 
 STRAIN = (0.7, 1.4)
 """Least and largest singular value of a mesh's deformation."""
@@ -41,6 +49,10 @@ SEEN = 0.3
 """Share of its outline that must show in `base` for a car to be one that is seen. Of what is hidden more the
 attack's set, which takes cars for boxes, may see nothing from the start; KITTI calls it largely occluded, and it
 is not judged."""
+RAYS = (48, 64)
+"""Rays through a car's image box at most, down and across; no more than one a pixel."""
+COLUMNS = 64
+"""Plumb lines each way over the ground that two cars may share."""
 MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 
@@ -74,11 +86,18 @@ def check_reach(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
     return found
 
 
-def check_scene(base: SceneIR, perturbed: SceneIR) -> list[str]:
+def judge_at_hand() -> JudgeName:
+    """Who judges here: `open3d` where it can be imported, which takes a second or two, or else `outlines`."""
+    return "outlines" if _open3d() is None else "open3d"
+
+
+def check_scene(base: SceneIR, perturbed: SceneIR, by: JudgeName | None = None) -> list[str]:
     """What is violated, one line each, such as `objects[3]: collision with objects[1], 0.52 m2 (0.00 before)`.
 
-    Nothing counts that was as bad in `base`. Empty where the change is feasible.
+    by: whose judgement counts, by default that of `judge_at_hand`, which also stands in where Open3D is asked for
+    and missing. Nothing counts that was as bad in `base`. Empty where the change is feasible.
     """
+    judge = _Outlines() if by == "outlines" else _judge()
     if len(base.objects) != len(perturbed.objects):
         return [f"objects: {len(base.objects)} before, {len(perturbed.objects)} after"]
     found = _unchanged(base, perturbed) + check_reach(base, perturbed, WIDEST)
@@ -88,15 +107,16 @@ def check_scene(base: SceneIR, perturbed: SceneIR) -> list[str]:
     for i, (old, new) in enumerate(zip(before, after, strict=True)):
         lines = _height(base, old, new) + _shape(old, new) + _road(base, road, old, new)
         found += [f"objects[{i}]: {line}" for line in lines + _frame(base, old, new)]
-    found += _collisions(dict(enumerate(before)), dict(enumerate(after)))
-    found += _hidden(base, before, after)
+    found += _collisions(dict(enumerate(before)), dict(enumerate(after)), judge)
+    found += _hidden(base, before, after, judge)
     return found
 
 
 def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list[str]:
     """Which of the objects `rows` left the ground or the road, or stand in one another; lines as of `check_scene`.
 
-    What only an attack is bound to, how far a car may go and turn, is not looked at.
+    What only an attack is bound to, how far a car may go and turn, is not looked at. Outlines judge, on every
+    machine: an edit waits for no library, and a scene drawn at random is the same everywhere.
     """
     before = {i: _Car(base, i) for i in rows}
     after = {i: _Car(perturbed, i) for i in before}
@@ -105,7 +125,7 @@ def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list
     for i, old in before.items():
         lines = _height(base, old, after[i]) + _road(base, road, old, after[i])
         found += [f"objects[{i}]: {line}" for line in lines]
-    return found + _collisions(before, after)
+    return found + _collisions(before, after, _Outlines())
 
 
 class _Pose:
@@ -128,7 +148,8 @@ class _Car(_Pose):
     def __init__(self, scene: SceneIR, i: int) -> None:
         super().__init__(scene, i)
         objects = scene.objects
-        self.unit = scene.meshes[int(objects.mesh_index[i])].vertices.detach().double().numpy()
+        mesh = scene.meshes[int(objects.mesh_index[i])]
+        self.unit, self.faces = mesh.vertices.detach().double().numpy(), mesh.faces.numpy()
         self.deformed = bend(self.unit, self.lattice)
         local = self.deformed * self.size
         self.low, self.high = local.min(axis=0), local.max(axis=0)
@@ -338,8 +359,8 @@ def _frame(base: SceneIR, old: _Car, new: _Car) -> list[str]:
     return found
 
 
-def _collisions(before: Mapping[int, _Car], after: Mapping[int, _Car]) -> list[str]:
-    """Cars that share more ground than before: their rectangles, and, where those meet, the meshes' outlines."""
+def _collisions(before: Mapping[int, _Car], after: Mapping[int, _Car], judge: _Judge) -> list[str]:
+    """Cars that share more ground than before: their rectangles, and, where those meet, the meshes themselves."""
     found = []
     for i in after:
         for j in (k for k in after if k < i):
@@ -348,19 +369,41 @@ def _collisions(before: Mapping[int, _Car], after: Mapping[int, _Car]) -> list[s
             if now > then + OVERLAP_TOLERANCE_M2:
                 found.append(f"objects[{i}]: collision with objects[{j}], {now:.2f} m2 ({then:.2f} before)")
             elif now > 0:
-                now = overlap_area(after[i].outline, after[j].outline)
-                then = overlap_area(before[i].outline, before[j].outline)
+                now, then = (judge.shared_m2(cars[i], cars[j]) for cars in (after, before))
                 if now > then + OUTLINE_TOLERANCE_M2:
                     areas = f"{now:.2f} m2 ({then:.2f} before)"
                     found.append(f"objects[{i}]: mesh runs into that of objects[{j}], {areas}")
     return found
 
 
-def _hidden(base: SceneIR, before: list[_Car], after: list[_Car]) -> list[str]:
-    """Cars that were seen and are now wholly behind others, by their convex outlines."""
-    then, now = _visible_pixels(base, before), _visible_pixels(base, after)
-    alone = [_visible_pixels(base, [car])[0] for car in before]
+def _hidden(base: SceneIR, before: list[_Car], after: list[_Car], judge: _Judge) -> list[str]:
+    """Cars that were seen and are now wholly behind others."""
+    (then, alone), (now, _) = judge.seen(base, before), judge.seen(base, after)
     return [f"objects[{i}]: hidden" for i in range(len(before)) if now[i] == 0 and then[i] > SEEN * alone[i]]
+
+
+class _Judge(Protocol):
+    """Whether cars show, and whether they meet."""
+
+    def seen(self, base: SceneIR, cars: list[_Car]) -> tuple[list[int], list[int]]:
+        """How much of each car shows, and how much would if it stood there alone."""
+        ...
+
+    def shared_m2(self, a: _Car, b: _Car) -> float:
+        """The ground on which both cars stand."""
+        ...
+
+
+class _Outlines:
+    """Judges by convex outlines, painted from far to near."""
+
+    def seen(self, base: SceneIR, cars: list[_Car]) -> tuple[list[int], list[int]]:
+        """In pixels."""
+        return _visible_pixels(base, cars), [_visible_pixels(base, [car])[0] for car in cars]
+
+    def shared_m2(self, a: _Car, b: _Car) -> float:
+        """Where the outlines from above overlap."""
+        return overlap_area(a.outline, b.outline)
 
 
 def _visible_pixels(base: SceneIR, cars: list[_Car]) -> list[int]:
@@ -372,3 +415,84 @@ def _visible_pixels(base: SceneIR, cars: list[_Car]) -> list[int]:
         cv2.fillConvexPoly(canvas, outline, i + 1)
     counts = np.bincount(canvas.ravel(), minlength=len(cars) + 1)
     return counts[1:].tolist()
+
+
+@functools.cache
+def _open3d() -> Any | None:
+    """The library; None where it, or a library of the system that it needs, is missing."""
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, OSError):
+        return None
+
+
+def _judge() -> _Judge:
+    open3d = _open3d()
+    return _Outlines() if open3d is None else _Rays(open3d)
+
+
+class _Rays:
+    """Judges by what rays of Open3D meet of the cars' triangles."""
+
+    def __init__(self, open3d: Any) -> None:
+        self._open3d = open3d
+
+    def seen(self, base: SceneIR, cars: list[_Car]) -> tuple[list[int], list[int]]:
+        """In rays through the car's image box: those that meet it first, and those that meet it at all."""
+        if not cars:
+            return [], []
+        matrix = base.camera.matrix.double().numpy()
+        inverse = np.linalg.inv(matrix[:, :3])
+        pixels = [_grid(_clipped(base, car)) for car in cars]
+        owner = np.repeat(np.arange(len(cars)), [len(grid) for grid in pixels])
+        rays = np.concatenate(pixels)
+        directions = np.column_stack([rays, np.ones(len(rays))]) @ inverse.T
+        ray, car, distance = self._met(cars, -inverse @ matrix[:, 3], directions)
+        first = np.full(len(rays), np.inf)
+        np.minimum.at(first, ray, distance)
+        own = car == owner[ray]
+        shown, met = np.unique(ray[own & (distance == first[ray])]), np.unique(ray[own])
+        counts = (np.bincount(owner[hit], minlength=len(cars)).tolist() for hit in (shown, met))
+        return next(counts), next(counts)
+
+    def shared_m2(self, a: _Car, b: _Car) -> float:
+        """Where a plumb line is inside of both at one height."""
+        corners = [(car.vertices.min(axis=0), car.vertices.max(axis=0)) for car in (a, b)]
+        low, high = np.maximum(corners[0][0], corners[1][0]), np.minimum(corners[0][1], corners[1][1])
+        if (low >= high).any():
+            return 0.0
+        steps = (np.arange(COLUMNS) + 0.5) / COLUMNS
+        x, z = np.meshgrid(low[0] + steps * (high[0] - low[0]), low[2] + steps * (high[2] - low[2]))
+        # y points down.
+        above = min(corners[0][0][1], corners[1][0][1]) - 1.0
+        origins = np.stack([x.ravel(), np.full(x.size, above), z.ravel()], axis=1)
+        ray, car, distance = self._met([a, b], origins, np.array([0.0, 1.0, 0.0]))
+        top, bottom = np.full((2, x.size), np.inf), np.full((2, x.size), -np.inf)
+        np.minimum.at(top, (car, ray), distance)
+        np.maximum.at(bottom, (car, ray), distance)
+        meet = top.max(axis=0) < bottom.min(axis=0)
+        return float(meet.mean() * (high[0] - low[0]) * (high[2] - low[2]))
+
+    def _met(self, cars: list[_Car], origins: Array, directions: Array) -> tuple[NDArray[Any], ...]:
+        """All that rays (R, 3), (R, 3) meet: ray (K,), car (K,), and distance in lengths of the direction (K,)."""
+        tensor = self._open3d.core.Tensor
+        scene = self._open3d.t.geometry.RaycastingScene(nthreads=1)
+        for car in cars:
+            vertices, faces = (np.ascontiguousarray(car.vertices, np.float32), car.faces.astype(np.uint32))
+            scene.add_triangles(tensor(vertices), tensor(faces))
+        origins, directions = np.broadcast_arrays(origins, directions)
+        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        met = scene.list_intersections(tensor(rays), nthreads=1)
+        return tuple(
+            met[name].numpy().astype(kind)
+            for name, kind in (("ray_ids", np.int64), ("geometry_ids", np.int64), ("t_hit", np.float64))
+        )
+
+
+def _grid(box: tuple[float, float, float, float]) -> Array:
+    """Pixels (R, 2), x and y, spread evenly over an image box."""
+    sides = []
+    for first, last, most in ((box[0], box[2], RAYS[1]), (box[1], box[3], RAYS[0])):
+        count = min(most, math.ceil(last - first) + 1)
+        sides.append(first + (np.arange(count) + 0.5) / count * (last - first))
+    return np.stack([side.ravel() for side in np.meshgrid(*sides)], axis=1)

@@ -44,7 +44,7 @@ from drivesem.report.answer import print_json
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Attack, Gradcheck, processes
+from drivesem.settings.commands import Gradcheck
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -460,10 +460,7 @@ class GradcheckWorker:
     def __init__(self, config: Gradcheck) -> None:
         self.config = config
         check_device(config.device)
-        attack = Attack(
-            dataset=config.dataset, root=config.root, fit=config.fit, seed=config.seed, limit=config.limit
-        )
-        self.source: SceneSource = open_source(attack)
+        self.source: SceneSource = open_source(config)
         self._detectors: dict[Backend, SqueezeDet] = {
             "reference": _detector(config.detector, "cpu").double(),
             "warp": _detector(config.detector, config.device),
@@ -489,7 +486,7 @@ def _check_all(worker: GradcheckWorker, names: Sequence[str]) -> tuple[dict[str,
     """The rows of each scene, and why others have none."""
     parts = (None, *Parameter)
     per_scene = [tuple(_Task(name, at, part) for at in POINTS for part in parts) for name in names]
-    if len(names) >= processes(worker.config):
+    if len(names) >= worker.config.processes:
         jobs = per_scene
     else:  # too few scenes to keep every process busy: each makes the scene ready for itself
         jobs = [(task,) for tasks in per_scene for task in tasks]

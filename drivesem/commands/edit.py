@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ from rich.console import Console
 
 from drivesem.attack.scene_edits import edited
 from drivesem.commands.render import picture_path
+from drivesem.report.answer import print_json
 from drivesem.scenes.scene import Scene, free_folder
 from drivesem.settings.commands import Edit
 from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
@@ -41,7 +41,7 @@ def run(config: Edit) -> int:
     written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
     if config.json:
         found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": result.notes}
-        sys.stdout.write(json.dumps({**found, "seconds": seconds}) + "\n")
+        print_json({**found, "seconds": seconds})
     else:
         what = f"{len(result.scene.objects)} vehicles, {len(result.removed)} removed ({seconds:.1f} s)"
         Console().print(f"{' and '.join(written.values())}: {what}", soft_wrap=True)

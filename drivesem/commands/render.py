@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from pathlib import Path
 
 from rich.console import Console
 
+from drivesem.report.answer import print_json
 from drivesem.scenes.scene import load_scene
 from drivesem.settings.commands import Render
 from drivesem.settings.errors import UsageError
@@ -24,7 +23,7 @@ def run(config: Render) -> int:
     seconds = round(time.perf_counter() - start, 3)
     if config.json:
         found = {"scene": config.scene, "out": str(out), "objects": len(scene), "seconds": seconds}
-        sys.stdout.write(json.dumps(found) + "\n")
+        print_json(found)
     else:
         Console().print(f"{out}: {len(scene)} vehicles ({seconds:.1f} s)", soft_wrap=True)
     return 0

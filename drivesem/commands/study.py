@@ -15,7 +15,7 @@ from rich.console import Console
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.plans import open_plans
-from drivesem.questions.confirm.report import Report as Confirmed
+from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study import report, retrain, retrain_report, transfer
 from drivesem.questions.study.arms import arms_of
 from drivesem.questions.study.labels import label_sets
@@ -81,7 +81,7 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     return found.to_json(), report.told(found), partial(write_plot, found=found)
 
 
-def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmed]:
+def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
     """What the generator's pictures say of each arm that is no control, where that is asked."""
     if not config.confirm:
         return {}

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from pathlib import Path
-
 from rich.console import Console
 
 from drivesem.questions.survey.page import (
     CHANGED,
+    KEY,
+    PAGE,
     UNCHANGED,
     items_of,
     render_page,
     survey_name,
     write_key,
 )
+from drivesem.report.answer import print_json
 from drivesem.run.finished import load_runs
+from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Survey
-from drivesem.settings.errors import UsageError
 from scene_ir import files
-
-PAGE, KEY = "survey.html", "survey-key.json"
 
 
 def run(config: Survey) -> int:
     """Make the page and its key; exit code 0. Raises UsageError or SceneError for bad input."""
     runs = load_runs(config.runs, setting="RUN")
-    out = Path(config.out) if config.out else runs[0].folder / "survey"
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    out = folder_of(config.out, runs[0].folder / "survey")
     chosen = items_of(runs, config.items, config.controls, config.seed)
     items = [item for item, _ in chosen]
     page = render_page(chosen)
@@ -40,7 +35,7 @@ def run(config: Survey) -> int:
     data["megabytes"] = round(len(page) / 1e6, 2)
     console = Console(stderr=True)
     if config.json:
-        sys.stdout.write(json.dumps(data) + "\n")
+        print_json(data)
     if counts[CHANGED] < config.items:
         console.print(f"only {counts[CHANGED]} of {config.items} pictures: the runs have no more", soft_wrap=True)
     console.print(f"give people {out / PAGE}, keep {out / KEY}", soft_wrap=True, highlight=False)

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
+from drivesem.report.answer import print_json
+from drivesem.report.progress import progress_bar
+from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
-from drivesem.settings.commands import Synth, processes
+from drivesem.settings.commands import Synth
 from drivesem.settings.errors import UsageError
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, in_processes, synthesise
@@ -30,9 +23,7 @@ _SHEET_FRAMES = 8
 
 def order_of(config: Synth) -> Order:
     """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
-    out = Path(config.out or f"data/synth-{config.layout}-{config.split}-seed{config.seed}")
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    out = folder_of(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
     for name in ("meshes", "assets"):
         folder = getattr(config, name)
@@ -62,12 +53,8 @@ def run(config: Synth) -> int:
     order = order_of(config)
     total = len(order.places())
     hold(order.out)
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
-        *(TimeElapsedColumn(), TimeRemainingColumn()),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        done = synthesise(order, in_processes(min(processes(config), total)))
+    with progress_bar(Console(stderr=True), remaining=True) as progress:
+        done = synthesise(order, in_processes(min(config.processes, total)))
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}
@@ -77,7 +64,7 @@ def run(config: Synth) -> int:
         found["distances"] = _compare(order)
     found["seconds"] = round(time.perf_counter() - start, 3)
     if config.json:
-        sys.stdout.write(json.dumps(found) + "\n")
+        print_json(found)
     else:
         Console().print(f"{total} frames in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True)
     return 0

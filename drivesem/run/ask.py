@@ -17,7 +17,7 @@ from drivesem.run.finished import Run
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import Common
+from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import SceneError
 
@@ -35,7 +35,7 @@ K = TypeVar("K", bound=Kept)
 
 
 @dataclass(frozen=True, slots=True)
-class Answers(Generic[J, R]):
+class JobResults(Generic[J, R]):
     """What came of jobs. results: by job, as they were done; failed: why, by the names of the others."""
 
     results: dict[J, R]
@@ -55,11 +55,11 @@ def ask(
     jobs: Sequence[J],
     work: Callable[[J], R],
     build: Callable[[], Callable[[J], R]],
-    config: Common,
+    config: Sharing,
     bar: Bar,
     name: Callable[[J], str] = str,
     size: Callable[[J], int] = lambda job: 1,
-) -> Answers[J, R]:
+) -> JobResults[J, R]:
     """Do all jobs, in this process or in several, with a bar. With `keep_going` a job that cannot be done is
     listed as failed; without, its SceneError ends it all.
 
@@ -79,7 +79,7 @@ def ask(
                     raise
                 failed[name(job)] = str(error)
             progress.advance(task, size(job))
-    return Answers(results, failed)
+    return JobResults(results, failed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class KeptFrames(Generic[K]):
         names: Sequence[str],
         work: Callable[[str], object],
         build: Callable[[], Callable[[str], object]],
-        config: Common,
+        config: Sharing,
         bar: Bar,
     ) -> tuple[list[K], dict[str, str]]:
         """The answers about frames in their order, and why others have none. work: writes a frame's folder."""

@@ -38,7 +38,8 @@ from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
-from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack, Common
+from drivesem.settings.blocks import FrameCommand
+from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -257,7 +258,7 @@ def _attacker(config: Attack, out: Path) -> Callable[[str], FrameResult | None]:
     return partial(Worker.of(config).attack, out=out)
 
 
-def select_frames(source: SceneSource, config: Common) -> tuple[list[str], int, dict[str, str]]:
+def select_frames(source: SceneSource, config: FrameCommand) -> tuple[list[str], int, dict[str, str]]:
     """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
     names: list[str] = []
     failed: dict[str, str] = {}

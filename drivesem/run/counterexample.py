@@ -5,7 +5,7 @@
 >>> found.picture.shape, found.feasible
 ((376, 1241, 3), True)
 >>> sorted(found.theta)[0]
-'objects[0].rotate'
+'objects[0].translate.across'
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from drivesem.run.attack import Worker
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.results import Failure, FrameResult
 from drivesem.scenes.scene import Scene, png
-from drivesem.settings.checks import validate
 from drivesem.settings.commands import Attack
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
@@ -163,7 +162,7 @@ def attack(
     held = scene if isinstance(scene, Scene) else Scene(scene)
     try:
         config = Attack(detector=named, **options)
-        validate(config)
+        config.check()
         check_device(config.device)
         worker = Worker.of(config, None if isinstance(detector, str) else detector)
     except UsageError as error:

@@ -14,7 +14,8 @@ from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from drivesem.attack.judging import JudgedClasses
 from drivesem.run.lock import LOCK, hold
-from drivesem.settings.commands import Attack, Common
+from drivesem.settings.blocks import Output
+from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import to_yaml
 from scene_ir import files
@@ -27,7 +28,7 @@ PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
 """Settings that change no frame's result: a run may be continued with others."""
 
 
-def claim(out: Path, config: Common, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
+def claim(out: Path, config: Output, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
     """Make `out` this run's folder, and hold it. written: names of the files and folders in it that an earlier run
     wrote, which --no-resume removes, and nothing else.
 
@@ -35,8 +36,7 @@ def claim(out: Path, config: Common, written: Iterable[str], presentation: Colle
     process is writing.
     """
     path = out / CONFIG
-    if out.exists() and not out.is_dir():
-        raise UsageError("--out", "a folder", f"the file {out}")
+    folder_of(None, out)
     if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     hold(out)
@@ -54,6 +54,14 @@ def _remove(paths: Iterable[Path]) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+
+
+def folder_of(given: str | None, default: Path) -> Path:
+    """The folder that --out names, or the default. Raises UsageError for a file."""
+    out = Path(given) if given else default
+    if out.exists() and not out.is_dir():
+        raise UsageError("--out", "a folder", f"the file {out}")
+    return out
 
 
 def attack_of(run: Path) -> Attack:
@@ -81,7 +89,7 @@ def detector_of(attack: Attack, device: str) -> Predictor:
     return detector
 
 
-def _check_settings(path: Path, config: Common, presentation: Collection[str]) -> None:
+def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
     def identity(settings: dict[str, Any]) -> dict[str, Any]:
         return {key: value for key, value in settings.items() if key not in presentation}
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
-from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import LabelMode, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
@@ -138,6 +138,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         identity_psnr_db=_psnr_in_boxes(scene, objective.benign.render.image),
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
+        checked_by=judge_at_hand(),
     )
 
 

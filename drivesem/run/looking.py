@@ -22,7 +22,7 @@ from drivesem.attack.judging import JudgedClasses
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.results import BoxRecord
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import Transfer
+from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -112,7 +112,7 @@ def weights_digest(module: nn.Module) -> str:
 
 
 def look(
-    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Transfer
+    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Sharing
 ) -> Iterator[tuple[Path, Callable[[], None]]]:
     """Each picture that is not known yet, as it is done, with a call that raises what went wrong with it. Of
     pictures with the same bytes the first stands for all.

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from drivesem.evaluation.coco import Scores
 from scene_ir.errors import FormatError
@@ -58,7 +58,8 @@ class Failure:
 class FrameResult:
     """One frame of a run. Lists of boxes are in the frame's pixels; `seconds` is the only field that may differ
     between two runs with the same configuration. violated_at_start: constraints that the photographed scene does
-    not meet, and that may only not get worse.
+    not meet, and that may only not get worse. checked_by: what the second feasibility check judged with, open3d or
+    (as before there was a choice) outlines.
     """
 
     identifier: str
@@ -80,6 +81,7 @@ class FrameResult:
     identity_psnr_db: float | None
     seconds: float
     violated_at_start: tuple[str, ...] = ()
+    checked_by: Literal["open3d", "outlines"] = "outlines"
 
     @property
     def feasible(self) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import torch
 
 from detectors.base import DetectorError
-from drivesem.settings.commands import Common, processes
+from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError
 
@@ -30,7 +30,7 @@ class UnforeseenError(SceneError):
 
 
 def outcomes(
-    work: Callable[[J], R], build: Callable[[], Callable[[J], R]], jobs: Sequence[J], config: Common
+    work: Callable[[J], R], build: Callable[[], Callable[[J], R]], jobs: Sequence[J], config: Sharing
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     """Each job with a call that gives its result or raises what went wrong, as they are done.
 
@@ -39,7 +39,7 @@ def outcomes(
     blame is raised as UnforeseenError, which says where it arose.
     """
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
-    threads = max((os.cpu_count() or 1) // processes(config), 1)
+    threads = max((os.cpu_count() or 1) // config.processes, 1)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -52,10 +52,10 @@ def _outcomes(
     work: Callable[[J], R],
     build: Callable[[], Callable[[J], R]],
     jobs: Sequence[J],
-    config: Common,
+    config: Sharing,
     threads: int,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
-    count = min(processes(config), len(jobs))
+    count = min(config.processes, len(jobs))
     if count <= 1:
         here = partial(_forgiving, work) if config.keep_going else work
         for job in jobs:

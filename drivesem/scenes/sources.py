@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from drivesem.settings.commands import DEMO, Attack, Derender
+from drivesem.settings.blocks import DEMO, Scenes
+from drivesem.settings.commands import Derender
 from scene_ir.errors import SceneError
 from scene_ir.types import Frame, SceneIR
 
@@ -61,7 +62,7 @@ class DemoSource:
 class PhotographSource:
     """Frames of a labelled data set of photographs, de-rendered by their labels."""
 
-    def __init__(self, config: Attack | Derender) -> None:
+    def __init__(self, config: Scenes) -> None:
         from drivesem.data.registry import open_dataset
 
         points = isinstance(config, Derender) and config.velodyne
@@ -135,13 +136,13 @@ def derender_settings(
     return settings
 
 
-def _settings(config: Attack | Derender) -> DerenderSettings:
+def _settings(config: Scenes) -> DerenderSettings:
     if isinstance(config, Derender):
         return derender_settings(config.fit, config.meshes, config.segmenter)
     return derender_settings(config.fit)
 
 
-def open_source(config: Attack | Derender) -> SceneSource:
+def open_source(config: Scenes) -> SceneSource:
     """The source that the configuration names. Raises SceneError for an unknown or unreadable data set."""
     if isinstance(config, Derender) and config.photo is not None:
         return PlainPhotograph(Path(config.photo), config)

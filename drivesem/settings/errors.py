@@ -15,3 +15,9 @@ class UsageError(ValueError):
     def __reduce__(self) -> tuple[type[UsageError], tuple[str, str, str]]:
         """As processes hand errors to one another."""
         return type(self), (self.field, self.expected, self.actual)
+
+
+def refuse(wrong: bool, setting: str, expected: str, found: object) -> None:
+    """Raise UsageError where something is wrong."""
+    if wrong:
+        raise UsageError(setting, expected, found)

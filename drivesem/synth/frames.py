@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from drivesem.data.truth import occlusion_of
+from drivesem.synth import kernels
 from drivesem.synth.assets import Sky, with_sky
 from drivesem.synth.layout import (
     Actor,
@@ -25,12 +26,12 @@ from drivesem.synth.layout import (
 )
 from drivesem.synth.light import Light, draw_light, draw_response
 from drivesem.synth.noise import noise_set
-from drivesem.synth.render import fine_matrix, nearest, pixel_sums, rasterise, render, render_without_actors, see
+from drivesem.synth.render import pixel_sums, rasterise, render, render_without_actors, see
 from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed, transformed
 from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
 from drivesem.synth.vehicles import instance_ffd
-from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks
+from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks, fine_matrix
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
@@ -442,7 +443,7 @@ def render_frame(
     plain = see(street, view) if with_background else None
     empty = None if plain is None else render_without_actors(plain, picture, setting)
     behind = plain or sight
-    closest = nearest(sight)
+    closest = kernels.nearest(sight.depth)
     tracks = np.array([0, *(a.track + 1 for a in plan.actors), 0], np.uint16)  # owner -1, the sky, reads the last
     vehicles = {t.actor.model for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(

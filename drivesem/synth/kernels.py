@@ -1,10 +1,10 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
 # ruff: noqa: E501, UP018, SIM102, SIM109, RUF046 - the line above; Warp needs int(0) to declare what a loop changes, and evaluates
 # both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
-"""Shadow maps, shading, camera as Warp kernels: what `render`, `shading`, `light` and `noise` define in numpy.
+"""Shadow maps, shading, camera as Warp kernels.
 
-Each function here follows the numpy function of the same name, with the same constants in the same order; a test
-holds both together. Rows and pixels are dealt out to the threads, so the result does not depend on their number.
+Each function here follows the numpy function of the same name in `tests/drivesem/synth/reference_*.py`, which defines
+it, with the same constants in the same order; a test holds both together. Rows and pixels are dealt out to the threads, so the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import warp as wp
 from drivesem.synth.layout import Road
 from drivesem.synth.light import PANORAMA_GLARE, Light, Response, develop
 from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
-from drivesem.synth.shading import (
+from drivesem.synth.soup import GROUND, Material, Semantic, Soup
+from drivesem.synth.surfaces import (
     LEAF_DEPTH_M,
     MIRRORED_GROUND,
     SHADOW_OFFSET_M,
@@ -27,8 +28,7 @@ from drivesem.synth.shading import (
     SOAKED,
     ground_light,
 )
-from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.view import Setting, Shadow, Sight, SunMaps
+from drivesem.synth.view import Setting, Shadow, Sight, SunMaps, fine_matrix
 from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
 from scene_ir.raster.launch import halves, launch, start_warp, threads
 from scene_ir.raster.verbs import NEAR_M
@@ -1239,12 +1239,10 @@ def develop_pixels(
     setting: Setting,
     maps: SunMaps | None,
     shadows: list[Shadow],
-    target: tuple[np.ndarray, np.ndarray, np.ndarray],
+    target: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """`render._develop_pixels`, in place. target: image (H * W, 3) float32, wanted (H * W,) bool, and `fine_matrix`.
-    Returns the pixels (H * W,) bool that actors touch.
-    """
-    image, wanted, fine = target
+    """Fill in display values. target: the image (H * W, 3) float32 to fill and the pixels (H * W,) bool to do. Returns the pixels (H * W,) bool that actors touch."""
+    image, wanted = target
     seen, view = sight.faces, setting.view
     scene = Scene()
     table = np.empty((max(len(seen), 1), TABLE), np.float32)
@@ -1257,7 +1255,7 @@ def develop_pixels(
     launch(mark_kernel, halves(sight.face.size), [scene.face, used])
     launch(table_kernel, halves(len(seen)), [used, *soup, *paint, scene.table])
     lens = Lens()
-    lens.ray, lens.axes = _mat(np.linalg.inv(fine)), _mat(view.rotation.T)
+    lens.ray, lens.axes = _mat(np.linalg.inv(fine_matrix(view))), _mat(view.rotation.T)
     lens.origin, lens.centre = _vec(view.origin), _vec(view.centre)
     lens.focal, lens.height_m, lens.width = float(view.camera.intrinsics[0, 0]), view.height_m, view.camera.width
     lens.develop = _vec(setting.response.exposure * setting.response.white_balance)

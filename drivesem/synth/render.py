@@ -1,32 +1,24 @@
 """From triangles to a photograph: visibility at twice the resolution, then shading, then lens and sensor.
 
-Each step has two implementations: kernels, and plain numpy with the project's rasteriser (`backend="reference"`),
-which defines what the kernels compute.
+Kernels do it. Plain numpy beside their tests, `tests/drivesem/synth/reference_*.py`, defines what they compute.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 
 from drivesem.synth import kernels
-from drivesem.synth.light import develop, sky_radiance
-from drivesem.synth.noise import white_noise
-from drivesem.synth.shading import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS, Samples, shade, unit
-from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.view import SHADOW_VIEWS_M, SUPERSAMPLING, Setting, Shadow, Sight, SunMaps, View, blocks
+from drivesem.synth.soup import Soup
+from drivesem.synth.view import SHADOW_VIEWS_M, SUPERSAMPLING, Setting, Shadow, Sight, SunMaps, View, fine_matrix
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Layout
 
-Backend = Literal["warp", "reference"]
-"""Kernels, or the plain numpy that defines what they compute."""
-_SHADOW_TEXELS = 1024
-_SHADOW_DISTANCE_M = 3000.0
-"""The sun stands this far away in the reference's shadow maps: it bends walls of 20 m by 3 cm."""
+SHADOW_TEXELS = 1024
+"""Along one side of a shadow map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,42 +33,11 @@ class Picture:
     sun_maps: SunMaps | None
 
 
-def _in_front(points: np.ndarray, view: View) -> np.ndarray:
-    """Faces (F,) that may be seen: not wholly beyond one border of the image."""
-    k = view.camera.intrinsics.numpy()
-    z = [points[:, i, 2] for i in range(3)]
-    near = np.minimum(np.minimum(z[0], z[1]), z[2]) > 0
-    out = np.maximum(np.maximum(z[0], z[1]), z[2]) < 0.05
-    for axis, size in ((0, view.camera.width), (1, view.camera.height)):
-        low, high = -k[axis, 2] / k[axis, axis], (size - k[axis, 2]) / k[axis, axis]
-        value = [points[:, i, axis] for i in range(3)]
-        out |= near & _all3([v < np.float32(low) * d for v, d in zip(value, z, strict=True)])
-        out |= near & _all3([v > np.float32(high) * d for v, d in zip(value, z, strict=True)])
-    return ~out
-
-
-def _all3(masks: list[np.ndarray]) -> np.ndarray:
-    return masks[0] & masks[1] & masks[2]
-
-
-def _extent(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest (F,) of three corners' values (F, 3)."""
-    a, b, c = values[:, 0], values[:, 1], values[:, 2]
-    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-
-
 def pixel_sums(samples: np.ndarray) -> np.ndarray:
     """Sums (H, W) over the samples (2H, 2W) of each pixel, in their type; see `blocks`."""
     n = SUPERSAMPLING
     rows = samples[::n] + samples[1::n]
     return rows[:, ::n] + rows[:, 1::n]
-
-
-def fine_matrix(view: View) -> np.ndarray:
-    """(3, 3): centre-relative camera-space points to homogeneous pixels of the supersampled image."""
-    n = SUPERSAMPLING
-    to_fine = np.array([[n, 0, (n - 1) / 2], [0, n, (n - 1) / 2], [0, 0, 1.0]])
-    return to_fine @ view.camera.matrix.double().numpy()[:, :3]
 
 
 def rasterise(
@@ -94,8 +55,14 @@ def rasterise(
     return fragments.face.numpy(), fragments.depth.numpy()
 
 
-def sun_maps(soup: Soup, setting: Setting, backend: Backend = "warp") -> SunMaps | None:
+def sun_maps(soup: Soup, setting: Setting) -> SunMaps | None:
     """Shadow maps over the ground, or None without sun. soup: camera axes about the centre of projection."""
+    rows = sun_rows(setting)
+    return None if rows is None else SunMaps(rows, kernels.sun_depth(soup, rows, SHADOW_VIEWS_M, SHADOW_TEXELS))
+
+
+def sun_rows(setting: Setting) -> np.ndarray | None:
+    """`SunMaps.rows`, or None without sun."""
     light, view = setting.light, setting.view
     if float(light.sun_colour.max()) <= 0.01:
         return None
@@ -108,158 +75,26 @@ def sun_maps(soup: Soup, setting: Setting, backend: Backend = "warp") -> SunMaps
     to_map = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     rows = to_map @ to_ground @ view.rotation.T
     shift = to_map @ (to_ground @ view.to_world(view.centre) - [*view.position_xz, 0.0])
-    placing = np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32)
-    if backend == "warp":
-        return SunMaps(placing, kernels.sun_depth(soup, placing, SHADOW_VIEWS_M, _SHADOW_TEXELS))
-    ground = np.isin(soup.material, GROUND)
-    corners = soup.corners[~ground]
-    actor = soup.owner[~ground] > 0
-    placed = corners @ rows.T.astype(np.float32) + shift.astype(np.float32)
-    depth = np.full((len(SHADOW_VIEWS_M), 2, _SHADOW_TEXELS, _SHADOW_TEXELS), np.inf, np.float32)
-    size = _SHADOW_TEXELS
-    ends = [_extent(placed[..., 0]), _extent(placed[..., 1])]
-    for i, (x0, x1, z0, z1) in enumerate(SHADOW_VIEWS_M):
-        inside = (ends[0][1] > x0) & (ends[0][0] < x1) & (ends[1][1] > z0) & (ends[1][0] < z1)
-        for j, chosen in enumerate((inside & ~actor, inside & actor)):
-            points = placed[chosen]
-            if not len(points):
-                continue
-            w = points[..., 2:] + np.float32(_SHADOW_DISTANCE_M)
-            texels = np.array([size / (x1 - x0), size / (z1 - z0)], np.float32)
-            pixels = (points[..., :2] - np.array([x0, z0], np.float32)) * texels - 0.5
-            clip = np.concatenate([pixels * w, w], axis=-1)
-            _, found = rasterise(clip, np.eye(3), np.array([[0, 0, size, size]]), np.array([[0, len(points)]]))
-            depth[i, j] = found.reshape(size, size) - np.float32(_SHADOW_DISTANCE_M)
-    return SunMaps(placing, depth)
+    return np.concatenate([rows, shift[:, None]], axis=1).astype(np.float32)
 
 
-def _lit(
-    maps: SunMaps | None, point: np.ndarray, normal: np.ndarray, samples: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Share (n,) of the sun that arrives, and where (n,) actors take some. samples: (material, owner, sun)."""
-    n = len(point)
-    shaded = np.zeros(n, bool)
-    if maps is None:
-        return np.zeros(n, np.float32), shaded
-    material, owner, sun = samples
-    lit = np.zeros(n, np.float32)
-    facing = normal @ sun.astype(np.float32)
-    leaf = material == Material.LEAF
-    towards = np.flatnonzero((facing > 0) | leaf)
-    slope = np.sqrt(np.maximum(1 - facing[towards] ** 2, 0))
-    away = np.where(leaf[towards, None], sun.astype(np.float32), normal[towards])
-    by_actor = ((np.isin(material, GROUND)) | (owner > 0))[towards]
-    share = np.ones(len(towards), np.float32)
-    pending = np.ones(len(towards), bool)
-    size = _SHADOW_TEXELS
-    for i, (x0, x1, z0, z1) in enumerate(SHADOW_VIEWS_M):
-        texel = (x1 - x0) / size
-        steep = SHADOW_OFFSET_M + SHADOW_OFFSET_TEXELS * texel * slope
-        offset = np.where(leaf[towards], LEAF_DEPTH_M, steep).astype(np.float32)
-        place = (point[towards] + offset[:, None] * away) @ maps.rows[:, :3].T + maps.rows[:, 3]
-        u = (place[:, 0] - np.float32(x0)) * np.float32(1 / texel) - 0.5
-        v = (place[:, 1] - np.float32(z0)) * np.float32(size / (z1 - z0)) - 0.5
-        here = pending & (u > 2) & (v > 2) & (u < size - 4) & (v < size - 4)
-        pending &= ~here
-        for j, chosen in ((0, np.flatnonzero(here)), (1, np.flatnonzero(here & by_actor))):
-            table = maps.depth[i, j]
-            if not len(chosen):
-                continue
-            open_share = _soft_compare(table, u[chosen], v[chosen], place[chosen, 2] - np.float32(0.02))
-            share[chosen] *= open_share
-            if j == 1:
-                shaded[towards[chosen]] = open_share < 1
-    lit[towards] = share
-    return lit, shaded
-
-
-def _soft_compare(table: np.ndarray, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Share (n,) of a map's texels around (u, v) that lie behind `depth`: a tent three texels wide."""
-    u0, v0 = np.floor(u), np.floor(v)
-    fu, fv = u - u0, v - v0
-    base = (v0.astype(np.int32) - 1) * np.int32(table.shape[1]) + u0.astype(np.int32) - 1
-    flat = table.reshape(-1)
-    total = np.zeros(len(u), np.float32)
-    for i, across in enumerate((1 - fv, None, None, fv)):
-        row = base + np.int32(i * table.shape[1])
-        part = (flat[row] >= depth) * (1 - fu)
-        part += flat[row + 1] >= depth
-        part += flat[row + 2] >= depth
-        part += (flat[row + 3] >= depth) * fu
-        total += part if across is None else part * across
-    total *= np.float32(1 / 9)
-    return total
-
-
-def _open_sky(
-    world: np.ndarray, material: np.ndarray, owner: np.ndarray, shadows: list[Shadow]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Share (n,) of the sky that lights a sample: less near the ground on upright things, and beside vehicles; and
-    where (n,) vehicles hide some of it.
-    """
-    hemmed = np.zeros(len(world), bool)
-    height = -world[:, 1]
-    upright = ~np.isin(material, GROUND)
-    open_sky = np.ones(len(height), np.float32)
-    low = 0.5 + 0.5 * np.clip(height / 1.2, 0, 1)
-    open_sky = np.where(upright, low, open_sky)
-    actor = owner > 0
-    open_sky = np.where(actor, 0.3 + 0.7 * np.clip((height - 0.12) / 0.6, 0, 1), open_sky).astype(np.float32)
-    ground = np.flatnonzero(~upright)
-    spot = world[ground][:, [0, 2]]
-    for shadow in shadows:
-        reach = 0.75 * shadow.size_lhw[1]
-        radius = 0.5 * float(np.hypot(shadow.size_lhw[0], shadow.size_lhw[2])) + reach
-        local = spot - np.asarray(shadow.position_xz, np.float32)
-        near = np.flatnonzero((np.abs(local[:, 0]) < radius) & (np.abs(local[:, 1]) < radius))
-        if not len(near):
-            continue
-        local = local[near]
-        cos, sin = np.float32(np.cos(shadow.yaw)), np.float32(np.sin(shadow.yaw))
-        along = np.abs(local[:, 0] * cos - local[:, 1] * sin) - np.float32(shadow.size_lhw[0] / 2)
-        across = np.abs(local[:, 0] * sin + local[:, 1] * cos) - np.float32(shadow.size_lhw[2] / 2)
-        outside = np.hypot(np.maximum(along, 0), np.maximum(across, 0))
-        inside = np.minimum(np.maximum(along, across), 0)
-        dark = 0.62 * np.exp(-outside / (0.32 * reach)) + 0.36 * np.clip(-inside / 0.25, 0, 1)
-        dark[dark < 0.004] = 0
-        open_sky[ground[near]] *= (1 - np.minimum(dark, 0.97)).astype(np.float32)
-        hemmed[ground[near]] |= dark > 0
-    return open_sky, hemmed
-
-
-def nearest(sight: Sight) -> np.ndarray:
-    """(H, W) int64 flat indices into the fine arrays: of each pixel's samples, the nearest to the camera."""
-    return kernels.nearest(sight.depth)
-
-
-def see(soup: Soup, view: View, backend: Backend = "warp") -> Sight:
+def see(soup: Soup, view: View) -> Sight:
     """Which triangle each sample shows. soup: camera axes about the centre of projection."""
     size = (SUPERSAMPLING * view.camera.height, SUPERSAMPLING * view.camera.width)
-    if backend == "warp":
-        return Sight(soup, *kernels.see(soup, fine_matrix(view), size))
-    seen = soup.take(_in_front(soup.corners, view))
-    rect = np.array([[0, 0, size[1], size[0]]])
-    face, depth = rasterise(seen.corners, fine_matrix(view), rect, np.array([[0, len(seen)]]))
-    hit, safe = face >= 0, np.maximum(face, 0)
-    material = np.where(hit, seen.material[safe], np.uint8(Material.SKY))
-    owner = np.where(hit, seen.owner[safe], np.int32(-1))
-    semantic = np.where(hit, seen.semantic[safe], np.uint8(Semantic.SKY))
-    return Sight(seen, *(a.reshape(size) for a in (face, depth, material, owner, semantic)))
+    return Sight(soup, *kernels.see(soup, fine_matrix(view), size))
 
 
-def render(
-    sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting, backend: Backend = "warp"
-) -> Picture:
+def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) -> Picture:
     """Photograph a world. sight: of the soup; shadows: of the actors in it."""
-    maps = sun_maps(soup, setting, backend)
+    maps = sun_maps(soup, setting)
     pixels = setting.view.camera.height * setting.view.camera.width
-    blank = np.empty((pixels, 3), np.float32)
-    developed, touched = _develop_pixels(sight, setting, maps, shadows, (blank, np.ones(pixels, bool)), backend)
-    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting, backend)
+    developed = np.empty((pixels, 3), np.float32)
+    touched = kernels.develop_pixels(sight, setting, maps, shadows, (developed, np.ones(pixels, bool)))
+    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting)
     return Picture(image, developed, touched, maps)
 
 
-def render_without_actors(sight: Sight, full: Picture, setting: Setting, backend: Backend = "warp") -> Picture:
+def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
     """The same photograph with no actors. sight: of the surroundings alone; full: with actors. Shades only
     what they touched.
     """
@@ -268,156 +103,30 @@ def render_without_actors(sight: Sight, full: Picture, setting: Setting, backend
         depth = maps.depth.copy()
         depth[:, 1] = np.inf
         maps = SunMaps(maps.rows, depth)
-    target = full.developed.copy(), full.touched
-    developed, _ = _develop_pixels(sight, setting, maps, [], target, backend)
-    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting, backend)
+    developed = full.developed.copy()
+    kernels.develop_pixels(sight, setting, maps, [], (developed, full.touched))
+    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting)
     return Picture(image, developed, np.zeros_like(full.touched), maps)
 
 
-def _develop_pixels(
-    sight: Sight,
-    setting: Setting,
-    maps: SunMaps | None,
-    shadows: list[Shadow],
-    target: tuple[np.ndarray, np.ndarray],
-    backend: Backend,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the
-    image and the pixels that actors touch.
-    """
-    image, wanted = target
-    if backend == "warp":
-        fine = fine_matrix(setting.view)
-        return image, kernels.develop_pixels(sight, setting, maps, shadows, (image, wanted, fine))
-    n, width = SUPERSAMPLING, setting.view.camera.width
-    once, apart = _shading_sites(sight)
-    whole, parts = np.flatnonzero(once & wanted), np.flatnonzero(apart & wanted)
-
-    def first_sample(pixels: np.ndarray) -> np.ndarray:
-        rows, columns = np.divmod(pixels, width)
-        return rows * (n * n * width) + columns * n
-
-    corner = first_sample(parts)
-    spread = np.stack([corner + dy * n * width + dx for dy in range(n) for dx in range(n)], axis=1).reshape(-1)
-    sites = np.concatenate([first_sample(whole), spread])
-    radiance, changed = _shade_sites(sight, sites, setting, maps, shadows)
-    shown = develop(radiance, setting.response)
-    image[whole] = shown[: len(whole)]
-    fine_shown = shown[len(whole) :].reshape(-1, n * n, 3)
-    image[parts] = sum(fine_shown[:, i] for i in range(n * n)) / np.float32(n * n)
-    touched = np.zeros(len(image), bool)
-    touched[whole] = changed[: len(whole)]
-    touched[parts] = changed[len(whole) :].reshape(-1, n * n).any(axis=1)
-    for owner in blocks(sight.owner):
-        touched |= owner.reshape(-1) > 0
-    return image, touched
-
-
-def _shading_sites(sight: Sight) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (H * W,) bool shaded once, and those where every sample is shaded: outlines, thin things."""
-    faces, depths = blocks(sight.face), blocks(sight.depth)
-    keys = blocks(sight.material.astype(np.int32) * 4096 + sight.owner)
-    same_face, alike = faces[1] == faces[0], keys[1] == keys[0]
-    near, far = depths[0], depths[0]
-    for i in range(1, len(faces)):
-        same_face = same_face & (faces[i] == faces[0])
-        alike = alike & (keys[i] == keys[0])
-        near, far = np.minimum(near, depths[i]), np.maximum(far, depths[i])
-    leaf = blocks(sight.material)[0] == Material.LEAF
-    # Deep foliage is all outline: one sample of its four is enough, as lens blur and grain hide the rest.
-    once = (same_face | alike & ((far < near * np.float32(1.03)) | leaf)).reshape(-1)
-    return once, ~once
-
-
-def _shade_sites(
-    sight: Sight, index: np.ndarray, setting: Setting, maps: SunMaps | None, shadows: list[Shadow]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Linear radiance (n, 3) at samples of the fine image, given by flat index (n,), and whether shadows of actors
-    change it (n,)."""
-    seen, view = sight.faces, setting.view
-    face, w = sight.face.reshape(-1)[index], sight.depth.reshape(-1)[index]
-    row, column = np.divmod(index, SUPERSAMPLING * view.camera.width)
-    inverse = np.linalg.inv(fine_matrix(view)).astype(np.float32)
-    ray = np.empty((len(index), 3), np.float32)
-    for axis in range(3):
-        ray[:, axis] = column * inverse[axis, 0] + row * inverse[axis, 1] + inverse[axis, 2]
-    out = np.empty((len(face), 3), np.float32)
-    sky = np.flatnonzero(face < 0)
-    if len(sky):
-        direction = unit(ray[sky])
-        out[sky] = sky_radiance(setting.light, direction, setting.noise)
-        if setting.light.weather == "fog":
-            out[sky] = setting.light.horizon.astype(np.float32) * 0.8
-    land = np.flatnonzero(face >= 0)
-    changed = np.zeros(len(face), bool)
-    if not len(land):
-        return out, changed
-    face = face[land]
-    marked = np.zeros(len(seen), bool)
-    marked[face] = True
-    used = np.flatnonzero(marked)
-    rank = np.cumsum(marked, dtype=np.int32) - 1
-    local = rank[face]
-    attributes = _attribute_maps(seen, used)
-    point = ray[land] * w[land, None]
-    values = np.matmul(attributes[local], point[:, :, None])[:, :, 0]
-    normal = unit(values[:, :3])
-    away = np.einsum("ni,ni->n", normal, point) > 0
-    normal[away] *= -1
-    world = view.to_world(point + view.centre.astype(np.float32))
-    material, owner = seen.material[face], seen.owner[face]
-    lit, shaded = _lit(maps, point, normal, (material, owner, setting.light.sun))
-    open_sky, hemmed = _open_sky(world, material, owner, shadows)
-    changed[land] = shaded | hemmed
-    samples = Samples(
-        point=point,
-        world=world,
-        normal=normal,
-        uv=values[:, 3:5],
-        material=material,
-        albedo=seen.albedo[face],
-        pattern=seen.pattern[face],
-        owner=owner,
-        lit=lit,
-        open_sky=open_sky,
-        pixel_m=point[:, 2] / np.float32(view.camera.intrinsics[0, 0]),
-    )
-    out[land] = shade(samples, setting.road, setting.light, setting.noise, view.height_m)
-    return out, changed
-
-
-def _attribute_maps(seen: Soup, used: np.ndarray) -> np.ndarray:
-    """(m, 5, 3) linear maps from a point on each used face (centre-relative) to its normal and surface
-    coordinates.
-
-    Barycentric coordinates are linear in the point, as the point is the same combination of the three corners.
-    """
-    corners = seen.corners[used].astype(np.float64)
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    volume = (a * rows[:, 0]).sum(axis=1)
-    rows /= np.where(np.abs(volume) < 1e-12, 1e-12, volume)[:, None, None]
-    values = np.concatenate([seen.normals[used], seen.uv[used]], axis=2)
-    return np.einsum("mik,mij->mkj", values, rows).astype(np.float32)
-
-
-def take(image: np.ndarray, setting: Setting, backend: Backend = "warp") -> np.ndarray:
+def take(image: np.ndarray, setting: Setting) -> np.ndarray:
     """Lens and sensor: (H, W, 3) display values to uint8, with chromatic error, blur, rain, vignette and noise."""
+    return kernels.expose(through_lens(image, setting), setting.response, grain_number(setting))
+
+
+def through_lens(image: np.ndarray, setting: Setting) -> np.ndarray:
+    """Display values (H, W, 3) with chromatic error, blur and rain."""
     response = setting.response
     image = _fringed(image, response.chromatic_px) if response.chromatic_px > 0 else image
     out = cv2.GaussianBlur(image, (5, 5), response.blur_px)
     if response.streaks > 0:
         _streak(out, response.streaks, np.random.default_rng([*setting.grain_seed, 0x5A1]))
-    seed = int(np.random.SeedSequence(list(setting.grain_seed)).generate_state(1)[0])
-    if backend == "warp":
-        return kernels.expose(out, response, seed)
-    height, width = out.shape[:2]
-    x = np.linspace(-1, 1, width, dtype=np.float32)[None]
-    y = np.linspace(-1, 1, height, dtype=np.float32)[:, None] * np.float32(height / width)
-    out *= (1 - np.float32(response.vignette) * (x * x + y * y))[..., None]
-    grain = white_noise(seed, out.size).reshape(out.shape)
-    out += grain * (np.float32(response.noise) * (np.float32(0.4) + np.sqrt(np.maximum(out, 0))))
-    return np.clip(np.rint(out * 255), 0, 255).astype(np.uint8)
+    return out
+
+
+def grain_number(setting: Setting) -> int:
+    """The seed of a picture's noise."""
+    return int(np.random.SeedSequence(list(setting.grain_seed)).generate_state(1)[0])
 
 
 def _fringed(image: np.ndarray, shift_px: float) -> np.ndarray:

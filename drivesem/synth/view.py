@@ -110,6 +110,13 @@ class Sight:
         return np.minimum.reduce(blocks(self.depth))
 
 
+def fine_matrix(view: View) -> np.ndarray:
+    """(3, 3): centre-relative camera-space points to homogeneous pixels of the supersampled image."""
+    n = SUPERSAMPLING
+    to_fine = np.array([[n, 0, (n - 1) / 2], [0, n, (n - 1) / 2], [0, 0, 1.0]])
+    return to_fine @ view.camera.matrix.double().numpy()[:, :3]
+
+
 def blocks(values: np.ndarray) -> list[np.ndarray]:
     """The samples of all pixels, one (H, W) array for each place inside a pixel."""
     n = SUPERSAMPLING

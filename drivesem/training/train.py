@@ -23,7 +23,7 @@ from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
 from drivesem.report.progress import training_bar
 from drivesem.run.folder import claim
-from drivesem.settings.commands import SYNTH, Train, processes
+from drivesem.settings.commands import SYNTH, Train
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import command_line
@@ -209,7 +209,7 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
         orders.append(Order(held_out, config.held_out_frames, config.seed, split="heldout"))
     if rank == 0:
         for order in orders:
-            done = synthesise(order, in_processes(min(processes(config), order.frames)))
+            done = synthesise(order, in_processes(min(config.processes, order.frames)))
             with training_bar(console) as bar:
                 for _ in bar.track(done, total=order.frames, description="making frames"):
                     pass

@@ -20,12 +20,11 @@ from drivesem.bench import memory, render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
 from drivesem.bench.tables import Section
-from drivesem.settings.commands import processes
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
 from tools.bench import derender, evaluation, found, label_free, rivals, synth
-from tools.bench.settings import BenchTool, check
+from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
 _RIVAL_SECONDS = (16.0, 180.0)
@@ -45,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(config: BenchTool) -> int:
     """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
-    check(config)
+    config.check()
     measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
         "derender": _derender,
         "found": _found,
@@ -60,7 +59,7 @@ def run(config: BenchTool) -> int:
 def _derender(config: BenchTool, console: Console) -> Measured:
     _on_cpu(config)
     frames = _frames(config, derender)
-    measured = derender.measure(frames, config.seed, processes(config), config.ablate, _sheets(config))
+    measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config))
     rows = list(watched(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)
@@ -93,7 +92,7 @@ def _synth(config: BenchTool, console: Console) -> Measured:
     if not memory.supported():
         raise UsageError("bench synth", "a system with /proc", sys.platform)
     _on_cpu(config)
-    rows = list(watched(synth.measure(_frames(config, synth), config.seed, processes(config)), 3, console))
+    rows = list(watched(synth.measure(_frames(config, synth), config.seed, config.processes), 3, console))
     first = {"frames_per_second": rows[0].frames_per_second, "peak_rss_mb": rows[0].peak_rss_mb}
     return _measured(synth, {**first, "rows": [asdict(row) for row in rows]})
 

@@ -27,7 +27,7 @@ from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Derender
+from drivesem.settings.blocks import Scenes
 from drivesem.settings.edits import FrameEdit, ObjectEdit
 from scene_ir import files
 from scene_ir.compositor import Compositor, render
@@ -111,7 +111,7 @@ def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[
 
 
 def _source(config: BenchTool) -> SceneSource:
-    asked = Derender(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
+    asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 

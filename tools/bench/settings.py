@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Annotated, Literal
 
 import tyro
 
-from drivesem.settings.checks import check_dataset, validate
-from drivesem.settings.commands import DEMO, Common, Flag
-from drivesem.settings.errors import UsageError
+from drivesem.settings.blocks import DEMO, SOURCES, Count, DataSource, Flag, FrameCommand, Tiles
+from drivesem.settings.constraints import OneOf, Parsed
+from drivesem.settings.errors import refuse
 from drivesem.settings.values import numbers
 
 
-@dataclass(frozen=True)
-class BenchTool(Common):
+@dataclass(frozen=True, kw_only=True)
+class BenchTool(Tiles, DataSource, FrameCommand):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
     what: tyro.conf.Positional[Literal["derender", "found", "label-free", "synth", "rivals", "eval"]] = "derender"
@@ -24,9 +25,9 @@ class BenchTool(Common):
     eval of many frames beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions or frames."""
-    cars: str = "1,4,8,16"
+    cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
     """Of rivals: how many cars, 1 to 16, with commas."""
-    triangles: str = "2000,5000"
+    triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
     """Of rivals: triangles a car, with commas."""
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
@@ -34,33 +35,24 @@ class BenchTool(Common):
     20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
-    threads: int | None = None
+    threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
     """Of found: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that was trained
     elsewhere."""
-    dataset: str = DEMO
+    dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """Of found and label-free: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
     root: str | None = None
     """Of found and label-free: folder of the data set, such as KITTI's with training/image_2, label_2, calib."""
     scenes: str | None = None
     """Of found: a folder of scenes that drivesem derender wrote, instead of a data set."""
-    tiles: Literal["auto", "off"] = "auto"
-    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 
-
-def check(config: BenchTool) -> None:
-    """Raise UsageError for values that no benchmark accepts."""
-    validate(config)
-    check_dataset(config.dataset, config.root)
-    numbers("--cars", config.cars)
-    numbers("--triangles", config.triangles, least=4)
-    fewest = 10 if config.what == "synth" else 1
-    if config.frames is not None and config.frames < fewest:
-        raise UsageError("--frames", f"at least {fewest}", config.frames)
-    if config.threads is not None and config.threads < 1:
-        raise UsageError("--threads", "at least 1", config.threads)
-    if config.scenes is not None and config.dataset != DEMO:
-        raise UsageError("--scenes", "no --dataset beside it", f"--dataset {config.dataset}")
+    def check(self) -> None:
+        super().check()
+        fewest = 10 if self.what == "synth" else 1
+        few = self.frames is not None and self.frames < fewest
+        refuse(few, "--frames", f"at least {fewest}", self.frames)
+        both = self.scenes is not None and self.dataset != DEMO
+        refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")

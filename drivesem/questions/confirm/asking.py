@@ -8,7 +8,7 @@ from pathlib import Path
 from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.confirm.frame import confirm_frame
 from drivesem.questions.confirm.plans import open_plans
-from drivesem.questions.confirm.report import Report, answer_of, summarise
+from drivesem.questions.confirm.report import Confirmation, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, load
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
@@ -22,7 +22,7 @@ from scene_ir import files
 _WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)
 
 
-def confirm_run(config: Confirm) -> tuple[Report, Answer]:
+def confirm_run(config: Confirm) -> tuple[Confirmation, Answer]:
     """Confirm a run's frames, or go on with it, and write what is said of them: the figures, and all of it. Raises
     UsageError or SceneError for bad input.
     """

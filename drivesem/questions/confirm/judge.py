@@ -21,7 +21,7 @@ from drivesem.synth.frames import SynthFrame, Truth, table
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class RendererFailure:
     """A failure in one of the two pictures. track: of the lost vehicle in the generator's plan; None for a
     phantom, and where the plan has no counterpart. survives: whether it is a failure in the other picture too: the
     same vehicle lost, or a phantom of the same class at an IoU of at least 0.5.
@@ -119,7 +119,7 @@ def findings(
     seen: Sequence[Detections],
     judged: JudgedClasses,
     t_star: float,
-) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+) -> tuple[tuple[RendererFailure, ...], tuple[RendererFailure, ...]]:
     """Failures in the compositor's picture, as the run has them, and in the generator's. seen: detections before
     and after the change; tracks: of the scene's objects."""
     benign, changed = judged.targets(exact.benign), judged.targets(exact.changed)
@@ -128,22 +128,24 @@ def findings(
     theirs = []
     for i in found.lost:
         label = CLASSES[int(exact.changed.labels[i])]
-        theirs.append(Finding("lost", label, _xyxy(changed.boxes_xyxy[i]), exact.tracks[i], None, False))
+        theirs.append(RendererFailure("lost", label, _xyxy(changed.boxes_xyxy[i]), exact.tracks[i], None, False))
     for i in found.phantoms:
         label, score = judged.names[int(after.labels[i])], float(after.scores[i])
-        theirs.append(Finding("phantom", label, _xyxy(after.boxes_xyxy[i]), None, score, False))
+        theirs.append(RendererFailure("phantom", label, _xyxy(after.boxes_xyxy[i]), None, score, False))
     ours = [
-        Finding(f.kind, f.label, f.xyxy, None if f.index is None else tracks[f.index], f.score, False)
+        RendererFailure(f.kind, f.label, f.xyxy, None if f.index is None else tracks[f.index], f.score, False)
         for f in result.failures
     ]
     return _with_survival(ours, theirs), _with_survival(theirs, ours)
 
 
-def _with_survival(these: Sequence[Finding], others: Sequence[Finding]) -> tuple[Finding, ...]:
+def _with_survival(
+    these: Sequence[RendererFailure], others: Sequence[RendererFailure]
+) -> tuple[RendererFailure, ...]:
     return tuple(dataclasses.replace(one, survives=any(_same(one, other) for other in others)) for one in these)
 
 
-def _same(one: Finding, other: Finding) -> bool:
+def _same(one: RendererFailure, other: RendererFailure) -> bool:
     if one.kind != other.kind:
         return False
     if one.kind == "lost":

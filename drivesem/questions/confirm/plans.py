@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.settings.commands import DEMO, Attack
+from drivesem.settings.blocks import DEMO
+from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.synth.demo import demo_plan
 from drivesem.synth.frames import GENERATOR_VERSION, Plan

@@ -51,7 +51,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class Confirmation:
     """frames: those whose change was carried over whole, on which all figures rest; left: reasons by frame, of the
     others. scores: by picture, with the labels it is judged by. overlap: mean and least IoU of judged vehicles'
     boxes in both pictures, and how many; None where there is none.
@@ -80,7 +80,7 @@ class Report:
 
 def summarise(
     found: Sequence[Confirmed], results: Sequence[FrameResult], names: tuple[str, ...], t_star: float
-) -> Report:
+) -> Confirmation:
     """The figures of confirmed frames. results: of the run, of the same frames; names: the judged classes."""
     pairs = [(one, result) for one, result in zip(found, results, strict=True) if not one.not_carried]
     whole = [one for one, _ in pairs]
@@ -97,7 +97,7 @@ def summarise(
         Share.of(NEW, [bool(one.generator) for one in whole if not one.compositor]),
     )
     ious = [s.iou for one in whole for s in one.stands if s.judged and s.iou is not None]
-    return Report(
+    return Confirmation(
         frames=len(whole),
         left={one.identifier: list(one.not_carried) for one in found if one.not_carried},
         shares=shares,
@@ -130,7 +130,7 @@ def _scores(
     }
 
 
-def sheets(report: Report) -> list[Sheet]:
+def sheets(report: Confirmation) -> list[Sheet]:
     """Two tables, %: what survives; precision and recall in either picture."""
     shares = tuple(
         (s.name, str(s.failures), str(s.survive), percent(s.share), f"{percent(s.low)} to {percent(s.high)}")
@@ -147,7 +147,7 @@ def sheets(report: Report) -> list[Sheet]:
     ]
 
 
-def notes(report: Report) -> list[str]:
+def notes(report: Confirmation) -> list[str]:
     """What the figures mean, and what they leave out."""
     told = [
         "Survive: the detector fails in the generator's picture of the same change too, by exact labels. Frames: "
@@ -165,7 +165,11 @@ def notes(report: Report) -> list[str]:
 
 
 def answer_of(
-    out: Path, report: Report, confirmed: Sequence[Confirmed], facts: Mapping[str, Any], failed: Mapping[str, str]
+    out: Path,
+    report: Confirmation,
+    confirmed: Sequence[Confirmed],
+    facts: Mapping[str, Any],
+    failed: Mapping[str, str],
 ) -> Answer:
     """confirm.json (with `facts` in front), confirm.md, and confirm.csv, a line a frame."""
     return Answer(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivesem.questions.confirm.judge import Finding, Stand
+from drivesem.questions.confirm.judge import RendererFailure, Stand
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -26,8 +26,8 @@ class Confirmed:
 
     identifier: str
     source: str
-    compositor: tuple[Finding, ...]
-    generator: tuple[Finding, ...]
+    compositor: tuple[RendererFailure, ...]
+    generator: tuple[RendererFailure, ...]
     stands: tuple[Stand, ...]
     targets_benign: tuple[BoxRecord, ...]
     targets_changed: tuple[BoxRecord, ...]
@@ -48,7 +48,8 @@ def load(path: Path) -> Confirmed:
     try:
         if data.pop("schema") != SCHEMA:
             raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        kinds: dict[str, Callable[..., Any]] = {"compositor": Finding, "generator": Finding, "stands": Stand}
+        kinds: dict[str, Callable[..., Any]] = dict.fromkeys(("compositor", "generator"), RendererFailure)
+        kinds |= {"stands": Stand}
         kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
         for name, kind in kinds.items():
             data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from drivesem.questions.confirm.judge import Finding
+from drivesem.questions.confirm.judge import RendererFailure
 from drivesem.questions.confirm.results import Confirmed
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, text_extent, write_text
 from drivesem.report.pictures import overlay
@@ -51,7 +51,7 @@ def _marked(
     image: np.ndarray,
     targets: Sequence[BoxRecord],
     detections: Sequence[BoxRecord],
-    found: Sequence[Finding],
+    found: Sequence[RendererFailure],
     t_star: float,
 ) -> np.ndarray:
     # Regions are drawn by nobody: they stand in the targets once for each class.
@@ -60,7 +60,7 @@ def _marked(
     return overlay(image, objects, tuple(detections), failed, t_star)
 
 
-def _told(found: Sequence[Finding]) -> str:
+def _told(found: Sequence[RendererFailure]) -> str:
     if not found:
         return "no failure"
     lost = sum(f.kind == "lost" for f in found)

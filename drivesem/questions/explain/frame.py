@@ -21,7 +21,7 @@ from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.questions.explain import players, sensitivity
-from drivesem.questions.explain.minimal import Block, Minimal, Search, minimal
+from drivesem.questions.explain.minimal import LeastSearch, Minimal, ThetaBlock, minimal
 from drivesem.questions.explain.players import Kind, Player
 from drivesem.questions.explain.plots import write_waterfalls
 from drivesem.questions.explain.results import (
@@ -29,7 +29,7 @@ from drivesem.questions.explain.results import (
     Contribution,
     Explanation,
     Least,
-    Outcome,
+    PartOutcome,
     Sensitivity,
     write_explanation,
 )
@@ -69,12 +69,12 @@ class Judge:
     def renders(self) -> int:
         return len(self._seen)
 
-    def outcome(self, theta: Tensor, mask: Tensor) -> Outcome:
+    def outcome(self, theta: Tensor, mask: Tensor) -> PartOutcome:
         """Of theta (D,) with the coordinates outside of `mask` (D,) bool as photographed, projected."""
         wanted = torch.where(mask, theta, 0)
         part = self.project(wanted)
         score = self._score(part)
-        return Outcome(score.loss, score.lost, score.phantoms, score.success, not torch.equal(part, wanted))
+        return PartOutcome(score.loss, score.lost, score.phantoms, score.success, not torch.equal(part, wanted))
 
     def project(self, theta: Tensor) -> Tensor:
         """theta (D,), feasible."""
@@ -84,14 +84,14 @@ class Judge:
         """Of theta (D,) in steps, by group (`Problem.size`)."""
         return float(self._problem.size(theta))
 
-    def search(self, points: int, lost: bool) -> Search:
+    def search(self, points: int, lost: bool) -> LeastSearch:
         """For the least change that fails, or that loses an object."""
 
         def fails(theta: Tensor) -> bool:
             score = self._score(theta)
             return score.lost > 0 if lost else score.success
 
-        return Search(self.project, fails, self.size, points)
+        return LeastSearch(self.project, fails, self.size, points)
 
     def _score(self, theta: Tensor) -> Score:
         self._seen.add(theta.cpu().numpy().tobytes())
@@ -178,9 +178,9 @@ def weigh(
 ) -> list[Contribution]:
     """What each player of a team, which covers theta (D,), adds. slope (D,): gradient at theta0 times theta."""
     masks = torch.stack([player.mask for player in team])
-    known: dict[bytes, Outcome] = {}
+    known: dict[bytes, PartOutcome] = {}
 
-    def outcome(members: Flags) -> Outcome:
+    def outcome(members: Flags) -> PartOutcome:
         key = members.tobytes()
         if key not in known:
             known[key] = judge.outcome(theta, masks[torch.from_numpy(members)].any(dim=0))
@@ -220,18 +220,18 @@ def _blocks(
     teams: Mapping[str, Sequence[Player]],
     contributions: Sequence[Contribution],
     judge: Judge,
-) -> list[Block]:
+) -> list[ThetaBlock]:
     """What to try to leave out: parameters and cars, those first that add least to the loss; then single
     parameters of single cars, the smallest first.
     """
     added = {c.name: c.loss for c in contributions}
     whole = sorted((p for team in teams.values() for p in team), key=lambda player: added[player.name])
-    blocks = [Block(player.name, player.mask) for player in whole]
-    parts: list[tuple[float, Block]] = []
+    blocks = [ThetaBlock(player.name, player.mask) for player in whole]
+    parts: list[tuple[float, ThetaBlock]] = []
     for cell in players.cells(space):
         mask = torch.zeros_like(theta, dtype=torch.bool)
         mask[cell.where] = True
-        parts.append((judge.size(torch.where(mask, theta, 0)), Block(cell.name, mask)))
+        parts.append((judge.size(torch.where(mask, theta, 0)), ThetaBlock(cell.name, mask)))
     return blocks + [block for size, block in sorted(parts, key=lambda part: part[0]) if size > 0]
 
 

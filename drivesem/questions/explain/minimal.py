@@ -23,7 +23,7 @@ _ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class ThetaBlock:
     """Coordinates that are dropped together. mask (D,) bool."""
 
     name: str
@@ -31,7 +31,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class LeastSearch:
     """What the search knows of thetas (D,). project: onto the feasible set. fails: of what was projected. size:
     the norm that shall be small. points: of the grid of scales, without 0.
     """
@@ -63,7 +63,7 @@ class Minimal:
         return sum(a != b for a, b in zip(self.scan, self.scan[1:], strict=False))
 
 
-def minimal(theta: Tensor, blocks: Sequence[Block], search: Search) -> Minimal:
+def minimal(theta: Tensor, blocks: Sequence[ThetaBlock], search: LeastSearch) -> Minimal:
     """The least of theta (D,) that fails. blocks: what to try to drop, in this order, until nothing more goes.
 
     A block goes where the rest, at some scale, still fails and is no larger than what there was. Raises RangeError
@@ -93,11 +93,11 @@ def minimal(theta: Tensor, blocks: Sequence[Block], search: Search) -> Minimal:
     return Minimal(search.project(direction * scale), scale, scan, shortened, shortened_scale, tuple(dropped))
 
 
-def _fails_at(direction: Tensor, scale: float, search: Search) -> bool:
+def _fails_at(direction: Tensor, scale: float, search: LeastSearch) -> bool:
     return search.fails(search.project(direction * scale))
 
 
-def _smallest(direction: Tensor, most: float, search: Search) -> float | None:
+def _smallest(direction: Tensor, most: float, search: LeastSearch) -> float | None:
     """A scale up to 1 that fails and is no larger than `most`; the smallest on half the grid, None without one."""
     limit = min(1.0, most / search.size(direction))
     points = max(search.points // 2, 1)
@@ -110,7 +110,7 @@ def _smallest(direction: Tensor, most: float, search: Search) -> float | None:
     return None
 
 
-def _shortest(direction: Tensor, scale: float, search: Search) -> float:
+def _shortest(direction: Tensor, scale: float, search: LeastSearch) -> float:
     """The smallest failing scale up to `scale`, which fails, as `minimal` says."""
     for k in range(1, search.points):
         if _fails_at(direction, scale * k / search.points, search):
@@ -118,7 +118,7 @@ def _shortest(direction: Tensor, scale: float, search: Search) -> float:
     return _bisected(direction, scale * (search.points - 1) / search.points, scale, search)
 
 
-def _bisected(direction: Tensor, low: float, high: float, search: Search) -> float:
+def _bisected(direction: Tensor, low: float, high: float, search: LeastSearch) -> float:
     """The failing end of an interval whose lower end does not fail, halved."""
     for _ in range(_HALVINGS):
         middle = (low + high) / 2

@@ -16,7 +16,7 @@ from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.resampling import Figure, Interval, Recalled, intervals
 from drivesem.questions.explain.players import Size
 from drivesem.questions.explain.plots import write_means
-from drivesem.questions.explain.results import Contribution, Explanation, Outcome
+from drivesem.questions.explain.results import Contribution, Explanation, PartOutcome
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
 
@@ -278,7 +278,7 @@ def _frame_row(explanation: Explanation) -> tuple[str, ...]:
     )
 
 
-def _told(outcome: Outcome) -> tuple[str, str]:
+def _told(outcome: PartOutcome) -> tuple[str, str]:
     """Loss; lost objects and phantoms."""
     return f"{outcome.loss:.2f}", f"{outcome.lost} + {outcome.phantoms}"
 

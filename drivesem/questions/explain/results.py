@@ -17,7 +17,7 @@ EXPLANATION = "explain.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PartOutcome:
     """What the detector makes of one theta, by `moved` labels. loss: the attack's objective; held_back: the
     projection onto the feasible set changed the theta.
     """
@@ -45,8 +45,8 @@ class Contribution:
     fails_error: float | None
     gradient: float | None
     gradient_share: float | None
-    alone: Outcome
-    without: Outcome
+    alone: PartOutcome
+    without: PartOutcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Least:
     norm_found: float
     norm_whole: float
     norm: float
-    outcome: Outcome
+    outcome: PartOutcome
     violations: tuple[str, ...]
     sizes: tuple[Size, ...]
     failures: tuple[Failure, ...]
@@ -107,8 +107,8 @@ class Explanation:
     identifier: str
     source: str
     objects: int
-    benign: Outcome
-    found: Outcome
+    benign: PartOutcome
+    found: PartOutcome
     contributions: tuple[Contribution, ...]
     exact: tuple[str, ...]
     sizes: tuple[Size, ...]
@@ -133,9 +133,9 @@ def read_explanation(path: Path) -> Explanation:
     try:
         if data.pop("schema") != SCHEMA:
             raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        data["benign"], data["found"] = Outcome(**data["benign"]), Outcome(**data["found"])
+        data["benign"], data["found"] = PartOutcome(**data["benign"]), PartOutcome(**data["found"])
         data["contributions"] = tuple(
-            Contribution(**{**c, "alone": Outcome(**c["alone"]), "without": Outcome(**c["without"])})
+            Contribution(**{**c, "alone": PartOutcome(**c["alone"]), "without": PartOutcome(**c["without"])})
             for c in data["contributions"]
         )
         data["exact"], data["sizes"] = tuple(data["exact"]), _all(Size, data["sizes"])
@@ -149,7 +149,7 @@ def read_explanation(path: Path) -> Explanation:
 def _least(data: dict[str, Any]) -> Least:
     kinds = {"sizes": Size, "failures": Failure, "theta": Coordinate}
     data |= {name: _all(kind, data[name]) for name, kind in kinds.items()}
-    return Least(**_tuples(data | {"outcome": Outcome(**data["outcome"])}))
+    return Least(**_tuples(data | {"outcome": PartOutcome(**data["outcome"])}))
 
 
 def _all(kind: Any, items: list[dict[str, Any]]) -> tuple[Any, ...]:

@@ -26,7 +26,7 @@ MOST_EXACT = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Shares:
+class ShapleyShares:
     """contributions (P, K) of each player to each value. errors (P, K): their standard errors, where orders were
     drawn; None where all coalitions were valued, or only one pair of orders was.
     """
@@ -35,12 +35,12 @@ class Shares:
     errors: Floats | None
 
 
-def shapley(game: Game, players: int, permutations: int, generator: np.random.Generator) -> Shares:
+def shapley(game: Game, players: int, permutations: int, generator: np.random.Generator) -> ShapleyShares:
     """Exact for at most MOST_EXACT players, else from so many orders. Raises RangeError as `sampled` does."""
     return exact(game, players) if players <= MOST_EXACT else sampled(game, players, permutations, generator)
 
 
-def exact(game: Game, players: int) -> Shares:
+def exact(game: Game, players: int) -> ShapleyShares:
     """From the values of all 2^P coalitions."""
     codes = np.arange(2**players)
     members = (codes[:, None] >> np.arange(players) & 1).astype(bool)
@@ -51,10 +51,10 @@ def exact(game: Game, players: int) -> Shares:
         without = codes[~members[:, player]]
         weight = np.array([1 / (players * comb(players - 1, int(size))) for size in sizes[without]])
         contributions[player] = weight @ (values[without | 1 << player] - values[without])
-    return Shares(contributions, None)
+    return ShapleyShares(contributions, None)
 
 
-def sampled(game: Game, players: int, permutations: int, generator: np.random.Generator) -> Shares:
+def sampled(game: Game, players: int, permutations: int, generator: np.random.Generator) -> ShapleyShares:
     """From orders drawn at random, each walked forwards and backwards: `permutations` walks, an even number.
 
     An order and its reverse err to opposite sides where players stand in for one another, so that the mean of the
@@ -65,7 +65,7 @@ def sampled(game: Game, players: int, permutations: int, generator: np.random.Ge
         raise RangeError("permutations", "an even number, at least 2", permutations)
     pairs = np.stack([_pair(game, generator.permutation(players)) for _ in range(permutations // 2)])
     errors = None if len(pairs) == 1 else pairs.std(axis=0, ddof=1) / np.sqrt(len(pairs))
-    return Shares(pairs.mean(axis=0), errors)
+    return ShapleyShares(pairs.mean(axis=0), errors)
 
 
 def _pair(game: Game, order: NDArray[np.int64]) -> Floats:

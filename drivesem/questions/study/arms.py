@@ -11,6 +11,7 @@ from pathlib import Path
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
+from drivesem.settings.blocks import Attacking, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 
 QUICK_FRAMES, FRAMES = 6, 200
@@ -40,24 +41,9 @@ class Arm:
 
 def attack_of(study: Study) -> Attack:
     """The attack that a study's arms vary."""
-    return Attack(
-        limit=study.limit or (QUICK_FRAMES if study.quick else FRAMES),
-        seed=study.seed,
-        workers=study.workers,
-        device=study.device,
-        keep_going=study.keep_going,
-        dataset=study.dataset,
-        root=study.root,
-        detector=study.detector,
-        method=study.method,
-        steps=study.steps,
-        budget=study.budget,
-        objective_labels=study.objective_labels,
-        objective=study.objective,
-        precision=study.precision,
-        fit=study.fit,
-        t_star=study.t_star,
-    )
+    limit = study.limit or (QUICK_FRAMES if study.quick else FRAMES)
+    alike = shared(study, Attacking) | shared(study, Sharing)
+    return Attack(**alike | {"limit": limit, "method": study.method})
 
 
 def arms_of(study: Study, out: Path) -> list[Arm]:

@@ -18,7 +18,8 @@ from drivesem.questions.study.arms import Arm, attack_of
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.run.attack import Worker
 from drivesem.scenes.sources import SceneSource
-from drivesem.settings.commands import DEFAULT_COMBO, DEMO, Retrain, Study, processes
+from drivesem.settings.blocks import DEMO
+from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
 from drivesem.settings.errors import UsageError
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage
 from drivesem.training.frames import FrameStore
@@ -230,7 +231,7 @@ def held_out_frames(study: Study, parts: Parts, classes: Sequence[str], out: Pat
     from drivesem.synth.write import Order, in_processes, synthesise
 
     order = Order(out / FRAMES, benign_count(study), study.seed + 1, split="heldout")
-    done = synthesise(order, in_processes(min(processes(study), order.frames)))
+    done = synthesise(order, in_processes(min(study.processes, order.frames)))
     for _ in track(done, "making frames", order.frames, console=console, transient=True):
         pass
     made = open_dataset("kitti", order.out)

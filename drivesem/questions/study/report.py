@@ -13,7 +13,7 @@ from rich.console import Console
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Difference, Interval
-from drivesem.questions.confirm.report import Report as Confirmed
+from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.rows import FIGURES, MODES, Row, feasible_fraction
@@ -61,7 +61,7 @@ class Findings:
     beside: Mapping[str, Difference] | None = None
     within: int = 0
     label_sets: Sequence[LabelSets] = ()
-    confirmed: Mapping[str, Confirmed] = field(default_factory=dict)
+    confirmed: Mapping[str, Confirmation] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -145,7 +145,7 @@ def _controls(rows: Sequence[Row]) -> Sheet:
     return Sheet("Controls: AP50, moved labels, points", columns, tuple(lines))
 
 
-def _confirmed(confirmed: Mapping[str, Confirmed]) -> Sheet:
+def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
     lines = []
     for name, one in confirmed.items():
         cells = [name, str(one.frames)]

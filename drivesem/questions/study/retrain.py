@@ -32,7 +32,8 @@ from drivesem.run.finished import load_runs
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.looking import weights_digest
 from drivesem.run.results import BoxRecord
-from drivesem.settings.commands import Study, Transfer
+from drivesem.settings.blocks import Asking
+from drivesem.settings.commands import Study
 from drivesem.settings.errors import UsageError
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.frames import FrameStore
@@ -258,7 +259,7 @@ def set_threshold(detector: Detector, weights: Path, t_star: float) -> None:
 
 def _known(study: Study, names: Mapping[str, str], run: Path, out: Path, console: Console) -> list[Known]:
     """The held-out counterexamples against the detector as it was, before all detectors."""
-    settings = Transfer(
+    settings = Asking(
         seed=study.seed,
         workers=study.workers,
         device=study.device,

@@ -27,7 +27,8 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.attack import Worker
 from drivesem.run.finished import Run, load_runs
-from drivesem.settings.commands import DEFAULT_COMBO, Study, Transfer
+from drivesem.settings.blocks import Asking
+from drivesem.settings.commands import DEFAULT_COMBO, Study
 
 _SIDES = ("source", "target")
 _LABELS = "labels"
@@ -136,9 +137,8 @@ def _beyond(row: Row, placebo: Row, mode: str, draws: int, seed: int) -> Interva
     return Interval(one.name, one.difference, one.low, one.high)
 
 
-def _settings(study: Study) -> Transfer:
-    return Transfer(
-        limit=study.limit,
+def _settings(study: Study) -> Asking:
+    return Asking(
         seed=study.seed,
         workers=study.workers,
         device=study.device,

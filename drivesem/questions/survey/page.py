@@ -29,6 +29,8 @@ from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError, ShapeError
 
+PAGE, KEY = "survey.html", "survey-key.json"
+"""Files of a survey: what people open, and what its pictures are."""
 CHANGED, UNCHANGED = "counterexample", "unchanged"
 KINDS = (CHANGED, UNCHANGED)
 OTHER, NOT_SURE = "Other", "Not sure"
@@ -75,7 +77,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Response:
     """One person's answers to one item. named: of CHOICES; realism: LEAST to MOST."""
 
     participant: str
@@ -191,14 +193,14 @@ def read_key(path: Path) -> tuple[str, list[Item]]:
         raise FormatError(str(path), "a key of drivesem survey", error) from error
 
 
-def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Answer]:
+def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Response]:
     """Answers in a file that the page made, of one or several people. Raises FormatError naming the line."""
     known = {item.item for item in items}
     reader = csv.DictReader(io.StringIO(files.read_text(path), newline=""))
     absent = [name for name in COLUMNS[:6] if name not in (reader.fieldnames or ())]
     if absent:
         raise FormatError(str(path), f"columns {', '.join(COLUMNS)}", f"no {absent[0]}")
-    found: list[Answer] = []
+    found: list[Response] = []
     for number, line in enumerate(reader, start=2):
         where = f"{path}:{number}"
         if line["survey"] != survey:
@@ -212,7 +214,7 @@ def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Answer]
             raise FormatError(f"{where}: realism", f"a whole number from {LEAST} to {MOST}", repr(line["realism"]))
         if not line["participant"]:
             raise FormatError(f"{where}: participant", "a name", "nothing")
-        one = Answer(line["participant"], line["item"], line["named"], int(rating))
+        one = Response(line["participant"], line["item"], line["named"], int(rating))
         if any((a.participant, a.item) == (one.participant, one.item) for a in found):
             raise FormatError(where, f"each item once from {one.participant}", one.item)
         found.append(one)
@@ -231,7 +233,7 @@ class _Mean:
         return float(counts @ self.values / counts.sum()) if counts.sum() > 0 else None
 
 
-def summary(items: Sequence[Item], answers: Sequence[Answer], draws: int, seed: int) -> dict[str, Any]:
+def summary(items: Sequence[Item], answers: Sequence[Response], draws: int, seed: int) -> dict[str, Any]:
     """JSON's form: for each kind of item the share named rightly, mean realism, the mean of the items' medians
     (the paper's average median), agreement; and each item. Intervals: bootstrap over people."""
     people = sorted({answer.participant for answer in answers})
@@ -271,7 +273,7 @@ def _interval(values: Floats, person: np.ndarray, people: int, draws: int, seed:
     return one
 
 
-def _by_item(items: Sequence[Item], answers: Sequence[Answer]) -> list[dict[str, Any]]:
+def _by_item(items: Sequence[Item], answers: Sequence[Response]) -> list[dict[str, Any]]:
     found = []
     for item in items:
         given = [answer for answer in answers if answer.item == item.item]

@@ -18,7 +18,7 @@ from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.transfer.matrix import Row, Target, row
 from drivesem.run.finished import PICTURES, Frame, Run
 from drivesem.run.looking import Memory, Order, look
-from drivesem.settings.commands import Transfer
+from drivesem.settings.blocks import Asking
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError
 
@@ -70,7 +70,7 @@ def short_names(names: Sequence[str]) -> list[str]:
     return short if len(set(short)) == len(short) else list(names)
 
 
-def detectors_of(specs: Sequence[str], config: Transfer, out: Path, t_star: float | None = None) -> list[Asked]:
+def detectors_of(specs: Sequence[str], config: Asking, out: Path, t_star: float | None = None) -> list[Asked]:
     """All of them loaded, before the first picture: a name that is misspelt shall not show after hours.
 
     out: in its folder DETECTIONS is remembered what they find; t_star: of all of them. Raises UsageError for what
@@ -89,7 +89,7 @@ def detectors_of(specs: Sequence[str], config: Transfer, out: Path, t_star: floa
 
 
 def rows_of(
-    runs: Sequence[Run], detectors: Sequence[Asked], config: Transfer, console: Console
+    runs: Sequence[Run], detectors: Sequence[Asked], config: Asking, console: Console
 ) -> tuple[list[Row], dict[str, str]]:
     """Each run before each detector, and the pictures that could not be used, with reasons.
 
@@ -109,7 +109,7 @@ def rows_of(
 
 
 def _look_at_all(
-    asked: Asked, runs: Sequence[Run], config: Transfer, failed: dict[str, str], console: Console
+    asked: Asked, runs: Sequence[Run], config: Asking, failed: dict[str, str], console: Console
 ) -> None:
     """All pictures of all runs before one detector; a bad one goes to `failed` or ends the command."""
     pictures = [path for one in runs for frame in one.frames for path in frame.pictures.values()]
@@ -129,7 +129,7 @@ def _look_at_all(
         progress.advance(task, left)
 
 
-def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Transfer, draws: int) -> Row:
+def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> Row:
     memory, predictor = Memory(asked.order, asked.predictor), asked.predictor
     otherwise = DEFAULT_T_STAR if config.t_star is None else config.t_star
     t_star = t_star_of(predictor, asked.t_star, otherwise)

@@ -12,13 +12,13 @@ from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import t_star_of
 from drivesem.attack.space import parse_params
-from drivesem.questions.verify.differences import CHECKS, Difference, Tally
+from drivesem.questions.verify.differences import CHECKS, CheckLog, Disagreement
 from drivesem.questions.verify.frame import BOX_PX, LABEL, LEVELS, SCORE, Checked, Given, check_frame
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import FRAMES, attack_of, detector_of
 from drivesem.run.results import FrameResult
-from drivesem.settings.commands import Common, Verify
+from drivesem.settings.commands import Verify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -38,8 +38,7 @@ def verify_run(config: Verify) -> tuple[dict[str, Any], Path]:
     if out.is_dir():
         raise UsageError("--out", "a file", f"the folder {out}")
     names = [frame.result.identifier for frame in run.frames][: config.limit]
-    shared = Common(workers=config.workers, keep_going=config.keep_going)
-    answers = ask(names, worker, build, shared, Bar("checking frames", stays=False))
+    answers = ask(names, worker, build, config, Bar("checking frames", stays=False))
     checked = [answers.results[name] for name in names if name in answers.results]
     data = _data(run, checked, _totals(run, worker.given.t_star), answers.failed)
     files.write_json(out, data)
@@ -76,13 +75,13 @@ def _hashes(run: Run) -> Mapping[str, Mapping[str, str]]:
     return frames
 
 
-def _totals(run: Run, t_star: float) -> Tally:
+def _totals(run: Run, t_star: float) -> CheckLog:
     """metrics.json against what all frames of the run hold."""
     results = [frame.result for frame in run.frames]
-    tally, metrics = Tally(), files.read_json(run.folder / METRICS)
+    log, metrics = CheckLog(), files.read_json(run.folder / METRICS)
     for name, found in {**_added_up(results), "t_star": t_star}.items():
-        tally.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
-    return tally
+        log.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
+    return log
 
 
 def _added_up(results: Sequence[FrameResult]) -> dict[str, Any]:
@@ -99,9 +98,9 @@ def _added_up(results: Sequence[FrameResult]) -> dict[str, Any]:
     }
 
 
-def _data(run: Run, checked: Sequence[Checked], totals: Tally, failed: dict[str, str]) -> dict[str, Any]:
+def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[str, str]) -> dict[str, Any]:
     """JSON's form."""
-    differences: list[tuple[str, Difference]] = [(c.identifier, d) for c in checked for d in c.differences]
+    differences: list[tuple[str, Disagreement]] = [(c.identifier, d) for c in checked for d in c.differences]
     differences += [(_WHOLE_RUN, d) for d in totals.differences]
     rows = []
     for check, holds in CHECKS.items():

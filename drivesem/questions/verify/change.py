@@ -11,7 +11,7 @@ from torch import Tensor
 
 from drivesem.attack.feasibility_check import Reach, check_reach, check_scene
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
-from drivesem.questions.verify.differences import Tally
+from drivesem.questions.verify.differences import CheckLog
 from drivesem.run.results import FrameResult
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -27,7 +27,7 @@ _CODES = ("weather", "foliage")
 
 
 def check_change(
-    tally: Tally,
+    log: CheckLog,
     folder: Path,
     result: FrameResult,
     base: SceneIR,
@@ -41,21 +41,21 @@ def check_change(
     written = files.read_json(folder / THETA)
     if not isinstance(written, dict):
         raise FormatError(str(folder / THETA), "coordinates by name", type(written).__name__)
-    tally.same("theta", f"{THETA}, names", [c.name for c in result.theta], list(written))
+    log.same("theta", f"{THETA}, names", [c.name for c in result.theta], list(written))
     for c in result.theta:
         if c.name in written:
             expected = {"value": c.value, "unit": c.unit, "bounds": [c.lower, c.upper], "display": c.display}
-            tally.same("theta", f"{THETA}: {c.name}", expected, written[c.name])
+            log.same("theta", f"{THETA}: {c.name}", expected, written[c.name])
     space = ParameterSpace(base, params, budget)
     names = [space.name(i) for i in range(space.dim)]
-    tally.same("theta", "coordinates", [c.name for c in result.theta], names)
+    log.same("theta", "coordinates", [c.name for c in result.theta], names)
     if len(result.theta) != space.dim:
         return
     for c, lower, upper in zip(result.theta, space.lower.tolist(), space.upper.tolist(), strict=True):
         bounds, own = f"[{c.lower:g}, {c.upper:g}]", f"[{lower:g}, {upper:g}]"
         same = abs(c.lower - lower) <= BOUND and abs(c.upper - upper) <= BOUND
-        tally.told("theta", f"{c.name}, bounds", bounds, own, agrees=same)
-        tally.told(
+        log.told("theta", f"{c.name}, bounds", bounds, own, agrees=same)
+        log.told(
             "feasibility",
             f"{c.name}, budget",
             f"a value in {own}",
@@ -63,30 +63,31 @@ def check_change(
             agrees=lower - BOUND <= c.value <= upper + BOUND,
         )
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
-    _compare_scenes(tally, space.apply(base, theta), perturbed)
+    _compare_scenes(log, space.apply(base, theta), perturbed)
 
 
-def _compare_scenes(tally: Tally, expected: SceneIR, found: SceneIR) -> None:
+def _compare_scenes(log: CheckLog, expected: SceneIR, found: SceneIR) -> None:
     """The scene that theta gives against the saved one."""
     for name in _MOVED:
         rows = zip(getattr(expected.objects, name), getattr(found.objects, name), strict=True)
         for i, (one, other) in enumerate(rows):
-            _compare_tensors(tally, f"scene: objects[{i}].{name}", one, other)
+            _compare_tensors(log, f"scene: objects[{i}].{name}", one, other)
     for name in _CODES:
         one, other = (getattr(scene.environment, name) for scene in (expected, found))
-        _compare_tensors(tally, f"scene: {name}", one, other)
+        _compare_tensors(log, f"scene: {name}", one, other)
 
 
-def _compare_tensors(tally: Tally, name: str, expected: Tensor, found: Tensor) -> None:
+def _compare_tensors(log: CheckLog, name: str, expected: Tensor, found: Tensor) -> None:
     apart = (expected - found).abs().reshape(-1)
     worst = int(apart.argmax())
     pair = [f"{float(side.reshape(-1)[worst]):.6g}" for side in (expected, found)]
-    tally.told("theta", name, *pair, agrees=float(apart[worst]) <= SCENE)
+    log.told("theta", name, *pair, agrees=float(apart[worst]) <= SCENE)
 
 
 def check_feasibility(
-    tally: Tally, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
+    log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
 ) -> None:
     """What the second check finds in the saved scene, and whether the poses in it lie within the run's budget."""
-    tally.same("feasibility", "violations", list(result.violations), check_scene(base, perturbed))
-    tally.same("feasibility", "budget", [], check_reach(base, perturbed, Reach(**asdict(budget))))
+    found = check_scene(base, perturbed, result.checked_by)
+    log.same("feasibility", "violations", list(result.violations), found)
+    log.same("feasibility", "budget", [], check_reach(base, perturbed, Reach(**asdict(budget))))

@@ -19,7 +19,7 @@ CHECKS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class Disagreement:
     """One thing that is not as the run says. field: such as `success_moved` or `objects[3].yaw`; expected: what
     the run's result says; found: what its files give.
     """
@@ -31,11 +31,11 @@ class Difference:
 
 
 @dataclass(slots=True)
-class Tally:
+class CheckLog:
     """Counts comparisons by check, and keeps what differs."""
 
     compared: dict[str, int] = field(default_factory=dict)
-    differences: list[Difference] = field(default_factory=list)
+    differences: list[Disagreement] = field(default_factory=list)
 
     def same(self, check: str, name: str, expected: object, found: object) -> None:
         """Compare exactly."""
@@ -45,7 +45,7 @@ class Tally:
         """Count a comparison whose outcome is known."""
         self.compared[check] = self.compared.get(check, 0) + 1
         if not agrees:
-            self.differences.append(Difference(check, name, _text(expected), _text(found)))
+            self.differences.append(Disagreement(check, name, _text(expected), _text(found)))
 
 
 def _text(value: object) -> str:

@@ -20,7 +20,7 @@ from drivesem.attack.space import Budget, Parameter
 from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.questions.verify.change import check_change, check_feasibility
-from drivesem.questions.verify.differences import Difference, Tally
+from drivesem.questions.verify.differences import CheckLog, Disagreement
 from drivesem.run.frame import RESULT, as_targets, detection_records, target_records
 from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import BoxRecord, FrameResult, load_frame
@@ -78,7 +78,7 @@ class Checked:
 
     identifier: str
     compared: dict[str, int]
-    differences: tuple[Difference, ...]
+    differences: tuple[Disagreement, ...]
     levels: dict[str, Level]
 
 
@@ -94,25 +94,25 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     result = load_frame(folder / RESULT)
     perturbed = load_scene(folder / "scene")
     base = perturbed.as_photographed()
-    tally = Tally()
+    log = CheckLog()
     for name, expected in given.hashes.get(identifier, {}).items():
         found = files.digest(folder / name)
-        tally.same("files", name, expected, found)
-    check_change(tally, folder, result, base, perturbed, given.params, given.budget)
-    check_feasibility(tally, result, base, perturbed, given.budget)
+        log.same("files", name, expected, found)
+    check_change(log, folder, result, base, perturbed, given.params, given.budget)
+    check_feasibility(log, result, base, perturbed, given.budget)
     size = (base.camera.height, base.camera.width)
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
-        levels, labels = _render(tally, pictures, base, perturbed, given.backend)
+        levels, labels = _render(log, pictures, base, perturbed, given.backend)
         seen = {
             name: detections_in(given.detector, as_picture(image, given.device))
             for name, image in pictures.items()
         }
     names = JudgedClasses.of(given.detector).names
     for name, field in _DETECTIONS.items():
-        _compare_boxes(tally, "detections", field, getattr(result, field), detection_records(seen[name], names))
-    _judge(tally, folder, result, labels, _Scenes(base, perturbed), seen, given)
-    return Checked(identifier, tally.compared, tuple(tally.differences), levels)
+        _compare_boxes(log, "detections", field, getattr(result, field), detection_records(seen[name], names))
+    _judge(log, folder, result, labels, _Scenes(base, perturbed), seen, given)
+    return Checked(identifier, log.compared, tuple(log.differences), levels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class _Scenes:
 
 
 def _render(
-    tally: Tally, pictures: Mapping[str, np.ndarray], base: SceneIR, perturbed: SceneIR, backend: str
+    log: CheckLog, pictures: Mapping[str, np.ndarray], base: SceneIR, perturbed: SceneIR, backend: str
 ) -> tuple[dict[str, Level], dict[str, MovedLabels]]:
     """The three pictures against the scene; labels of the scene by mode."""
     compositor = Compositor(base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
@@ -135,13 +135,13 @@ def _render(
         apart = np.abs(pictures[name].astype(np.int16) - to_uint8(image)).max(axis=2)
         levels[name] = Level(int(apart.max()), float((apart > 0).mean()))
         found = f"up to {levels[name].largest} levels off, in {100 * levels[name].share:.3g} % of the pixels"
-        tally.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
+        log.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
     labeller = Labeller(base, before)
     return levels, {"paper": labeller.paper(), "moved": labeller.moved(perturbed, after)}
 
 
 def _judge(
-    tally: Tally,
+    log: CheckLog,
     folder: Path,
     result: FrameResult,
     labels: Mapping[str, MovedLabels],
@@ -153,8 +153,8 @@ def _judge(
     recorded = {"paper": result.targets_benign, "moved": result.targets_moved}
     count = len(scenes.base.objects)
     for mode, own in labels.items():
-        _compare_targets(tally, f"targets_{mode}", recorded[mode], target_records(own.targets, CLASSES, count))
-    tally.same(
+        _compare_targets(log, f"targets_{mode}", recorded[mode], target_records(own.targets, CLASSES, count))
+    log.same(
         "labels",
         "became_ignored",
         list(result.became_ignored),
@@ -164,15 +164,15 @@ def _judge(
     for mode, own in labels.items():
         name = f"labels_{mode}.txt"
         written = read_labels(folder / name)
-        if _compare_labels(tally, name, written, to_kitti_labels(own, scenes.base, scenes.perturbed)):
+        if _compare_labels(log, name, written, to_kitti_labels(own, scenes.base, scenes.perturbed)):
             judged[mode][f" by {name}"] = _targets_of(written, own, judged[mode][""].ignore)
     sizes = {len(targets) for kinds in judged.values() for targets in kinds.values()}
     if len(sizes) > 1:
-        tally.told("success", "targets", "as many of either label mode", sorted(sizes), agrees=False)
+        log.told("success", "targets", "as many of either label mode", sorted(sizes), agrees=False)
         return
     for mode, kinds in judged.items():
         for by, targets in kinds.items():
-            _compare_success(tally, result, mode, by, _failures(judged["paper"][""], targets, seen, given))
+            _compare_success(log, result, mode, by, _failures(judged["paper"][""], targets, seen, given))
 
 
 def _failures(
@@ -191,32 +191,32 @@ def _failures(
 
 
 def _compare_success(
-    tally: Tally, result: FrameResult, mode: str, by: str, found: tuple[tuple[int, ...], tuple[BoxRecord, ...]]
+    log: CheckLog, result: FrameResult, mode: str, by: str, found: tuple[tuple[int, ...], tuple[BoxRecord, ...]]
 ) -> None:
     lost, phantoms = found
     expected = result.success_moved if mode == "moved" else result.success_paper
-    tally.same("success", f"success_{mode}{by}", expected, bool(lost or phantoms))
+    log.same("success", f"success_{mode}{by}", expected, bool(lost or phantoms))
     if mode == "moved":
         known = [f.index for f in result.failures if f.kind == "lost"]
-        tally.same("success", f"lost{by}", [f"objects[{i}]" for i in known], [f"objects[{i}]" for i in lost])
+        log.same("success", f"lost{by}", [f"objects[{i}]" for i in known], [f"objects[{i}]" for i in lost])
         boxes = [BoxRecord(f.xyxy, f.label, f.score) for f in result.failures if f.kind == "phantom"]
-        _compare_boxes(tally, "success", f"phantoms{by}", boxes, phantoms)
+        _compare_boxes(log, "success", f"phantoms{by}", boxes, phantoms)
 
 
 def _compare_boxes(
-    tally: Tally, check: str, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]
+    log: CheckLog, check: str, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]
 ) -> None:
     """Detections, each with the first that is like it; order and what lies within the tolerance do not matter."""
     left = list(found)
     for record in expected:
         like = next((other for other in left if _alike(record, other)), None)
         if like is None:
-            tally.told(check, name, _said(record), "none like it", agrees=False)
+            log.told(check, name, _said(record), "none like it", agrees=False)
         else:
             left.remove(like)
-            tally.told(check, name, "", "", agrees=True)
+            log.told(check, name, "", "", agrees=True)
     for record in left:
-        tally.told(check, name, "none like it", _said(record), agrees=False)
+        log.told(check, name, "none like it", _said(record), agrees=False)
 
 
 def _alike(one: BoxRecord, other: BoxRecord) -> bool:
@@ -230,30 +230,30 @@ def _said(record: BoxRecord) -> str:
     return f"{record.label}{score} at {corners}"
 
 
-def _compare_targets(tally: Tally, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]) -> None:
+def _compare_targets(log: CheckLog, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]) -> None:
     """Recorded targets against those of the saved scene."""
-    tally.same("labels", f"{name}, how many", len(expected), len(found))
+    log.same("labels", f"{name}, how many", len(expected), len(found))
     for i, (one, other) in enumerate(zip(expected, found, strict=False)):
         apart = max(abs(a - b) for a, b in zip(one.xyxy, other.xyxy, strict=True))
         same = (one.label, one.ignore, one.index) == (other.label, other.ignore, other.index)
         told = [_said(r) + (", ignored" if r.ignore else "") for r in (one, other)]
-        tally.told("labels", f"{name}[{i}]", *told, agrees=same and apart <= LABEL)
+        log.told("labels", f"{name}[{i}]", *told, agrees=same and apart <= LABEL)
 
 
-def _compare_labels(tally: Tally, name: str, written: Labels, own: Labels) -> bool:
+def _compare_labels(log: CheckLog, name: str, written: Labels, own: Labels) -> bool:
     """A label file against the saved scene. Returns whether both have the same objects and as many regions."""
-    tally.same("labels", f"{name}: type", list(written.kind), list(own.kind))
+    log.same("labels", f"{name}: type", list(written.kind), list(own.kind))
     regions = len(written.ignore_xyxy), len(own.ignore_xyxy)
-    tally.same("labels", f"{name}: DontCare", *regions)
+    log.same("labels", f"{name}: DontCare", *regions)
     if written.kind != own.kind or regions[0] != regions[1]:
         return False
     for field in _LABEL_FIELDS:
-        _compare_rows(tally, f"{name}: objects[{{}}].{field}", getattr(written, field), getattr(own, field))
-    _compare_rows(tally, f"{name}: DontCare[{{}}]", written.ignore_xyxy, own.ignore_xyxy)
+        _compare_rows(log, f"{name}: objects[{{}}].{field}", getattr(written, field), getattr(own, field))
+    _compare_rows(log, f"{name}: DontCare[{{}}]", written.ignore_xyxy, own.ignore_xyxy)
     return True
 
 
-def _compare_rows(tally: Tally, name: str, written: Tensor, own: Tensor) -> None:
+def _compare_rows(log: CheckLog, name: str, written: Tensor, own: Tensor) -> None:
     """Rows of numbers; name: with a place for the row's."""
     for i, (one, other) in enumerate(zip(written.tolist(), own.tolist(), strict=True)):
         pair = [side if isinstance(side, list) else [side] for side in (one, other)]
@@ -262,7 +262,7 @@ def _compare_rows(tally: Tally, name: str, written: Tensor, own: Tensor) -> None
             ways = [math.remainder(way, 2 * math.pi) for way in ways]
         apart = max(map(abs, ways))
         told = [" ".join(f"{value:.3f}" for value in side) for side in pair]
-        tally.told("labels", name.format(i), *told, agrees=apart <= LABEL)
+        log.told("labels", name.format(i), *told, agrees=apart <= LABEL)
 
 
 def _targets_of(written: Labels, own: MovedLabels, ignore: Tensor) -> Targets:

@@ -1,5 +1,6 @@
 import ast
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import drivesem.attack.feasibility_check
-from drivesem.attack.feasibility_check import _Car, _collisions, check_scene, overlap_area
+from drivesem.attack.feasibility_check import (
+    _Car,
+    _collisions,
+    _Outlines,
+    check_scene,
+    judge_at_hand,
+    overlap_area,
+)
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.cars import Cars
 from drivesem.attack.feasible.collisions import gap_between, shared_ground
@@ -227,7 +235,7 @@ def test_the_second_check_shares_no_code():
         for a in n.names
     }
     assert imported <= {
-        *("__future__", "collections.abc", "dataclasses", "math"),
+        *("__future__", "collections.abc", "dataclasses", "functools", "importlib", "math", "typing"),
         *("cv2", "numpy", "numpy.typing", "scene_ir.types"),
     }
 
@@ -289,10 +297,10 @@ def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):
     before[1].vertices = _spindle(before[1])
     less = overlap_area(before[0].outline, before[1].outline)
     assert less < shared - 0.2
-    found = _collisions(dict(enumerate(before)), dict(enumerate(after)))
+    found = _collisions(dict(enumerate(before)), dict(enumerate(after)), _Outlines())
     assert found == [f"objects[1]: mesh runs into that of objects[0], {shared:.2f} m2 ({less:.2f} before)"]
-    assert _collisions(dict(enumerate(after)), dict(enumerate(before))) == []
-    assert _collisions(dict(enumerate(after)), dict(enumerate(after))) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(before)), _Outlines()) == []
+    assert _collisions(dict(enumerate(after)), dict(enumerate(after)), _Outlines()) == []
 
 
 def _spindle(car):
@@ -300,6 +308,63 @@ def _spindle(car):
     local = (car.vertices - car.position) @ car.axes.T
     local[:, 2] *= 1 - np.abs(local[:, 0]) / (car.high[0] - car.low[0]) * 1.8
     return local @ car.axes + car.position
+
+
+@pytest.fixture
+def rays():
+    """Open3D as the judge."""
+    pytest.importorskip("open3d", reason="Open3D or its libusb is not installed", exc_type=ImportError)
+    return drivesem.attack.feasibility_check._judge()
+
+
+def test_rays_see_what_outlines_see(street, rays):
+    for places in (CROWDED, ((0.0, 6.0), (0.0, 12.0)), ((7.5, 9.0), (0.0, 3.0)), ()):
+        scene = street(positions_xz=places)
+        cars = [_Car(scene, i) for i in range(len(places))]
+        (shown, whole), (pixels, all_pixels) = rays.seen(scene, cars), _Outlines().seen(scene, cars)
+        shares = [a / b for a, b in zip(shown, whole, strict=True)]
+        assert shares == pytest.approx([a / b for a, b in zip(pixels, all_pixels, strict=True)], abs=0.1)
+
+
+def test_rays_measure_the_ground_that_two_meshes_share(street, rays):
+    scene = street(positions_xz=((0.0, 10.0), (1.0, 12.0)), yaw=0.3)
+    cars = [_Car(scene, i) for i in range(2)]
+    shared = overlap_area(cars[0].outline, cars[1].outline)
+    assert rays.shared_m2(*cars) == pytest.approx(shared, abs=0.05)
+    assert rays.shared_m2(cars[0], cars[0]) == pytest.approx(overlap_area(*(cars[0].outline,) * 2), rel=0.02)
+    apart = [_Car(street(positions_xz=((0.0, 10.0), (0.0, 20.0))), i) for i in range(2)]
+    assert rays.shared_m2(*apart) == 0
+    # One mesh above the other: their outlines overlap, and they do not meet.
+    cars[1].vertices = cars[1].vertices - [0.0, 5.0, 0.0]
+    assert rays.shared_m2(*cars) == 0
+
+
+def test_rays_find_a_mesh_in_another_and_a_car_behind_another(street, rays):
+    scene = street(positions_xz=((0.0, 10.0), (1.8, 10.0)), yaw=0.0)
+    scene = scene.with_objects(yaw=torch.tensor([0.0, math.pi / 2]))
+    before, after = [_Car(scene, i) for i in range(2)], [_Car(scene, i) for i in range(2)]
+    before[1].vertices = _spindle(before[1])
+    (line,) = _collisions(dict(enumerate(before)), dict(enumerate(after)), rays)
+    assert line.startswith("objects[1]: mesh runs into that of objects[0]")
+    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
+    assert "objects[1]: hidden" in check_scene(pair, hidden, "open3d")
+
+
+@pytest.mark.parametrize("asked", [None, "open3d", "outlines"])
+def test_without_open3d_outlines_judge(street, monkeypatch, asked):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    drivesem.attack.feasibility_check._open3d.cache_clear()
+    try:
+        assert judge_at_hand() == "outlines"
+        pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
+        pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+        moved = pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]])
+        assert "objects[1]: hidden" in check_scene(pair, pair.with_objects(translation=moved), asked)
+        assert check_scene(pair, pair, asked) == []
+    finally:
+        drivesem.attack.feasibility_check._open3d.cache_clear()
 
 
 def test_overlap_area_of_known_shapes():

@@ -14,8 +14,9 @@ import torch
 from drivesem.attack.space import Parameter
 from drivesem.bench import gradcheck
 from drivesem.bench.gradcheck import LOSS, PICTURE, Differences, Row, rows_of, worst
-from drivesem.cli import main, parse
+from drivesem.cli import main
 from drivesem.settings.commands import Gradcheck
+from drivesem.settings.parsing import parse
 from scene_ir.types import Camera, Mesh, SceneIR
 
 COUNT, OUTPUTS = 12, gradcheck.FUNCTIONALS + 1

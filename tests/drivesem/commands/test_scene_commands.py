@@ -14,13 +14,15 @@ import pytest
 import torch
 import trimesh
 
-from drivesem.cli import main, parse
+from drivesem.cli import main
 from drivesem.data.registry import DATASETS as READERS
 from drivesem.data.registry import open_dataset
 from drivesem.run.lock import LOCK
 from drivesem.scenes.sheet import GAIN, PANEL_PX, scene_sheet
-from drivesem.settings.commands import DATASETS, DEMO, Derender, Edit, Render
+from drivesem.settings.blocks import DATASETS
+from drivesem.settings.commands import Derender, Edit, Render
 from drivesem.settings.edits import read_frame_edit
+from drivesem.settings.parsing import parse
 from scene_ir import files
 from scene_ir.derender.silhouette import extent, placed, silhouettes
 from scene_ir.errors import RangeError
@@ -84,7 +86,7 @@ def test_presets_hold_repeated_settings(tmp_path: Path) -> None:
 
 
 def test_data_sets_are_those_that_can_be_read() -> None:
-    assert sorted(DATASETS) == sorted((DEMO, *READERS))
+    assert sorted(DATASETS) == sorted(READERS)
 
 
 @pytest.mark.parametrize("command", ["derender", "attack", "gradcheck"])

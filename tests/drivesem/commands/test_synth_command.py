@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.cli import main, parse
+from drivesem.cli import main
 from drivesem.commands.synth import order_of
 from drivesem.data.registry import open_dataset
 from drivesem.settings.commands import Synth
+from drivesem.settings.parsing import parse
 from scene_ir import files
 
 

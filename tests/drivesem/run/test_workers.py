@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from drivesem.run.workers import outcomes
-from drivesem.settings.commands import Common
+from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 
@@ -33,7 +33,7 @@ def build(offset: int) -> Callable[[int], tuple[int, int]]:
     return partial(square, offset=offset)
 
 
-def in_order(jobs: list[int], config: Common) -> dict[int, tuple[int, int] | str]:
+def in_order(jobs: list[int], config: Sharing) -> dict[int, tuple[int, int] | str]:
     found: dict[int, tuple[int, int] | str] = {}
     for job, outcome in outcomes(square, partial(build, 100), jobs, config):
         try:
@@ -44,14 +44,14 @@ def in_order(jobs: list[int], config: Common) -> dict[int, tuple[int, int] | str
 
 
 def test_one_process_does_it_here() -> None:
-    found = in_order([1, 2, 3], Common(workers=1))
+    found = in_order([1, 2, 3], Sharing(workers=1))
     assert found == {1: (1, os.getpid()), 2: (4, os.getpid()), 3: "three: expected another number, found 3"}
-    assert in_order([2], Common(workers=4)) == {2: (4, os.getpid())}, "one job is not worth a process"
-    assert in_order([], Common(workers=4)) == {}
+    assert in_order([2], Sharing(workers=4)) == {2: (4, os.getpid())}, "one job is not worth a process"
+    assert in_order([], Sharing(workers=4)) == {}
 
 
 def test_processes_make_their_own_and_hand_errors_back() -> None:
-    found = in_order([1, 2, 3, 4], Common(workers=2))
+    found = in_order([1, 2, 3, 4], Sharing(workers=2))
     assert found[3] == "three: expected another number, found 3"
     for job in (1, 2, 4):
         value = found[job]
@@ -73,7 +73,7 @@ def test_threads_are_shared_among_processes_only_while_they_work(jobs: list[int]
     before, shared = torch.get_num_threads(), max((os.cpu_count() or 1) // 2, 1)
     try:
         torch.set_num_threads(shared + 1)
-        for _, outcome in outcomes(square, partial(build, 0), jobs, Common(workers=2)):
+        for _, outcome in outcomes(square, partial(build, 0), jobs, Sharing(workers=2)):
             outcome()
             assert torch.get_num_threads() == shared
         assert torch.get_num_threads() == shared + 1
@@ -93,7 +93,7 @@ def stumbling() -> Callable[[int], int]:
 def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None:
     def found(*, keep_going: bool) -> dict[int, int | str]:
         results: dict[int, int | str] = {}
-        config = Common(workers=workers, keep_going=keep_going)
+        config = Sharing(workers=workers, keep_going=keep_going)
         for job, outcome in outcomes(stumble, stumbling, [3, 0, 4], config):
             try:
                 results[job] = outcome()
@@ -116,7 +116,7 @@ def test_bad_settings_end_it_in_any_case(keep_going: bool) -> None:
     def refuse(job: int) -> int:
         raise UsageError("--detector", "another", job)
 
-    ((_, outcome),) = outcomes(refuse, stumbling, [1], Common(workers=1, keep_going=keep_going))
+    ((_, outcome),) = outcomes(refuse, stumbling, [1], Sharing(workers=1, keep_going=keep_going))
     with pytest.raises(UsageError, match="--detector"):
         outcome()
 
@@ -134,12 +134,12 @@ def lingering(folder: str) -> Callable[[int], None]:
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
 def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
     script = (
-        "from drivesem.settings.commands import Common\n"
+        "from drivesem.settings.blocks import Sharing\n"
         "from drivesem.run.workers import outcomes\n"
         "from tests.drivesem.run.test_workers import lingering\n"
         "from functools import partial\n"
         "if __name__ == '__main__':\n"
-        f"    list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Common(workers=2)))\n"
+        f"    list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Sharing(workers=2)))\n"
     )
     file = tmp_path / "killed.py"
     file.write_text(script)

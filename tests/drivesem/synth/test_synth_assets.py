@@ -9,13 +9,14 @@ import trimesh
 import yaml
 
 from drivesem.synth import assets
-from drivesem.synth.light import draw_light, sky_radiance
+from drivesem.synth.light import draw_light
 from drivesem.synth.noise import noise_set
 from drivesem.synth.soup import Material
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.meshes.load import save_mesh
 from scene_ir.meshes.templates import template
 from scene_ir.types import Mesh, Part
+from tests.drivesem.synth.reference_light import sky_radiance
 
 KENNEY = Path(__file__).resolve().parents[4] / "shared" / "data" / "meshes_kenney"
 UP = np.array([0.0, -1.0, 0.0])

@@ -1,4 +1,4 @@
-"""The kernels compute what the plain numpy defines, and the weather they draw looks as it should."""
+"""The kernels compute what the plain numpy beside defines, and the weather they draw looks as it should."""
 
 from dataclasses import replace
 
@@ -10,12 +10,14 @@ from drivesem.synth import kernels
 from drivesem.synth import render as rendering
 from drivesem.synth.frames import SynthSettings, actor_soups, plan_frame
 from drivesem.synth.layout import Marking, Road
-from drivesem.synth.light import Light, Panorama, Response, develop, reflected_radiance, sky_radiance
-from drivesem.synth.noise import noise_set, white_noise
-from drivesem.synth.render import nearest, render, see, sun_maps, take
+from drivesem.synth.light import Light, Panorama, Response, develop
+from drivesem.synth.noise import noise_set
+from drivesem.synth.render import render, see, sun_maps, take
 from drivesem.synth.soup import Material, box, join, make, placed
-from drivesem.synth.view import Setting, Shadow, View, blocks
+from drivesem.synth.view import Setting, Shadow, View, blocks, fine_matrix
 from scene_ir.types import Camera
+from tests.drivesem.synth import reference_render as reference
+from tests.drivesem.synth.reference_light import reflected_radiance, sky_radiance, white_noise
 
 PAINTED = [m for m in Material if m != Material.SKY]
 
@@ -91,13 +93,12 @@ def a_world(view: View):
 SHADOWS = [Shadow((-2.0, 8.0), 1.2, (4.2, 1.5, 1.8)), Shadow((2.5, 8.0), 1.2, (4.2, 1.5, 1.8))]
 
 
-def shaded(setting: Setting, backend, maps=None):
+def shaded(setting: Setting, develop_pixels):
     world = a_world(setting.view)
-    sight = see(world, setting.view)
-    maps = sun_maps(world, setting, "reference") if maps is None else maps
+    sight, maps = see(world, setting.view), reference.sun_maps(world, setting)
     pixels = setting.view.camera.height * setting.view.camera.width
-    target = np.zeros((pixels, 3), np.float32), np.ones(pixels, bool)
-    return rendering._develop_pixels(sight, setting, maps, SHADOWS, target, backend)
+    image = np.zeros((pixels, 3), np.float32)
+    return image, develop_pixels(sight, setting, maps, SHADOWS, (image, np.ones(pixels, bool)))
 
 
 RAMP = np.stack(np.meshgrid(np.linspace(0, 1, 64), np.linspace(1, 0, 32)), axis=-1)
@@ -118,8 +119,8 @@ def test_every_material_looks_the_same_by_kernel_and_by_numpy(weather, heading):
     view = a_view(heading, (1.5, -2.0), (160, 480))
     light = a_light(view, heading=heading, **WEATHERS[weather])
     setting = a_setting(view, replace(light, sun=light.sun / np.linalg.norm(light.sun)))
-    fast, touched = shaded(setting, "warp")
-    slow, expected = shaded(setting, "reference")
+    fast, touched = shaded(setting, kernels.develop_pixels)
+    slow, expected = shaded(setting, reference.develop_pixels)
     difference = np.abs(fast - slow).max(axis=1)
     assert (difference > 2e-3).mean() < 5e-4
     assert np.quantile(difference, 0.99) < 5e-4
@@ -139,14 +140,14 @@ def test_a_street_photographed_by_kernel_and_by_numpy(seed):
     view = replace(plan.setting.view, camera=Camera(k, 130, 440))
     setting = replace(plan.setting, view=view)
     world = join([a_world(view), *actor_soups(replace(plan, setting=setting))])
-    fast, slow = see(world, view), see(world, view, "reference")
+    fast, slow = see(world, view), reference.see(world, view)
     assert (fast.owner != slow.owner).mean() < 1e-3
     assert (fast.material != slow.material).mean() < 1e-3
     assert (np.isinf(fast.depth) == np.isinf(slow.depth)).all()
     land = np.isfinite(slow.depth) & (fast.owner == slow.owner)
     assert np.quantile(np.abs(fast.depth[land] / slow.depth[land] - 1), 0.995) < 1e-5
-    one, two = render(fast, world, [], setting), render(slow, world, [], setting, "reference")
-    assert (np.abs(one.image.astype(int) - two.image).max(axis=2) > 1).mean() < 0.02
+    one, two = render(fast, world, [], setting).image, reference.render(slow, world, [], setting)
+    assert (np.abs(one.astype(int) - two).max(axis=2) > 1).mean() < 0.02
 
 
 def test_as_many_threads_as_you_like_give_the_same_bytes():
@@ -169,7 +170,7 @@ def test_as_many_threads_as_you_like_give_the_same_bytes():
 def test_the_nearest_sample_is_the_nearest():
     view = a_view()
     sight = see(a_world(view), view)
-    places = nearest(sight)
+    places = kernels.nearest(sight.depth)
     assert places.dtype == np.int64
     assert np.array_equal(sight.depth.reshape(-1)[places], sight.depth_m)
     rows, columns = np.divmod(places, sight.depth.shape[1])
@@ -204,7 +205,7 @@ def test_a_turned_and_moved_camera_sees_the_same_shadows():
         world = a_world(view)
         picture = render(see(world, view), world, SHADOWS, a_setting(view))
         for point in ([1.2, 0.0, 8.2], [0.4, 0.0, 6.5]):
-            place = rendering.fine_matrix(view) @ (view.to_camera(np.array(point)) - view.centre)
+            place = fine_matrix(view) @ (view.to_camera(np.array(point)) - view.centre)
             u, v = np.rint(place[:2] / place[2] / 2).astype(int)
             shown.append(float(picture.developed.reshape(160, 480, 3)[v, u].mean()))
     dark, light = shown[:2]
@@ -265,7 +266,7 @@ def test_grain_is_normal_does_not_repeat_and_is_the_same_by_both_ways():
     view = a_view()
     image = np.random.default_rng(0).random((96, 320, 3), dtype=np.float32)
     setting = a_setting(view, noise=0.05)
-    one, two = take(image, setting), take(image, setting, "reference")
+    one, two = take(image, setting), reference.take(image, setting)
     assert np.abs(one.astype(int) - two).max() <= 1
     assert (one != two).mean() < 1e-3
     assert not np.array_equal(take(image, replace(setting, grain_seed=(1, 2, 4))), one)

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from drivesem.synth import buildings, flora, people
-from drivesem.synth.light import develop, draw_light, draw_response, sky_radiance
-from drivesem.synth.noise import SIZE, noise_set, sample
+from drivesem.synth.light import develop, draw_light, draw_response
+from drivesem.synth.noise import SIZE, noise_set
 from drivesem.synth.soup import Material, Soup, ball, box, creased_normals, join, make, placed, stick, unit_sphere
 from scene_ir.geometry import place
+from tests.drivesem.synth.reference_light import sample, sky_radiance
 
 
 def _check(soup: Soup) -> None:

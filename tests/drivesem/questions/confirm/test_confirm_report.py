@@ -10,7 +10,7 @@ import pytest
 
 from detectors.types import CLASSES
 from drivesem.evaluation.resampling import wilson
-from drivesem.questions.confirm.judge import Finding, Stand
+from drivesem.questions.confirm.judge import RendererFailure, Stand
 from drivesem.questions.confirm.report import Share, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, dump, load
 from drivesem.run.results import BoxRecord, FrameResult
@@ -19,16 +19,16 @@ from scene_ir.errors import FormatError
 BOX = (100.0, 100.0, 160.0, 140.0)
 
 
-def lost(survives: bool, track: int | None = 1) -> Finding:
-    return Finding("lost", "Car", BOX, track, None, survives)
+def lost(survives: bool, track: int | None = 1) -> RendererFailure:
+    return RendererFailure("lost", "Car", BOX, track, None, survives)
 
 
-def phantom(survives: bool) -> Finding:
-    return Finding("phantom", "Car", BOX, None, 0.75, survives)
+def phantom(survives: bool) -> RendererFailure:
+    return RendererFailure("phantom", "Car", BOX, None, 0.75, survives)
 
 
 def confirmed(
-    name: str, ours: tuple[Finding, ...] = (), theirs: tuple[Finding, ...] = (), **changes: Any
+    name: str, ours: tuple[RendererFailure, ...] = (), theirs: tuple[RendererFailure, ...] = (), **changes: Any
 ) -> Confirmed:
     facts: dict[str, Any] = {
         "identifier": name,

@@ -16,7 +16,7 @@ from drivesem.questions.explain.results import (
     Contribution,
     Explanation,
     Least,
-    Outcome,
+    PartOutcome,
     Sensitivity,
     read_explanation,
     write_explanation,
@@ -24,7 +24,7 @@ from drivesem.questions.explain.results import (
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import FormatError
 
-GOOD, BAD = Outcome(1.0, 0, 0, False, False), Outcome(3.0, 1, 2, True, False)
+GOOD, BAD = PartOutcome(1.0, 0, 0, False, False), PartOutcome(3.0, 1, 2, True, False)
 
 
 def contribution(kind: str, name: str, loss: float, fails: float, error: float | None = None) -> Contribution:

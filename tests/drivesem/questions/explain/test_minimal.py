@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.questions.explain.minimal import Block, Search, minimal
+from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
 from scene_ir.errors import RangeError
 
 RESOLUTION = 1 / (16 * 32)
@@ -18,7 +18,7 @@ def blocks(*groups):
     for name, indices in groups:
         mask = torch.zeros(4, dtype=torch.bool)
         mask[list(indices)] = True
-        found.append(Block(name, mask))
+        found.append(ThetaBlock(name, mask))
     return found
 
 
@@ -26,7 +26,7 @@ PAIRS = blocks(("a", (0, 1)), ("b", (2, 3)))
 
 
 def search(fails, project=lambda theta: theta, points=16):
-    return Search(project, fails, lambda theta: float(theta.norm()), points)
+    return LeastSearch(project, fails, lambda theta: float(theta.norm()), points)
 
 
 def test_what_is_not_needed_goes_and_the_rest_is_shortened():

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, arms_of
-from drivesem.settings.checks import validate
 from drivesem.settings.commands import Study
 
 OUT = Path("out")
@@ -21,7 +20,7 @@ def test_arms_are_attacks_that_the_command_takes(name: str, quick: bool, tmp_pat
     for arm in arms:
         if arm.config.like is not None:
             Path(arm.config.like).mkdir(parents=True)
-        validate(arm.config)
+        arm.config.check()
         assert arm.config.limit == (QUICK_FRAMES if quick else FRAMES)
     assert arms[0].config.method == "si-fgsm"
 

@@ -14,7 +14,6 @@ import torch
 from rich.console import Console
 
 from detectors.registry import load_detector, read_weights
-from drivesem.cli import parse
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiWriter
 from drivesem.questions.study import lessons, retrain
@@ -22,6 +21,7 @@ from drivesem.questions.study.lessons import OURS, Among, Lesson, learn, lessons
 from drivesem.run.results import dump_frame
 from drivesem.settings.commands import Retrain, Study
 from drivesem.settings.errors import UsageError
+from drivesem.settings.parsing import parse
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.mixture import Mixture
 from scene_ir import files

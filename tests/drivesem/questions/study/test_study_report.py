@@ -11,8 +11,7 @@ import cv2
 import pytest
 from rich.console import Console
 
-from drivesem.questions.confirm.report import Report as Confirmed
-from drivesem.questions.confirm.report import Share
+from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.plots import write_plot
@@ -90,7 +89,7 @@ def test_the_papers_figures_stand_beside(controlled: Findings) -> None:
 
 def test_what_survives_the_second_renderer_stands_beside(controlled: Findings) -> None:
     shares = tuple(Share.of(name, outcomes) for name, outcomes in (("frames", [True, True, False]), ("lost", [])))
-    drawn = Confirmed(frames=4, left={}, shares=shares, scores={}, overlap=None)
+    drawn = Confirmation(frames=4, left={}, shares=shares, scores={}, overlap=None)
     found = replace(controlled, confirmed={"rotate": drawn, "mesh": drawn})
     row = cells(found, "Failures that survive", "rotate")
     assert (row["drawn"], row["lost"]) == ("4", "-")

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.questions.plausibility import NAMES, Plausibility, Scale, plausibility, scales, scales_of
+from drivesem.questions.plausibility.percentiles import NAMES, Plausibility, Scale, plausibility, scales, scales_of
 from drivesem.synth.compare import QUANTITIES, Quantity, histograms, reference
 from scene_ir.errors import RangeError
 from scene_ir.types import Labels

@@ -1,4 +1,4 @@
-"""Colour of surface samples: albedo painted by noise and patterns, sun, sky, reflections, haze."""
+"""Colour of surface samples in plain numpy: it defines what the generator's kernels compute."""
 
 from __future__ import annotations
 
@@ -7,38 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivesem.synth.layout import Road
-from drivesem.synth.light import Light, reflected_radiance
-from drivesem.synth.noise import NoiseSet, sample
+from drivesem.synth.light import Light
+from drivesem.synth.noise import NoiseSet
 from drivesem.synth.soup import GROUND, Material
+from drivesem.synth.surfaces import MIRRORED_GROUND, SOAKED, ground_light
+from tests.drivesem.synth.reference_light import reflected_radiance, sample
 
 _F = np.float32
-SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS = 0.015, 3.0
-"""How far before a surface its shadow is looked up, the more the more it turns from the sun: the lookup's tent
-spans two texels to each side, 2.8 across, which must not meet the surface itself.
-"""
-LEAF_DEPTH_M = 0.25
-"""How deep the sun shines into a crown."""
-
-
-def _soaked() -> np.ndarray:
-    table = np.zeros((len(Material), 3), np.float32)
-    table[Material.ROAD] = 0.48, 0.24, 0.50
-    table[[Material.PARKING, Material.PAVEMENT]] = 0.42, 0.18, 0.40
-    table[Material.KERB] = 0.36, 0.15, 0.0
-    table[Material.GRAVEL] = 0.36, 0.04, 0.60
-    table[Material.ROOF] = 0.30, 0.10, 0.0
-    table[[Material.GRASS, Material.FACADE, Material.WALL, Material.FENCE, Material.BARK], 0] = 0.2
-    table[Material.LEAF, 0] = 0.1
-    return table
-
-
-MIRRORED_GROUND = 0.12
-"""Albedo of the ground as seen in reflections."""
-SOAKED = _soaked()
-"""Of each material: the share of its light that it loses when wet, how much of it mirrors as a film of water, how
-much more in puddles. Wet, porous ground is about half as bright. Source: Lekner and Dorf 1988, "Why some things
-are darker when wet".
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,11 +196,6 @@ def _polish(
     sharp = (glint ** _F(gloss[2])) * 14.0 + (glint**12) * 0.25
     out += (sharp * fresnel * s.lit)[:, None] * light.sun_colour.astype(_F)
     return base + out
-
-
-def ground_light(light: Light) -> np.ndarray:
-    """Radiance (3,) that the ground casts on what faces down."""
-    return 0.16 * (light.ambient + 0.6 * light.sun_colour)
 
 
 def shade(s: Samples, road: Road, light: Light, noise: NoiseSet, camera_height_m: float) -> np.ndarray:

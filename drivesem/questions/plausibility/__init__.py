@@ -1,0 +1,1 @@
+"""How common vehicles are by KITTI's labels, before and after an attack."""

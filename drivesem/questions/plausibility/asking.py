@@ -1,0 +1,148 @@
+"""How common a run's vehicles are, before and after the attack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivesem.data.kitti import read_labels
+from drivesem.questions.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
+from drivesem.report.answer import Answer
+from drivesem.report.tables import Sheet
+from drivesem.run.finished import Run, load_runs
+from drivesem.run.folder import folder_of
+from drivesem.settings.commands import Plausibility as Config
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import ShapeError
+
+LOWEST = "lowest"
+_BEFORE, _AFTER = "labels_paper.txt", "labels_moved.txt"
+_DECIMALS = 2
+_NOTE = (
+    "Percentile: two-sided share of the vehicles in KITTI's 7,481 label files that are at least as unusual; 100 "
+    "is the median (for yaw the commonest heading), 0 is never seen. Each figure by itself: distributions are "
+    f"marginal, over Car, Van and Truck. Lowest: of a vehicle's figures. Unusual: below {UNUSUAL:g}."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FramePair:
+    """One frame's vehicles before and after the attack."""
+
+    identifier: str
+    kinds: tuple[str, ...]
+    before: Plausibility
+    after: Plausibility
+
+
+def plausibility_run(config: Config) -> Answer:
+    """Look up all vehicles of a run, and write what is said. Raises UsageError or SceneError for bad input."""
+    (run,) = load_runs([config.run or ""], config.limit)
+    out = folder_of(config.out, run.folder / "plausibility")
+    pairs = [_pair(run, frame.result.identifier) for frame in run.frames]
+    if not any(pair.kinds for pair in pairs):
+        raise UsageError("--run", "a run with vehicles", run.folder)
+    data = {"run": str(run.folder), **summary(pairs)}
+    least = tuple((row["frame"], _shown(row["before"]), _shown(row["after"])) for row in data["by_frame"])
+    figures = _sheet(data)
+    answer = Answer(
+        out=out,
+        name="plausibility",
+        heading="Plausibility",
+        data=data,
+        tables={"plausibility": _vehicles(pairs)},
+        sheets=[figures, Sheet("least common vehicle of each frame", ("frame", "before", "after"), least)],
+        printed=[figures],
+        notes=[_NOTE],
+        only_json=True,
+    )
+    answer.write()
+    return answer
+
+
+def _pair(run: Run, identifier: str) -> FramePair:
+    folder = run.folder / "frames" / identifier
+    before, after = (read_labels(folder / name) for name in (_BEFORE, _AFTER))
+    if before.kind != after.kind:
+        raise ShapeError(str(folder / _AFTER), f"the {len(before.kind)} vehicles of {_BEFORE}", len(after.kind))
+    return FramePair(identifier, before.kind, plausibility(before), plausibility(after))
+
+
+def _figures(found: Plausibility) -> dict[str, np.ndarray]:
+    return {LOWEST: found.lowest, **found.percentiles}
+
+
+def summary(pairs: Sequence[FramePair]) -> dict[str, Any]:
+    """JSON's form: a row a figure over all vehicles, and each frame's least common vehicle; fractions of 1 for
+    shares, percentiles in [0, 100], None where nothing is known."""
+    rows = []
+    for name in (LOWEST, *NAMES):
+        before, after = (
+            np.concatenate([_figures(side)[name] for side in sides])
+            for sides in ([p.before for p in pairs], [p.after for p in pairs])
+        )
+        known = np.isfinite(before) & np.isfinite(after)
+        before, after = before[known], after[known]
+        rows.append(
+            {
+                "name": name,
+                "vehicles": len(before),
+                "median_before": _rounded(np.median(before)) if len(before) else None,
+                "median_after": _rounded(np.median(after)) if len(after) else None,
+                "unusual_before": float((before < UNUSUAL).mean()) if len(before) else None,
+                "unusual_after": float((after < UNUSUAL).mean()) if len(after) else None,
+                "largest_fall": _rounded((before - after).max()) if len(before) else None,
+            }
+        )
+    frames = [
+        {"frame": pair.identifier, "before": _least(pair.before), "after": _least(pair.after)} for pair in pairs
+    ]
+    return {"frames": len(pairs), "rows": rows, "by_frame": frames}
+
+
+def _least(found: Plausibility) -> float | None:
+    known = found.lowest[np.isfinite(found.lowest)]
+    return _rounded(known.min()) if len(known) else None
+
+
+def _rounded(value: np.floating[Any] | float) -> float | None:
+    return round(float(value), _DECIMALS) if np.isfinite(value) else None
+
+
+def _vehicles(pairs: Sequence[FramePair]) -> list[dict[str, Any]]:
+    """A line a vehicle: each figure before and after."""
+    lines = []
+    for pair in pairs:
+        sides = {"before": _figures(pair.before), "after": _figures(pair.after)}
+        for i, kind in enumerate(pair.kinds):
+            line: dict[str, Any] = {"frame": pair.identifier, "object": i, "kind": kind}
+            lines.append(
+                line
+                | {f"{n}_{when}": _rounded(side[n][i]) for n in (LOWEST, *NAMES) for when, side in sides.items()}
+            )
+    return lines
+
+
+def _sheet(data: dict[str, Any]) -> Sheet:
+    title = f"{data['frames']} frames: percentiles by KITTI's labels"
+    columns = ("figure", "vehicles", "median before", "after", "unusual before, %", "after, %", "largest fall")
+    rows = tuple(
+        (
+            row["name"],
+            str(row["vehicles"]),
+            _shown(row["median_before"]),
+            _shown(row["median_after"]),
+            _shown(row["unusual_before"], 100),
+            _shown(row["unusual_after"], 100),
+            _shown(row["largest_fall"]),
+        )
+        for row in data["rows"]
+    )
+    return Sheet(title, columns, rows)
+
+
+def _shown(value: float | None, factor: float = 1.0) -> str:
+    return "-" if value is None else f"{factor * value:.1f}"

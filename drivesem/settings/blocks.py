@@ -1,0 +1,271 @@
+"""Settings that several commands share, each declared once: its type and range, its default, what `--help` says.
+
+A block is a base class. A command's settings are its blocks' fields and its own, in one flat dataclass: options,
+keys of config.yaml and attributes do not tell which block a setting is from. A function takes the narrowest block
+that it reads, as `open_source(config: Scenes)` does. A command for which a setting means something else declares
+it again, with a default or a docstring of its own.
+
+This module is loaded by `drivesem --help`: it imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+import tyro
+
+from drivesem.settings.constraints import POSITIVE, Constraint, Of, OneOf, Parsed, Required, Within, at_least
+from drivesem.settings.errors import refuse
+from drivesem.settings.values import interval, size_hw
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Count = Annotated[int, at_least(1)]
+NotNegative = Annotated[int, at_least(0)]
+Run = Annotated[str | None, Required("a folder of drivesem attack")]
+Score = Annotated[float, Within(0, 1, "(]", "a score in (0, 1]")]
+LabelMode = Literal["moved", "paper"]
+
+DEMO = "demo"
+DATASETS = ("kitti", "vkitti1", "vkitti2", "coco", "yolo")
+"""The readers of `drivesem.data.registry`."""
+SOURCES = (DEMO, *DATASETS)
+"""What --dataset takes: the embedded scenes, and the readers."""
+
+_MOST_PROCESSES = 4
+"""Each process takes about 1 GB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What all blocks have in common."""
+
+    def check(self) -> None:
+        """Raise UsageError for values that no command accepts: of a field, what its type declares; in blocks and
+        commands that extend this, conditions between fields.
+        """
+        markers = constraints(type(self))
+        for field in fields(self):
+            value = getattr(self, field.name)
+            for marker in markers[field.name]:
+                if isinstance(marker, Of):
+                    if value != field.default:
+                        marker.check(option(field.name), vars(self)["method"])
+                elif value is not None or isinstance(marker, Required):
+                    marker.check(option(field.name), value)
+
+
+def constraints(block: type[Options]) -> dict[str, tuple[Constraint, ...]]:
+    """What each field's type declares of its values."""
+    return {name: tuple(_markers(kind)) for name, kind in get_type_hints(block, include_extras=True).items()}
+
+
+def _markers(kind: Any) -> Iterator[Constraint]:
+    yield from (marker for marker in getattr(kind, "__metadata__", ()) if isinstance(marker, Constraint))
+    for part in get_args(kind):
+        yield from _markers(part)
+
+
+def option(name: str) -> str:
+    """How a setting is written on the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def shared(config: Options, block: type[Options]) -> dict[str, Any]:
+    """The settings of one block, to make another command's of."""
+    return {field.name: getattr(config, field.name) for field in fields(block)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(Options):
+    """The option that every command has."""
+
+    json: Flag = False
+    """Print one JSON object on standard output; everything else goes to standard error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output(Options):
+    """A folder of results that a second run goes on with."""
+
+    out: str | None = None
+    """Folder for the results; a second run with the same folder goes on where it stopped."""
+    resume: bool = True
+    """Keep the frames that are already there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit(Options):
+    """How many frames."""
+
+    limit: Count | None = None
+    """Take the first N frames (those with vehicles, where a command needs vehicles)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seed(Options):
+    """Where random numbers begin."""
+
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sharing(Options):
+    """Frames that are shared by processes."""
+
+    workers: Count | None = None
+    """Processes that share the frames; by default one a core, at most 4."""
+    keep_going: Flag = False
+    """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
+
+    @property
+    def processes(self) -> int:
+        """How many processes share the frames."""
+        return self.workers or min(os.cpu_count() or 1, _MOST_PROCESSES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Device(Options):
+    """Where networks run."""
+
+    device: str = "cpu"
+    """torch device: cpu, cuda, cuda:1, ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCommand(Device, Sharing, Seed, Limit, Output, Command):
+    """What every command takes that works through frames into a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSource(Seed, Limit):
+    """Frames: the embedded scenes, or a data set's."""
+
+    dataset: Annotated[str, OneOf(SOURCES)] = DEMO
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    root: str | None = None
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
+
+    def check(self) -> None:
+        super().check()
+        demo, given = self.dataset == DEMO, self.root is not None
+        refuse(not demo and not given, "--root", f"the folder of data set {self.dataset!r}", "nothing")
+        no_folder = "no folder for data set 'demo' (did you mean --dataset kitti?)"
+        refuse(demo and given, "--root", no_folder, self.root)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes(DataSource):
+    """Frames, and how photographs are taken apart."""
+
+    fit: bool = True
+    """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Threshold(Options):
+    """When a detection counts."""
+
+    t_star: Score | None = None
+    """Score from which a detection counts; by default the detector's own, or 0.3 where it has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiles(Options):
+    """How ONNX detectors look."""
+
+    tiles: Literal["auto", "off"] = "auto"
+    """Of an ONNX detector: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Precision(Device):
+    """What networks compute in."""
+
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the network computes in: bfloat16 where the processor has it, float16 on GPUs."""
+
+    def check(self) -> None:
+        super().check()
+        slow = self.precision == "float16" and self.device.startswith("cpu")
+        refuse(slow, "--precision", "float32 or bfloat16 on a CPU", self.precision)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bootstrap(Options):
+    """Intervals of figures."""
+
+    bootstrap: NotNegative | None = None
+    """Draws of frames for intervals, by default 200; 0 leaves them out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draws(Bootstrap, Seed):
+    """Intervals, where nothing else is random."""
+
+    seed: int = 0
+    """Seed of these draws."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asking(Bootstrap, Threshold, Tiles, Device, Sharing, Seed):
+    """How detectors are asked about pictures of runs."""
+
+    t_star: Score | None = None
+    """Score from which a detection counts, of detectors that have no threshold of their own; by default 0.3."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedRun(Options):
+    """A run that a question is asked of."""
+
+    run: Run = None
+    """Folder of a run of drivesem attack."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attacking(Threshold, Precision, Scenes):
+    """An attack, as far as a study gives it to all of its arms."""
+
+    detector: str = "squeezedet"
+    """A shipped detector, a file, or another project's (docs/detectors.md); without a gradient, such as an ONNX
+    graph, for the methods that need none."""
+    steps: Count = 10
+    """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
+    budget: str = "paper"
+    """How far parameters may go: paper; parking (0.5 m, 5 degrees); a YAML file; or translate=0.5m,rotate=5deg."""
+    objective_labels: LabelMode = "moved"
+    """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
+    objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (
+        "objectness"
+    )
+    """What the attack raises. objectness: the detector's confidence term, with 1 as the target of what finds the
+    true objects; confidence: SqueezeDet's as published, with the IoU of the predicted box; total: its whole loss;
+    hide: objects fall below t*; phantom: something rises to t* where nothing is; failure: both; localisation:
+    boxes leave their objects."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Precision):
+    """How weights are trained."""
+
+    minutes: Annotated[float, at_least(0)] = 0.0
+    """Where above 0, training also ends after so many minutes by the clock."""
+    batch: Annotated[int, POSITIVE] = 16
+    """Views a step."""
+    window: Annotated[str, Parsed(size_hw)] = "640x224"
+    """WIDTHxHEIGHT of the views, px."""
+    scale: Annotated[str, Parsed(interval)] = "0.5,1.35"
+    """LOW,HIGH of the zoom of the views."""
+    warmup: NotNegative = 60
+    """Steps in which the rate rises."""
+    loss: Literal["published", "quality"] = "published"
+    """SqueezeDet: the published loss, or the one of detectors/quality.py (confidence is the overlap)."""
+    checkpoint_every: Annotated[int, POSITIVE] = 50
+    """Steps between checkpoints."""

@@ -1,0 +1,121 @@
+"""The words of a command line, and the YAML presets that they name, as a command's settings."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import Field, fields
+from pathlib import Path
+from typing import Any
+
+import tyro
+import yaml
+
+from drivesem.settings.blocks import Command, option
+from drivesem.settings.commands import COMMANDS
+from drivesem.settings.errors import UsageError
+
+_DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
+_FOR = "for"
+"""Key of a preset: the commands that it is for. A setting that only some of them have is left out for others."""
+
+
+def parse(argv: Sequence[str]) -> Command:
+    """The settings that `argv` asks for. Raises UsageError; SystemExit(0) after `--help`."""
+    words = list(argv)
+    if words and words[0] in COMMANDS:
+        words = [words[0], *_with_presets(words[0], words[1:])]
+    captured = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(captured):
+            config: Command = tyro.extras.subcommand_cli_from_dict(  # pyright: ignore[reportAssignmentType]
+                COMMANDS, prog="drivesem", description=_DESCRIPTION, args=words
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise UsageError(
+            "command line", "known options (see drivesem --help)", _unboxed(captured.getvalue())
+        ) from None
+    config.check()
+    return config
+
+
+def _with_presets(command: str, words: list[str]) -> list[str]:
+    """Replace `--config FILE` by the file's settings, in front, so that the command line wins."""
+    presets: list[str] = []
+    rest: list[str] = []
+    left = list(words)
+    while left:
+        word, equals, path = left.pop(0).partition("=")
+        if word == "--config" and (equals or left):
+            presets += preset_words(path or left.pop(0), command)
+        else:
+            rest.append(f"{word}{equals}{path}")
+    return presets + rest
+
+
+def _unboxed(text: str) -> str:
+    """The parser's message without its frame, on one line."""
+    lines = [line.strip("│╭╮╰╯─ \t") for line in text.splitlines()]
+    message = " ".join(line for line in lines if line)
+    message = re.split(r"For full helptext|Perhaps you meant", message)[0]
+    return " ".join(message.split()) or "an unknown command"
+
+
+def preset_words(path: str, command: str) -> list[str]:
+    """The settings of a YAML preset as command-line words, so that both are checked by one parser.
+
+    Raises UsageError naming the file, and the key where there is one.
+    """
+    loaded = _mapping(path)
+    wanted = loaded.pop(_FOR, command)
+    commands = wanted if isinstance(wanted, list) else [wanted]
+    if not all(name in list(COMMANDS) for name in commands):
+        raise UsageError(f"{path}: {_FOR}", f"commands: {', '.join(COMMANDS)}", repr(wanted))
+    if command not in commands:
+        raise UsageError(path, f"a preset for drivesem {command}", f"one for {', '.join(commands)}")
+    own = {field.name: field for field in fields(COMMANDS[command])}
+    known = dict.fromkeys([*own, *(field.name for name in commands for field in fields(COMMANDS[name]))])
+    words: list[str] = []
+    for key, value in loaded.items():
+        name = str(key).replace("-", "_")
+        if name not in known:
+            raise UsageError(f"{path}: {key}", f"one of {', '.join(known)}", "an unknown key")
+        if name in own:
+            words += _words(path, own[name], value)
+    return words
+
+
+def _mapping(path: str) -> dict[Any, Any]:
+    """What a YAML file holds."""
+    try:
+        loaded: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(path, "a readable YAML file", error) from error
+    except yaml.YAMLError as error:
+        raise UsageError(path, "YAML", " ".join(str(error).split())) from error
+    if loaded is not None and not isinstance(loaded, dict):
+        raise UsageError(path, "a mapping of settings", type(loaded).__name__)
+    return loaded or {}
+
+
+def _words(path: str, field: Field[Any], value: Any) -> list[str]:
+    kind = str(field.type)
+    if kind in ("Flag", "bool"):
+        if not isinstance(value, bool):
+            raise UsageError(f"{path}: {field.name}", "true or false", repr(value))
+        if value:
+            return [option(field.name)]
+        return [option(f"no-{field.name}")] if kind == "bool" else []
+    if kind == "Repeated" and isinstance(value, list):
+        return [f"{option(field.name)}={item}" for item in value]
+    if isinstance(value, list | tuple):
+        value = ",".join(str(item) for item in value)
+    if isinstance(value, dict) or (isinstance(value, float) and not math.isfinite(value)):
+        raise UsageError(f"{path}: {field.name}", "one value", repr(value))
+    # "=": a value that begins with a dash stays a value.
+    return [f"{option(field.name)}={value}"]

@@ -1,0 +1,156 @@
+"""Every block of code in README.md and docs/: Python runs, the real parser reads commands, data is well-formed.
+
+A Python block that needs what is not there has a comment before it, `<!-- not run: needs ... -->`,
+and must compile.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import pkgutil
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import tyro
+import yaml
+
+from drivesem.cli import main, parse
+from tools.bench.settings import BenchTool
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+LANGUAGES = ("python", "sh", "yaml", "json", "")
+CHEAP = ("render", "edit", "report", "plausibility", "convert", "verify")
+"""Commands that take seconds where a run, scenes and a data set are there."""
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_PATH = re.compile(r"(?<=`)(?:drivesem|scene_ir|detectors|tools|configs)/[\w./-]+(?=`)")
+_NAME = re.compile(r"`((?:drivesem|scene_ir|detectors)(?:\.\w+)+)(?:\([^`]*\))?`")
+_LINK = re.compile(r"\]\(([^)#]*)(?:#[^)]*)?\)")
+_NOT_RUN = re.compile(r"<!-- not run: \S.* -->\s*$")
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A fenced block. line: of its first line in the page."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    runs: bool
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+def blocks_of(page: Path) -> Iterator[Block]:
+    """The blocks of a page, in order."""
+    content = page.read_text(encoding="utf-8")
+    for match in _FENCE.finditer(content):
+        before = content[: match.start()]
+        yield Block(page, before.count("\n") + 2, match[1], match[2], _NOT_RUN.search(before) is None)
+
+
+BLOCKS = tuple(block for page in PAGES for block in blocks_of(page))
+
+
+def commands_of(block: Block) -> Iterator[tuple[str, list[str]]]:
+    """The commands of a shell block: where each stands, and its words."""
+    joined = block.text.replace("\\\n", " ")
+    for line in joined.splitlines():
+        words = shlex.split(line, comments=True)
+        while words:
+            end = words.index("&&") if "&&" in words else len(words)
+            yield f"{block}: {line.strip()}", words[:end]
+            words = words[end + 1 :]
+
+
+SHELL = tuple(command for block in BLOCKS if block.language == "sh" for command in commands_of(block))
+
+
+@pytest.fixture
+def workplace(small_kitti: Path, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder where the names that the pages use stand for something."""
+    for name in ("PATH_TO_KITTI", "data/kitti"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).symlink_to(small_kitti)
+    (tmp_path / "runs").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "runs" / name).symlink_to(small_run)
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_block_has_a_language() -> None:
+    assert not [str(block) for block in BLOCKS if block.language not in LANGUAGES]
+    assert {block.language for block in BLOCKS} >= {"python", "sh", "yaml"}
+    bare = [str(block) for block in BLOCKS if not block.language and "drivesem " in block.text.split(": ")[0]]
+    assert not bare, "commands stand in sh blocks"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "architecture"], ids=lambda page: page.name)
+def test_what_a_page_names_is_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    paths = {match[0].rstrip("/") for match in _PATH.finditer(text)}
+    targets = {match[1] for match in _LINK.finditer(text) if match[1] and "://" not in match[1]}
+    missing = [path for path in paths if not (ROOT / path).exists()]
+    missing += [target for target in targets if not (page.parent / target).exists()]
+    assert not missing
+    for name in {match[1] for match in _NAME.finditer(text)}:
+        assert pkgutil.resolve_name(name) is not None
+
+
+@pytest.mark.parametrize(("where", "words"), SHELL, ids=[where for where, _ in SHELL])
+def test_commands_are_read_by_the_parser(where: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    program = Path(words[0]).name
+    if program == "drivesem":
+        parse(words[1:])
+    elif words[1:3] == ["-m", "tools.bench"]:
+        tyro.cli(BenchTool, args=words[3:])
+    elif program.startswith("python") and words[1] != "-m":
+        assert (ROOT / words[1]).is_file()
+    else:
+        assert program in ("python", "python3", "pip"), where
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in ("yaml", "json")], ids=str)
+def test_data_is_well_formed(block: Block) -> None:
+    assert yaml.safe_load(block.text) if block.language == "yaml" else json.loads(block.text)
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "python" and not b.runs], ids=str)
+def test_python_that_does_not_run_compiles(block: Block) -> None:
+    ast.parse(block.text)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if any(b.language == "python" and b.runs for b in blocks_of(page))],
+    ids=lambda page: page.name,
+)
+def test_python_runs(page: Path, workplace: Path) -> None:
+    names: dict[str, object] = {"__name__": "__main__"}
+    for block in blocks_of(page):
+        if block.language == "python" and block.runs:
+            padded = "\n" * (block.line - 1) + block.text  # so that a traceback names the page's line
+            exec(compile(padded, str(page), "exec"), names)
+
+
+@pytest.mark.slow
+def test_cheap_commands_run(workplace: Path, small_kitti: Path) -> None:
+    assert main(["derender", "--dataset", "kitti", "--root", str(small_kitti), "--fast", "--out", "scenes"]) == 0
+    ran = []
+    for where, words in SHELL:
+        if Path(words[0]).name == "drivesem" and words[1] in CHEAP and "--help" not in words:
+            paths = [word for word in words[2:] if word.startswith(("runs/", "scenes/", "data/", "PATH_TO"))]
+            if all(Path(path).exists() for path in paths):
+                assert main(words[1:]) == 0, where
+                ran.append(words[1])
+    assert set(ran) == set(CHEAP)
