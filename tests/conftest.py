@@ -27,10 +27,10 @@ def small_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two steps on two embedded frames."""
+    """A run of two steps on one embedded frame."""
     from drivesem.cli import main
 
     out = tmp_path_factory.mktemp("runs") / "a"
-    words = ["--limit", "2", "--workers", "1", "--params", "translate,rotate", "--steps", "2", "--out", str(out)]
+    words = ["--limit", "1", "--workers", "1", "--params", "translate,rotate", "--steps", "2", "--out", str(out)]
     assert main(["attack", *words]) == 0
     return out

@@ -20,10 +20,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from averaged import AveragedRun
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detectors.averaged import AveragedRun
 from drivesem.synth.assets import Assets, assets_from, of_split
 from drivesem.synth.frames import (
     GENERATOR_VERSION,

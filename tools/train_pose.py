@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
+from averaged import AveragedRun
 from torch import Tensor
 
-from detectors.averaged import AveragedRun
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES

@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from averaged import AveragedRun
 from torch import Tensor
 
-from detectors.averaged import AveragedRun
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
     VARIANTS,

@@ -1,4 +1,4 @@
-"""`drivesem gradcheck`: the gradients that attacks follow against central differences, on scenes of one's choice.
+"""The gradients that attacks follow against central differences.
 
 A scene is looked at as photographed (theta0) and at a random feasible theta that moves all six parameters. There,
 for each parameter with all objects together, the gradient in float64 with backend `reference` and in float32 with
@@ -15,39 +15,23 @@ Shapes: D coordinates of theta, K directions, S steps, F + 1 outputs: F function
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 import sys
-import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Literal
 
 import kornia
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
-from detectors.base import DetectorError, RawPredictions
-from detectors.registry import load_detector
+from detectors.base import RawPredictions
 from detectors.squeezedet import Assignment, SqueezeDet
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
-from drivesem.report.answer import print_json
-from drivesem.run.ask import Bar, ask
-from drivesem.run.attack import select_frames
-from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Gradcheck
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
-from scene_ir import files
 from scene_ir.compositor import Compositor, RenderSettings, scene_to
 from scene_ir.errors import RangeError
 from scene_ir.raster.verbs import Backend
@@ -67,7 +51,6 @@ COMBO = 2
 FUNCTIONALS = 3
 SMOOTHING_PX = 2.5
 """Standard deviation of the Gaussian that smooths a functional's weights, so that none hangs on single pixels."""
-DEFAULT_SCENES = 1
 
 CODE_STEPS = (1e-5, 1e-6, 1e-7)
 """Steps of the codes, which move no pixel: small enough that few of the detector's rectifiers switch."""
@@ -99,9 +82,6 @@ of a photograph are of one value, and a pooling over equal inputs has no derivat
 smallest step makes them differ."""
 _ROUNDING = 1e-15
 """A float64 sum of the outputs' terms is exact to about this share of their magnitude."""
-_FILE_WIDTH = 120
-"""Characters a line of the table where it goes to a file and not to a terminal."""
-_PACKAGES = ("drivesem", "torch", "kornia", "numpy", "warp-lang")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +96,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class GradcheckRow:
     """One comparison. name: the parameter, or `combo 2 detector loss`; at, functional, backend, scene: of what.
     cosine, relative_error, step: those of the step that agrees best, None where the parameter has no effect on the
     functional by either account. steps: all three.
@@ -327,7 +307,7 @@ def _generator(seed: int, purpose: int) -> torch.Generator:
 
 def rows_of(
     scene: str, at: Point, gradients: Gradients, differences: dict[Parameter, Differences]
-) -> tuple[Row, ...]:
+) -> tuple[GradcheckRow, ...]:
     """All comparisons of one scene at one point."""
     rows = []
     for backend, gradient in gradients.items():
@@ -343,9 +323,9 @@ def rows_of(
     return tuple(rows)
 
 
-def worst(rows: Iterable[Row]) -> tuple[Row, ...]:
+def worst(rows: Iterable[GradcheckRow]) -> tuple[GradcheckRow, ...]:
     """Of the rows that differ by their scene alone the one that agrees worst, in the order of first appearance."""
-    found: dict[tuple[str, str, str, str], Row] = {}
+    found: dict[tuple[str, str, str, str], GradcheckRow] = {}
     for row in rows:
         key = (row.name, row.at, row.functional, row.backend)
         if key not in found or row.severity > found[key].severity:
@@ -383,7 +363,7 @@ class _Compared:
         return _Compared(self.analytic[:, which], self.numeric[:, which], self.noise[:, which])
 
 
-def _row(where: tuple[str, Point, str, Backend, str], steps: Sequence[float], compared: _Compared) -> Row:
+def _row(where: tuple[str, Point, str, Backend, str], steps: Sequence[float], compared: _Compared) -> GradcheckRow:
     agreements = []
     silent = True
     for step, analytic, numeric, noise in zip(
@@ -397,169 +377,6 @@ def _row(where: tuple[str, Point, str, Backend, str], steps: Sequence[float], co
         error = float(np.linalg.norm(analytic - numeric)) / max(lengths[1], floor)
         agreements.append(Agreement(step, cosine, error))
     if silent:
-        return Row(*where, cosine=None, relative_error=None, step=None, steps=())
+        return GradcheckRow(*where, cosine=None, relative_error=None, step=None, steps=())
     best = min(agreements, key=lambda a: a.relative_error)
-    return Row(*where, best.cosine, best.relative_error, best.step, tuple(agreements))
-
-
-def run(config: Gradcheck) -> int:
-    """Check the scenes asked for; exit code 0 where all is inside the tolerance, 1 where something is not.
-
-    Raises UsageError or SceneError for bad input.
-    """
-    start = time.perf_counter()
-    worker = GradcheckWorker(config)
-    names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or DEFAULT_SCENES))
-    if not names:
-        raise UsageError("gradcheck", "at least one frame with vehicles", "none")
-    scenes, failed = _check_all(worker, names)
-    failed = unreadable | failed
-    rows = worst(row for found in scenes.values() for row in found)
-    passed = bool(rows) and all(row.passes(config.min_cosine, config.max_error) for row in rows)
-    summary = {
-        "rows": [asdict(row) for row in rows],
-        "passed": passed,
-        "tolerance": {"cosine": config.min_cosine, "relative_error": config.max_error},
-        "scenes": {name: [asdict(row) for row in found] for name, found in scenes.items()},
-        "frames_failed": dict(sorted(failed.items())),
-        "settings": {
-            "dataset": config.dataset,
-            "detector": config.detector,
-            "term": TERM,
-            "seed": config.seed,
-            "directions": config.directions,
-            "functionals": FUNCTIONALS,
-        },
-        "versions": {package: importlib.metadata.version(package) for package in _PACKAGES},
-        "seconds": round(time.perf_counter() - start, 3),
-    }
-    if config.out:
-        files.write_json(Path(config.out) / "gradcheck.json", summary)
-    if config.json:
-        print_json(summary)
-    else:
-        console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
-        _print(rows, config, console, len(scenes))
-        for name, reason in failed.items():
-            console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
-    return 0 if passed else 1
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A part of one scene's work at one point: the gradients, or the differences of one parameter."""
-
-    identifier: str
-    at: Point
-    parameter: Parameter | None
-
-
-class GradcheckWorker:
-    """What one process needs: built once, used for many tasks. Raises UsageError or SceneError for bad input."""
-
-    def __init__(self, config: Gradcheck) -> None:
-        self.config = config
-        check_device(config.device)
-        self.source: SceneSource = open_source(config)
-        self._detectors: dict[Backend, SqueezeDet] = {
-            "reference": _detector(config.detector, "cpu").double(),
-            "warp": _detector(config.detector, config.device),
-        }
-        self._current: tuple[str, SceneCheck] | None = None
-
-    def do(self, task: _Task) -> Gradients | Differences:
-        """One task; the scene is kept for the next one."""
-        if self._current is None or self._current[0] != task.identifier:
-            self._current = None
-            scene = self.source.scene(task.identifier)
-            check = SceneCheck(scene, self._detectors, self.config.seed, self.config.directions)
-            self._current = (task.identifier, check)
-        check = self._current[1]
-        return check.gradients(task.at) if task.parameter is None else check.differences(task.at, task.parameter)
-
-    def __call__(self, tasks: Sequence[_Task]) -> list[Gradients | Differences]:
-        """Several tasks."""
-        return [self.do(task) for task in tasks]
-
-
-def _check_all(worker: GradcheckWorker, names: Sequence[str]) -> tuple[dict[str, tuple[Row, ...]], dict[str, str]]:
-    """The rows of each scene, and why others have none."""
-    parts = (None, *Parameter)
-    per_scene = [tuple(_Task(name, at, part) for at in POINTS for part in parts) for name in names]
-    if len(names) >= worker.config.processes:
-        jobs = per_scene
-    else:  # too few scenes to keep every process busy: each makes the scene ready for itself
-        jobs = [(task,) for tasks in per_scene for task in tasks]
-    answers = ask(
-        jobs,
-        worker,
-        partial(GradcheckWorker, worker.config),
-        worker.config,
-        Bar("checking gradients"),
-        name=lambda tasks: tasks[0].identifier,
-        size=len,
-    )
-    gradients: dict[tuple[str, Point], Gradients] = {}
-    differences: dict[tuple[str, Point], dict[Parameter, Differences]] = {}
-    for tasks, results in answers.results.items():
-        for task, result in zip(tasks, results, strict=True):
-            key = (task.identifier, task.at)
-            if task.parameter is None:
-                assert isinstance(result, dict)
-                gradients[key] = result
-            else:
-                assert isinstance(result, Differences)
-                differences.setdefault(key, {})[task.parameter] = result
-    scenes = {}
-    for name in names:
-        if name in answers.failed:
-            continue
-        rows = []
-        for at in POINTS:
-            found = differences[name, at]
-            rows += rows_of(name, at, gradients[name, at], {p: found[p] for p in Parameter})
-        scenes[name] = tuple(rows)
-    return scenes, answers.failed
-
-
-def _detector(name: str, device: str) -> SqueezeDet:
-    try:
-        detector = load_detector(name, device)
-    except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(
-            "--device", "a torch device of this machine", f"{device!r}: {error}".split("\n")[0]
-        ) from error
-    if not isinstance(detector, SqueezeDet):
-        raise UsageError("--detector", "one whose anchors can be held fixed: SqueezeDet", type(detector).__name__)
-    return detector
-
-
-def _print(rows: Sequence[Row], config: Gradcheck, console: Console, scenes: int) -> None:
-    title = f"gradients against central differences: {config.dataset}, "
-    title += "1 scene" if scenes == 1 else f"the worst of {scenes} scenes"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "at", "of", "backend"):
-        table.add_column(heading)
-    for heading in ("cosine", "error", "step", "other steps: error"):
-        table.add_column(heading, justify="right")
-    if scenes > 1:
-        table.add_column("scene")
-    for row in rows:
-        of = "loss" if row.functional == LOSS else row.functional
-        cells = [row.name.removesuffix(f" {LOSS}"), row.at, of, row.backend]
-        if row.cosine is None or row.relative_error is None or row.step is None:
-            cells += ["no effect", "", "", ""]
-        else:
-            others = [f"{a.step:.0e}: {a.relative_error:.1e}" for a in row.steps if a.step != row.step]
-            cells += [f"{row.cosine:.5f}", f"{row.relative_error:.1e}", f"{row.step:.0e}", ", ".join(others)]
-        style = None if row.passes(config.min_cosine, config.max_error) else "bold red"
-        table.add_row(*cells, *([row.scene] if scenes > 1 else []), style=style)
-    console.print(table)
-    outside = sum(not row.passes(config.min_cosine, config.max_error) for row in rows)
-    silent = sum(row.cosine is None for row in rows)
-    counts = f"{len(rows) - outside - silent} of {len(rows)} rows inside the tolerance, {outside} outside"
-    counts += f", {silent} without effect" if silent else ""
-    tolerance = f"cosine at least {config.min_cosine:g}, error at most {config.max_error:g}"
-    console.print(f"{counts} ({tolerance})", soft_wrap=True)
+    return GradcheckRow(*where, best.cosine, best.relative_error, best.step, tuple(agreements))

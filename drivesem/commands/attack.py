@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.report.answer import print_json
 from drivesem.run.attack import attack_run
 from drivesem.run.results import RunSummary
@@ -28,7 +29,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         title=f"{summary.detector} on {summary.dataset}: {' + '.join(summary.params)}", title_justify="left"
     )
     table.add_column(f"{summary.headline}, %")
-    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*"):
+    for title in SCORE_TITLES:
         table.add_column(title, justify="right")
     rows = {
         "benign": summary.benign,
@@ -37,9 +38,8 @@ def _print(summary: RunSummary, console: Console) -> None:
         "attacked, benign labels (paper)": summary.attacked_paper,
     }
     for name, scores in rows.items():
-        one = scores.headline
-        cells = (one.ap50, one.ap70, one.ap, one.recall, one.recall_at_t_star)
-        table.add_row(name, *("-" if cell is None else f"{100 * cell:.1f}" for cell in cells))
+        figures = scores.headline.shown
+        table.add_row(name, *("-" if figure is None else f"{100 * figure:.1f}" for figure in figures))
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(

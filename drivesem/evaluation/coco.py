@@ -27,6 +27,10 @@ _IOU_50, _IOU_70 = 0, 4
 """Places of 0.5 and 0.7 among COCO's thresholds 0.5, 0.55, ..., 0.95."""
 
 
+SCORE_TITLES = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
+"""Titles of `ClassScores.shown`."""
+
+
 @dataclass(frozen=True, slots=True)
 class ClassScores:
     """Fractions of 1; None where there is no object to find. ap50, ap70: at IoU 0.5 and 0.7; ap: mean over IoU 0.5
@@ -40,6 +44,11 @@ class ClassScores:
     recall: float | None
     recall_at_t_star: float | None
     objects: int
+
+    @property
+    def shown(self) -> tuple[float | None, ...]:
+        """The figures that tables show, as SCORE_TITLES calls them."""
+        return self.ap50, self.ap70, self.ap, self.recall, self.recall_at_t_star
 
 
 @dataclass(frozen=True, slots=True)

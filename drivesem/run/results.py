@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivesem.evaluation.coco import Scores
+from drivesem.run.records import from_json
 from scene_ir.errors import FormatError
 
 SCHEMA = 1
@@ -146,18 +147,7 @@ def load_frame(path: Path) -> FrameResult:
         raise FormatError(str(path), "a frame's result as JSON", error) from error
     if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
         raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-    nested: dict[str, type[BoxRecord] | type[Coordinate] | type[Failure]] = {
-        "theta": Coordinate,
-        "failures": Failure,
-        **{name: BoxRecord for name in data if name.startswith(("targets_", "detections_"))},
-    }
     try:
-        for name, kind in nested.items():
-            data[name] = tuple(kind(**_tuples(item)) for item in data[name])
-        return FrameResult(**_tuples(data))
-    except (KeyError, TypeError) as error:
+        return from_json(FrameResult, data)
+    except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(str(path), "the fields of a frame's result", error) from error
-
-
-def _tuples(item: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in item.items()}

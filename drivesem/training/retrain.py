@@ -17,8 +17,8 @@ from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
 from drivesem.data.registry import open_dataset
-from drivesem.evaluation.coco import ClassScores
-from drivesem.report.tables import csv_text, percent
+from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
+from drivesem.report.tables import Sheet, csv_text, percent
 from drivesem.run.attack import Worker, attack_frames
 from drivesem.run.folder import attack_of, claim
 from drivesem.run.frame import as_targets
@@ -185,24 +185,16 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
     return rows
 
 
-_COLUMNS = ("ap50", "ap70", "ap", "recall", "recall_at_t_star")
-_TITLES = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
-
-
 def _write(out: Path, rows: Sequence[RetrainRow]) -> None:
     """The table as CSV and as Markdown."""
-    lines = [
-        "| frames | labels | detector | " + " | ".join(_TITLES) + " | objects | frames broken |",
-        "| --- | --- | --- |" + " ---: |" * (len(_TITLES) + 2),
-    ]
-    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
+    words = ("frames", "labels", "detector")
+    sheet = Sheet("", (*words, *SCORE_TITLES, "objects", "frames broken"), tuple(map(_cells, rows)))
     csv_name, markdown_name = TABLES
     files.write_text(out / csv_name, csv_text([row.to_json() for row in rows], line_end="\r\n"))
-    files.write_text(out / markdown_name, "\n".join(lines) + "\n")
+    files.write_text(out / markdown_name, "\n".join(sheet.markdown(words)[2:]) + "\n")  # without a heading
 
 
-def _cells(row: RetrainRow) -> list[str]:
-    facts = asdict(row.scores)
+def _cells(row: RetrainRow) -> tuple[str, ...]:
     share = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
-    numbers = [percent(facts[name]) for name in _COLUMNS]
-    return [row.frames, row.labels, row.detector, *numbers, str(row.scores.objects), share]
+    figures = map(percent, row.scores.shown)
+    return row.frames, row.labels, row.detector, *figures, str(row.scores.objects), share

@@ -19,7 +19,8 @@ import pytest
 import tyro
 import yaml
 
-from drivesem.cli import main, parse
+from drivesem.cli import main
+from drivesem.settings.parsing import parse
 from tools.bench.settings import BenchTool
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals
-from scene_ir.errors import RangeError
+from drivesem.attack.methods.base import Attack, Problem, Proposals, check_counts, check_rate
 
 FORWARD = 0.75
 """Of a move, what the gradient says; the rest goes on as the move before (alpha of the paper)."""
@@ -37,10 +36,8 @@ class APGD(Attack):
     rate: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise RangeError("rate", "a positive number", self.rate)
+        check_counts(steps=self.steps)
+        check_rate(self.rate)
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         start = problem.project(theta0.detach())
@@ -85,7 +82,7 @@ class APGD(Attack):
             thetas=tuple(thetas),
             losses=(*losses, None),
             queries=len(losses),
-            active_constraints=tuple(dict.fromkeys(active)),
+            active_constraints=tuple(active),
         )
 
 

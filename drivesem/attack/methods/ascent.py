@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals
+from drivesem.attack.methods.base import Attack, Problem, Proposals, check_counts, check_rate
 from scene_ir.errors import RangeError
 
 
@@ -29,12 +28,10 @@ class Ascent(Attack):
     rate: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+        check_counts(steps=self.steps)
         if not 0 <= self.momentum <= 1:
             raise RangeError("momentum", "a number in [0, 1]", self.momentum)
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise RangeError("rate", "a positive number", self.rate)
+        check_rate(self.rate)
 
     @abstractmethod
     def _move(self, problem: Problem, gradient: Tensor) -> Tensor:
@@ -72,5 +69,5 @@ class Ascent(Attack):
             thetas=tuple(thetas),
             losses=(*losses, None),
             queries=len(losses),
-            active_constraints=tuple(dict.fromkeys(active)),
+            active_constraints=tuple(active),
         )

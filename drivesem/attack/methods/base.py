@@ -6,13 +6,16 @@ success. No attack marks its own homework.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, final
 
 import torch
 from torch import Tensor
+
+from scene_ir.errors import RangeError
 
 if TYPE_CHECKING:
     from drivesem.attack.feasible.projection import Projected
@@ -38,6 +41,19 @@ class Score:
     success: bool
     success_paper: bool
     violations: tuple[str, ...] = ()
+
+
+def check_counts(least: int = 1, **counts: int | None) -> None:
+    """RangeError where one of the settings, None left out, is less than `least`."""
+    for name, value in counts.items():
+        if value is not None and value < least:
+            raise RangeError(name, f"at least {least}", value)
+
+
+def check_rate(rate: float) -> None:
+    """RangeError where it is not positive."""
+    if not (math.isfinite(rate) and rate > 0):
+        raise RangeError("rate", "a positive number", rate)
 
 
 def _unseen(theta: Tensor) -> Score | None:
@@ -108,13 +124,24 @@ class Problem:
 class Proposals:
     """What `_propose` hands over. thetas: the iterates in order; losses: one each, None where it was not computed;
     queries: gradients taken, and thetas judged by a search without gradient; active_constraints: what projections
-    on the way held back.
+    on the way held back, as often as they did.
     """
 
     thetas: tuple[Tensor, ...]
     losses: tuple[float | None, ...]
     queries: int
     active_constraints: tuple[str, ...] = ()
+
+    @classmethod
+    def joined(cls, runs: Iterable[Proposals]) -> Proposals:
+        """What several runs propose, one after the other."""
+        runs = tuple(runs)
+        return cls(
+            thetas=tuple(theta for run in runs for theta in run.thetas),
+            losses=tuple(loss for run in runs for loss in run.losses),
+            queries=sum(run.queries for run in runs),
+            active_constraints=tuple(name for run in runs for name in run.active_constraints),
+        )
 
 
 @dataclass(frozen=True, slots=True)

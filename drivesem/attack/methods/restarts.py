@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
-from scene_ir.errors import RangeError
+from drivesem.attack.methods.base import Attack, Problem, Proposals, Score, check_counts
 
 _PART = 0.25
 """Share of the box in which further starts lie. The steps then still lead most of the way; far out, a start would
@@ -31,10 +30,7 @@ class Restarted(Attack):
     early_stop: bool = False
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise RangeError("restarts", "at least 1", self.count)
-        if self.steps is not None and self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+        check_counts(restarts=self.count, steps=self.steps)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         return self.inner._rank(problem, theta, score)
@@ -46,12 +42,7 @@ class Restarted(Attack):
             place = torch.rand(len(theta0), generator=generator, dtype=torch.float64).to(theta0)
             start = theta0 + _PART * (lower + place * (upper - lower) - theta0)
             runs.append(self.inner._propose(problem, problem.project(start).theta, generator))
-        return Proposals(
-            thetas=tuple(theta for run in runs for theta in run.thetas),
-            losses=tuple(loss for run in runs for loss in run.losses),
-            queries=sum(run.queries for run in runs),
-            active_constraints=tuple(dict.fromkeys(name for run in runs for name in run.active_constraints)),
-        )
+        return Proposals.joined(runs)
 
     @staticmethod
     def _failed(problem: Problem, run: Proposals) -> bool:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
+from drivesem.attack.methods.base import Attack, Problem, Proposals, Score, check_counts
 from drivesem.attack.methods.sampling import Sampling
-from scene_ir.errors import RangeError
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +26,7 @@ class Scouted(Attack):
     early_stop: bool = False
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise RangeError("scouts", "at least 1", self.count)
-        if self.steps is not None and self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+        check_counts(scouts=self.count, steps=self.steps)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         return self.inner._rank(problem, theta, score)
@@ -44,12 +40,7 @@ class Scouted(Attack):
         if self.early_stop and scores[best].success:
             return seen
         climb = self._run(self.inner, problem, starts[best], generator)
-        return Proposals(
-            thetas=(*seen.thetas, *climb.thetas),
-            losses=(*seen.losses, *climb.losses),
-            queries=seen.queries + climb.queries,
-            active_constraints=tuple(dict.fromkeys((*seen.active_constraints, *climb.active_constraints))),
-        )
+        return Proposals.joined((seen, climb))
 
     @staticmethod
     def _run(attack: Attack, problem: Problem, start: Tensor, generator: torch.Generator) -> Proposals:

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
+from drivesem.attack.methods.base import Attack, Problem, Proposals, Score, check_counts, check_rate
 from scene_ir.errors import RangeError
 
 Norm = Literal[1, 2]
@@ -49,13 +49,10 @@ class SCW(Attack):
     early_stop: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("queries", "steps"):
-            if getattr(self, name) < 1:
-                raise RangeError(name, "at least 1", getattr(self, name))
+        check_counts(queries=self.queries, steps=self.steps)
         if self.norm not in (1, 2):
             raise RangeError("norm", "1 or 2", self.norm)
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise RangeError("rate", "a positive number", self.rate)
+        check_rate(self.rate)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         return (1.0, -float(problem.size(theta, self.norm))) if score.success else (0.0, score.loss)
@@ -78,7 +75,7 @@ class SCW(Attack):
             thetas=tuple(search.thetas),
             losses=tuple(search.losses),
             queries=len(search.thetas),
-            active_constraints=tuple(dict.fromkeys(search.active)),
+            active_constraints=tuple(search.active),
         )
 
 

@@ -9,10 +9,9 @@ from itertools import combinations, pairwise
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Group, Problem, Proposals, Score
+from drivesem.attack.methods.base import Attack, Group, Problem, Proposals, Score, check_counts
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.trials import Trials
-from scene_ir.errors import RangeError
 
 _HALVINGS = 4
 """Judged thetas for each subset of the fewest groups, to find how small it may be: to 1/16 of what it was."""
@@ -37,10 +36,8 @@ class Subsets(Attack):
     steps: int = 10
 
     def __post_init__(self) -> None:
-        if self.queries < 2:
-            raise RangeError("queries", "at least 2", self.queries)
-        if self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+        check_counts(2, queries=self.queries)
+        check_counts(steps=self.steps)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         if not score.success:
@@ -63,13 +60,7 @@ class Subsets(Attack):
         found = max(failing, key=lambda theta: climb._rank(problem, theta, problem.score(theta)))
         trials = Trials(problem, self.queries - run.queries)
         _Reduction(problem, found, raised(problem.groups, run.thetas, gradients), trials).reduce()
-        tried = trials.proposals()
-        return Proposals(
-            thetas=(*run.thetas, *tried.thetas),
-            losses=(*run.losses, *tried.losses),
-            queries=run.queries + tried.queries,
-            active_constraints=tuple(dict.fromkeys((*run.active_constraints, *tried.active_constraints))),
-        )
+        return Proposals.joined((run, trials.proposals()))
 
     def _climb(self) -> Attack:
         return SiFGSM(min(self.steps, self.queries // 2))

@@ -11,8 +11,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
-from scene_ir.errors import RangeError
+from drivesem.attack.methods.base import Attack, Problem, Proposals, Score, check_counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +29,7 @@ class Search(Attack):
     needs_gradient: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.queries < 1:
-            raise RangeError("queries", "at least 1", self.queries)
-        if self.steps is not None and self.steps < 1:
-            raise RangeError("steps", "at least 1", self.steps)
+        check_counts(queries=self.queries, steps=self.steps)
 
 
 @dataclass(slots=True)
@@ -69,5 +65,5 @@ class Trials:
             thetas=tuple(self._thetas),
             losses=tuple(self._losses),
             queries=len(self._thetas),
-            active_constraints=tuple(dict.fromkeys(self._active)),
+            active_constraints=tuple(self._active),
         )

@@ -136,14 +136,10 @@ def sheets(report: Confirmation) -> list[Sheet]:
         (s.name, str(s.failures), str(s.survive), percent(s.share), f"{percent(s.low)} to {percent(s.high)}")
         for s in report.shares
     )
-    figures = []
-    for name, scores in report.scores.items():
-        one = scores.headline
-        figures.append((name, *map(percent, (one.ap50, one.ap70, one.ap, one.recall, one.recall_at_t_star))))
-    scored = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
+    figures = [(name, *map(percent, scores.headline.shown)) for name, scores in report.scores.items()]
     return [
         Sheet("failures that survive, %", ("figure", "failures", "survive", "share", "95 %"), shares),
-        Sheet(f"{HEADLINE}, %", ("picture", *scored), tuple(figures)),
+        Sheet(f"{HEADLINE}, %", ("picture", *coco.SCORE_TITLES), tuple(figures)),
     ]
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from drivesem.questions.confirm.judge import RendererFailure, Stand
+from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -48,15 +47,6 @@ def load(path: Path) -> Confirmed:
     try:
         if data.pop("schema") != SCHEMA:
             raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        kinds: dict[str, Callable[..., Any]] = dict.fromkeys(("compositor", "generator"), RendererFailure)
-        kinds |= {"stands": Stand}
-        kinds |= dict.fromkeys([name for name in data if name.startswith(("targets_", "detections_"))], BoxRecord)
-        for name, kind in kinds.items():
-            data[name] = tuple(kind(**{**one, **_box_of(one)}) for one in data[name])
-        return Confirmed(**{**data, "not_carried": tuple(data["not_carried"])})
+        return from_json(Confirmed, data)
     except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
-
-
-def _box_of(entry: dict[str, Any]) -> dict[str, Any]:
-    return {"xyxy": tuple(entry["xyxy"])} if "xyxy" in entry else {}

@@ -143,12 +143,10 @@ def print_figures(figures: DetectorFigures, console: Console) -> None:
     data = figures.data
     table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
     table.add_column("class")
-    for title in ("AP50", "AP70", "AP50:95", "recall", "recall at t*", "objects"):
+    for title in (*coco.SCORE_TITLES, "objects"):
         table.add_column(title, justify="right")
     for name, scores in figures.per_class.items():
-        row = asdict(scores)
-        cells = [percent(row[key]) for key in ("ap50", "ap70", "ap", "recall", "recall_at_t_star")]
-        table.add_row(name, *cells, str(scores.objects))
+        table.add_row(name, *map(percent, scores.shown), str(scores.objects))
     console.print(table)
     for one in figures.intervals:
         if one.low is not None and one.high is not None:

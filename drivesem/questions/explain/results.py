@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from drivesem.questions.explain.players import Size
+from drivesem.run.records import from_json
 from drivesem.run.results import Coordinate, Failure
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -133,28 +133,6 @@ def read_explanation(path: Path) -> Explanation:
     try:
         if data.pop("schema") != SCHEMA:
             raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        data["benign"], data["found"] = PartOutcome(**data["benign"]), PartOutcome(**data["found"])
-        data["contributions"] = tuple(
-            Contribution(**{**c, "alone": PartOutcome(**c["alone"]), "without": PartOutcome(**c["without"])})
-            for c in data["contributions"]
-        )
-        data["exact"], data["sizes"] = tuple(data["exact"]), _all(Size, data["sizes"])
-        data["least"] = _least(data["least"])
-        data["sensitivity"] = {k: Sensitivity(**_tuples(v)) for k, v in data["sensitivity"].items()}
-        return Explanation(**data)
+        return from_json(Explanation, data)
     except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(str(path), "an explanation as drivesem explain writes it", error) from error
-
-
-def _least(data: dict[str, Any]) -> Least:
-    kinds = {"sizes": Size, "failures": Failure, "theta": Coordinate}
-    data |= {name: _all(kind, data[name]) for name, kind in kinds.items()}
-    return Least(**_tuples(data | {"outcome": PartOutcome(**data["outcome"])}))
-
-
-def _all(kind: Any, items: list[dict[str, Any]]) -> tuple[Any, ...]:
-    return tuple(kind(**_tuples(item)) for item in items)
-
-
-def _tuples(item: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in item.items()}

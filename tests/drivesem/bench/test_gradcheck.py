@@ -13,8 +13,9 @@ import torch
 
 from drivesem.attack.space import Parameter
 from drivesem.bench import gradcheck
-from drivesem.bench.gradcheck import LOSS, PICTURE, Differences, Row, rows_of, worst
+from drivesem.bench.gradcheck import LOSS, PICTURE, Differences, GradcheckRow, rows_of, worst
 from drivesem.cli import main
+from drivesem.commands import gradcheck as gradcheck_command
 from drivesem.settings.commands import Gradcheck
 from drivesem.settings.parsing import parse
 from scene_ir.types import Camera, Mesh, SceneIR
@@ -38,7 +39,7 @@ def _gradient() -> np.ndarray:
     return torch.randn(OUTPUTS, COUNT, generator=_generator(), dtype=torch.float64).numpy()
 
 
-def _rows(analytic: np.ndarray, truth: np.ndarray) -> dict[tuple[str, str], Row]:
+def _rows(analytic: np.ndarray, truth: np.ndarray) -> dict[tuple[str, str], GradcheckRow]:
     blocks = (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.MESH)
     found = {p: _differences(truth, slice(4 * i, 4 * i + 4)) for i, p in enumerate(blocks)}
     rows = rows_of("a scene", "theta0", {"warp": analytic}, found)
@@ -196,7 +197,7 @@ def small_street(street: Callable[..., SceneIR], monkeypatch: pytest.MonkeyPatch
         depth=whole.depth[rows, columns],
         objects=replace(whole.objects, box2d=box.clamp(min=0).minimum(torch.tensor([95.0, 63, 95, 63]))),
     )
-    monkeypatch.setattr(gradcheck, "open_source", lambda _: _Streets(scene))
+    monkeypatch.setattr(gradcheck_command, "open_source", lambda _: _Streets(scene))
 
 
 @pytest.mark.usefixtures("small_street")
@@ -220,7 +221,7 @@ def test_exit_code(
     factor: float, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = _rows(factor * _gradient(), _gradient()).values()
-    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
+    monkeypatch.setattr(gradcheck_command, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
     assert main(["gradcheck", "--json"]) == code
     assert json.loads(capsys.readouterr().out)["passed"] is (code == 0)
 
@@ -229,8 +230,8 @@ def test_exit_code(
 def test_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     still = np.zeros((OUTPUTS, COUNT))
     rows = [*_rows(1.2 * _gradient(), _gradient()).values(), *_rows(still, still).values()]
-    monkeypatch.setattr(gradcheck, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
-    monkeypatch.setattr(gradcheck, "worst", tuple)
+    monkeypatch.setattr(gradcheck_command, "_check_all", lambda *_: ({"street": tuple(rows)}, {}))
+    monkeypatch.setattr(gradcheck_command, "worst", tuple)
     assert main(["gradcheck", "--max-error", "0.1"]) == 1
     out = capsys.readouterr().out
     assert "no effect" in out

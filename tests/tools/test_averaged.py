@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from detectors.averaged import AveragedRun
 from detectors.registry import read_weights
+from tests.tools.loading import tool
+
+AveragedRun: Any = tool("averaged").AveragedRun
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Line(nn.Module):
         self.slope = nn.Parameter(torch.tensor([1.0]))
 
 
-def run_of(settings: Settings | None = None) -> AveragedRun[Line]:
+def run_of(settings: Settings | None = None) -> Any:
     return AveragedRun(Line(), settings or Settings())
 
 

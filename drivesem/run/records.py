@@ -1,0 +1,22 @@
+"""Dataclasses back from what `dataclasses.asdict` and JSON made of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, get_args, get_origin, get_type_hints
+
+_hints = functools.cache(get_type_hints)
+
+
+def from_json(kind: Any, value: Any) -> Any:
+    """A value of a type: dataclasses, tuples and dicts of others are built again, all else is as JSON has it.
+    Raises KeyError, TypeError or AttributeError where the value was not made of the type.
+    """
+    if dataclasses.is_dataclass(kind):
+        return kind(**{name: from_json(_hints(kind)[name], part) for name, part in value.items()})  # pyright: ignore[reportCallIssue]
+    if get_origin(kind) is tuple:
+        return tuple(from_json(get_args(kind)[0], part) for part in value)
+    if get_origin(kind) is dict:
+        return {name: from_json(get_args(kind)[1], part) for name, part in value.items()}
+    return value
