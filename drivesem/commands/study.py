@@ -2,126 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
-from typing import Any
-
-from rich.console import Console
-
-from drivesem.evaluation.resampling import DRAWS
-from drivesem.questions.confirm.asking import confirm_run
-from drivesem.questions.confirm.plans import open_plans
-from drivesem.questions.confirm.report import Confirmation
-from drivesem.questions.study import report, retrain, retrain_report, transfer
-from drivesem.questions.study.arms import arms_of
-from drivesem.questions.study.labels import label_sets
-from drivesem.questions.study.largest import largest, write_largest
-from drivesem.questions.study.lessons import CACHE, FRAMES, RETRAINED
-from drivesem.questions.study.plots import write_plot
-from drivesem.questions.study.report import Findings, Told, print_told, write_tables
-from drivesem.questions.study.rows import rows_of
-from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
-from drivesem.questions.study.success import against, curve_of
-from drivesem.questions.transfer.asking import DETECTIONS
-from drivesem.questions.transfer.plot import write_heatmap
-from drivesem.run.folder import PRESENTATION, claim
-from drivesem.settings.commands import Confirm, Study
+from drivesem.questions.study.asking import study_run
+from drivesem.run.ask import say
+from drivesem.settings.commands import Study
 from drivesem.settings.devices import check_device
-from drivesem.settings.text import command_line
-from scene_ir import files
-
-_PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
-_TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
-_WRITTEN = (*(_PICTURE, _FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
-_FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
-"""Settings that may change on the way: they add frames, arms or draws, and alter none."""
-_FREE_IN_RETRAIN = (
-    *(name for name in PRESENTATION if name != "limit"),
-    *("bootstrap", "benign_frames", "fresh", "controls", "detectors", "sources"),
-)
-"""Of retrain: other frames to train on would make other detectors."""
-_NOT_TOLD = ("out", "json", "resume", "workers", "name")
 
 
 def run(config: Study) -> int:
     """Run or continue a study; exit code 0. Raises UsageError or SceneError for bad input."""
     check_device(config.device)
-    out = Path(config.out or f"runs/study-{config.name}-{config.dataset}-seed{config.seed}")
-    console = Console(stderr=True)
-    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, console)
-    files.write_json(out / _FIGURES, data)
-    command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
-    write_tables(out, told, _PICTURE, command)
-    draw(out / _PICTURE)
-    if config.json:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-    print_told(told, console if config.json else Console())
-    console.print(f"written to {out}", soft_wrap=True)
+    say(study_run(config), config.json)
     return 0
-
-
-_Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
-"""A study's figures for JSON, its text, and what draws its picture."""
-
-
-def _arms(config: Study, out: Path, console: Console) -> _Found:
-    """Attacks side by side."""
-    arms = arms_of(config, out)
-    workers = workers_of(arms)
-    claim(out, config, _WRITTEN, _FREE)
-    if config.confirm:  # before hours of attacks: whether the frames can be drawn again
-        open_plans(workers[0].config, None)
-    ran = run_arms(arms, workers, out, console)
-    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out))
-    write_largest(out / _LARGEST, largest(ran.runs, out))
-    return found.to_json(), report.told(found), partial(write_plot, found=found)
-
-
-def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
-    """What the generator's pictures say of each arm that is no control, where that is asked."""
-    if not config.confirm:
-        return {}
-    shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
-    arms = [run.arm for run in ran.runs if run.arm.control is None]
-    return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)))[0] for arm in arms}
-
-
-def _transfer(config: Study, out: Path, console: Console) -> _Found:
-    """Counterexamples before other detectors."""
-    arms = arms_of(config, out)
-    workers = workers_of(arms)
-    asked = transfer.detectors_asked(config, out)
-    claim(out, config, _WRITTEN, (*_FREE, "detectors", "sources"))
-    found = transfer.run(config, arms, workers, asked, out, console)
-    return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
-
-
-def _retrain(config: Study, out: Path, console: Console) -> _Found:
-    """Detectors trained on with counterexamples."""
-    ready = retrain.prepare(config)
-    claim(out, config, _WRITTEN, _FREE_IN_RETRAIN)
-    found = retrain.run(config, ready, out, console)
-    return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
-
-
-_STUDIES = {"transfer": _transfer, "retrain": _retrain}
-"""Studies that are more than attacks side by side."""
-
-
-def _findings(config: Study, ran: Ran) -> Findings:
-    draws = DRAWS if config.bootstrap is None else config.bootstrap
-    rows = rows_of(ran.runs, draws, config.seed)
-    if config.name == "labels":
-        return Findings(config, draws, ran, rows, label_sets=[label_sets(one) for one in ran.runs])
-    if config.name not in ("samples", "steps"):
-        return Findings(config, draws, ran, rows)
-    curves = [curve_of(one, draws, config.seed) for one in ran.runs]
-    if config.name == "steps":
-        return Findings(config, draws, ran, rows, curves)
-    first = ran.runs[0]
-    beside = {one.arm.name: against(first, config.steps, one, draws, config.seed) for one in ran.runs}
-    return Findings(config, draws, ran, rows, curves, beside, config.steps)

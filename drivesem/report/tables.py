@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
-
-from scene_ir import files
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,19 +36,6 @@ class Sheet:
         for row in self.rows:
             table.add_row(*row)
         return table
-
-
-def publish(
-    sheet: Sheet, path: Path, heading: str, words: Collection[str], note: str, data: Mapping[str, Any] | None
-) -> None:
-    """One table with a note: as a Markdown file, and on standard output; there as JSON where `data` is given."""
-    files.write_text(path, "\n".join([f"# {heading}", "", *sheet.markdown(words), "", note, ""]))
-    if data is not None:
-        sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
-        return
-    people = Console()
-    people.print(sheet.table(words))
-    people.print(note, soft_wrap=True)
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:

@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -19,9 +19,9 @@ from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
 from detectors.types import Detections
 from drivesem.attack.judging import JudgedClasses
+from drivesem.run.ask import Bar, ask
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.results import BoxRecord
-from drivesem.run.workers import outcomes
 from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -112,16 +112,16 @@ def weights_digest(module: nn.Module) -> str:
 
 
 def look(
-    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Sharing
-) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Each picture that is not known yet, as it is done, with a call that raises what went wrong with it. Of
-    pictures with the same bytes the first stands for all.
+    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Sharing, title: str
+) -> dict[str, str]:
+    """Look at each picture that is not known yet. Returns which could not be used, and why, where the settings
+    keep going; else the first ends it. Pictures with the same bytes are looked at once. title: of the bar.
     """
     memory = Memory(order, predictor)
     unknown = {memory.place(picture): picture for picture in reversed(pictures) if not memory.has(picture)}
     todo = list(reversed(unknown.values()))
     work = partial(_look, predictor=predictor, memory=memory, device=order.device)
-    yield from outcomes(work, partial(_in_process, order), todo, config)
+    return ask(todo, work, partial(_in_process, order), config, Bar(title, stays=False)).failed
 
 
 def _look(picture: Path, predictor: Predictor, memory: Memory, device: str) -> None:

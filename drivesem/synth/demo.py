@@ -117,13 +117,6 @@ def demo_scene(seed: int, index: int) -> SceneIR:
     raise RangeError(f"demo scene {index} of seed {seed}", f"a street within {_ATTEMPTS} attempts", "none")
 
 
-def demo_scenes(count: int = 10, seed: int = 0) -> list[SceneIR]:
-    """The first `count` embedded scenes of stream `seed`. Raises RangeError for a negative count."""
-    if count < 0:
-        raise RangeError("demo scenes", "a count of at least 0", count)
-    return [demo_scene(seed, index) for index in range(count)]
-
-
 def take_apart(frame: SynthFrame, name: str, shape: Callable[[str, int], Mesh] = template) -> SceneIR:
     """The scene of a frame rendered with its background: exact objects, mattes, shadows and maps; all its actors
     must be vehicles that appear in the image. shape: the mesh of a kind and variant.

@@ -36,6 +36,14 @@ from scene_ir.raster.verbs import NEAR_M
 start_warp()
 wp.set_module_options(OPTIONS)
 
+Floats = wp.array(dtype=wp.float32)
+Ints = wp.array(dtype=wp.int32)
+Longs = wp.array(dtype=wp.int64)
+Bytes = wp.array(dtype=wp.uint8)
+Vec2s = wp.array(dtype=wp.vec2f)
+Vec3s = wp.array(dtype=wp.vec3f)
+Vec4s = wp.array(dtype=wp.vec4f)
+
 FOLD, UNFOLD = wp.constant(wp.float32(1.0 / SIZE)), wp.constant(wp.float32(SIZE))
 LAST = wp.constant(wp.float32(SIZE - 1e-3))
 STRIDE = wp.constant(SIZE + 1)
@@ -70,9 +78,9 @@ vec22 = wp.types.vector(length=TABLE, dtype=wp.float32)
 class Noise:
     """The textures of `NoiseSet`, flat."""
 
-    soft: wp.array(dtype=wp.float32)
-    rough: wp.array(dtype=wp.float32)
-    grain: wp.array(dtype=wp.float32)
+    soft: Floats
+    rough: Floats
+    grain: Floats
 
 
 @wp.struct
@@ -95,7 +103,7 @@ class Air:
     cloud_seed: wp.float32
     wet: wp.float32
     fog: wp.int32
-    panorama: wp.array(dtype=wp.float32)
+    panorama: Floats
     panorama_height: wp.int32
     panorama_width: wp.int32
     panorama_turn: wp.float32
@@ -106,11 +114,11 @@ class Street:
     """Markings (middle, width, dash, period), the crossing (from, to; from > to: none), d from which on its stop line
     lies, and `SOAKED` by material."""
 
-    markings: wp.array(dtype=wp.vec4f)
+    markings: Vec4s
     count: wp.int32
     crossing: wp.vec2f
     own_side: wp.float32
-    soaked: wp.array(dtype=wp.vec3f)
+    soaked: Vec3s
 
 
 @wp.struct
@@ -126,19 +134,19 @@ class Lens:
     height_m: wp.float32
     width: wp.int32
     develop: wp.vec3f
-    curve: wp.array(dtype=wp.float32)
+    curve: Floats
 
 
 @wp.struct
 class Scene:
     """What each fine pixel shows, flat, and the faces' numbers."""
 
-    table: wp.array(dtype=wp.float32)
-    face: wp.array(dtype=wp.int32)
-    depth: wp.array(dtype=wp.float32)
-    material: wp.array(dtype=wp.uint8)
-    owner: wp.array(dtype=wp.int32)
-    ground: wp.array(dtype=wp.uint8)
+    table: Floats
+    face: Ints
+    depth: Floats
+    material: Bytes
+    owner: Ints
+    ground: Bytes
 
 
 @wp.struct
@@ -147,7 +155,7 @@ class Shade:
 
     rows: wp.mat33f
     shift: wp.vec3f
-    depth: wp.array(dtype=wp.float32)
+    depth: Floats
     near: wp.vec4f
     far: wp.vec4f
     texels: wp.int32
@@ -157,7 +165,7 @@ class Shade:
 
 @wp.struct
 class Spot:
-    """One sample: `shading.Samples`."""
+    """One sample: the reference's `Samples`."""
 
     point: wp.vec3f
     world: wp.vec3f
@@ -187,7 +195,7 @@ def power(x: float, exponent: float):
 
 
 @wp.func
-def noise(texture: wp.array(dtype=wp.float32), u: float, v: float, per_m: float):
+def noise(texture: Floats, u: float, v: float, per_m: float):
     x = u * per_m * FOLD
     y = v * per_m * FOLD
     x = wp.min((x - wp.floor(x)) * UNFOLD, LAST)
@@ -203,7 +211,7 @@ def noise(texture: wp.array(dtype=wp.float32), u: float, v: float, per_m: float)
 
 
 @wp.func
-def texel(pixels: wp.array(dtype=wp.float32), i: int):
+def texel(pixels: Floats, i: int):
     return wp.vec3f(load(pixels, 3 * i), load(pixels, 3 * i + 1), load(pixels, 3 * i + 2))
 
 
@@ -274,7 +282,7 @@ def reflected_radiance(air: Air, textures: Noise, direction: wp.vec3f, soft: boo
 
 
 @wp.func
-def shown(x: float, curve: wp.array(dtype=wp.float32)):
+def shown(x: float, curve: Floats):
     """`light.develop` of a radiance x, exposed and white, by a table over the root of x."""
     place = wp.sqrt(wp.min(wp.max(x, 0.0), WHITE)) * PER_ROOT
     i = wp.int32(place)
@@ -394,7 +402,7 @@ def fifth(x: float):
 
 @wp.func
 def facade(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
-    """Radiance of a wall with windows: `shading._facade`, lit."""
+    """Radiance of a wall with windows: `_facade` of the reference, lit."""
     pitch = s.pattern[0]
     storey = s.pattern[1]
     wide = s.pattern[2]
@@ -573,7 +581,7 @@ def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: Street, text
 
 
 @wp.func
-def soft_compare(maps: wp.array(dtype=wp.float32), base: int, texels: int, u: float, v: float, depth: float):
+def soft_compare(maps: Floats, base: int, texels: int, u: float, v: float, depth: float):
     u0 = wp.floor(u)
     v0 = wp.floor(v)
     fu = u - u0
@@ -673,9 +681,9 @@ def pixel_kernel(
     textures: Noise,
     lens: Lens,
     shade: Shade,
-    wanted: wp.array(dtype=wp.uint8),
-    out: wp.array(dtype=wp.vec3f),
-    touched: wp.array(dtype=wp.uint8),
+    wanted: Bytes,
+    out: Vec3s,
+    touched: Bytes,
 ):
     # A row a thread: structures are copied once a row.
     row = start + wp.tid()
@@ -756,7 +764,7 @@ def pixel_kernel(
 
 
 @wp.kernel
-def mark_kernel(start: int, face: wp.array(dtype=wp.int32), used: wp.array(dtype=wp.uint8)):
+def mark_kernel(start: int, face: Ints, used: Bytes):
     """Marks the faces that a pixel shows; threads may write the same mark at once."""
     i = start + wp.tid()
     f = face[i]
@@ -767,15 +775,15 @@ def mark_kernel(start: int, face: wp.array(dtype=wp.int32), used: wp.array(dtype
 @wp.kernel
 def table_kernel(
     start: int,
-    used: wp.array(dtype=wp.uint8),
-    corners: wp.array(dtype=wp.vec3f),
-    normals: wp.array(dtype=wp.vec3f),
-    uv: wp.array(dtype=wp.vec2f),
-    albedo: wp.array(dtype=wp.vec3f),
-    pattern: wp.array(dtype=wp.vec4f),
-    table: wp.array(dtype=wp.float32),
+    used: Bytes,
+    corners: Vec3s,
+    normals: Vec3s,
+    uv: Vec2s,
+    albedo: Vec3s,
+    pattern: Vec4s,
+    table: Floats,
 ):
-    """`render._attribute_maps`: barycentric coordinates are linear in the point, in camera axes about the centre."""
+    """`_attribute_maps` of the reference: barycentric coordinates are linear in the point, in camera axes about the centre."""
     f = start + wp.tid()
     if used[f] != wp.uint8(0):
         a = wp.vec3d(corners[3 * f])
@@ -813,14 +821,14 @@ def table_kernel(
 @wp.kernel
 def owner_kernel(
     start: int,
-    face: wp.array(dtype=wp.int32),
-    materials: wp.array(dtype=wp.uint8),
-    owners: wp.array(dtype=wp.int32),
-    semantics: wp.array(dtype=wp.uint8),
-    depth: wp.array(dtype=wp.float32),
-    material: wp.array(dtype=wp.uint8),
-    owner: wp.array(dtype=wp.int32),
-    semantic: wp.array(dtype=wp.uint8),
+    face: Ints,
+    materials: Bytes,
+    owners: Ints,
+    semantics: Bytes,
+    depth: Floats,
+    material: Bytes,
+    owner: Ints,
+    semantic: Bytes,
 ):
     i = start + wp.tid()
     f = face[i]
@@ -837,7 +845,7 @@ def owner_kernel(
 
 
 @wp.kernel
-def nearest_kernel(start: int, width: int, depth: wp.array(dtype=wp.float32), nearest: wp.array(dtype=wp.int64)):
+def nearest_kernel(start: int, width: int, depth: Floats, nearest: Longs):
     """The nearest of the four samples of a pixel; width: of the image."""
     i = start + wp.tid()
     y = i // width
@@ -864,9 +872,9 @@ def fill(
     width: int,
     first: int,
     end: int,
-    depth: wp.array(dtype=wp.float32),
+    depth: Floats,
     face: int,
-    faces: wp.array(dtype=wp.int32),
+    faces: Ints,
 ):
     """Offers a triangle of corners (x, y pixels, depth) to rows [first, end) of an image that starts at `base`.
 
@@ -934,15 +942,7 @@ def to_texels(p: wp.vec3d, area: wp.vec4f, texels: int):
 
 
 @wp.kernel
-def sun_kernel(
-    start: int,
-    bands: int,
-    corners: wp.array(dtype=wp.vec3f),
-    material: wp.array(dtype=wp.uint8),
-    owner: wp.array(dtype=wp.int32),
-    shade: Shade,
-    ground: wp.array(dtype=wp.uint8),
-):
+def sun_kernel(start: int, bands: int, corners: Vec3s, material: Bytes, owner: Ints, shade: Shade, ground: Bytes):
     """Fills the rows of one band of all maps."""
     band = start + wp.tid()
     texels = shade.texels
@@ -1007,14 +1007,7 @@ def cut(a: wp.vec3d, b: wp.vec3d):
 
 @wp.kernel
 def sight_kernel(
-    start: int,
-    bands: int,
-    width: int,
-    height: int,
-    matrix: wp.mat33d,
-    corners: wp.array(dtype=wp.vec3f),
-    depth: wp.array(dtype=wp.float32),
-    faces: wp.array(dtype=wp.int32),
+    start: int, bands: int, width: int, height: int, matrix: wp.mat33d, corners: Vec3s, depth: Floats, faces: Ints
 ):
     """Fills the rows of one band: the nearest face of each pixel and minus its inverse depth."""
     band = start + wp.tid()
@@ -1081,9 +1074,9 @@ def sight_kernel(
     }
 """)
 def expose_row(
-    image: wp.array(dtype=wp.float32),
-    across: wp.array(dtype=wp.float32),
-    out: wp.array(dtype=wp.uint8),
+    image: Floats,
+    across: Floats,
+    out: Bytes,
     row: int,
     length: int,
     down: float,
@@ -1097,13 +1090,13 @@ def expose_row(
 @wp.kernel
 def camera_kernel(
     start: int,
-    image: wp.array(dtype=wp.float32),
-    across: wp.array(dtype=wp.float32),
-    down: wp.array(dtype=wp.float32),
+    image: Floats,
+    across: Floats,
+    down: Floats,
     vignette: float,
     noise: float,
     seed: wp.uint32,
-    out: wp.array(dtype=wp.uint8),
+    out: Bytes,
 ):
     row = start + wp.tid()
     expose_row(image, across, out, row, across.shape[0], down[row], vignette, noise, BYTES, seed)
@@ -1241,7 +1234,9 @@ def develop_pixels(
     shadows: list[Shadow],
     target: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Fill in display values. target: the image (H * W, 3) float32 to fill and the pixels (H * W,) bool to do. Returns the pixels (H * W,) bool that actors touch."""
+    """Fill in display values. target: the image (H * W, 3) float32 to fill and the pixels (H * W,) bool to do.
+    Returns the pixels (H * W,) bool that actors touch.
+    """
     image, wanted = target
     seen, view = sight.faces, setting.view
     scene = Scene()
@@ -1280,7 +1275,7 @@ def develop_pixels(
 
 
 def expose(image: np.ndarray, response: Response, seed: int) -> np.ndarray:
-    """Vignette, grain and rounding: (H, W, 3) float32 display values to uint8; see `render.expose`."""
+    """Vignette, grain and rounding: (H, W, 3) float32 display values to uint8; see `render.take`."""
     height, width = image.shape[:2]
     across = np.repeat(np.square(np.linspace(-1, 1, width, dtype=np.float32)), 3)
     down = np.square(np.linspace(-1, 1, height, dtype=np.float32) * np.float32(height / width))

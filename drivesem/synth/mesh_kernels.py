@@ -15,6 +15,12 @@ from scene_ir.types import LATTICE, LATTICE_POINTS
 start_warp()
 wp.set_module_options(OPTIONS)
 
+Floats = wp.array(dtype=wp.float32)
+Ints = wp.array(dtype=wp.int32)
+Vec3s = wp.array(dtype=wp.vec3f)
+Vec4s = wp.array(dtype=wp.vec4f)
+Mat33s = wp.array(dtype=wp.mat33f)
+
 SLIVER_M = wp.constant(wp.float32(1e-4))
 """A tenth of a millimetre: thinner slivers are not worth a triangle."""
 NOTHING = wp.constant(wp.float32(1e-6))
@@ -25,14 +31,7 @@ assert LATTICE == (4, 4, 4)
 
 @wp.kernel
 def cut_kernel(
-    start: int,
-    corners: wp.array(dtype=wp.vec3f),
-    parent: wp.array(dtype=wp.int32),
-    whole: wp.array(dtype=wp.vec3f),
-    planes: wp.array(dtype=wp.vec4f),
-    room: int,
-    slots: wp.array(dtype=wp.vec3f),
-    counts: wp.array(dtype=wp.int32),
+    start: int, corners: Vec3s, parent: Ints, whole: Vec3s, planes: Vec4s, room: int, slots: Vec3s, counts: Ints
 ):
     """One triangle of a face, cut by every plane. room: triangles in the slots of each; a count beyond it says that
     they did not do."""
@@ -96,9 +95,7 @@ def cut_kernel(
 
 
 @wp.kernel
-def flat_kernel(
-    start: int, corners: wp.array(dtype=wp.vec3f), flat: wp.array(dtype=wp.vec3f), unit: wp.array(dtype=wp.vec3f)
-):
+def flat_kernel(start: int, corners: Vec3s, flat: Vec3s, unit: Vec3s):
     """Normals of the faces: as long as twice their area, and of length 1."""
     i = start + wp.tid()
     a = corners[3 * i]
@@ -109,14 +106,7 @@ def flat_kernel(
 
 @wp.kernel
 def crease_kernel(
-    start: int,
-    point: wp.array(dtype=wp.int32),
-    starts: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-    flat: wp.array(dtype=wp.vec3f),
-    unit: wp.array(dtype=wp.vec3f),
-    least: float,
-    normals: wp.array(dtype=wp.vec3f),
+    start: int, point: Ints, starts: Ints, order: Ints, flat: Vec3s, unit: Vec3s, least: float, normals: Vec3s
 ):
     """The mean normal of the faces that meet at one corner at less than the crease angle; least: its cosine."""
     i = start + wp.tid()
@@ -144,13 +134,7 @@ def cubic_slope(t: float):
 
 
 @wp.kernel
-def bend_kernel(
-    start: int,
-    points: wp.array(dtype=wp.vec3f),
-    lattice: wp.array(dtype=wp.vec3f),
-    moved: wp.array(dtype=wp.vec3f),
-    cofactors: wp.array(dtype=wp.mat33f),
-):
+def bend_kernel(start: int, points: Vec3s, lattice: Vec3s, moved: Vec3s, cofactors: Mat33s):
     """One vertex of the unit box after the free-form deformation, and the cofactors of its Jacobian."""
     i = start + wp.tid()
     p = points[i]
@@ -193,14 +177,14 @@ def bend_kernel(
 @wp.kernel
 def piece_kernel(
     start: int,
-    faces: wp.array(dtype=wp.int32),
-    normals: wp.array(dtype=wp.vec3f),
-    parent: wp.array(dtype=wp.int32),
-    share: wp.array(dtype=wp.vec3f),
-    moved: wp.array(dtype=wp.vec3f),
-    cofactors: wp.array(dtype=wp.mat33f),
-    corners: wp.array(dtype=wp.vec3f),
-    turned: wp.array(dtype=wp.vec3f),
+    faces: Ints,
+    normals: Vec3s,
+    parent: Ints,
+    share: Vec3s,
+    moved: Vec3s,
+    cofactors: Mat33s,
+    corners: Vec3s,
+    turned: Vec3s,
 ):
     """Corners and normals of one piece of a bent face."""
     i = start + wp.tid()
@@ -220,15 +204,15 @@ def piece_kernel(
 @wp.kernel
 def crown_kernel(
     start: int,
-    centres: wp.array(dtype=wp.vec3f),
-    radii: wp.array(dtype=wp.vec3f),
-    frame: wp.array(dtype=wp.vec3f),
-    blob: wp.array(dtype=wp.int32),
-    direction: wp.array(dtype=wp.vec3f),
-    depth: wp.array(dtype=wp.float32),
-    points: wp.array(dtype=wp.vec3f),
-    outward: wp.array(dtype=wp.vec3f),
-    light: wp.array(dtype=wp.float32),
+    centres: Vec3s,
+    radii: Vec3s,
+    frame: Vec3s,
+    blob: Ints,
+    direction: Vec3s,
+    depth: Floats,
+    points: Vec3s,
+    outward: Vec3s,
+    light: Floats,
 ):
     """One leaf's place, direction and light; a light below 0 where it lies deep inside a blob. frame: the crown's
     middle and size."""
@@ -252,13 +236,13 @@ def crown_kernel(
 @wp.kernel
 def leaf_kernel(
     start: int,
-    points: wp.array(dtype=wp.vec3f),
-    outward: wp.array(dtype=wp.vec3f),
-    jitter: wp.array(dtype=wp.vec3f),
-    spin: wp.array(dtype=wp.vec3f),
-    reach: wp.array(dtype=wp.float32),
-    corners: wp.array(dtype=wp.vec3f),
-    normals: wp.array(dtype=wp.vec3f),
+    points: Vec3s,
+    outward: Vec3s,
+    jitter: Vec3s,
+    spin: Vec3s,
+    reach: Floats,
+    corners: Vec3s,
+    normals: Vec3s,
 ):
     """One slender triangle, lit half as the surface that it stands on."""
     i = start + wp.tid()

@@ -1,19 +1,16 @@
-"""A contact sheet of a data set: a row a frame, photograph with boxes, depth, classes, objects' masks.
-
-`sheet` shows exposures as they were made, `sheet_of` a folder as this project's readers see it.
-"""
+"""A contact sheet of a data set as its reader sees it: photograph with boxes, depth, classes, objects' masks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from drivesem.data.registry import Dataset
-from drivesem.data.truth import SKY_CM, Exposure, Place
 from drivesem.data.vkitti2 import COLOURS
 from drivesem.report.drawing import (
     FAR_M,
@@ -29,7 +26,7 @@ from drivesem.report.drawing import (
     text_extent,
     write_text,
 )
-from scene_ir.errors import RangeError, ShapeError
+from scene_ir.errors import RangeError
 from scene_ir.types import Frame
 
 MOST_FRAMES = 12
@@ -52,7 +49,7 @@ _MORE_COLOURS = {"Pedestrian": (220, 20, 60), "Cyclist": (119, 11, 32), "Rider":
 
 
 @dataclass(frozen=True, slots=True)
-class _Row:
+class _SheetRow:
     """What one row shows. boxes: (xyxy, colour, text); depth_m (H, W), inf in the sky; classes (H, W) into
     class_names; instances (H, W), 0 is none. A map that the data set has not is None.
     """
@@ -67,14 +64,6 @@ class _Row:
     instances: np.ndarray | None
 
 
-def sheet(exposures: Sequence[Exposure], places: Sequence[Place]) -> np.ndarray:
-    """A sheet (h, 2000, 3) uint8 RGB of exposures and their places. RangeError for none or more than 12."""
-    if len(exposures) != len(places):
-        raise ShapeError("places", f"{len(exposures)} entries", len(places))
-    rows = [_of_exposure(exposure, place) for exposure, place in zip(exposures, places, strict=True)]
-    return _compose(rows)
-
-
 def sheet_of(dataset: Dataset, identifiers: Sequence[str]) -> np.ndarray:
     """A sheet (h, 2000, 3) uint8 RGB of frames as a reader gives them: what was written, not what was meant.
 
@@ -83,32 +72,7 @@ def sheet_of(dataset: Dataset, identifiers: Sequence[str]) -> np.ndarray:
     return _compose([_of_frame(dataset.frame(identifier)) for identifier in identifiers])
 
 
-def _distance(translation: Sequence[float]) -> str:
-    x, _, z = translation
-    distance = math.hypot(x, z)
-    return f" {distance:.0f} m" if math.isfinite(distance) else ""
-
-
-def _of_exposure(exposure: Exposure, place: Place) -> _Row:
-    boxes, labels = [], exposure.labels
-    for i, thing in enumerate(o for o in exposure.objects if o.labelled):
-        text = f"{thing.kind}{_distance(thing.translation)} {100 * thing.visible:.0f} %"
-        boxes.append((labels.boxes_xyxy[i].tolist(), BOX_COLOURS.get(thing.kind, _OTHER_COLOUR), text))
-    depth_m = exposure.depth_cm.astype(np.float32) / 100
-    depth_m[exposure.depth_cm == SKY_CM] = np.inf
-    return _Row(
-        title=f"{place.number:06d}   Scene{place.scene} / {place.variation} / {place.frame}   {place.part}",
-        image=exposure.image,
-        boxes=tuple(boxes),
-        ignored=tuple(labels.ignore_xyxy.tolist()),
-        depth_m=depth_m,
-        classes=exposure.classes.astype(np.int64),
-        class_names=exposure.class_names,
-        instances=exposure.instances.astype(np.int64),
-    )
-
-
-def _of_frame(frame: Frame) -> _Row:
+def _of_frame(frame: Frame) -> _SheetRow:
     """A reader's frame: occlusion is KITTI's 0 to 3 where truncation is known, masks are those of labels."""
     boxes, ignored, instances = [], [], None
     labels = frame.labels
@@ -117,13 +81,14 @@ def _of_frame(frame: Frame) -> _Row:
         for i, kind in enumerate(labels.kind):
             known = math.isfinite(float(labels.truncation[i]))
             occlusion = f" occ {int(labels.occlusion[i])}" if known else ""
-            text = f"{kind}{_distance(labels.translation[i].tolist())}{occlusion}"
+            away = math.hypot(float(labels.translation[i, 0]), float(labels.translation[i, 2]))
+            text = f"{kind}{f' {away:.0f} m' if math.isfinite(away) else ''}{occlusion}"
             boxes.append((labels.boxes_xyxy[i].tolist(), BOX_COLOURS.get(kind, _OTHER_COLOUR), text))
     if frame.masks is not None:
         instances = np.zeros((frame.camera.height, frame.camera.width), np.int64)
         for i, mask in enumerate(frame.masks.numpy()):
             instances[mask > 0.5] = i + 1
-    return _Row(
+    return _SheetRow(
         title=f"{frame.identifier}   {frame.provenance.get('dataset', '')}",
         image=(frame.photograph.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8),
         boxes=tuple(boxes),
@@ -135,7 +100,7 @@ def _of_frame(frame: Frame) -> _Row:
     )
 
 
-def _compose(rows: Sequence[_Row]) -> np.ndarray:
+def _compose(rows: Sequence[_SheetRow]) -> np.ndarray:
     if not 1 <= len(rows) <= MOST_FRAMES:
         raise RangeError("frames of a sheet", f"1 to {MOST_FRAMES}", len(rows))
     strips = [_strip(row) for row in rows]
@@ -143,7 +108,7 @@ def _compose(rows: Sequence[_Row]) -> np.ndarray:
     return np.concatenate([part for strip in strips for part in (gap, strip)] + [gap])
 
 
-def _strip(row: _Row) -> np.ndarray:
+def _strip(row: _SheetRow) -> np.ndarray:
     """One frame: a title, the photograph, and right of it depth and classes over masks and a legend."""
     height, width = row.image.shape[:2]
     tall = max(round(_PHOTO_PX * height / width), 2 * TEXT_PX)
@@ -168,7 +133,7 @@ def _strip(row: _Row) -> np.ndarray:
     return strip
 
 
-def _photograph(row: _Row, size_wh: tuple[int, int]) -> np.ndarray:
+def _photograph(row: _SheetRow, size_wh: tuple[int, int]) -> np.ndarray:
     """The photograph with thin boxes, drawn at the sheet's size, and texts that do not leave it."""
     scale = size_wh[0] / row.image.shape[1]
     canvas = cv2.resize(row.image, size_wh, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
@@ -208,13 +173,10 @@ def _class_colours(classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return np.array([_class_colour(name) for name in names], np.uint8)[classes]
 
 
-def _legend(strip: np.ndarray, corner: tuple[int, int], row: _Row) -> None:
+def _legend(strip: np.ndarray, corner: tuple[int, int], row: _SheetRow) -> None:
     """Counts of the objects, the depth scale, and the classes that the frame shows, largest first."""
     x0, y0 = corner
-    kinds: Mapping[str, int] = {}
-    for _, _, text in row.boxes:
-        kind = text.split()[0]
-        kinds = {**kinds, kind: kinds.get(kind, 0) + 1}
+    kinds = Counter(text.split()[0] for _, _, text in row.boxes)
     counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "no objects"
     write_text(strip, (x0, y0), f"{counts}; {len(row.ignored)} ignored")
     y = y0 + TEXT_PX + 8

@@ -11,6 +11,7 @@ import json
 import pkgutil
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,9 +81,8 @@ def workplace(small_kitti: Path, small_run: Path, tmp_path: Path, monkeypatch: p
     for name in ("PATH_TO_KITTI", "data/kitti"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).symlink_to(small_kitti)
-    (tmp_path / "runs").mkdir()
     for name in ("a", "b"):
-        (tmp_path / "runs" / name).symlink_to(small_run)
+        shutil.copytree(small_run, tmp_path / "runs" / name)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Difference, Interval
@@ -20,10 +16,10 @@ from drivesem.questions.study.rows import FIGURES, MODES, Row, feasible_fraction
 from drivesem.questions.study.running import Ran
 from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
+from drivesem.report.answer import Answer
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.report.tables import Sheet, percent
 from drivesem.settings.commands import Study
-from scene_ir import files
 
 _ARM, _MEASURE = "arm", "figure"
 _WORDS = (_ARM, _MEASURE)
@@ -275,24 +271,20 @@ def told(found: Findings) -> Told:
     return Told(found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS)
 
 
-def print_told(told: Told, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in told.short:
-        console.print(sheet.table(told.words, unbroken=told.unbroken))
-    for note in told.notes:
-        console.print(note, soft_wrap=True)
-
-
-def write_tables(out: Path, told: Told, picture: str, command: str) -> None:
-    """study.csv, further CSVs, and study.md. picture: its file's name; command: what repeats the study."""
-    for name, rows in told.tables.items():
-        buffer = io.StringIO()
-        writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        files.write_text(out / f"{name}.csv", buffer.getvalue())
-    lines = [f"# Study: {told.study}", "", f"    {command}", "", f"![]({picture})", ""]
-    for sheet in told.sheets:
-        lines += [*sheet.markdown(told.words), ""]
-    lines += [f"{note}\n" for note in told.notes]
-    files.write_text(out / "study.md", "\n".join(lines))
+def answer_of(
+    told: Told, out: Path, data: Mapping[str, Any], command: str, picture: Callable[[Path], object] | None
+) -> Answer:
+    """A study in its folder. data: its JSON; command: what repeats it; picture: draws it."""
+    return Answer(
+        out=out,
+        name="study",
+        heading=f"Study: {told.study}",
+        lead=[f"    {command}", ""],
+        data=data,
+        tables=told.tables,
+        sheets=told.sheets,
+        printed=[replace(sheet, looks={"unbroken": told.unbroken}) for sheet in told.short],
+        notes=told.notes,
+        words=told.words,
+        picture=picture,
+    )

@@ -172,7 +172,7 @@ def prepare(study: Study) -> Ready:
 
 def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
     """Attack, train, attack again, judge: what is there already stays. Raises UsageError or SceneError."""
-    learned = run_arms([ready.arm], ready.workers, out, console)
+    learned = run_arms([ready.arm], ready.workers, out)
     folder = out / ARMS / ready.arm.folder / "frames"
     frames = [AttackedFrame(folder / result.identifier) for result in learned.runs[0].results]
     benign = partial(plan.benign_samples, ready.parts, frames, out=out)
@@ -185,10 +185,10 @@ def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
         weights = plan.weights_of(out, lesson)
         forget_other_weights(out / ARMS / lesson.run, weights, weights.parent / _STAMP)
     arms = plan.judging_arms(study, ready.lessons, out)
-    judged = run_arms(arms, plan.among(workers_of(arms), ready.parts.judged), out, console)
+    judged = run_arms(arms, plan.among(workers_of(arms), ready.parts.judged), out)
     if not judged.runs[0].results:
         raise UsageError("--held-out", "frames with vehicles that can be taken apart", "none")
-    known = _known(study, names, out / ARMS / arms[0].folder, out, console)
+    known = _known(study, names, out / ARMS / arms[0].folder, out)
     draws = DRAWS if study.bootstrap is None else study.bootstrap
     rows = rows_for(study, ready.lessons, seen, known, judged.runs, draws)
     shown = {
@@ -257,7 +257,7 @@ def set_threshold(detector: Detector, weights: Path, t_star: float) -> None:
     detector.t_star = float(f"{t_star:.6g}")
 
 
-def _known(study: Study, names: Mapping[str, str], run: Path, out: Path, console: Console) -> list[Known]:
+def _known(study: Study, names: Mapping[str, str], run: Path, out: Path) -> list[Known]:
     """The held-out counterexamples against the detector as it was, before all detectors."""
     settings = Asking(
         seed=study.seed,
@@ -268,7 +268,7 @@ def _known(study: Study, names: Mapping[str, str], run: Path, out: Path, console
     )
     asked = detectors_of(list(names.values()), settings, out, study.t_star)
     named = [replace(one, name=name) for one, name in zip(asked, names, strict=True)]
-    return transfer_rows(load_runs([str(run)]), named, settings, console)[0]
+    return transfer_rows(load_runs([str(run)]), named, settings)[0]
 
 
 def rows_for(

@@ -7,19 +7,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.study.arms import Arm
+from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import WRITTEN, Worker, attack_frames, select_frames
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult, RunSummary, load_frame
-from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
-from scene_ir.errors import SceneError
 
 ARMS = "arms"
 """Folder of the arms' runs."""
@@ -48,7 +44,7 @@ class Ran:
     failed: dict[str, str]
 
 
-def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console: Console) -> Ran:
+def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path) -> Ran:
     """Run or continue all arms in `out / ARMS`. workers: of the arms, as `workers_of` makes them.
 
     Raises UsageError or SceneError for bad input.
@@ -59,21 +55,10 @@ def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path, console:
     for worker, folder in zip(workers, folders, strict=True):
         claim(folder, worker.config, WRITTEN, _FREE)
     todo = [name for name in names if not all(_done(folder, name) for folder in folders)]
-    empty: set[str] = set()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not todo) as progress:
-        task = progress.add_task(f"frames, {len(arms)} attacks each", total=len(todo))
-        work = partial(_attack, workers=workers, folders=folders)
-        for name, outcome in outcomes(work, partial(_in_process, arms, folders), todo, first.config):
-            try:
-                outcome()
-            except NoVehicleError:
-                empty.add(name)
-            except SceneError as error:
-                if not first.config.keep_going:
-                    raise
-                failed[name] = str(error)
-            progress.advance(task)
+    work, build = partial(_attack, workers=workers, folders=folders), partial(_in_process, arms, folders)
+    answers = ask(todo, work, build, first.config, Bar(f"frames, {len(arms)} attacks each"))
+    failed |= answers.failed
+    empty = {name for name, usable in answers.results.items() if not usable}
     names = [name for name in names if name not in failed and name not in empty]
     runs = []
     for arm, worker, folder in zip(arms, workers, folders, strict=True):
@@ -97,18 +82,22 @@ def workers_of(arms: Sequence[Arm]) -> list[Worker]:
     return [first[arm.config.detector].beside(arm.config) for arm in arms]
 
 
-def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> None:
-    """One frame by all arms that have not done it, in their order."""
+def _attack(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> bool:
+    """One frame by all arms that have not done it, in their order. False where it has no vehicle."""
     todo = [(w, folder) for w, folder in zip(workers, folders, strict=True) if not _done(folder, name)]
     scene = workers[0].source.scene(name)
     for worker, folder in todo:
-        worker.attack_scene(name, scene, folder)
+        try:
+            worker.attack_scene(name, scene, folder)
+        except NoVehicleError:
+            return False
         # Photograph, background and what else all arms have is most of a frame's folder.
         if folder != folders[0] and _done(folders[0], name):
             files.share_alike(folder / "frames" / name, folders[0] / "frames" / name)
+    return True
 
 
-def _in_process(arms: Sequence[Arm], folders: Sequence[Path]) -> Callable[[str], None]:
+def _in_process(arms: Sequence[Arm], folders: Sequence[Path]) -> Callable[[str], bool]:
     return partial(_attack, workers=workers_of(arms), folders=folders)
 
 

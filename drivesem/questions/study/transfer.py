@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from detectors.base import Predictor
 from detectors.squeezedet import SqueezeDet
@@ -105,14 +104,13 @@ def run(
     workers: Sequence[Worker],
     asked: Sequence[Asked],
     out: Path,
-    console: Console,
 ) -> Matrix:
     """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
-    ran = run_arms(arms, workers, out, console)
+    ran = run_arms(arms, workers, out)
     runs = load_runs([str(out / ARMS / arm.folder) for arm in arms])
     named = [replace(run, name=arm.of or arm.name) for run, arm in zip(runs, arms, strict=True)]
     settings = _settings(study)
-    rows, failed = rows_of(named, asked, settings, console)
+    rows, failed = rows_of(named, asked, settings)
     split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
     draws = DRAWS if study.bootstrap is None else study.bootstrap
     found: list[Before] = []

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import SHIPPED
-from drivesem.attack.judging import DEFAULT_T_STAR, JudgedClasses, t_star_of
+from drivesem.attack.judging import DEFAULT_T_STAR, HEADLINE, JudgedClasses, t_star_of
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.transfer.matrix import Row, Target, row
-from drivesem.run.finished import PICTURES, Frame, Run
+from drivesem.questions.transfer.report import answer_of
+from drivesem.report.answer import Answer
+from drivesem.run.finished import PICTURES, Frame, Run, load_runs
+from drivesem.run.folder import claim
 from drivesem.run.looking import Memory, Order, look
 from drivesem.settings.blocks import Asking
+from drivesem.settings.commands import Transfer
 from drivesem.settings.errors import UsageError
-from scene_ir.errors import SceneError
 
 DETECTIONS = "detections"
 """Folder of what detectors found."""
@@ -36,6 +37,9 @@ class Asked:
     order: Order
     predictor: Predictor
     t_star: float | None = None
+
+
+_WRITTEN = ("transfer.json", "transfer.md", "transfer.csv", "transfer.png", DETECTIONS)
 
 
 def words(text: str) -> list[str]:
@@ -88,45 +92,39 @@ def detectors_of(specs: Sequence[str], config: Asking, out: Path, t_star: float 
     return asked
 
 
-def rows_of(
-    runs: Sequence[Run], detectors: Sequence[Asked], config: Asking, console: Console
-) -> tuple[list[Row], dict[str, str]]:
+def transfer_run(config: Transfer) -> Answer:
+    """Show pictures of runs to detectors, and write what is said of them. Raises UsageError or SceneError."""
+    runs = load_runs(words(config.run or ""), config.limit)
+    specs = detector_names(config.detectors or "")
+    out = Path(config.out) if config.out else runs[0].folder / "transfer"
+    detectors = detectors_of(specs, config, out)
+    # Detections are kept by content, so that no setting of an earlier call is in the way.
+    claim(out, config, _WRITTEN, presentation=[field.name for field in fields(config)])
+    rows, failed = rows_of(runs, detectors, config)
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    data = {"rows": [r.to_json() for r in rows], "headline": HEADLINE, "bootstrap": draws, "frames_failed": failed}
+    answer = answer_of(out, rows, draws, failed, data)
+    answer.write()
+    return answer
+
+
+def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Asking) -> tuple[list[Row], dict[str, str]]:
     """Each run before each detector, and the pictures that could not be used, with reasons.
 
     Raises UsageError where no frame of a run is left, SceneError for a bad picture unless `keep_going`.
     """
     failed: dict[str, str] = {}
-    for one in detectors:
-        _look_at_all(one, runs, config, failed, console)
+    pictures = [path for run in runs for frame in run.frames for path in frame.pictures.values()]
+    for asked in detectors:
+        failed |= look(asked.order, asked.predictor, pictures, config, asked.name)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     rows: list[Row] = []
     for run in runs:
         frames = [f for f in run.frames if not any(str(p) in failed for p in f.pictures.values())]
         if not frames:
             raise UsageError("--run", "a run with frames that can be read", run.folder)
-        rows += [_row(run, one, frames, config, draws) for one in detectors]
+        rows += [_row(run, asked, frames, config, draws) for asked in detectors]
     return rows, failed
-
-
-def _look_at_all(
-    asked: Asked, runs: Sequence[Run], config: Asking, failed: dict[str, str], console: Console
-) -> None:
-    """All pictures of all runs before one detector; a bad one goes to `failed` or ends the command."""
-    pictures = [path for one in runs for frame in one.frames for path in frame.pictures.values()]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(asked.name, total=len(pictures))
-        left = len(pictures)
-        for path, outcome in look(asked.order, asked.predictor, pictures, config):
-            try:
-                outcome()
-            except SceneError as error:
-                if not config.keep_going:
-                    raise
-                failed[str(path)] = str(error)
-            left -= 1
-            progress.advance(task)
-        progress.advance(task, left)
 
 
 def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> Row:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-
-from rich.console import Console
+from typing import Any
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, Row
 from drivesem.questions.transfer.plot import write_heatmap
+from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, percent
-from scene_ir import files
 
 _SHARES = {TRANSFER: "transfer rate", LOST: "lost anyway", FRAMES: "frames"}
 _SIDES = ("source", "target")
@@ -58,28 +57,23 @@ def notes(rows: Sequence[Row], draws: int) -> list[str]:
     ]
 
 
-def print_rows(rows: Sequence[Row], draws: int, console: Console) -> None:
-    """The tables, and what they mean."""
-    for sheet in sheets(rows):
-        console.print(sheet.table((*_SIDES, _LABELS), show_lines=len(sheet.rows) == len(rows)))
-    for note in notes(rows, draws):
-        console.print(note, soft_wrap=True)
-
-
-def write_report(out: Path, rows: Sequence[Row], draws: int) -> None:
-    """transfer.md, transfer.csv and transfer.png."""
-    flat = [row.flat() for row in rows]
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(flat[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    files.write_text(out / "transfer.csv", buffer.getvalue())
-    lines = ["# Transfer", "", "![](transfer.png)", ""]
-    for sheet in sheets(rows):
-        lines += [*sheet.markdown((*_SIDES, _LABELS)), ""]
-    lines += [f"{note}\n" for note in notes(rows, draws)]
-    files.write_text(out / "transfer.md", "\n".join(lines))
-    write_heatmap(out / "transfer.png", rows)
+def answer_of(
+    out: Path, rows: Sequence[Row], draws: int, failed: Mapping[str, str], data: Mapping[str, Any]
+) -> Answer:
+    """All that is written and printed of a transfer. failed: pictures that could not be used, and why."""
+    figures, shares = sheets(rows)
+    return Answer(
+        out=out,
+        name="transfer",
+        heading="Transfer",
+        data=data,
+        tables={"transfer": [row.flat() for row in rows]},
+        sheets=[figures, replace(shares, looks={"show_lines": True})],
+        notes=notes(rows, draws),
+        words=(*_SIDES, _LABELS),
+        picture=partial(write_heatmap, rows=rows),
+        failed=failed,
+    )
 
 
 def bounded(one: Interval) -> str:

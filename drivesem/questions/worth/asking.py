@@ -201,8 +201,7 @@ class _Second:
 
     def find(self, picture: Path) -> Detections:
         """Detections whose labels are places in CLASSES."""
-        for _, outcome in look(self._order, self._predictor, [picture], self._settings):
-            outcome()
+        look(self._order, self._predictor, [picture], self._settings, self.name)
         found = self._memory.recall(picture)
         places = torch.tensor([CLASSES.index(name) for name in self._names])
         return Detections(found.boxes_xyxy, places[found.labels], found.scores)

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from drivesem.cli import main
-from drivesem.commands import study as study_command
+from drivesem.questions.study import asking as study_asking
 from drivesem.questions.study.arms import Arm, arms_of
 from drivesem.settings.commands import Study
 from drivesem.synth.write import Order, synthesise
@@ -40,14 +40,14 @@ def study(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any
 
 @pytest.fixture(autouse=True)
 def fewer_arms(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study_command, "arms_of", first_arm)
+    monkeypatch.setattr(study_asking, "arms_of", first_arm)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study_command, "arms_of", first_arm)
+        patch.setattr(study_asking, "arms_of", first_arm)
         assert main([*WORDS, "--out", str(out)]) == 0
     return out
 

@@ -15,7 +15,7 @@ from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.plots import write_plot
-from drivesem.questions.study.report import Findings, notes, print_told, sheets, told, write_tables
+from drivesem.questions.study.report import Findings, answer_of, notes, sheets, told
 from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.running import Ran
 from drivesem.questions.study.success import against, curve_of
@@ -132,7 +132,7 @@ def test_label_sets(labelled: Findings) -> None:
 @pytest.mark.parametrize("kind", ["controlled", "sampled", "labelled"])
 def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     found: Findings = request.getfixturevalue(kind)
-    write_tables(tmp_path, told(found), "study.png", "drivesem study any")
+    answer_of(told(found), tmp_path, {}, "drivesem study any", None).write()
     write_plot(tmp_path / "study.png", found)
     lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
     assert [line["name"] for line in lines] == [row.name for row in found.rows]
@@ -143,7 +143,7 @@ def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     picture = cv2.imread(str(tmp_path / "study.png"))
     assert min(picture.shape[:2]) > 400
     stream = io.StringIO()
-    print_told(told(found), Console(file=stream, width=100))
+    answer_of(told(found), tmp_path, {}, "", None).print(Console(file=stream, width=100))
     assert found.rows[0].name in stream.getvalue()
 
 
@@ -154,5 +154,5 @@ def test_nothing_to_attack(frame, arm_run, arm, tmp_path: Path) -> None:
     found = Findings(Study(name="single"), DRAWS, Ran(tuple(runs), 5, {}), rows_of(runs, DRAWS, 0))
     assert found.to_json()["feasible_fraction"] is None
     assert cells(found, "Car AP50", "rotate")["benign"] == "-"
-    write_tables(tmp_path, told(found), "study.png", "drivesem study single")
+    answer_of(told(found), tmp_path, {}, "drivesem study single", None).write()
     write_plot(tmp_path / "study.png", found)

@@ -23,7 +23,7 @@ from drivesem.attack.methods.base import Attack
 from drivesem.cli import main
 from drivesem.questions.study import lessons, retrain, retrain_report
 from drivesem.questions.study.lessons import BENIGN, lessons_of
-from drivesem.questions.study.report import print_told, write_tables
+from drivesem.questions.study.report import answer_of
 from drivesem.questions.study.retrain import Taught
 from drivesem.questions.study.running import Ran
 from drivesem.questions.transfer.matrix import Row, Target, row
@@ -127,7 +127,7 @@ def test_what_is_told(found: Taught, tmp_path: Path) -> None:
     assert shown["retrained, ours"] == ("counterexample", "moved")
     assert shown["retrained on benign re-rendered images"] == ("rerender", "benign")
     told = retrain_report.told(found)
-    write_tables(tmp_path, told, "study.png", "drivesem study retrain")
+    answer_of(told, tmp_path, {}, "drivesem study retrain", None).write()
     text = (tmp_path / "study.md").read_text()
     assert all(f"## {sheet.title}" in text for sheet in told.sheets)
     for part in ("72.76", "84.73", "92.97", "Frame 9 could not be used: no camera", "1 frames without vehicles"):
@@ -135,7 +135,7 @@ def test_what_is_told(found: Taught, tmp_path: Path) -> None:
     lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
     assert [line["name"] for line in lines] == [r.name for r in found.rows]
     stream = io.StringIO()
-    print_told(told, Console(file=stream, width=100))
+    answer_of(told, tmp_path, {}, "", None).print(Console(file=stream, width=100))
     assert "retrained, ours" in stream.getvalue()
     retrain_report.write_plot(tmp_path / "study.png", found)
     assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
