@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from drivesem.data.conversion import Conversion, convert
-from drivesem.data.label_writers import Written
+from drivesem.data.label_table import Written
 from drivesem.report.answer import print_json
+from drivesem.run.conversion import Conversion, convert
 from drivesem.settings.commands import Convert
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import class_map

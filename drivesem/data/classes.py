@@ -43,7 +43,7 @@ class ClassMap:
         """What a detector is trained on and judged by.
 
         Objects in file order, then the DontCare regions. What is ignored for every class carries the label 0: an
-        ignored target's label says nothing.
+        ignored target's label says nothing. An object whose box has no area is ignored: nothing can meet it.
         """
         categories = [self.category(kind) for kind in labels.kind]
         named = [self.ignored.get(kind) for kind in labels.kind]
@@ -52,10 +52,12 @@ class ClassMap:
             for c, n in zip(categories, named, strict=True)
         ]
         regions = labels.ignore_xyxy.shape[0]
+        flat = (labels.boxes_xyxy[:, 2:] <= labels.boxes_xyxy[:, :2]).any(dim=1).tolist()
+        ignored = [c is None or thin for c, thin in zip(categories, flat, strict=True)]
         return Targets(
             boxes_xyxy=torch.cat([labels.boxes_xyxy, labels.ignore_xyxy]),
             labels=torch.tensor([*index, *[0] * regions], dtype=torch.int64),
-            ignore=torch.tensor([*(c is None for c in categories), *[True] * regions], dtype=torch.bool),
+            ignore=torch.tensor([*ignored, *[True] * regions], dtype=torch.bool),
         )
 
 

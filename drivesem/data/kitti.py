@@ -6,20 +6,43 @@ times the semantic id plus the instance's number, Cityscapes' ids; Abu Alhaija e
 is here the object's line in `label_2`, from 1; objects without a line have higher numbers; 0 is no instance.
 
 Labels follow the object development kit (Geiger et al. 2012): `type truncated occluded alpha left top right bottom
-h w l x y z ry`, results have the score as a 16th field. Errors name the file, the line or key, and the field.
+h w l x y z ry`, results have the score as a 16th field. A label table takes any type and any finite number; a
+scene needs more, which `read_labels` says. Errors name the file, the line or key, and the field.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from drivesem.data.frames import (
+    PNG_COMPRESSION,
+    Frames,
+    as_photograph,
+    check_size,
+    images_by_place,
+    images_of,
+    in_front,
+)
+from drivesem.data.label_table import (
+    REGION,
+    UNKNOWN_OCCLUSION,
+    LabelTable,
+    Written,
+    copy_images,
+    known_pose,
+    matrix_of,
+    number_text,
+    positional,
+)
 from drivesem.data.truth import SKY_CM, Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -33,22 +56,11 @@ FIELDS = (
 )
 UNKNOWN_SIZE, UNKNOWN_POSITION, UNKNOWN_ANGLE = -1.0, -1000.0, -10.0
 """What the development kit writes where a value is not known."""
-UNKNOWN_OCCLUSION = 3
-"""KITTI's own code for an occlusion that is not known."""
-BOX_MARGIN_PX = 2.0
-"""How far a label's box may lie outside the image: KITTI's never do (checked on all 7,481), rounding may."""
-CENTRE_RANGE = (0.25, 0.75)
-"""Where the principal point may lie, as a fraction of the image: KITTI's lie at 0.46 to 0.50. Elsewhere, image and
-calibration do not belong together."""
-NEAR_M = 0.1
-"""The near plane of projected boxes: what lies wholly before it has no image."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 DEPTH_SCALE = 256
 """Values a metre in `depth_2`."""
 INSTANCES = 256
 """Values a semantic id in `instance_2`: the lower byte is the instance."""
-PNG_COMPRESSION = 1
-"""zlib's level for images: several times as fast as its best."""
 SEMANTIC_NAMES = (
     *("Undefined", "EgoVehicle", "Border", "OutOfRoi", "Misc", "Dynamic", "Ground", "Road", "Sidewalk", "Parking"),
     *("RailTrack", "Building", "Wall", "Fence", "GuardRail", "Bridge", "Tunnel", "Pole", "PoleGroup"),
@@ -73,119 +85,175 @@ def finite_number(where: str, text: str) -> float:
     return value
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """One line of a label file, checked. `values` are the fields 1 to 15 (a score of 1 where there is none)."""
+class _Lines:
+    """The label lines of files, in columns. kinds (N,): types as written; values (N, 14), with a score 15: the
+    other fields; counts: lines of each file.
 
-    where: str
-    kind: str
-    values: tuple[float, ...]
+    names, texts: of the files; scored: whether a line must have a score. FormatError naming file, line and field:
+    a wrong field count, a value that is no finite number, a box that ends before it begins.
+    """
 
-    @property
-    def box_xyxy(self) -> tuple[float, ...]:
-        return self.values[3:7]
+    def __init__(self, names: Sequence[str], texts: Sequence[str], scored: bool) -> None:
+        self._names, self._texts = names, texts
+        of_files = [[line for line in text.splitlines() if line and not line.isspace()] for text in texts]
+        self.counts = np.array([len(lines) for lines in of_files], np.int64)
+        words = [line.split() for lines in of_files for line in lines]
+        self.kinds = [parts[0] for parts in words]
+        fields = 16 if scored else 15
+        values = _numbers(words, fields)
+        self.values = self._one_by_one(words, fields) if values is None else values
+        for low, high in ((3, 5), (4, 6)):
+            for row in np.flatnonzero(self.values[:, high] < self.values[:, low])[:1].tolist():
+                first, last = self.values[row, [low, high]].tolist()
+                raise FormatError(self.where(row, FIELDS[high + 1]), f"at least {first:g}", f"{last:g}")
 
-    @property
-    def pose(self) -> tuple[float, ...]:
-        """Length, height, width, x, y, z, yaw; NaN where the file says that it does not know."""
-        h, w, l, *rest = self.values[7:14]  # noqa: E741
-        return (l, h, w, *rest) if l > 0 else (math.nan,) * 7
+    def where(self, row: int, field: str = "") -> str:
+        """File and line of a row, and the field; blank lines are counted too."""
+        ends = np.cumsum(self.counts)
+        i = int(np.searchsorted(ends, row, side="right"))
+        numbers = [n for n, line in enumerate(self._texts[i].splitlines(), start=1) if line.strip()]
+        line = f"{self._names[i]}:{numbers[row - int(ends[i] - self.counts[i])]}"
+        return f"{line}: {field}" if field else line
 
+    def _one_by_one(self, words: Sequence[Sequence[str]], fields: int) -> NDArray[np.float64]:
+        """The numbers of lines of which some have a score and some have none, or of which one is wrong."""
+        rows: list[list[float]] = []
+        for row, parts in enumerate(words):
+            if len(parts) not in {fields, 16}:
+                expected = "16 fields (with a score)" if fields == 16 else "15 or 16 fields"
+                raise FormatError(self.where(row), expected, len(parts))
+            named = zip(FIELDS[1:], parts[1:], strict=False)
+            rows.append([finite_number(self.where(row, name), part) for name, part in named][: fields - 1])
+        return np.array(rows, np.float64).reshape(-1, fields - 1)
 
-def _require(condition: bool, where: str, field: str, expected: str, actual: object) -> None:
-    if not condition:
-        raise FormatError(f"{where}: {field}", expected, actual)
+    def check_scene(self, scored: bool) -> None:
+        """FormatError for what a scene cannot use: see `read_labels`."""
+        for row, (kind, values) in enumerate(zip(self.kinds, self.values.tolist(), strict=True)):
 
+            def require(good: bool, field: str, expected: str, found: str, row: int = row) -> None:
+                if not good:
+                    raise FormatError(self.where(row, field), expected, found)
 
-def _parse_line(where: str, text: str, with_score: bool) -> _Line:
-    """One label line. FormatError naming the line and the field."""
-    parts = text.split()
-    counts = (16,) if with_score else (15, 16)
-    expected = "16 fields (with a score)" if with_score else "15 or 16 fields"
-    if len(parts) not in counts:
-        raise FormatError(where, expected, len(parts))
-    kind = parts[0]
-    _require(kind in TYPES, where, "type", f"one of {', '.join(TYPES)}", repr(kind))
-    values = [finite_number(f"{where}: {FIELDS[i + 1]}", part) for i, part in enumerate(parts[1:])]
-    truncated, occluded, _, left, top, right, bottom, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
-    _require(left < right, where, "right", f"more than left ({left:g})", f"{right:g}")
-    _require(top < bottom, where, "bottom", f"more than top ({top:g})", f"{bottom:g}")
-    if kind != "DontCare":
-        may_be_unknown = (-1.0,) if with_score else ()
-        _require(
-            0 <= truncated <= 1 or truncated in may_be_unknown, where, "truncated", "[0, 1]", f"{truncated:g}"
-        )
-        _require(occluded in (0, 1, 2, 3, *may_be_unknown), where, "occluded", "0, 1, 2 or 3", f"{occluded:g}")
-        unknown = [v == UNKNOWN_SIZE for v in (h, w, l)] + [v == UNKNOWN_POSITION for v in (x, y, z)]
-        if not all(unknown):
+            require(kind in TYPES, "type", f"one of {', '.join(TYPES)}", repr(kind))
+            if kind == "DontCare":
+                continue
+            truncated, occluded, _, _, _, _, _, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
+            unknown = (-1.0,) if scored else ()
+            good = 0 <= truncated <= 1 or truncated in unknown
+            require(good, "truncated", "[0, 1]", f"{truncated:g}")
+            require(occluded in (0, 1, 2, 3, *unknown), "occluded", "0, 1, 2 or 3", f"{occluded:g}")
+            if {h, w, l} == {UNKNOWN_SIZE} and {x, y, z} == {UNKNOWN_POSITION}:
+                continue
             for name, size in zip(("height", "width", "length"), (h, w, l), strict=True):
-                _require(size > 0, where, name, "positive metres", f"{size:g}")
-            _require(abs(yaw) <= 2 * math.pi + 0.01, where, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
-            farthest = z + 0.5 * (l * abs(math.sin(yaw)) + w * abs(math.cos(yaw)))
-            _require(
-                farthest > NEAR_M, where, "z", "a 3D box in front of the camera", f"{z:g} m, wholly behind it"
-            )
-    return _Line(where, kind, tuple(values) if len(values) == 15 else (*values, 1.0))
+                require(size > 0, name, "positive metres", f"{size:g}")
+            require(abs(yaw) <= 2 * math.pi + 0.01, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
+            behind = f"{z:g} m, wholly behind it"
+            require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
+
+    def table(self, frames: Sequence[str], scored: bool) -> LabelTable:
+        """The lines as a table of `frames`, one a file. A 3D box that is marked as unknown is NaN."""
+        values = self.values
+        kinds = sorted({name for name in self.kinds if name.lower() != "dontcare"})
+        number = {name: i for i, name in enumerate(kinds)}
+        size, position = values[:, [9, 7, 8]], values[:, 10:14]
+        known = (size > 0).all(axis=1) & (position[:, :3] != UNKNOWN_POSITION).any(axis=1)
+        return LabelTable.of(
+            frames,
+            kinds,
+            np.repeat(np.arange(len(frames)), self.counts),
+            [number.get(name, REGION) for name in self.kinds],
+            values[:, 3:7].copy(),
+            "xyxy",
+            score=values[:, 14].copy() if scored else np.full(len(values), np.nan),
+            truncation=values[:, 0].copy(),
+            occlusion=values[:, 1].astype(np.int64),
+            alpha=np.where(values[:, 2] == UNKNOWN_ANGLE, np.nan, values[:, 2]),
+            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan),
+        )
 
 
-def _to_labels(lines: Sequence[_Line]) -> Labels:
-    objects = [line for line in lines if line.kind != "DontCare"]
-    regions = [line for line in lines if line.kind == "DontCare"]
-
-    def table(rows: list[tuple[float, ...]], width: int) -> Tensor:
-        return torch.tensor(rows, dtype=torch.float32).reshape(-1, width)
-
-    poses = table([line.pose for line in objects], 7)
-    truncation = table([(line.values[0] if line.values[0] >= 0 else math.nan,) for line in objects], 1)
-    occlusion = [int(line.values[1]) if line.values[1] >= 0 else UNKNOWN_OCCLUSION for line in objects]
-    return Labels(
-        kind=tuple(line.kind for line in objects),
-        boxes_xyxy=table([line.box_xyxy for line in objects], 4),
-        truncation=truncation[:, 0],
-        occlusion=torch.tensor(occlusion, dtype=torch.int64),
-        translation=poses[:, 3:6].clone(),
-        yaw=poses[:, 6].clone(),
-        size_lhw=poses[:, :3].clone(),
-        ignore_xyxy=table([line.box_xyxy for line in regions], 4),
-    )
+def _numbers(words: Sequence[Sequence[str]], fields: int) -> NDArray[np.float64] | None:
+    """The numbers (N, 14 or 15) of lines that all have as many fields; None where a look at each is needed."""
+    lengths = {len(word) for word in words}
+    if len(lengths) != 1 or not lengths <= {fields, 16}:
+        return None
+    try:
+        values = np.array([text for word in words for text in word[1:]], dtype=np.float64)
+    except ValueError:
+        return None
+    return values.reshape(len(words), -1) if np.isfinite(values).all() else None
 
 
-def _parse(name: str, text: str, with_score: bool) -> list[_Line]:
-    lines = enumerate(text.splitlines(), start=1)
-    return [_parse_line(f"{name}:{i}", line, with_score) for i, line in lines if line.strip()]
+def read_labels(path: Path, scored: bool = False) -> Labels:
+    """The labels of one frame, or a detector's results where `scored`. An empty file is a frame without objects.
 
-
-def read_labels(path: Path) -> Labels:
-    """The labels of one frame. An empty file is a frame without objects.
-
-    A 3D box that the file marks as unknown (sizes -1, position -1000) is NaN in translation, yaw and size_lhw.
-    Raises FormatError naming file, line and field: wrong field count, a value that is no finite number or out of
-    its range, an unknown type, a box without area, a 3D box wholly behind the camera.
+    A 3D box that the file marks as unknown (sizes -1, position -1000) is NaN in translation, yaw and size_lhw; in
+    results truncation and occlusion may be unknown too. Raises FormatError naming file, line and field: wrong
+    field count, a value that is no finite number or out of its range, an unknown type, a box that ends before it
+    begins, a 3D box wholly behind the camera.
     """
-    return _to_labels(_parse(str(path), files.read_text(path), with_score=False))
+    return _scene_labels(str(path), files.read_text(path), scored)
 
 
-def read_results(path: Path) -> tuple[Labels, Tensor]:
-    """A detector's results for one frame: labels, and scores (M,), a row each.
-
-    Unknown truncation is NaN, unknown occlusion is 3 (KITTI's code for it). Raises as `read_labels` does.
-    """
-    lines = [line for line in _parse(str(path), files.read_text(path), with_score=True) if line.kind != "DontCare"]
-    scores = torch.tensor([line.values[14] for line in lines], dtype=torch.float32)
-    return _to_labels(lines), scores
+def _scene_labels(name: str, text: str, scored: bool) -> Labels:
+    lines = _Lines([name], [text], scored)
+    lines.check_scene(scored)
+    return lines.table([name], scored).labels()
 
 
-def _decimal(value: float) -> str:
-    """Two decimals as KITTI writes, or three where two are not enough."""
-    text = f"{value:.3f}"
-    text = "0.000" if text == "-0.000" else text
-    return text.removesuffix("0")
+def label_folder(path: Path) -> Path | None:
+    """The folder of label files that a path means: itself, or `label_2`, `training/label_2`, `data` below it."""
+    for folder in (path / "training" / "label_2", path / "label_2", path / "data", path):
+        if folder.is_dir() and any(folder.glob("[!.]*.txt")):
+            return folder
+    return None
 
 
-def _angle(value: float) -> str:
-    """An angle in [-pi, pi] as KITTI's angles are, also after rounding."""
-    text = _decimal(math.remainder(value, 2 * math.pi))
-    return text if abs(float(text)) <= math.pi else text.replace("3.142", "3.141")
+def text_files(folder: Path) -> list[Path]:
+    """The text files of a folder, sorted by name: of tens of thousands, paths would take seconds to sort."""
+    return [folder / name for name in sorted(os.listdir(folder)) if name.endswith(".txt") and name[0] != "."]
+
+
+def read_table(path: Path, scored: bool) -> LabelTable:
+    """The labels, or detections where `scored`, of a folder: see `label_folder`. FormatError as `_Lines`."""
+    folder = label_folder(path) if path.is_dir() else None
+    if folder is None:
+        raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
+    paths = text_files(folder)
+    lines = _Lines([str(file) for file in paths], [files.read_text(file) for file in paths], scored)
+    if scored and not lines.kinds:
+        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
+    return lines.table([file.stem for file in paths], scored)
+
+
+def _line(
+    kind: str,
+    truncation: float,
+    occlusion: int,
+    alpha: float,
+    box: Sequence[float],
+    pose: Sequence[float] | None,
+    score: str | None,
+) -> str:
+    """A line of a label file. pose: length, height, width, x, y, z, yaw; what is not known is NaN or None."""
+    fields = [kind, number_text(truncation) if truncation >= 0 else "-1", str(occlusion)]
+    fields += ["-10" if math.isnan(alpha) else number_text(alpha), *map(number_text, box)]
+    if pose is None:
+        fields += _UNKNOWN_POSE
+    else:
+        length, height, width, *rest = pose
+        fields += map(number_text, (height, width, length, *rest))
+    return " ".join(fields if score is None else [*fields, score])
+
+
+def _rounded(values: Sequence[float]) -> list[float]:
+    return [round(v, 3) for v in values]
+
+
+def _angle(value: float) -> float:
+    """An angle in [-pi, pi] as KITTI's angles are, to 0.001, also after rounding."""
+    turned = round(math.remainder(value, 2 * math.pi), 3)
+    return math.copysign(min(abs(turned), 3.141), turned)
 
 
 def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
@@ -197,32 +265,89 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
     """
     if scores is not None and tuple(scores.shape) != (len(labels.kind),):
         raise ShapeError("scores", f"shape {(len(labels.kind),)}", tuple(scores.shape))
-    unknown = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
-    text = []
+    text: list[str] = []
     for i, kind in enumerate(labels.kind):
-        l, h, w = labels.size_lhw[i].tolist()  # noqa: E741
         x, y, z = labels.translation[i].tolist()
         yaw = float(labels.yaw[i])
-        known = all(map(math.isfinite, (l, h, w, x, y, z, yaw)))
-        alpha = yaw - math.atan2(x, z) if known else UNKNOWN_ANGLE
-        truncation = float(labels.truncation[i])
-        fields = [kind, "-1" if math.isnan(truncation) else _decimal(truncation), str(int(labels.occlusion[i]))]
-        fields += [_angle(alpha) if known else "-10"]
-        fields += [_decimal(v) for v in labels.boxes_xyxy[i].tolist()]
-        fields += [*map(_decimal, (h, w, l, x, y, z)), _angle(yaw)] if known else unknown
-        fields += [] if scores is None else [f"{float(scores[i]):.6f}"]
-        text.append(" ".join(fields))
+        pose, alpha = None, math.nan
+        if known_pose((*labels.size_lhw[i].tolist(), x, y, z, yaw)):
+            pose = [*_rounded([*labels.size_lhw[i].tolist(), x, y, z]), _angle(yaw)]
+            alpha = _angle(yaw - math.atan2(x, z))
+        truncation, box = round(float(labels.truncation[i]), 3), _rounded(labels.boxes_xyxy[i].tolist())
+        score = None if scores is None else f"{float(scores[i]):.6f}"
+        text.append(_line(kind, truncation, int(labels.occlusion[i]), alpha, box, pose, score))
     if scores is None:
-        for box in labels.ignore_xyxy.tolist():
-            text.append(" ".join(["DontCare", "-1", "-1", "-10", *map(_decimal, box), *unknown]))
-    for number, line in enumerate(text, start=1):
-        _parse_line(f"label {number}", line, with_score=scores is not None)
-    return "".join(f"{line}\n" for line in text)
+        regions = labels.ignore_xyxy.tolist()
+        text += [_line("DontCare", -1, -1, math.nan, _rounded(box), None, None) for box in regions]
+    whole = "".join(f"{line}\n" for line in text)
+    _scene_labels("labels", whole, scores is not None)
+    return whole
 
 
 def write_labels(path: Path, labels: Labels, scores: Tensor | None = None) -> None:
     """Write labels, or results where scores (M,) are given, atomically: see `format_labels`."""
     files.write_text(path, format_labels(labels, scores))
+
+
+def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
+    """Write label files right into `out`, or a whole `training` folder where there are images or calibrations.
+    Numbers are written so that they read back as they were.
+    """
+    table = table.in_edges("xyxy")
+    kinds = [_type_of(kind, int((table.kind == i).sum())) for i, kind in enumerate(table.kinds)]
+    names, renamed = table.file_names()
+    scored = table.scored
+    whole = out / "training" if images or table.cameras else out
+    folder = whole / "label_2" if whole != out else out
+    for name, rows in zip(names, table.by_frame(), strict=True):
+        kept = [row for row in rows if not (scored and table.kind[row] == REGION)]
+        text = "".join(f"{_row_text(table, row, kinds, scored)}\n" for row in kept)
+        files.write_text(folder / f"{name}.txt", text)
+    for i, camera in table.cameras.items():
+        calibration = format_calib(torch.from_numpy(matrix_of(camera)))
+        files.write_text(whole / "calib" / f"{names[i]}.txt", calibration)
+    places = {identifier: whole / "image_2" / name for identifier, name in zip(table.frames, names, strict=True)}
+    count = len(names) + copy_images(places, images)
+    had, objects = table.known(), table.kind != REGION
+    held = ("truncation", "occlusion", "alpha", "3D box", "score", "region", "camera")
+    lost = table.lost(held, renamed | ({"region": int((~objects).sum())} if scored else {}))
+    assumed = {
+        "occlusion (3, unknown)": int((objects & ~had["occlusion"]).sum()),
+        "truncation (0)": int((objects & ~had["truncation"]).sum()),
+    }
+    return Written.of(count, lost, {} if scored else assumed)
+
+
+def _type_of(kind: str, boxes: int) -> str:
+    by_name = {name.lower(): name for name in TYPES}
+    if kind.lower() in by_name:
+        return by_name[kind.lower()]
+    if boxes:
+        expected = f"one of {', '.join(TYPES[:-1])}, or --map {kind}=TYPE"
+        raise FormatError(f"class {kind!r}", expected, f"{boxes} boxes")
+    return kind
+
+
+def _row_text(table: LabelTable, row: int, kinds: Sequence[str], scored: bool) -> str:
+    region = table.kind[row] == REGION or bool(table.ignore[row])
+    truncation, occlusion, alpha = float(table.truncation[row]), int(table.occlusion[row]), float(table.alpha[row])
+    pose = table.pose[row].tolist()
+    pose = pose if known_pose(pose) and not region else None
+    if pose is not None and not math.isfinite(alpha):
+        alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
+    if not region and not scored:
+        # labels have a code for an unknown occlusion, and none for truncation
+        occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
+        truncation = max(truncation, 0.0)
+    score = positional(float(table.score[row])) if scored else None
+    kind = "DontCare" if region else kinds[int(table.kind[row])]
+    return _line(kind, truncation, occlusion, alpha, table.boxes[row].tolist(), pose, score)
+
+
+def images_beside(path: Path, frames: Sequence[str]) -> dict[str, Path]:
+    """The images of label files in a folder, where they are in KITTI's own place."""
+    places = (path / "training" / "image_2", path / "image_2", path.parent / "image_2")
+    return images_by_place(places, frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +374,8 @@ def read_calib(path: Path) -> Calibration:
         if not line.strip():
             continue
         key, colon, rest = line.partition(":")
-        _require(bool(colon), f"{path}:{number}", "line", "'KEY: numbers'", repr(line[:40]))
+        if not colon:
+            raise FormatError(f"{path}:{number}: line", "'KEY: numbers'", repr(line[:40]))
         key = key.strip()
         if key not in _CALIBRATION_COUNTS:
             continue
@@ -290,8 +416,8 @@ def read_points(path: Path, calibration: Calibration) -> Tensor:
     return (points @ transform[:, :3].T + transform[:, 3]) @ calibration.rectification.T
 
 
-class KittiDataset:
-    """The frames of a KITTI object folder.
+class KittiDataset(Frames[Path | None]):
+    """The frames of a KITTI object folder: every image and every label file.
 
     root: the folder that holds `split`, or `split` itself. with_points: read the laser's points where a frame has
     them. Raises FormatError naming the folder where there is no image_2 or it is empty, or no velodyne for points;
@@ -303,37 +429,19 @@ class KittiDataset:
         self.folder = root if (root / "image_2").is_dir() and not (root / split).is_dir() else root / split
         if not root.is_dir():
             raise FormatError(str(root), "a KITTI folder", "no such folder")
-        if not (self.folder / "image_2").is_dir():
-            raise FormatError(str(self.folder / "image_2"), "a folder of images", "no such folder")
+        images = {path.stem: path for path in images_of(self.folder / "image_2")}
         if with_points and not (self.folder / "velodyne").is_dir():
             raise FormatError(str(self.folder / "velodyne"), "a folder of a laser's points", "no such folder")
         self.with_points = with_points
-        self._images = {
-            path.stem: path
-            for path in sorted((self.folder / "image_2").iterdir())
-            if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-        }
-        if not self._images:
+        if not images:
             raise FormatError(str(self.folder / "image_2"), "at least one .png or .jpg", "none")
         self._has_labels = (self.folder / "label_2").is_dir()
         labelled = (path.stem for path in (self.folder / "label_2").glob("[!.]*.txt")) if self._has_labels else ()
-        self._identifiers = tuple(sorted({*self._images, *labelled}))
-
-    @property
-    def identifiers(self) -> tuple[str, ...]:
-        """Identifiers of the frames, sorted: every image and every label file."""
-        return self._identifiers
-
-    def __len__(self) -> int:
-        return len(self._identifiers)
-
-    def _check_identifier(self, identifier: str) -> None:
-        if identifier not in self._identifiers:
-            raise RangeError(f"frame of {self.folder}", f"one of {len(self)} identifiers", repr(identifier))
+        super().__init__(self.folder, {name: images.get(name) for name in sorted({*images, *labelled})})
 
     def labels(self, identifier: str) -> Labels | None:
         """The labels of one frame; None where the folder has no label_2 (test split)."""
-        self._check_identifier(identifier)
+        self._entry(identifier)
         return read_labels(self.folder / "label_2" / f"{identifier}.txt") if self._has_labels else None
 
     def frame(self, identifier: str) -> Frame:
@@ -343,10 +451,9 @@ class KittiDataset:
         Raises FormatError naming the file and what is wrong: an image, label or calibration that is missing or
         does not read; an image whose size does not go with its labels or its calibration.
         """
-        self._check_identifier(identifier)
-        if identifier not in self._images:
+        image_path = self._entry(identifier)
+        if image_path is None:
             raise FormatError(str(self.folder / "image_2" / f"{identifier}.png"), "an image", "no such file")
-        image_path = self._images[identifier]
         calib_path = self.folder / "calib" / f"{identifier}.txt"
         labels = self.labels(identifier)
         calibration = read_calib(calib_path)
@@ -360,7 +467,7 @@ class KittiDataset:
         classes, masks = _read_instances(self.folder / "instance_2" / f"{identifier}.png", size_hw, labels)
         return Frame(
             identifier=identifier,
-            photograph=torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255,
+            photograph=as_photograph(image),
             camera=camera,
             labels=labels,
             masks=masks,
@@ -394,26 +501,6 @@ def _read_instances(
     if labels is not None:
         masks = (number == torch.arange(1, len(labels.kind) + 1)[:, None, None]).float()
     return torch.from_numpy(classes), masks
-
-
-def check_size(image_path: Path, camera: Camera, labels: Labels | None) -> None:
-    """Refuse an image whose size contradicts its calibration or its labels."""
-    found = f"{camera.width}x{camera.height} px"
-    low, high = CENTRE_RANGE
-    for axis, size in ((0, camera.width), (1, camera.height)):
-        centre = float(camera.intrinsics[axis, 2])
-        if not low * size <= centre <= high * size:
-            name = ("wide", "high")[axis]
-            expected = f"{centre / high:.0f} to {centre / low:.0f} px {name} (principal point of the calibration)"
-            raise FormatError(str(image_path), expected, found)
-    if labels is None:
-        return
-    boxes = torch.cat([labels.boxes_xyxy, labels.ignore_xyxy])
-    limit = torch.tensor([camera.width, camera.height], dtype=boxes.dtype) - 1 + BOX_MARGIN_PX
-    outside = ((boxes[:, 2:] > limit) | (boxes[:, :2] < -BOX_MARGIN_PX)).any(dim=1)
-    if bool(outside.any()):
-        box = [round(v, 2) for v in boxes[outside][0].tolist()]
-        raise FormatError(str(image_path), f"an image that holds the label's box {box}", found)
 
 
 def _plain(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Data sets by name: who reads them, and who writes them."""
+"""Layouts by name: who reads and writes their data sets and their labels, and which one lies at a path."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.data.coco import CocoDataset, CocoWriter
-from drivesem.data.kitti import KittiDataset, KittiWriter
+from drivesem.data import coco, kitti, vkitti1, vkitti2, yolo
+from drivesem.data.label_table import LabelTable, Written
 from drivesem.data.truth import Exposure, Place
-from drivesem.data.vkitti1 import Vkitti1Dataset, Vkitti1Writer
-from drivesem.data.vkitti2 import Vkitti2Dataset, Vkitti2Writer
-from drivesem.data.yolo import YoloDataset, YoloWriter
-from scene_ir.errors import RangeError
+from drivesem.data.virtual import VirtualDataset
+from scene_ir import files
+from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
 
 
@@ -50,21 +49,31 @@ class Writer(Protocol):
 
 
 DATASETS: dict[str, Callable[[Path], Dataset]] = {
-    "coco": CocoDataset,
-    "kitti": KittiDataset,
-    "vkitti1": Vkitti1Dataset,
-    "vkitti2": Vkitti2Dataset,
-    "yolo": YoloDataset,
+    "coco": coco.CocoDataset,
+    "kitti": kitti.KittiDataset,
+    "vkitti1": vkitti1.Vkitti1Dataset,
+    "vkitti2": vkitti2.Vkitti2Dataset,
+    "yolo": yolo.YoloDataset,
 }
 """Readers by the name that the command line takes."""
 WRITERS: dict[str, Callable[[Path], Writer]] = {
-    "vkitti2": Vkitti2Writer,
-    "vkitti1": Vkitti1Writer,
-    "kitti": KittiWriter,
-    "coco": CocoWriter,
-    "yolo": YoloWriter,
+    "vkitti2": vkitti2.Vkitti2Writer,
+    "vkitti1": vkitti1.Vkitti1Writer,
+    "kitti": kitti.KittiWriter,
+    "coco": coco.CocoWriter,
+    "yolo": yolo.YoloWriter,
 }
 """Writers by the name of their layout."""
+
+
+_TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+    "kitti": kitti.write_table,
+    "coco": coco.write_table,
+    "yolo": yolo.write_table,
+    "vkitti1": vkitti1.write_table,
+    "vkitti2": vkitti2.write_table,
+}
+LAYOUTS = tuple(_TABLE_WRITERS)
 
 
 def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
@@ -77,5 +86,71 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Data
     if with_points:
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
-        return KittiDataset(Path(root), with_points=True)
+        return kitti.KittiDataset(Path(root), with_points=True)
     return DATASETS[name](Path(root))
+
+
+def layout_of(path: Path) -> str | None:
+    """One of LAYOUTS by what lies there; None for a folder of none. FormatError for a file of none, or nothing."""
+    if path.is_file():
+        if path.suffix.lower() == ".json":
+            return "coco"
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return "yolo"
+        raise FormatError(str(path), "a .json or .yaml file, or a folder of labels", f"a {path.suffix or 'file'}")
+    if not path.is_dir():
+        raise FormatError(str(path), "a file or folder of labels", "nothing there")
+    if (path / "data.yaml").is_file():
+        return "yolo"
+    if any((path / "annotations").glob("instances_*.json")):
+        return "coco"
+    if (path / "vkitti_1.3.1_rgb").is_dir():
+        return "vkitti1"
+    if any(p.is_dir() for pattern in ("Scene[0-9]*", "vkitti_2*") for p in path.glob(pattern)):
+        return "vkitti2"
+    folder = kitti.label_folder(path)
+    if folder is None:
+        return None
+    # YOLO's lines begin with a class number, KITTI's with a name
+    begins = (files.read_text(file).split(None, 1)[:1] for file in kitti.text_files(folder))
+    first = next((words[0] for words in begins if words), "")
+    return "yolo" if first.isdecimal() else "kitti"
+
+
+def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
+    """The labels, or detections where `scored`, of a path. truth: the labels beside which detections are read, for
+    COCO's ids, YOLO's classes and image sizes. FormatError naming file, line or entry, and field.
+    """
+    if not path.exists():
+        raise FormatError(str(path), "a file or folder of labels", "nothing there")
+    if layout == "kitti":
+        return kitti.read_table(path, scored)
+    if layout in ("coco", "yolo"):
+        return (coco if layout == "coco" else yolo).read_table(path, scored, truth)
+    if layout not in LAYOUTS:
+        raise RangeError("layout", f"one of {', '.join(LAYOUTS)}", layout)
+    if scored:
+        raise FormatError(str(path), "detections with scores", "Virtual KITTI, which holds labels only")
+    dataset = DATASETS[layout](path)
+    assert isinstance(dataset, VirtualDataset)
+    return dataset.table()
+
+
+def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, Path]) -> Written:
+    """Write labels, or detections where they have scores. images: identifier -> file to copy; empty: none.
+
+    out: a folder, or a .json file for COCO. Numbers are written so that they read back as they were; sums of
+    decimals are rounded to 1e-9 px. FormatError for what the layout cannot do without.
+    """
+    return _TABLE_WRITERS[layout](table, out, images)
+
+
+def images_beside(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:
+    """The images of labels, where they are in their layout's own place; those of a run lie elsewhere."""
+    if layout not in LAYOUTS:
+        return {}
+    if layout in ("kitti", "coco"):
+        return (kitti if layout == "kitti" else coco).images_beside(path, frames)
+    dataset = DATASETS[layout](path)
+    assert isinstance(dataset, (VirtualDataset, yolo.YoloDataset))
+    return {name: dataset.image_path(name) for name in frames}

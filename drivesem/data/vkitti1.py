@@ -9,36 +9,22 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import torch
 
-from drivesem.data.kitti import check_size
-from drivesem.data.pixels import Colours, read_depth_m
-from drivesem.data.tables import Recent, Row, Table, decimal, one_word, text_of
+from drivesem.data import virtual
+from drivesem.data.label_table import LabelTable, Written, copy_images
+from drivesem.data.pixels import Colours
+from drivesem.data.tables import Recent, Row, decimal, one_word, text_of
 from drivesem.data.truth import Exposure, Place, TrackedObject
-from drivesem.data.vkitti2 import (
-    COLOURS,
-    KINDS,
-    MATRIX,
-    alpha,
-    category,
-    check_camera,
-    check_tracks,
-    clips_of,
-    labels_of,
-    masks_of,
-    matrix_text,
-    parsed_matrix,
-    pose_of,
-    tracks_of,
-)
+from drivesem.data.virtual import KINDS, MATRIX, Segments, Shot, VirtualDataset
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
-from scene_ir.types import Camera, Frame, Labels
+from scene_ir.types import Camera
 
 MOTGT = (
     "frame tid label truncated occluded alpha l t r b w3d h3d l3d x3d y3d z3d ry rx rz "
@@ -48,7 +34,7 @@ EXTRINSICS = "frame r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 
 ENCODING = "Category(:id) r g b"
 FOCAL_PX, CENTRE_PX, SIZE_HW = 725.0, (620.5, 187.0), (375, 1242)
 """The one camera of the data set; no file says so."""
-COLOURS_1: Mapping[str, tuple[int, int, int]] = {**COLOURS, "GuardRail": (255, 100, 255)}
+COLOURS_1: Mapping[str, tuple[int, int, int]] = {**virtual.COLOURS, "GuardRail": (255, 100, 255)}
 """Colours of the categories; those of objects are free."""
 _CAMERA_TOLERANCE_PX = 1e-3
 """Rounding; Virtual KITTI 2's focal length, 725.0087 px, is another camera's."""
@@ -59,8 +45,6 @@ _STRIDE = 0x61C885
 MAX_TRACK = 9999
 """Far above what a world has; up to it no object's colour is a category's (checked by a test)."""
 _PREFIX = "vkitti_1.3.1_"
-_CACHED = 8
-"""Tables kept of each sort: that of a thousand frames takes a few megabytes."""
 _IMAGE_NAME = re.compile(r"(\d+)\.png$")
 
 
@@ -77,11 +61,25 @@ def format_row(frame: int, thing: TrackedObject) -> str:
     pose = (width, height, length, *thing.translation, thing.yaw)
     fields = (
         *(frame, thing.track, thing.kind if thing.labelled else "DontCare", truncated, min(thing.occlusion, 2)),
-        *(decimal(alpha(thing)), *thing.box_ltrb, *map(decimal, pose), 0, 0),
+        *(decimal(virtual.alpha(thing)), *thing.box_ltrb, *map(decimal, pose), 0, 0),
         *(repr(float(thing.truncation)), repr(float(thing.visible)), thing.kind, int(thing.moving)),
         *(one_word(thing.model), one_word(thing.paint)),
     )
     return " ".join(map(str, fields))
+
+
+def _entry(place: Place, things: Sequence[TrackedObject], extrinsic: np.ndarray) -> dict[str, object]:
+    """A frame's rows of each table."""
+    return {
+        "number": place.number,
+        "scene": _world(place.scene),
+        "variation": place.variation,
+        "frame": place.frame,
+        "camera": 0,
+        "extrinsic": f"{place.frame} {virtual.matrix_text(extrinsic)}",
+        "motgt": [format_row(place.frame, thing) for thing in things],
+        "tracks": [[thing.track, virtual.category(thing.kind)] for thing in things],
+    }
 
 
 class Vkitti1Writer:
@@ -90,13 +88,14 @@ class Vkitti1Writer:
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
 
-    def _image(self, place: Place, modality: str) -> Path:
+    def image(self, place: Place, modality: str) -> Path:
+        """The file of one of a place's images."""
         folder = self.root / f"{_PREFIX}{modality}" / _world(place.scene) / place.variation
         return folder / f"{place.frame:05d}.png"
 
     def exists(self, place: Place) -> bool:
         """Whether the frame's image is there."""
-        return self._image(place, "rgb").exists()
+        return self.image(place, "rgb").exists()
 
     def write(self, place: Place, exposure: Exposure) -> dict[str, object]:
         """Write a frame's images, each atomically, the photograph last -> an entry for `finish`.
@@ -104,14 +103,14 @@ class Vkitti1Writer:
         RangeError for what the layout cannot hold: another camera than the data set's, an unknown class, a pixel
         of an object that is not among the exposure's.
         """
-        check_camera(exposure.camera)
+        virtual.check_camera(exposure.camera)
         _check_intrinsics(exposure.camera)
-        check_tracks(exposure)
+        virtual.check_tracks(exposure)
         things = sorted(exposure.objects, key=lambda thing: thing.track)
         for thing in things:
             if thing.track > MAX_TRACK:
                 raise RangeError("exposure.objects: track", f"at most {MAX_TRACK}", thing.track)
-        colours = np.array([COLOURS_1[category(name)] for name in exposure.class_names], np.uint8)
+        colours = np.array([COLOURS_1[virtual.category(name)] for name in exposure.class_names], np.uint8)
         scene = colours[exposure.classes]
         left = exposure.instances > 0
         for thing in things:
@@ -121,19 +120,10 @@ class Vkitti1Writer:
         if left.any():
             unknown = int(exposure.instances[left][0]) - 1
             raise RangeError("exposure.instances", "tracks of the exposure's objects", unknown)
-        entry: dict[str, object] = {
-            "number": place.number,
-            "scene": _world(place.scene),
-            "variation": place.variation,
-            "frame": place.frame,
-            "camera": 0,
-            "extrinsic": f"{place.frame} {matrix_text(exposure.extrinsic)}",
-            "motgt": [format_row(place.frame, thing) for thing in things],
-            "tracks": [[thing.track, category(thing.kind)] for thing in things],
-        }
-        files.write_png(self._image(place, "depthgt"), exposure.depth_cm)
-        files.write_png(self._image(place, "scenegt"), scene)
-        files.write_png(self._image(place, "rgb"), exposure.image)
+        entry = _entry(place, things, exposure.extrinsic)
+        files.write_png(self.image(place, "depthgt"), exposure.depth_cm)
+        files.write_png(self.image(place, "scenegt"), scene)
+        files.write_png(self.image(place, "rgb"), exposure.image)
         return entry
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> None:
@@ -141,18 +131,39 @@ class Vkitti1Writer:
 
         FormatError where two entries are of one frame, or where a track is of two categories.
         """
-        for world, variation, group in clips_of(entries):
-            name = f"{world}_{variation}"
-            path = self.root / f"{_PREFIX}scenegt" / f"{name}_scenegt_rgb_encoding.txt"
+        for world, variation, group in virtual.clips_of(entries):
+            path = self.root / f"{_PREFIX}scenegt" / f"{world}_{variation}_scenegt_rgb_encoding.txt"
             colours = dict(COLOURS_1)
-            for track, kind in tracks_of(path, group).items():
+            for track, kind in virtual.tracks_of(path, group).items():
                 colours[f"{kind}:{track}"] = object_colour(track)
             lines = [f"{kind} {r} {g} {b}" for kind, (r, g, b) in colours.items()]
             files.write_text(path, text_of(ENCODING, lines))
+        self.write_tables(entries)
+
+    def write_tables(self, entries: Sequence[Mapping[str, object]]) -> int:
+        """Write the tables but for the colours; how many."""
+        count = 0
+        for world, variation, group in virtual.clips_of(entries):
+            name = f"{world}_{variation}.txt"
             rows = [line for entry in group for line in cast(list[str], entry["motgt"])]
-            files.write_text(self.root / f"{_PREFIX}motgt" / f"{name}.txt", text_of(MOTGT, rows))
+            files.write_text(self.root / f"{_PREFIX}motgt" / name, text_of(MOTGT, rows))
             poses = [str(entry["extrinsic"]) for entry in group]
-            files.write_text(self.root / f"{_PREFIX}extrinsicsgt" / f"{name}.txt", text_of(EXTRINSICS, poses))
+            files.write_text(self.root / f"{_PREFIX}extrinsicsgt" / name, text_of(EXTRINSICS, poses))
+            count += 2
+        return count
+
+
+def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
+    """Write a table's objects, which all need a 3D box. FormatError."""
+    places, changed = virtual.places_of(table, "0001")
+    frames, lost, assumed = virtual.objects_in(table)
+    writer = Vkitti1Writer(out)
+    count = writer.write_tables([_entry(place, frames[place.number], np.eye(4)) for place in places])
+    targets = {table.frames[p.number]: writer.image(p, "rgb").with_suffix("") for p in places}
+    deep = sum(thing.occlusion > 2 for things in frames for thing in things)
+    more = {"occlusion 3 (2 is the most)": deep, "frame names": changed}
+    copied = copy_images(targets, images, only=".png")
+    return Written.of(count + copied, lost | more | table.lost(virtual.HELD, {}), assumed)
 
 
 def _world(scene: str) -> str:
@@ -169,19 +180,7 @@ def _check_intrinsics(camera: Camera) -> None:
         raise RangeError("exposure.camera", expected, f"{found} px at {camera.width}x{camera.height}")
 
 
-@dataclass(frozen=True, slots=True)
-class _Shot:
-    world: str
-    variation: str
-    digits: str
-    path: Path
-
-    @property
-    def identifier(self) -> str:
-        return f"{self.world}/{self.variation}/{self.digits}"
-
-
-class Vkitti1Dataset:
+class Vkitti1Dataset(VirtualDataset):
     """The frames of a Virtual KITTI 1.3.1 folder, named `0001/clone/00003`.
 
     root: holds `vkitti_1.3.1_rgb` and `vkitti_1.3.1_motgt`; `vkitti_1.3.1_depthgt` and `vkitti_1.3.1_scenegt` are
@@ -190,123 +189,63 @@ class Vkitti1Dataset:
     for a variation of which there is none; a frame's own faults are raised by `labels` and `frame`.
     """
 
+    layout = "vkitti1"
+    size_hw = SIZE_HW
+
     def __init__(self, root: Path, variations: Sequence[str] | None = None, with_dont_care: bool = False) -> None:
-        self.root = Path(root)
+        root = Path(root)
         self.with_dont_care = with_dont_care
-        if not self.root.is_dir():
+        if not root.is_dir():
             raise FormatError(str(root), "a Virtual KITTI 1.3.1 folder", "no such folder")
-        images = self.root / f"{_PREFIX}rgb"
+        images = root / f"{_PREFIX}rgb"
         if not images.is_dir():
             raise FormatError(str(images), "a folder of images", "no such folder")
         clips = [v for w in sorted(images.iterdir()) if w.is_dir() for v in sorted(w.iterdir()) if v.is_dir()]
-        there = sorted({clip.name for clip in clips})
-        for value in variations or ():
-            if value not in there:
-                raise RangeError(f"variation of {root}", f"one of {', '.join(there)}", value)
-        shots = [
-            _Shot(clip.parent.name, clip.name, match[1], path)
+        shots = {
+            f"{clip.parent.name}/{clip.name}/{match[1]}": Shot(clip.parent.name, clip.name, None, match[1], path)
             for clip in clips
-            if variations is None or clip.name in variations
             for path in clip.iterdir()
             if (match := _IMAGE_NAME.match(path.name))
-        ]
+        }
         if not shots:
             raise FormatError(str(images), "<world>/<variation>/NNNNN.png", "none")
-        shots.sort(key=lambda s: (s.world, s.variation, int(s.digits)))
-        self._shots = {shot.identifier: shot for shot in shots}
-        self._tables = Recent[Table](_CACHED)
-        self._encodings = Recent[_Encoding](_CACHED)
+        super().__init__(root, shots, None, variations)
+        self._encodings = Recent[_Encoding](virtual.CACHED_TABLES)
 
-    @property
-    def identifiers(self) -> tuple[str, ...]:
-        """Identifiers of the frames, sorted."""
-        return tuple(self._shots)
+    def _file(self, shot: Shot, kind: str, ending: str = "") -> Path:
+        return self.root / f"{_PREFIX}{kind}" / f"{shot.scene}_{shot.variation}{ending}.txt"
 
-    def __len__(self) -> int:
-        return len(self._shots)
-
-    def _shot(self, identifier: str) -> _Shot:
-        if identifier not in self._shots:
-            raise RangeError(f"frame of {self.root}", f"one of {len(self)} identifiers", repr(identifier))
-        return self._shots[identifier]
-
-    def _file(self, shot: _Shot, kind: str, ending: str = "") -> Path:
-        return self.root / f"{_PREFIX}{kind}" / f"{shot.world}_{shot.variation}{ending}.txt"
-
-    def _image(self, shot: _Shot, kind: str) -> Path | None:
-        """The file of another modality, whether it is there or not; None where its folder is missing."""
-        folder = self.root / f"{_PREFIX}{kind}" / shot.world / shot.variation
+    def _image(self, shot: Shot, modality: str) -> Path | None:
+        folder = self.root / f"{_PREFIX}{modality}gt" / shot.scene / shot.variation
         return folder / f"{shot.digits}.png" if folder.is_dir() else None
-
-    def image_path(self, identifier: str) -> Path:
-        """The file of a frame's photograph. RangeError for a frame that is not there."""
-        return self._shot(identifier).path
 
     def objects(self, identifier: str) -> tuple[TrackedObject, ...]:
         """All that motgt says of the objects in one frame, in file order.
 
-        kind: the true type; labelled: whether it is not DontCare. Unknown are the number of pixels, which is 0,
-        and poses in world axes, which are NaN. Occlusion is the file's flag; rotations about x and z are left out.
-        FormatError naming file, line and field.
+        kind: the true type; labelled: whether it is not DontCare, or these count too. Unknown are the number of
+        pixels, which is 0, and poses in world axes, which are NaN. Occlusion is the file's flag; rotations about x
+        and z are left out. FormatError naming file, line and field.
         """
-        shot = self._shot(identifier)
+        shot = self._entry(identifier)
         columns = MOTGT.split()
-        table = self._tables.get(self._file(shot, "motgt"), lambda path: Table(path, columns[:1], columns[1:]))
-        rows = table.unique("tid", int(shot.digits))
-        return tuple(_object(track, row) for track, row in rows.items())
+        rows = self._table(self._file(shot, "motgt"), columns[:1], columns[1:]).unique("tid", shot.frame)
+        things = (_object(track, row) for track, row in rows.items())
+        return tuple(replace(thing, labelled=thing.labelled or self.with_dont_care) for thing in things)
 
-    def labels(self, identifier: str) -> Labels:
-        """The labels of one frame, in file order, and DontCare as regions; see `objects`."""
-        return self._split(self.objects(identifier))[1]
+    def _extrinsic(self, shot: Shot) -> Row:
+        return self._table(self._file(shot, "extrinsicsgt"), ("frame",), MATRIX).row(shot.frame)
 
-    def _split(self, things: Sequence[TrackedObject]) -> tuple[list[TrackedObject], Labels]:
-        """The objects that count as such, and the labels of all."""
-        kept = [t for t in things if t.labelled or self.with_dont_care]
-        boxes = [t.box_ltrb for t in things if not (t.labelled or self.with_dont_care)]
-        regions = torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4)
-        return kept, replace(labels_of(kept), ignore_xyxy=regions)
+    def _camera(self, shot: Shot, size_hw: tuple[int, int]) -> Camera:
+        (cx, cy), (height, width) = CENTRE_PX, size_hw
+        return Camera(torch.tensor([[FOCAL_PX, 0.0, cx], [0.0, FOCAL_PX, cy], [0.0, 0.0, 1.0]]), height, width)
 
-    def extrinsic(self, identifier: str) -> torch.Tensor:
-        """World to camera axes, (4, 4) float64. FormatError."""
-        shot = self._shot(identifier)
-        path = self._file(shot, "extrinsicsgt")
-        return parsed_matrix(self._tables.get(path, lambda p: Table(p, ("frame",), MATRIX)).row(int(shot.digits)))
-
-    def frame(self, identifier: str) -> Frame:
-        """One frame: photograph (3, H, W) float32, camera, labels, masks (M, H, W), depth m, classes with names.
-
-        What has no folder is None. Raises FormatError naming the file and what is wrong with it: missing, not
-        decodable, not 1242x375, a colour that the encoding does not have, a box outside the image.
-        """
-        shot = self._shot(identifier)
-        things, labels = self._split(self.objects(identifier))
-        image = files.read_image(shot.path, SIZE_HW)
-        (cx, cy), (height, width) = CENTRE_PX, SIZE_HW
-        k = torch.tensor([[FOCAL_PX, 0.0, cx], [0.0, FOCAL_PX, cy], [0.0, 0.0, 1.0]])
-        camera = Camera(k, height, width)
-        check_size(shot.path, camera, labels)
-        depth, scene = self._image(shot, "depthgt"), self._image(shot, "scenegt")
-        encoding = rows = None
-        if scene is not None:
-            encoding = self._encodings.get(self._file(shot, "scenegt", "_scenegt_rgb_encoding"), _Encoding)
-            rows = encoding.colours.read(scene, SIZE_HW)
-        return Frame(
-            identifier=identifier,
-            photograph=torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255,
-            camera=camera,
-            labels=labels,
-            masks=None if encoding is None else masks_of(encoding.instance[rows], things),
-            depth=None if depth is None else torch.from_numpy(read_depth_m(depth, SIZE_HW)),
-            classes=None if encoding is None else torch.from_numpy(encoding.category[rows]),
-            class_names=() if encoding is None else encoding.names,
-            provenance={
-                "dataset": "vkitti1",
-                "image": shot.path.relative_to(self.root).as_posix(),
-                "scene": shot.world,
-                "variation": shot.variation,
-                "tracks": ",".join(str(t.track) for t in things),
-            },
-        )
+    def _segments(self, shot: Shot, size_hw: tuple[int, int]) -> Segments:
+        scene = self._image(shot, "scene")
+        if scene is None:
+            return Segments(None, None, ())
+        encoding = self._encodings.get(self._file(shot, "scenegt", "_scenegt_rgb_encoding"), _Encoding)
+        rows = encoding.colours.read(scene, size_hw)
+        return Segments(encoding.instance[rows], encoding.category[rows], encoding.names)
 
 
 class _Encoding:
@@ -327,13 +266,9 @@ class _Encoding:
 
 def _object(track: int, row: Row) -> TrackedObject:
     """One object from its row in motgt."""
-    left, top, right, bottom = (row.integer(c) for c in "ltrb")
-    for low, high, name in ((left, right, "r"), (top, bottom, "b")):
-        if high < low:
-            raise FormatError(f"{row.where}: {name}", f"at least {low}", high)
     occluded = int(row.word("occluded", ("0", "1", "2")))
     row.word("truncated", ("0", "1", "2"))
-    translation, size, yaw = pose_of(row, ("x3d", "y3d", "z3d"), ("l3d", "h3d", "w3d"), "ry")
+    translation, size, yaw = virtual.pose_of(row, ("x3d", "y3d", "z3d"), ("l3d", "h3d", "w3d"), "ry")
     nowhere = (math.nan, math.nan, math.nan)
     return TrackedObject(
         track=track,
@@ -341,7 +276,7 @@ def _object(track: int, row: Row) -> TrackedObject:
         model=row.word("model"),
         paint=row.word("color"),
         moving=row.word("moving", ("0", "1")) == "1",
-        box_ltrb=(left, top, right, bottom),
+        box_ltrb=virtual.box_of(row, "ltrb"),
         pixels=0,
         truncation=row.number("truncr", 0, 1),
         visible=row.number("occupr", 0, 1),

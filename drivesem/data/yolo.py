@@ -11,21 +11,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import yaml
 
-from drivesem.data.coco import CATEGORIES, CATEGORY_IDS, from_coco, pinhole, to_coco
-from drivesem.data.kitti import IMAGE_SUFFIXES, PNG_COMPRESSION, UNKNOWN_OCCLUSION, format_calib, read_calib
+from drivesem.data.coco import CATEGORIES, CATEGORY_IDS
+from drivesem.data.frames import (
+    PNG_COMPRESSION,
+    Frames,
+    as_photograph,
+    check_focal,
+    images_of,
+    pinhole,
+    size_of_image,
+)
+from drivesem.data.kitti import finite_number, format_calib, read_calib
+from drivesem.data.label_table import REGION, LabelTable, Written, copy_images, matrix_of, positional, to_coco
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera, Frame, Labels
 
 DECIMALS = 8
-"""Of shares: 1e-8 of 4000 px is 4e-5 px."""
+"""Of a whole data set's shares: 1e-8 of 4000 px is 4e-5 px."""
+TABLE_DECIMALS = 15
+"""Of a table's shares, all that float64 has: in 4000 px that is 4e-12 px, far below other files' decimals."""
 PARTS = ("train", "val", "test")
 """Keys of `data.yaml` that name images."""
 EDGE = 1e-4
@@ -51,9 +65,11 @@ class YoloWriter:
     def write(self, place: Place, exposure: Exposure) -> dict[str, object]:
         """Write one frame, the image last."""
         labels, camera = exposure.labels, exposure.camera
+        boxes = to_coco(labels.boxes_xyxy.double().numpy()).tolist()
+        size_wh = (camera.width, camera.height)
         lines = [
-            _line(CATEGORY_IDS[kind] - 1, box, camera.width, camera.height)
-            for kind, box in zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True)
+            _line(CATEGORY_IDS[kind] - 1, box, size_wh, DECIMALS)
+            for kind, box in zip(labels.kind, boxes, strict=True)
         ]
         files.write_text(self._path("calib", place, ".txt"), format_calib(camera.matrix))
         files.write_text(self._path("labels", place, ".txt"), "".join(f"{line}\n" for line in lines))
@@ -66,17 +82,132 @@ class YoloWriter:
         if not found:
             raise RangeError("frames of the data set", "at least one", 0)
         parts = {part: f"images/{part if part in found else found[0]}" for part in ("train", "val")}
-        content = {**parts, "nc": len(CATEGORIES), "names": dict(enumerate(CATEGORIES))}
-        files.write_text(self.root / "data.yaml", yaml.safe_dump(content, sort_keys=False))
+        _write_yaml(self.root, parts, tuple(CATEGORIES))
 
 
-def _line(label: int, box_xyxy: Sequence[float], width: int, height: int) -> str:
-    x, y, w, h = to_coco(box_xyxy)
+def _write_yaml(root: Path, parts: Mapping[str, str], kinds: Sequence[str]) -> None:
+    content = {**parts, "nc": len(kinds), "names": dict(enumerate(kinds))}
+    files.write_text(root / "data.yaml", yaml.safe_dump(content, sort_keys=False))
+
+
+def _line(label: int, box_xywh: Sequence[float], size_wh: Sequence[int], decimals: int) -> str:
+    """A label line of a box in COCO's pixels, without a score."""
+    (x, y, w, h), (width, height) = box_xywh, size_wh
     shares = ((x + w / 2) / width, (y + h / 2) / height, w / width, h / height)
-    return " ".join([str(label), *(f"{share:.{DECIMALS}f}" for share in shares)])
+    return " ".join([str(label), *(f"{share:.{decimals}f}" for share in shares)])
 
 
-class YoloDataset:
+def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
+    """Write a table's objects that have an area as part "train" and "val" of a data set."""
+    table.need_sizes("yolo")
+    table = table.in_edges("xywh")
+    names, renamed = table.file_names()
+    scored = table.scored
+    judged, area = ~table.ignore & (table.kind != REGION), table.boxes[:, 2:].prod(axis=1)
+    written = judged & (table.boxes[:, 2:] > 0).all(axis=1)
+    for name, rows, size_wh in zip(names, table.by_frame(), table.sizes_wh.tolist(), strict=True):
+        lines: list[str] = []
+        for row in (row for row in rows if written[row]):
+            line = _line(int(table.kind[row]), table.boxes[row].tolist(), size_wh, TABLE_DECIMALS)
+            lines.append(f"{line} {positional(float(table.score[row]))}\n" if scored else f"{line}\n")
+        files.write_text(out / "labels" / "train" / f"{name}.txt", "".join(lines))
+    for i, camera in table.cameras.items():
+        calibration = format_calib(torch.from_numpy(matrix_of(camera)))
+        files.write_text(out / "calib" / "train" / f"{names[i]}.txt", calibration)
+    _write_yaml(out, {"train": "images/train", "val": "images/train"}, table.kinds)
+    folder = out / "images" / "train"
+    places = {identifier: folder / name for identifier, name in zip(table.frames, names, strict=True)}
+    drawn = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
+    without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
+    more = {"box without area": int(without.sum()), "area of the mask": int(drawn.sum())}
+    count = len(names) + 1 + copy_images(places, images)
+    return Written.of(count, table.lost(("score", "camera"), renamed | more))
+
+
+class _Text(NamedTuple):
+    """A label file's lines. kinds: class numbers; boxes: left, top, width, height in COCO's pixels; scores."""
+
+    kinds: list[int]
+    boxes: list[list[float]]
+    scores: list[float]
+
+
+def _read_text(path: Path, kinds: Mapping[int, str], size_wh: tuple[int, int], scored: bool) -> _Text:
+    """The lines `class cx cy w h`, and a score where `scored`. FormatError naming file, line and field."""
+    told = _Text([], [], [])
+    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
+        parts, where = line.split(), f"{path}:{number}"
+        if not parts:
+            continue
+        if len(parts) != 5 + scored:
+            expected = "6 fields: class cx cy w h score" if scored else "5 fields: class cx cy w h"
+            raise FormatError(where, expected, len(parts))
+        if not parts[0].isdecimal() or int(parts[0]) not in kinds:
+            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(parts[0]))
+        told.kinds.append(int(parts[0]))
+        cx, cy, w, h = (_share(f"{where}: {name}", part) for name, part in zip(_SHARES, parts[1:5], strict=True))
+        width, height = size_wh
+        told.boxes.append([(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height])
+        told.scores.extend(finite_number(f"{where}: score", part) for part in parts[5:])
+    return told
+
+
+_SHARES = ("cx", "cy", "w", "h")
+
+
+def _share(where: str, text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = math.nan
+    low = 0 if where.endswith((" w", " h")) else -EDGE
+    if not low <= share <= 1 + EDGE:
+        raise FormatError(where, "a share of the image in [0, 1]", repr(text))
+    return share
+
+
+def _table(
+    frames: Sequence[str], kinds: Mapping[int, str], texts: Sequence[_Text], scored: bool, sizes_wh: np.ndarray
+) -> LabelTable:
+    """Label files as a table, one a frame."""
+    place = {number: i for i, number in enumerate(kinds)}
+    boxes = np.array([box for text in texts for box in text.boxes], np.float64).reshape(-1, 4)
+    table = LabelTable.of(
+        frames,
+        list(kinds.values()),
+        np.repeat(np.arange(len(texts)), [len(text.boxes) for text in texts]),
+        [place[kind] for text in texts for kind in text.kinds],
+        boxes,
+        "xywh",
+        area=boxes[:, 2] * boxes[:, 3],
+        sizes_wh=sizes_wh,
+    )
+    return replace(table, score=np.array([s for text in texts for s in text.scores])) if scored else table
+
+
+def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable:
+    """The labels of a data set; detections where `scored`: text files whose classes and image sizes are those of
+    `truth`. FormatError.
+    """
+    if not scored:
+        dataset = YoloDataset(path)
+        return dataset.table(dataset.identifiers)
+    folder = path / "labels" if (path / "labels").is_dir() else path
+    paths = sorted(folder.rglob("[!.]*.txt"))
+    if truth is None or not truth.sizes_wh.all():
+        raise FormatError(str(path), "labels with image sizes (YOLO's or COCO's) beside it", "none")
+    kinds = dict(enumerate(truth.kinds))
+    size = dict(zip(truth.frames, truth.sizes_wh.tolist(), strict=True))
+    for file in paths:
+        if file.stem not in size:
+            raise FormatError(str(file), f"a name of one of the {len(size)} labelled frames", repr(file.stem))
+    texts = [_read_text(file, kinds, size[file.stem], True) for file in paths]
+    if not any(text.boxes for text in texts):
+        raise FormatError(str(path), "at least one detection", f"{len(paths)} empty files")
+    return _table([file.stem for file in paths], kinds, texts, True, np.zeros((len(paths), 2), np.int64))
+
+
+class YoloDataset(Frames[Path]):
     """The frames of a YOLO data set, all its parts together.
 
     root: the folder that holds `data.yaml`, or another YAML file like it. focal_px: the focal length of images
@@ -89,8 +220,7 @@ class YoloDataset:
 
     def __init__(self, root: Path, focal_px: float | None = None) -> None:
         root = Path(root)
-        if focal_px is not None and not (math.isfinite(focal_px) and focal_px > 0):
-            raise RangeError("focal_px", "positive px", focal_px)
+        check_focal(focal_px)
         self.focal_px = focal_px
         path = root / "data.yaml" if root.is_dir() else root
         content = _mapping(path)
@@ -99,67 +229,32 @@ class YoloDataset:
         folders = list(dict.fromkeys(folder for part in PARTS for folder in _folders(path, content, part)))
         if not folders:
             raise FormatError(f"{path}: train", "a folder of images", "none")
-        self._images: dict[str, Path] = {}
-        for folder in (base / name for name in folders):
-            if not folder.is_dir():
-                raise FormatError(str(folder), "a folder of images", "no such folder")
-            for image in sorted(folder.iterdir()):
-                if image.suffix.lower() not in IMAGE_SUFFIXES or image.name.startswith("."):
-                    continue
-                if image.stem in self._images:
-                    raise FormatError(str(image), "a name of its own", f"the name of {self._images[image.stem]}")
-                self._images[image.stem] = image
-        if not self._images:
+        images: dict[str, Path] = {}
+        for image in (image for name in folders for image in images_of(base / name)):
+            if image.stem in images:
+                raise FormatError(str(image), "a name of its own", f"the name of {images[image.stem]}")
+            images[image.stem] = image
+        if not images:
             raise FormatError(str(base / folders[0]), "at least one .png or .jpg", "none")
-        self._identifiers = tuple(sorted(self._images))
-
-    @property
-    def identifiers(self) -> tuple[str, ...]:
-        """Identifiers of the frames, sorted."""
-        return self._identifiers
-
-    def __len__(self) -> int:
-        return len(self._identifiers)
-
-    def _image(self, identifier: str) -> Path:
-        if identifier not in self._images:
-            raise RangeError("frame of the YOLO folder", f"one of {len(self)} identifiers", repr(identifier))
-        return self._images[identifier]
+        super().__init__("the YOLO folder", dict(sorted(images.items())))
 
     def labels(self, identifier: str) -> Labels:
         """The labels of one frame; of its image, the header is read. FormatError naming file, line and field."""
-        rows, _ = self.rows(identifier)
-        count = len(rows)
-        return Labels(
-            kind=tuple(kind for kind, _ in rows),
-            boxes_xyxy=torch.tensor([from_coco(box) for _, box in rows]).reshape(-1, 4),
-            truncation=torch.full((count,), math.nan),
-            occlusion=torch.full((count,), UNKNOWN_OCCLUSION, dtype=torch.int64),
-            translation=torch.full((count, 3), math.nan),
-            yaw=torch.full((count,), math.nan),
-            size_lhw=torch.full((count, 3), math.nan),
-            ignore_xyxy=torch.zeros(0, 4),
-        )
+        return self.table((identifier,)).labels()
 
-    def rows(self, identifier: str) -> tuple[list[tuple[str, list[float]]], tuple[int, int]]:
-        """A frame's class and box (left, top, width, height in COCO's pixels) a line, and its width and height.
-
-        Of the image, the header is read. FormatError naming file, line and field.
-        """
-        image = self._image(identifier)
-        width, height = size_of_image(image)
-        path = _beside(image, "labels")
-        text = files.read_text(path) if path.exists() else ""
-        rows = [
-            parse_line(f"{path}:{i}", line.split(), self.class_names, (width, height))
-            for i, line in enumerate(text.splitlines(), start=1)
-            if line.strip()
+    def table(self, identifiers: Sequence[str]) -> LabelTable:
+        """The labels of some frames in columns; of their images, the headers are read. FormatError as `labels`."""
+        images = [self._entry(identifier) for identifier in identifiers]
+        sizes = [size_of_image(image) for image in images]
+        texts = [
+            _read_text(path, self.class_names, size, False) if path.exists() else _Text([], [], [])
+            for path, size in zip((_beside(image, "labels") for image in images), sizes, strict=True)
         ]
-        return rows, (width, height)
+        return _table(identifiers, self.class_names, texts, False, np.array(sizes, np.int64).reshape(-1, 2))
 
     def image_path(self, identifier: str) -> Path:
         """The file of a frame's image. RangeError for a frame that is not there."""
-        return self._image(identifier)
+        return self._entry(identifier)
 
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph, camera, labels.
@@ -167,7 +262,7 @@ class YoloDataset:
         Raises FormatError naming the file: an image that does not decode, or that has neither a calibration nor
         focal_px.
         """
-        image_path = self._image(identifier)
+        image_path = self._entry(identifier)
         image = files.read_image(image_path)
         height, width = image.shape[:2]
         calib_path = _beside(image_path, "calib")
@@ -180,33 +275,11 @@ class YoloDataset:
             raise FormatError(str(image_path), "a calibration, or a focal length (focal_px)", "neither")
         return Frame(
             identifier=identifier,
-            photograph=torch.from_numpy(image).permute(2, 0, 1).contiguous().to(torch.float32) / 255,
+            photograph=as_photograph(image),
             camera=camera,
             labels=self.labels(identifier),
             provenance={"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name},
         )
-
-
-def parse_line(
-    where: str, parts: Sequence[str], class_names: Mapping[int, str], size_wh: tuple[int, int]
-) -> tuple[str, list[float]]:
-    """A line's class, and its box as left, top, width, height in COCO's pixels. FormatError naming the field."""
-    if len(parts) != 5:
-        raise FormatError(where, "5 fields: class cx cy w h", len(parts))
-    if not parts[0].isdecimal() or int(parts[0]) not in class_names:
-        raise FormatError(f"{where}: class", f"one of the {len(class_names)} in names", repr(parts[0]))
-    shares: list[float] = []
-    for name, part in zip(("cx", "cy", "w", "h"), parts[1:], strict=True):
-        try:
-            share = float(part)
-        except ValueError:
-            share = math.nan
-        positive = share > 0 or name in ("cx", "cy")
-        if not (-EDGE <= share <= 1 + EDGE and positive):
-            raise FormatError(f"{where}: {name}", "a share of the image in [0, 1]", repr(part))
-        shares.append(share)
-    (cx, cy, w, h), (width, height) = shares, size_wh
-    return class_names[int(parts[0])], [(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height]
 
 
 def _mapping(path: Path) -> dict[str, Any]:
@@ -224,7 +297,7 @@ def _names(path: Path, content: Mapping[str, Any]) -> dict[int, str]:
     pairs = dict(enumerate(names)) if isinstance(names, list) else names
     if not isinstance(pairs, dict) or not pairs or any(type(k) is not int or k < 0 for k in pairs):
         raise FormatError(f"{path}: names", "a list of classes, or number: class", repr(names)[:60])
-    return {k: str(v) for k, v in pairs.items()}
+    return {k: str(pairs[k]) for k in sorted(pairs)}
 
 
 def _folders(path: Path, content: Mapping[str, Any], part: str) -> list[str]:
@@ -242,14 +315,3 @@ def _beside(image: Path, folder: str) -> Path:
     if places:
         parts[places[-1]] = folder
     return Path(*parts).with_suffix(".txt")
-
-
-def size_of_image(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header. FormatError."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error

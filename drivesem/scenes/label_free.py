@@ -20,7 +20,7 @@ from detectors.base import Detector
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections
-from drivesem.data.coco import pinhole
+from drivesem.data.frames import pinhole
 from drivesem.data.truth import occlusion_of
 from scene_ir import files
 from scene_ir.derender.derender import DerenderSettings

@@ -120,7 +120,7 @@ def _write(
 
     files.write_json(out / "metrics.json", data)
     for name, one in zip(names, found, strict=True):
-        # KITTI's lines cannot hold a box without an area
+        # a box without an area meets nothing, and one that ends before it begins would not be read
         kept = ((one.boxes_xyxy[:, 2:] - one.boxes_xyxy[:, :2]) >= 0.01).all(dim=1)
         n = int(kept.sum())
         unknown = torch.full((n, 3), torch.nan)

@@ -10,10 +10,10 @@ import numpy as np
 
 from detectors.types import CLASSES
 from drivesem.data import kitti as kitti_files
-from drivesem.data.label_files import Reading, layout_of, read
 from drivesem.data.label_table import REGION, LabelTable
 from drivesem.evaluation import kitti
 from drivesem.evaluation.instances import Found, Truths, from_xywh, from_xyxy
+from drivesem.run.labels import layout_of, read
 from drivesem.settings.commands import Eval
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import class_map
@@ -46,14 +46,14 @@ def open_sets(config: Eval) -> EvalSet:
     """
     gt_path, paths = Path(config.gt or ""), [Path(p) for p in (config.pred, config.pred_b) if p is not None]
     gt_layout = layout_of(gt_path) if config.gt_format == "auto" else config.gt_format
-    truth = read(gt_path, Reading(gt_layout, stage=config.stage))
+    truth = read(gt_path, gt_layout, stage=config.stage)
     wanted = _wanted(config, truth)
     gt_known = _known(gt_layout, truth)
     stages = (config.stage, config.stage_b or config.stage)
     tables: list[LabelTable] = []
     for path, stage in zip(paths, stages, strict=False):
         layout = layout_of(path) if config.pred_format == "auto" else config.pred_format
-        table = read(path, Reading(layout, scores=True, stage=stage, truth=truth))
+        table = read(path, layout, scored=True, stage=stage, truth=truth)
         # KITTI and runs have a file for every frame; in other layouts a frame without detections has none
         needed = (wanted or truth.frames) if layout in ("kitti", "run") else ()
         table = _aligned(table, truth, path, needed)

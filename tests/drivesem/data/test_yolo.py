@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from drivesem.data import yolo
 from drivesem.data.coco import CATEGORIES
+from drivesem.data.label_table import to_coco
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
@@ -78,16 +79,20 @@ def test_what_is_written_reads_back(folder: Path, make_exposure: Callable[..., E
     st.tuples(st.integers(2, 4000), st.integers(2, 4000)),
     st.lists(st.floats(0, 1), min_size=4, max_size=4, unique=True),
 )
-def test_boxes_round_trip(size_wh: tuple[int, int], shares: list[float]) -> None:
+def test_boxes_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, size_wh: tuple[int, int], shares: list[float]
+) -> None:
     width, height = size_wh
     x0, x1 = (v * (width - 1) for v in sorted(shares[:2]))
     y0, y1 = (v * (height - 1) for v in sorted(shares[2:]))
     if min((x1 - x0) / width, (y1 - y0) / height) < 1e-7:
         return
-    line = yolo._line(2, [x0, y0, x1, y1], width, height)
-    kind, box = yolo.parse_line("here", line.split(), {2: "Truck"}, (width, height))
-    assert kind == "Truck"
-    assert yolo.from_coco(box) == pytest.approx([x0, y0, x1, y1], abs=1e-4)
+    box = to_coco(np.array([x0, y0, x1, y1]))
+    path = tmp_path_factory.getbasetemp() / "box.txt"
+    path.write_text(yolo._line(2, box.tolist(), size_wh, yolo.DECIMALS))
+    told = yolo._read_text(path, {2: "Truck"}, size_wh, scored=False)
+    assert (told.kinds, told.scores) == ([2], [])
+    assert told.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
 
 
 def test_without_a_calibration_a_focal_length_is_needed(folder: Path) -> None:
@@ -120,7 +125,7 @@ BAD_LINES = [
     ("-1 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names"),
     ("0 1.5 0.5 0.25 0.25", r"cx: expected a share of the image in \[0, 1\], found '1.5'"),
     ("0 0.5 nan 0.25 0.25", "cy: expected a share"),
-    ("0 0.5 0.5 0 0.25", "w: expected a share"),
+    ("0 0.5 0.5 -0.01 0.25", "w: expected a share"),
     ("0 0.5 0.5 0.25 x", "h: expected a share .*found 'x'"),
 ]
 

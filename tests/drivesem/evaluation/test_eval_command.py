@@ -159,6 +159,17 @@ def test_one_set_in_three_layouts_gives_the_same_figures(run: Run, kitti: tuple[
         assert rows[0]["ap50"] == rows[1]["ap50"] == rows[2]["ap50"]
 
 
+@pytest.mark.parametrize("protocol", ["coco", "kitti", "voc"])
+def test_a_box_without_an_area_meets_nothing(run: Run, tmp_path: Path, protocol: str):
+    flat = (300.0, 100.0, 300.0, 170.0)
+    gt = _write(tmp_path / "gt", [[_line("Car", BOXES[0]), _line("Car", flat)]])
+    pred = _write(tmp_path / "pred", [[_line("Car", BOXES[0], 0.9), _line("Car", flat, 0.8)]])
+    code, data, _ = run("--gt", gt, "--pred", pred, "--protocol", protocol, "--bootstrap", 0)
+    assert code == 0
+    car = next(row for row in data["classes"] if row["class"] == "Car")
+    assert (car["objects"], car["recall"]) == (2, 0.5)
+
+
 def test_voc(run: Run, kitti: tuple[Path, Path]):
     row = run("--gt", kitti[0], "--pred", kitti[1], "--protocol", "voc")[1]["classes"][0]
     # hits at ranks 1 and 4 of 4 false or true (one lies on DontCare), three cars
@@ -286,7 +297,7 @@ def _broken(folder: Path, name: str) -> list[object]:
         ("no number", r"000000\.txt:1: score: expected a number, found 'high'"),
         ("turned box", r"000000\.txt:1: right: expected at least 200, found 100"),
         ("coco ids", r"image_id: expected ids of the 3 images, found 1 others \(77\)"),
-        ("coco class", r"pred\.json: category_id: expected ids of the 2 categories, found 1 others \(99\)"),
+        ("coco class", r"pred\.json\[0\]\.category_id: expected ids of the 2 categories, found 1 others \(99\)"),
         ("coco NaN", r"\[0\]\.score: expected a finite number, found NaN"),
         ("coco no score", r"\[0\]\.score: expected a finite number, found null"),
         ("coco empty", r"pred\.json: expected COCO annotations or results, found an empty file"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.data.label_files import Reading, read
+from drivesem.data.registry import read_table
 from scene_ir.errors import FormatError
 from tools.bench import evaluation
 from tools.bench.__main__ import main
@@ -17,10 +17,10 @@ _FRAMES = 5
 
 def test_both_layouts_hold_the_same_boxes(tmp_path: Path) -> None:
     assert evaluation._write(tmp_path, _FRAMES, 0) == 20 * _FRAMES
-    labels = read(tmp_path / "label_2", Reading("kitti"))
-    coco = read(tmp_path / "truth.json", Reading("coco"))
-    detected = read(tmp_path / "found", Reading("kitti", scores=True, truth=labels))
-    results = read(tmp_path / "found.json", Reading("coco", scores=True, truth=coco))
+    labels = read_table(tmp_path / "label_2", "kitti")
+    coco = read_table(tmp_path / "truth.json", "coco")
+    detected = read_table(tmp_path / "found", "kitti", scored=True, truth=labels)
+    results = read_table(tmp_path / "found.json", "coco", scored=True, truth=coco)
     for first, second, count in ((labels, coco, 5), (detected, results, 20)):
         assert len(first.boxes) == len(second.boxes) == count * _FRAMES
         assert first.boxes == pytest.approx(second.in_edges(first.edges).boxes, abs=1e-6)

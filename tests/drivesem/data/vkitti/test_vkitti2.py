@@ -21,6 +21,7 @@ from PIL import Image
 from drivesem.data import vkitti2
 from drivesem.data.registry import DATASETS, WRITERS, open_dataset
 from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
+from drivesem.data.virtual import CACHED_TABLES, KINDS
 from drivesem.data.vkitti1 import Vkitti1Dataset
 from drivesem.data.vkitti2 import Vkitti2Dataset, Vkitti2Writer
 from drivesem.synth.exposure import expose
@@ -672,7 +673,7 @@ def test_caches_are_bounded(tmp_path: Path, make_shot: MakeShot) -> None:
     dataset = Vkitti2Dataset(tmp_path)
     for identifier in dataset.identifiers:
         dataset.labels(identifier)
-    assert len(dataset._tables) == vkitti2.CACHED_TABLES
+    assert len(dataset._tables) == CACHED_TABLES
 
 
 def test_a_scene_of_a_thousand_frames_opens_fast(tmp_path: Path, make_shot: MakeShot) -> None:
@@ -706,7 +707,7 @@ angle = st.floats(-3.15, 3.15)
 THINGS = st.builds(
     TrackedObject,
     track=st.integers(0, 254),
-    kind=st.sampled_from(vkitti2.KINDS),
+    kind=st.sampled_from(KINDS),
     model=st.text(st.characters(codec="ascii", categories=["L", "N", "P"]), min_size=1, max_size=9),
     paint=st.sampled_from(["red", "Silver", "none"]),
     moving=st.booleans(),

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drivesem.data.kitti import read_calib
-from drivesem.data.label_files import Reading, kitti_folder, layout_of, read
-from drivesem.data.label_table import REGION, LabelTable
-from drivesem.data.label_writers import Written, images_beside, images_in, write
-from drivesem.data.yolo import size_of_image
+from drivesem.data.frames import images_in, size_of_image
+from drivesem.data.kitti import label_folder, read_calib
+from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
+from drivesem.data.registry import images_beside, write_table
+from drivesem.run.labels import layout_of, read
 from drivesem.settings.errors import UsageError
 
 
@@ -39,7 +40,7 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
     to be copied and are not there.
     """
     layout = how.from_format or layout_of(source)
-    table = read(source, Reading(layout, scores=how.scores))
+    table = read(source, layout, scored=how.scores)
     if how.mapping:
         table = renamed(table, how.mapping)
     found = images_in([how.images], table.frames) if how.images is not None else {}
@@ -57,7 +58,7 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
         table = replace(table, cameras=_calibrations(source, table))
     if how.copy_images and len(found) < len(table.frames):
         raise UsageError("--copy-images", f"an image of each of {len(table.frames)} frames", len(found))
-    return write(table, out, how.to_format, found if how.copy_images else {})
+    return write_table(table, out, how.to_format, found if how.copy_images else {})
 
 
 def renamed(table: LabelTable, mapping: Mapping[str, str | None]) -> LabelTable:
@@ -76,17 +77,14 @@ def renamed(table: LabelTable, mapping: Mapping[str, str | None]) -> LabelTable:
     return table.rows(kind != left_out)
 
 
-def _calibrations(source: Path, table: LabelTable) -> dict[int, dict[str, list[float]]]:
+def _calibrations(source: Path, table: LabelTable) -> dict[int, dict[str, Any]]:
     """COCO's "camera" entries of the calibrations beside KITTI's labels, where there are any."""
-    folder = kitti_folder(source)
-    cameras: dict[int, dict[str, list[float]]] = {}
+    folder = label_folder(source)
+    cameras: dict[int, dict[str, Any]] = {}
     if folder is None or folder.name != "label_2":
         return cameras
     for i, name in enumerate(table.frames):
         path = folder.parent / "calib" / f"{name}.txt"
         if path.is_file():
-            matrix = read_calib(path).projection.numpy()
-            values = [float(str(v)) for v in matrix.flatten()]  # the shortest decimals of float32
-            fx, fy, cx, cy = values[0], values[5], values[2], values[6]
-            cameras[i] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "projection": values}  # pyright: ignore[reportArgumentType]
+            cameras[i] = camera_entry(read_calib(path).projection)
     return cameras
