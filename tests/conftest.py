@@ -8,6 +8,43 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+QUICK = [
+    "architecture",
+    "scene_ir/test_geometry.py",
+    "scene_ir/test_ffd.py",
+    "scene_ir/test_types.py",
+    "scene_ir/test_files.py",
+    "scene_ir/raster/test_raster_layout.py",
+    "scene_ir/raster/test_interpolate.py",
+    "scene_ir/meshes/test_templates.py",
+    "scene_ir/render/test_environment.py",
+    "scene_ir/derender/test_derender_matte.py",
+    "scene_ir/derender/test_derender_maps.py",
+    "detectors/test_boxes.py",
+    "detectors/test_quality.py",
+    "detectors/adapters/test_formats.py",
+    "detectors/yolov3/test_yolov3_cfg.py",
+    "drivesem/settings/test_edits.py",
+    "drivesem/data/test_joined.py",
+    "drivesem/data/test_label_table.py",
+    "drivesem/evaluation/test_voc_matching.py",
+    "drivesem/evaluation/test_resampling.py",
+    "drivesem/report/test_report_charts.py",
+    "drivesem/synth/test_synth_variations.py",
+    "drivesem/attack/test_budgets.py",
+    "drivesem/attack/test_space.py",
+    "drivesem/attack/test_judging.py",
+    "drivesem/scenes/test_segmenter.py",
+    "drivesem/run/test_results.py",
+    "drivesem/training/test_mixture.py",
+    "drivesem/questions/explain/test_shapley.py",
+    "drivesem/questions/survey/test_agreement.py",
+    "drivesem/bench/test_timing.py",
+    "drivesem/commands/test_convert_command.py",
+    "tools/test_fit_kitti_statistics.py",
+]
+"""Tests of `pytest -m quick`: something of every package, in under a minute."""
+
 settings.register_profile("drivesem", deadline=None, derandomize=True, database=None)
 settings.load_profile("drivesem")
 
@@ -34,3 +71,14 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["--limit", "1", "--workers", "1", "--params", "translate,rotate", "--steps", "2", "--out", str(out)]
     assert main(["attack", *words]) == 0
     return out
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of QUICK."""
+    here = Path(__file__).parent
+    chosen = [here / name for name in QUICK]
+    missing = [str(path) for path in chosen if not path.exists()]
+    assert not missing, f"quick tests that are not there: {', '.join(missing)}"
+    for item in items:
+        if any(item.path == path or path in item.path.parents for path in chosen) and "slow" not in item.keywords:
+            item.add_marker(pytest.mark.quick)

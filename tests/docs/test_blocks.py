@@ -95,7 +95,7 @@ def test_every_block_has_a_language() -> None:
     assert not bare, "commands stand in sh blocks"
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "architecture"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_a_page_names_is_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     paths = {match[0].rstrip("/") for match in _PATH.finditer(text)}

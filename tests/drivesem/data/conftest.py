@@ -8,6 +8,7 @@ import torch
 
 from drivesem.data.truth import SKY_CM, Exposure, TrackedObject
 from scene_ir.types import Camera, Labels
+from tests.drivesem.data.shots import shot, thing
 
 HEIGHT, WIDTH = 40, 80
 CLASS_NAMES = (
@@ -100,3 +101,15 @@ def make_exposure() -> Callable[..., Exposure]:
     """An exposure of 80x40 px by seed. things: (track, kind, rows, columns, labelled) a rectangle; empty_box: a
     region to ignore where no object stands."""
     return _exposure
+
+
+@pytest.fixture(scope="session")
+def make_thing() -> Callable[..., TrackedObject]:
+    """The factory of objects, by track, kind and whatever else is to differ."""
+    return thing
+
+
+@pytest.fixture(scope="session")
+def make_shot() -> Callable[..., Exposure]:
+    """The factory of exposures, by height, width, camera and seed."""
+    return shot

@@ -30,7 +30,7 @@ from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.types import Camera
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[3]
 FIRST = "Scene01/clone/Camera_0/00000"
 MakeShot = Callable[..., Exposure]
 MakeThing = Callable[..., TrackedObject]

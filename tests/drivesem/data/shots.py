@@ -1,11 +1,9 @@
 """A small exposure made by hand: a road, two cars of which one hides part of the other, and a walker."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 from drivesem.data.truth import SKY_CM, Exposure, TrackedObject, occlusion_of
@@ -14,7 +12,7 @@ from scene_ir.types import Camera, Labels
 CLASS_NAMES = ("Undefined", "Sky", "Road", "Tree", "Car", "Van", "Pedestrian", "GuardRail")
 
 
-def _thing(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
+def thing(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
     """A car a little to the right of the camera, changed as asked."""
     base = TrackedObject(
         track=track,
@@ -38,7 +36,7 @@ def _thing(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
     return replace(changed, occlusion=occlusion_of(changed.visible))
 
 
-def _exposure(height: int = 40, width: int = 80, camera: Camera | None = None, seed: int = 0) -> Exposure:
+def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: int = 0) -> Exposure:
     """The exposure, in the upper left 40x80 pixels of an image of this size."""
     rng = np.random.default_rng(seed)
     instances = np.zeros((height, width), np.uint16)
@@ -50,10 +48,10 @@ def _exposure(height: int = 40, width: int = 80, camera: Camera | None = None, s
     depth = rng.integers(300, 65534, (height, width)).astype(np.uint16)
     depth[classes == CLASS_NAMES.index("Sky")] = SKY_CM
     depth[-1, -1] = SKY_CM - 1
-    far = _thing(7, "Van", box_ltrb=(18, 12, 33, 22), visible=0.6, truncation=0.0)
-    near = _thing(0, "Car", box_ltrb=(10, 14, 27, 24))
-    cut = _thing(3, "Car", box_ltrb=(70, 15, 79, 39), truncation=0.3123456789, visible=1.0, yaw=3.1)
-    walker = _thing(12, "Pedestrian", box_ltrb=(50, 18, 50, 18), visible=0.1, pixels=1, labelled=False)
+    far = thing(7, "Van", box_ltrb=(18, 12, 33, 22), visible=0.6, truncation=0.0)
+    near = thing(0, "Car", box_ltrb=(10, 14, 27, 24))
+    cut = thing(3, "Car", box_ltrb=(70, 15, 79, 39), truncation=0.3123456789, visible=1.0, yaw=3.1)
+    walker = thing(12, "Pedestrian", box_ltrb=(50, 18, 50, 18), visible=0.1, pixels=1, labelled=False)
     for item in (far, near, cut, walker):  # the nearer ones last
         left, top, right, bottom = item.box_ltrb
         instances[top : bottom + 1, left : right + 1] = item.track + 1
@@ -85,15 +83,3 @@ def _exposure(height: int = 40, width: int = 80, camera: Camera | None = None, s
             ignore_xyxy=small,
         ),
     )
-
-
-@pytest.fixture(scope="session")
-def make_thing() -> Callable[..., TrackedObject]:
-    """The factory of objects, by track, kind and whatever else is to differ."""
-    return _thing
-
-
-@pytest.fixture(scope="session")
-def make_shot() -> Callable[..., Exposure]:
-    """The factory of exposures, by height, width, camera and seed."""
-    return _exposure

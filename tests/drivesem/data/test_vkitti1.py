@@ -23,7 +23,7 @@ from drivesem.data.vkitti1 import Vkitti1Dataset, Vkitti1Writer
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[3]
 FACTS = ROOT / ".." / "shared" / "FORMATS.md"
 SIZE = (375, 1242)
 CAMERA = Camera(torch.tensor([[725.0, 0, 620.5], [0, 725, 187], [0, 0, 1]]), *SIZE)
