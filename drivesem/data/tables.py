@@ -20,7 +20,7 @@ _LARGEST_WHOLE = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """One row: fields as text by column. where: file and line, for errors."""
 
     where: str
@@ -101,22 +101,22 @@ class Table:
             values = tuple(_integer(f"{path}:{number}: {self.header[i]}", start[i]) for i in places)
             self._lines.setdefault(values, []).append((number, line))
 
-    def rows(self, *key: int) -> list[Row]:
+    def rows(self, *key: int) -> list[TableRow]:
         """The rows of one key, in file order. FormatError where a row has more or fewer fields than the header."""
         return [self._parsed(number, line) for number, line in self._lines.get(key, ())]
 
-    def all_rows(self) -> list[Row]:
+    def all_rows(self) -> list[TableRow]:
         """Every row, in file order. FormatError as `rows`."""
         lines = sorted(line for group in self._lines.values() for line in group)
         return [self._parsed(number, line) for number, line in lines]
 
-    def _parsed(self, number: int, line: str) -> Row:
+    def _parsed(self, number: int, line: str) -> TableRow:
         where, fields = f"{self.path}:{number}", line.split()
         if len(fields) != len(self.header):
             raise FormatError(where, f"{len(self.header)} fields", len(fields))
-        return Row(where, dict(zip(self.header, fields, strict=True)))
+        return TableRow(where, dict(zip(self.header, fields, strict=True)))
 
-    def row(self, *key: int) -> Row:
+    def row(self, *key: int) -> TableRow:
         """The only row of one key. FormatError where there is none, or there are several."""
         rows = self.rows(*key)
         name = " ".join(f"{column} {value}" for column, value in zip(self._key, key, strict=True))
@@ -126,9 +126,9 @@ class Table:
             raise FormatError(rows[1].where, f"one row of {name}", f"{len(rows)}")
         return rows[0]
 
-    def unique(self, column: str, *key: int) -> dict[int, Row]:
+    def unique(self, column: str, *key: int) -> dict[int, TableRow]:
         """The rows of one key by the whole number in `column`, in file order. FormatError for one twice."""
-        found: dict[int, Row] = {}
+        found: dict[int, TableRow] = {}
         for row in self.rows(*key):
             value = row.integer(column)
             if value in found:

@@ -20,7 +20,7 @@ from drivesem.data.frames import Frames, as_photograph, check_size, in_front
 from drivesem.data.kitti import TYPES
 from drivesem.data.label_table import REGION, LabelTable, known_pose
 from drivesem.data.pixels import read_depth_m
-from drivesem.data.tables import Recent, Row, Table, decimal
+from drivesem.data.tables import Recent, Table, TableRow, decimal
 from drivesem.data.truth import Exposure, Place, TrackedObject
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -250,7 +250,7 @@ def table_of(
 _EXTRA = ("track", "visible", "model", "paint", "moving", "kind")
 
 
-def box_of(row: Row, columns: Sequence[str]) -> tuple[int, int, int, int]:
+def box_of(row: TableRow, columns: Sequence[str]) -> tuple[int, int, int, int]:
     """Left, top, right, bottom px from columns of these names. FormatError where it ends before it begins."""
     left, top, right, bottom = (row.integer(name) for name in columns)
     for low, high, name in ((left, right, columns[2]), (top, bottom, columns[3])):
@@ -260,7 +260,7 @@ def box_of(row: Row, columns: Sequence[str]) -> tuple[int, int, int, int]:
 
 
 def pose_of(
-    row: Row, place: Sequence[str], size_lhw: Sequence[str], yaw: str
+    row: TableRow, place: Sequence[str], size_lhw: Sequence[str], yaw: str
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
     """Translation m, size (length, height, width) m and yaw rad from the columns of these names.
 
@@ -342,7 +342,7 @@ class VirtualDataset(Frames[Shot], ABC):
         """All that the tables say of the objects in one frame, in file order."""
 
     @abstractmethod
-    def _extrinsic(self, shot: Shot) -> Row:
+    def _extrinsic(self, shot: Shot) -> TableRow:
         """The row of a shot's extrinsic matrix."""
 
     @abstractmethod

@@ -19,7 +19,7 @@ import torch
 from drivesem.data import virtual
 from drivesem.data.label_table import LabelTable, Written, copy_images
 from drivesem.data.pixels import Colours
-from drivesem.data.tables import Recent, Row, decimal, one_word, text_of
+from drivesem.data.tables import Recent, TableRow, decimal, one_word, text_of
 from drivesem.data.truth import Exposure, Place, TrackedObject
 from drivesem.data.virtual import KINDS, MATRIX, Segments, Shot, VirtualDataset
 from scene_ir import files
@@ -232,7 +232,7 @@ class Vkitti1Dataset(VirtualDataset):
         things = (_object(track, row) for track, row in rows.items())
         return tuple(replace(thing, labelled=thing.labelled or self.with_dont_care) for thing in things)
 
-    def _extrinsic(self, shot: Shot) -> Row:
+    def _extrinsic(self, shot: Shot) -> TableRow:
         return self._table(self._file(shot, "extrinsicsgt"), ("frame",), MATRIX).row(shot.frame)
 
     def _camera(self, shot: Shot, size_hw: tuple[int, int]) -> Camera:
@@ -264,7 +264,7 @@ class _Encoding:
         self.instance = np.array([int(number) + 1 if colon else 0 for _, colon, number in split], np.int64)
 
 
-def _object(track: int, row: Row) -> TrackedObject:
+def _object(track: int, row: TableRow) -> TrackedObject:
     """One object from its row in motgt."""
     occluded = int(row.word("occluded", ("0", "1", "2")))
     row.word("truncated", ("0", "1", "2"))

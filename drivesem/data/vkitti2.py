@@ -20,7 +20,7 @@ import torch
 from drivesem.data import virtual
 from drivesem.data.label_table import LabelTable, Written, copy_images, matrix_of
 from drivesem.data.pixels import Colours, read_indices, write_indices
-from drivesem.data.tables import Recent, Row, Table, decimal, one_word, text_of
+from drivesem.data.tables import Recent, Table, TableRow, decimal, one_word, text_of
 from drivesem.data.truth import Exposure, Place, TrackedObject, occlusion_of
 from drivesem.data.virtual import COLOURS, KINDS, Segments, Shot, VirtualDataset
 from scene_ir import files
@@ -281,7 +281,7 @@ class Vkitti2Dataset(VirtualDataset):
                 raise FormatError(str(poses_table.path), what, "none")
         return tuple(_object(track, box, poses[track], info.row(track)) for track, box in boxes.items())
 
-    def _extrinsic(self, shot: Shot) -> Row:
+    def _extrinsic(self, shot: Shot) -> TableRow:
         return self._read(shot, "extrinsic", EXTRINSIC).row(shot.frame, shot.camera or 0)
 
     def _segments(self, shot: Shot, size_hw: tuple[int, int]) -> Segments:
@@ -299,7 +299,7 @@ class Vkitti2Dataset(VirtualDataset):
         return Camera(torch.tensor(k), *size_hw)
 
 
-def _object(track: int, box: Row, pose: Row, info: Row) -> TrackedObject:
+def _object(track: int, box: TableRow, pose: TableRow, info: TableRow) -> TrackedObject:
     """One object from its rows in bbox.txt, pose.txt and info.txt."""
     camera = [f"camera_space_{axis}" for axis in "XYZ"]
     sizes = ("length", "height", "width")

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import track
 
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.questions.realism.comparison import PAIRS, FrameParts, Row, frame_parts, rows
+from drivesem.questions.realism.comparison import PAIRS, FrameParts, RealismRow, frame_parts, rows
 from drivesem.questions.realism.measures import METRICS, load, missing, psnr_db
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
@@ -105,7 +105,7 @@ def _run_json(run: Run, parts: Sequence[FrameParts]) -> dict[str, Any]:
     }
 
 
-def _row_json(run: Run, row: Row) -> dict[str, Any]:
+def _row_json(run: Run, row: RealismRow) -> dict[str, Any]:
     metric = METRICS[row.metric]
     return {"run": run.name, "params": run.params, **asdict(row), "name": metric.name, "unit": metric.unit}
 
@@ -128,7 +128,7 @@ def _parts(
     return lines
 
 
-def _sheet(table: Sequence[tuple[Run, Row]], several: bool) -> Sheet:
+def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> Sheet:
     """A line a run, region and metric; pairs stand beside one another."""
     columns = ("run", "parameters", "where", "metric", *(_between(*pair) for pair in PAIRS), "pictures")
     lines: dict[tuple[str, ...], list[str]] = {}

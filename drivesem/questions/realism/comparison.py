@@ -51,7 +51,7 @@ class FrameParts:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class RealismRow:
     """One figure of a run. value: mean over frames (of vehicles: of each frame's mean), for PSNR that of the mean
     squared error, for a Fréchet distance that of all pictures; low, high: its interval, which a Fréchet distance
     does not have; median: over frames. None is an infinite PSNR, and what cannot be said. pictures: how many of
@@ -151,9 +151,9 @@ class _Mean:
         return float(np.average(self.values, weights=weights)) if len(self.values) else None
 
 
-def rows(frames: Sequence[FrameParts], metrics: Sequence[str], draws: int, seed: int) -> list[Row]:
+def rows(frames: Sequence[FrameParts], metrics: Sequence[str], draws: int, seed: int) -> list[RealismRow]:
     """Every figure of a run, with intervals by drawing frames."""
-    found: list[Row] = []
+    found: list[RealismRow] = []
     for region in REGIONS:
         parts = [frame.region(region) for frame in frames]
         known = [p for p in parts if p]
@@ -168,17 +168,17 @@ def rows(frames: Sequence[FrameParts], metrics: Sequence[str], draws: int, seed:
 
 def _pair_row(
     parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tuple[str, str], spread: tuple[int, int]
-) -> Row:
+) -> RealismRow:
     values = np.array([np.mean([p.distances[metric][pair] for p in frame]) for frame in parts], np.float64)
     one = _interval(_Mean(values), len(values), spread)
     ends: list[float | None] = [one.value, one.low, one.high, float(np.median(values)) if len(values) else None]
     if METRICS[metric].squared:
         ends = [None if end is None else psnr_db(end) for end in ends]
         ends[1:3] = ends[2:0:-1]
-    return Row(region, metric, *pair, *ends, pictures=sum(map(len, parts)))
+    return RealismRow(region, metric, *pair, *ends, pictures=sum(map(len, parts)))
 
 
-def _set_row(parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tuple[str, str]) -> Row:
+def _set_row(parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tuple[str, str]) -> RealismRow:
     """Without an interval: draws with repetitions lie farther apart than the sets themselves."""
     everything = [part for frame in parts for part in frame]
     sides = [[part.features[metric][side] for part in everything] for side in pair]
@@ -186,7 +186,7 @@ def _set_row(parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tu
     if len(everything) > 1:
         equal = all(a is b for a, b in zip(*sides, strict=True))
         value = 0.0 if equal else frechet(*(Gaussian.of(np.stack(side)) for side in sides))
-    return Row(region, metric, *pair, value, None, None, None, pictures=len(everything))
+    return RealismRow(region, metric, *pair, value, None, None, None, pictures=len(everything))
 
 
 def _interval(part: _Mean, frames: int, spread: tuple[int, int]) -> Interval:

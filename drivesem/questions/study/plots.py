@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.report import Findings
-from drivesem.questions.study.rows import Row
+from drivesem.questions.study.rows import StudyRow
 from drivesem.questions.study.success import Curve
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.report.plots import COLOURS, LINES, STYLE
@@ -51,7 +51,7 @@ def write_plot(path: Path, found: Findings) -> None:
     files.write_bytes(path, buffer.getvalue())
 
 
-def _falls(axes: Axes, rows: Sequence[Row]) -> None:
+def _falls(axes: Axes, rows: Sequence[StudyRow]) -> None:
     """Bars of points of AP50 by arm; the paper's as marks."""
     series: dict[str, list[Interval | None]] = {
         "attack, benign labels": [row.drops["paper"]["ap50"] for row in rows],

@@ -12,7 +12,7 @@ from drivesem.evaluation.resampling import Difference, Interval
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
-from drivesem.questions.study.rows import FIGURES, MODES, Row, feasible_fraction
+from drivesem.questions.study.rows import FIGURES, MODES, StudyRow, feasible_fraction
 from drivesem.questions.study.running import Ran
 from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
@@ -52,7 +52,7 @@ class Findings:
     study: Study
     draws: int
     ran: Ran
-    rows: Sequence[Row]
+    rows: Sequence[StudyRow]
     curves: Sequence[Curve] = ()
     beside: Mapping[str, Difference] | None = None
     within: int = 0
@@ -104,7 +104,7 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     return [*tables, *([_further(found.rows)] if whole else []), _frames(found.rows)]
 
 
-def _precision(rows: Sequence[Row]) -> Sheet:
+def _precision(rows: Sequence[StudyRow]) -> Sheet:
     told = any(row.run.arm.reference is not None for row in rows)
     columns = [_ARM, "benign", *(f"{mode} labels" for mode in MODES), *(f"falls, {mode}" for mode in MODES)]
     lines = []
@@ -119,7 +119,7 @@ def _precision(rows: Sequence[Row]) -> Sheet:
     return Sheet(f"{HEADLINE} AP50, %", tuple(columns), tuple(lines))
 
 
-def _controls(rows: Sequence[Row]) -> Sheet:
+def _controls(rows: Sequence[StudyRow]) -> Sheet:
     lines = []
     for row in rows:
         cells = [row.name]
@@ -157,7 +157,7 @@ def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
     )
 
 
-def _further(rows: Sequence[Row]) -> Sheet:
+def _further(rows: Sequence[StudyRow]) -> Sheet:
     lines = []
     for row in rows:
         for key, name in FIGURES.items():
@@ -170,7 +170,7 @@ def _further(rows: Sequence[Row]) -> Sheet:
     return Sheet(f"{HEADLINE}, further figures, %", columns, tuple(lines))
 
 
-def _frames(rows: Sequence[Row]) -> Sheet:
+def _frames(rows: Sequence[StudyRow]) -> Sheet:
     controls = [name for name in (RANDOM, PLACEBO) if any(name in row.controls for row in rows)]
     lines = []
     for row in rows:

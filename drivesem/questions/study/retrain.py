@@ -21,12 +21,11 @@ from drivesem.evaluation.resampling import DRAWS, Figure, Interval, differences,
 from drivesem.questions.study import lessons as plan
 from drivesem.questions.study.arms import Arm
 from drivesem.questions.study.lessons import BENIGN, RETRAINED, Lesson, Parts
-from drivesem.questions.study.rows import MODES, Figures, Row, feasible_fraction, rows_of
+from drivesem.questions.study.rows import MODES, Figures, StudyRow, feasible_fraction, rows_of
 from drivesem.questions.study.running import ARMS, ArmRun, Ran, run_arms, workers_of
 from drivesem.questions.transfer.asking import detectors_of
 from drivesem.questions.transfer.asking import rows_of as transfer_rows
-from drivesem.questions.transfer.matrix import AP50, BROKEN, figures_of
-from drivesem.questions.transfer.matrix import Row as Known
+from drivesem.questions.transfer.matrix import AP50, BROKEN, TransferRow, figures_of
 from drivesem.run.attack import Worker, select_frames
 from drivesem.run.finished import load_runs
 from drivesem.run.frame import as_detections, detection_records
@@ -61,8 +60,8 @@ class Judged:
     benign_frames: int
     benign: ClassScores
     spread: dict[str, Interval]
-    known: Known
-    fresh: Row
+    known: TransferRow
+    fresh: StudyRow
     drops: dict[str, Interval]
     gains: dict[str, dict[str, Interval]]
 
@@ -257,7 +256,7 @@ def set_threshold(detector: Detector, weights: Path, t_star: float) -> None:
     detector.t_star = float(f"{t_star:.6g}")
 
 
-def _known(study: Study, names: Mapping[str, str], run: Path, out: Path) -> list[Known]:
+def _known(study: Study, names: Mapping[str, str], run: Path, out: Path) -> list[TransferRow]:
     """The held-out counterexamples against the detector as it was, before all detectors."""
     settings = Asking(
         seed=study.seed,
@@ -275,7 +274,7 @@ def rows_for(
     study: Study,
     lessons: Sequence[Lesson],
     seen: Mapping[str, Seen],
-    known: Sequence[Known],
+    known: Sequence[TransferRow],
     runs: Sequence[ArmRun],
     draws: int,
 ) -> list[Judged]:

@@ -25,7 +25,7 @@ _SINGLE_OVERLAPS = {"ap50": 0.5, "ap70": 0.7}
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StudyRow:
     """One arm. benign, paper, moved: HEADLINE's figures in the photographs, and after the attack by either label
     mode. drops: by mode and figure, from benign to attacked. effects: by control and mode, how far AP50 falls
     below the control's. controls: their own rows. size: of a control's edits, relative to the arm's.
@@ -37,7 +37,7 @@ class Row:
     moved: ClassScores
     drops: dict[str, dict[str, Interval]]
     effects: dict[str, dict[str, Interval]]
-    controls: dict[str, Row]
+    controls: dict[str, StudyRow]
     size: float | None = None
 
     @property
@@ -84,7 +84,7 @@ class Row:
         return found
 
 
-def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[Row]:
+def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[StudyRow]:
     """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
     figures = {run.arm.name: Figures.of(run) for run in runs}
     rows = []
@@ -101,7 +101,9 @@ def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
     return sum(r.feasible for r in results) / len(results) if results else None
 
 
-def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figures], draws: int, seed: int) -> Row:
+def _row(
+    run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figures], draws: int, seed: int
+) -> StudyRow:
     mine, summary = figures[run.arm.name], run.summary
     effects = {
         name: {mode: mine.falls(figures[other.arm.name], mode, draws, seed) for mode in MODES}
@@ -111,7 +113,7 @@ def _row(run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figure
         name: replace(_row(other, {}, figures, draws, seed), size=relative_size(other.results, run.results))
         for name, other in beside.items()
     }
-    return Row(
+    return StudyRow(
         run=run,
         benign=summary.benign.headline,
         paper=summary.attacked_paper.headline,

@@ -19,7 +19,7 @@ from drivesem.questions.study.report import Told
 from drivesem.questions.study.rows import MODES, feasible_fraction
 from drivesem.questions.study.running import ARMS, Ran, run_arms
 from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, rows_of
-from drivesem.questions.transfer.matrix import AP50, BROKEN, FRAMES, LOST, TRANSFER, Row
+from drivesem.questions.transfer.matrix import AP50, BROKEN, FRAMES, LOST, TRANSFER, TransferRow
 from drivesem.questions.transfer.report import bounded
 from drivesem.questions.transfer.report import sheets as matrix_sheets
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
@@ -41,8 +41,8 @@ class Before:
     reference: the paper's mAP of such a pair, benign and attacked.
     """
 
-    row: Row
-    placebo: Row | None
+    row: TransferRow
+    placebo: TransferRow | None
     beyond: Mapping[str, Interval]
     reference: tuple[float, float] | None
 
@@ -129,7 +129,7 @@ def run(
     return Matrix(study, draws, ran, found, failed)
 
 
-def _beyond(row: Row, placebo: Row, mode: str, draws: int, seed: int) -> Interval:
+def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
     after, theirs = (one.figures[mode][:1] for one in (row, placebo))
     (one,) = differences(after, theirs, row.frames, draws, np.random.default_rng(seed))
     return Interval(one.name, one.difference, one.low, one.high)
@@ -197,11 +197,11 @@ def _falls(rows: Sequence[Before]) -> Sheet:
     return Sheet(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
 
 
-def _sides(row: Row) -> tuple[str, str]:
+def _sides(row: TransferRow) -> tuple[str, str]:
     return row.run.name, row.target.name
 
 
-def _fall(row: Row, mode: str) -> Interval:
+def _fall(row: TransferRow, mode: str) -> Interval:
     return next(one for one in row.drops[mode] if one.name == AP50)
 
 

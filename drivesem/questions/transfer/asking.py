@@ -13,7 +13,7 @@ from detectors.base import DetectorError, Predictor
 from detectors.registry import SHIPPED
 from drivesem.attack.judging import DEFAULT_T_STAR, HEADLINE, JudgedClasses, t_star_of
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.questions.transfer.matrix import Row, Target, row
+from drivesem.questions.transfer.matrix import Target, TransferRow, row
 from drivesem.questions.transfer.report import answer_of
 from drivesem.report.answer import Answer
 from drivesem.run.finished import PICTURES, Frame, Run, load_runs
@@ -108,7 +108,9 @@ def transfer_run(config: Transfer) -> Answer:
     return answer
 
 
-def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Asking) -> tuple[list[Row], dict[str, str]]:
+def rows_of(
+    runs: Sequence[Run], detectors: Sequence[Asked], config: Asking
+) -> tuple[list[TransferRow], dict[str, str]]:
     """Each run before each detector, and the pictures that could not be used, with reasons.
 
     Raises UsageError where no frame of a run is left, SceneError for a bad picture unless `keep_going`.
@@ -118,7 +120,7 @@ def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Asking) -> 
     for asked in detectors:
         failed |= look(asked.order, asked.predictor, pictures, config, asked.name)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    rows: list[Row] = []
+    rows: list[TransferRow] = []
     for run in runs:
         frames = [f for f in run.frames if not any(str(p) in failed for p in f.pictures.values())]
         if not frames:
@@ -127,7 +129,7 @@ def rows_of(runs: Sequence[Run], detectors: Sequence[Asked], config: Asking) -> 
     return rows, failed
 
 
-def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> Row:
+def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> TransferRow:
     memory, predictor = Memory(asked.order, asked.predictor), asked.predictor
     otherwise = DEFAULT_T_STAR if config.t_star is None else config.t_star
     t_star = t_star_of(predictor, asked.t_star, otherwise)

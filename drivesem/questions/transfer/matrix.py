@@ -32,7 +32,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TransferRow:
     """One run before one target. benign, rerendered, paper, moved: figures in the photographs, in these rendered
     again, and in the counterexamples by either label mode. drops: by how much HEADLINE's AP50 and recall fall from
     benign to attacked, by label mode. shares: TRANSFER, LOST, FRAMES, BROKEN; counts: their numerators and
@@ -101,7 +101,7 @@ def row(
     found: dict[str, list[Detections]],
     draws: int,
     seed: int,
-) -> Row:
+) -> TransferRow:
     """The figures of the run's frames. found: detections in the pictures of PICTURES, one for each result, with
     labels among the judged classes; draws: of the bootstrap over frames.
     """
@@ -129,7 +129,7 @@ def row(
     shares = intervals(
         [Figure(name, (Recalled(tally),)) for name, tally in tallies.items()], len(results), draws, rng
     )
-    return Row(
+    return TransferRow(
         run=run,
         target=target,
         frames=len(results),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivesem.questions.transfer.matrix import TRANSFER, Row
+from drivesem.questions.transfer.matrix import TRANSFER, TransferRow
 from drivesem.report.plots import STYLE
 from scene_ir import files
 
@@ -23,14 +23,14 @@ _LONGEST = 24
 """Characters of a name beside the picture: what is longer loses its beginning."""
 
 
-def write_heatmap(path: Path, rows: Sequence[Row]) -> None:
+def write_heatmap(path: Path, rows: Sequence[TransferRow]) -> None:
     """Two panels, %: how far AP50 falls by moved labels, and which share of the source's failures transfers."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     sources = list(dict.fromkeys(row.run.name for row in rows))
     targets = list(dict.fromkeys(row.target.name for row in rows))
-    panels: list[tuple[str, Callable[[Row], float | None]]] = [
+    panels: list[tuple[str, Callable[[TransferRow], float | None]]] = [
         ("drop of AP50, moved labels, %", lambda row: row.flat()["drop_moved"]),
         ("transferred failures, %", lambda row: row.shares[TRANSFER].value),
     ]

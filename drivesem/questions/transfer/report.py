@@ -10,7 +10,7 @@ from typing import Any
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Interval
-from drivesem.questions.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, Row
+from drivesem.questions.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, TransferRow
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, percent
@@ -21,7 +21,7 @@ _LABELS = "labels"
 """Of the photographs (benign), or of the counterexamples by either label mode."""
 
 
-def sheets(rows: Sequence[Row]) -> list[Sheet]:
+def sheets(rows: Sequence[TransferRow]) -> list[Sheet]:
     """Two tables, %: precision and recall by picture and label mode; what falls and what transfers."""
     figures: list[tuple[str, ...]] = []
     shares: list[tuple[str, ...]] = []
@@ -43,7 +43,7 @@ def sheets(rows: Sequence[Row]) -> list[Sheet]:
     ]
 
 
-def notes(rows: Sequence[Row], draws: int) -> list[str]:
+def notes(rows: Sequence[TransferRow], draws: int) -> list[str]:
     """What the columns mean."""
     spread = f" In brackets: 95 % of {draws} draws of frames." if draws else ""
     stars = "; ".join(dict.fromkeys(f"{r.target.name}: t* {r.target.t_star:.3f}" for r in rows))
@@ -58,7 +58,7 @@ def notes(rows: Sequence[Row], draws: int) -> list[str]:
 
 
 def answer_of(
-    out: Path, rows: Sequence[Row], draws: int, failed: Mapping[str, str], data: Mapping[str, Any]
+    out: Path, rows: Sequence[TransferRow], draws: int, failed: Mapping[str, str], data: Mapping[str, Any]
 ) -> Answer:
     """All that is written and printed of a transfer. failed: pictures that could not be used, and why."""
     figures, shares = sheets(rows)

@@ -141,7 +141,7 @@ def test_bad_input(survey: Path, tmp_path: Path, refused: Callable[..., str]) ->
     (tmp_path / "key.json").write_text("{}")
     assert "expected a key" in says("survey-results", good, "--survey", tmp_path / "key.json")
     assert "RUN: expected folders" in says("survey")
-    assert "--items, --controls" in says("survey", tmp_path / "run", "--items", "0")
+    assert "--items: expected at least 1" in says("survey", tmp_path / "run", "--items", "0")
     assert "--out: expected a folder" in says("survey", tmp_path / "run", "--out", good)
 
 

@@ -177,7 +177,7 @@ def test_large_pictures_are_made_smaller(
 
 
 def test_no_folder(refused: Callable[..., str]) -> None:
-    assert refused("report") == "drivesem: RUN: expected folders of drivesem attack, found none"
+    assert refused("report") == "drivesem: RUN: expected folders of drivesem attack, found nothing"
 
 
 def test_no_run(refused: Callable[..., str]) -> None:

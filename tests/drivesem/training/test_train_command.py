@@ -51,7 +51,9 @@ def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[
     assert (out / CURVES).stat().st_size > 10_000
     card = (out / f"{detector}.md").read_text()
     assert "5 frames of layout kitti (`train`)" in card
-    assert f"drivesem train --detector {detector} --root train" in card or detector == "squeezedet"
+    assert f"--detector {detector}" in card or detector == "squeezedet"
+    assert "drivesem train " in card
+    assert "--root train" in card
     assert "| Car | 2 |" in card
     assert str(tmp_path) not in card
     before = (out / LOG).read_text()

@@ -26,7 +26,7 @@ from drivesem.questions.study.lessons import BENIGN, lessons_of
 from drivesem.questions.study.report import answer_of
 from drivesem.questions.study.retrain import Taught
 from drivesem.questions.study.running import Ran
-from drivesem.questions.transfer.matrix import Row, Target, row
+from drivesem.questions.transfer.matrix import Target, TransferRow, row
 from drivesem.run.finished import Run
 from drivesem.run.frame import as_detections
 from drivesem.run.results import FrameResult
@@ -53,7 +53,7 @@ def seen(missed: Sequence[int] = ()) -> retrain.Seen:
     return retrain.seen_by(load_detector("squeezedet"), *benign_frames(missed), 0.5)
 
 
-def known(name: str, results: Sequence[FrameResult], kept: int) -> Row:
+def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferRow:
     """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
     run = Run(BENIGN, Path("run"), "squeezedet", "si-fgsm", "rotate", ())
     target = Target(name, name, JudgedClasses(CLASSES, CLASSES), 0.5)
