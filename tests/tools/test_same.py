@@ -1,0 +1,101 @@
+"""What tools/same.py leaves out of its hashes, what it runs first, and what it tells of two tables."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from tests.tools.loading import tool
+
+same = tool("same")
+
+
+def rows(folder: Path, **files: Any) -> dict[str, str]:
+    """Hashes of files with these contents, `_` in a name standing for its dot."""
+    folder.mkdir()
+    for name, content in files.items():
+        path = folder / name.replace("_", ".")
+        if isinstance(content, str):
+            path.write_text(content)
+        elif path.suffix == ".npz":
+            np.savez(path, **content)
+        else:
+            save_file(content[0], path, metadata=content[1])
+    return same.Hasher({folder: "WORK"}).rows("case", folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("a_json", '{"b": [{"seconds": 1.5, "c": 2}]}', '{"b": [{"seconds": 7, "c": 2}]}'),
+        ("a_out", '{"b": 1, "versions": {"x": "1"}}\n', '{"b": 1, "versions": {"x": "2"}}\n'),
+        ("a_csv", "step,seconds,loss\n1,0.5,3\n", "step,seconds,loss\n1,0.75,3\n"),
+        ("a_err", "done ━━━━ 2/2 0:00:34", "done ━━━━ 2/2 0:01:02"),
+        ("a_md", "2 frames in 12.3 s", "2 frames in 9 s"),
+    ],
+)
+def test_times_and_versions_do_not_count(tmp_path: Path, name: str, before: str, after: str) -> None:
+    assert rows(tmp_path / "1", **{name: before}) == rows(tmp_path / "2", **{name: after})
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("a_json", '{"b": 1}', '{"b": 2}'),
+        ("a_json", '{"b": 1, "c": 2}', '{"c": 2, "b": 1}'),
+        ("a_csv", "step,loss\n1,3\n", "step,loss\n1,4\n"),
+        ("a_md", "2 frames in 9 s", "3 frames in 9 s"),
+        ("a_npz", {"x": np.zeros(2)}, {"x": np.zeros(2, np.float32)}),
+        ("a_safetensors", ({"x": np.zeros(2)}, {"step": "1"}), ({"x": np.zeros(2)}, {"step": "2"})),
+    ],
+)
+def test_all_else_does(tmp_path: Path, name: str, before: Any, after: Any) -> None:
+    assert rows(tmp_path / "1", **{name: before}) != rows(tmp_path / "2", **{name: after})
+
+
+def test_places_and_containers_do_not_count(tmp_path: Path) -> None:
+    found = [
+        rows(
+            folder,
+            a_yaml=f"out: {folder}/run\n",
+            b_json=json.dumps({str(folder / "x"): str(folder / "y")}),
+            c_npz={"x": np.arange(3)},
+            d_safetensors=({"x": np.arange(3)}, {"seconds": str(seconds), "step": "1"}),
+        )
+        for seconds, folder in enumerate((tmp_path / "one", tmp_path / "another"))
+    ]
+    assert found[0] == found[1]
+    assert set(found[0]) == {"case/a.yaml", "case/b.json", "case/c.npz", "case/d.safetensors"}
+
+
+def test_every_case_can_begin() -> None:
+    cases = same.suite()
+    order = same.in_order(cases, cases)
+    assert len(set(order)) == len(order) == len({*cases, *same.MADE})
+    for place, name in enumerate(order):
+        assert same.needs(name, cases) <= set(order[:place])
+    assert same.in_order(["worth-table"], cases) == ["inputs", "worth-table"]
+    assert {"attack --combo 7", "render", ""} <= set(cases["refused"])
+    assert {"--help", "retrain --help"} <= set(cases["help"])
+
+
+def test_paths_are_seen_from_where_a_command_runs(tmp_path: Path) -> None:
+    case = tmp_path / "edit"
+    line = "edit @derender/scenes -o @/edit.png"
+    assert same.words_of(line, case, case) == ["edit", "../derender/scenes", "-o", "./edit.png"]
+    assert same.words_of(line, case, case / "empty")[1] == "../../derender/scenes"
+
+
+def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after = tmp_path / "before.txt", tmp_path / "after.txt"
+    before.write_text("a/x y.txt 1\na/z 2\nb/x 3\n")
+    after.write_text("a/x y.txt 1\nb/w 4\nb/x 5\n")
+    assert same.main(["--compare", str(before), str(after)]) == 1
+    assert capsys.readouterr().out.splitlines() == ["gone: a/z", "new: b/w", "differs: b/x", "3 lines differ"]
+    assert same.main(["--compare", str(before), str(after), "--only", "b"]) == 1
+    assert same.main(["--compare", str(before), str(before)]) == 0
