@@ -50,7 +50,7 @@ ATTACK = f"attack {ALL} --workers 1 --limit 1 --out @/run"
 WORKERS = "--workers 1"
 RUN, SET, FOUND = "@attack-si-fgsm/run", "@synth-kitti/set", "@eval-detector/figures/detections"
 SCENE = "@derender-demo/scenes/demo-000"
-SMALL = "--dataset kitti --root @small"
+SMALL, TINY = "--dataset kitti --root @small", "--dataset kitti --root @tiny --no-fit"
 
 SUITE = f"""
 attack-si-fgsm: attack {ALL} {WORKERS} --limit 2 --steps 3 --out @/run
@@ -67,14 +67,15 @@ attack-placebo: {ATTACK} --method placebo --like {RUN}
 attack-two: attack --params weather,rotate {WORKERS} --limit 2 --steps 3 --out @/run
 attack-kitti: attack {SMALL} --no-fit {WORKERS} --limit 1 --combo 2 --steps 2 --detector yolov3-slim\
  --budget parking --out @/run
-study-multi: study multi --quick --limit 1 --steps 1 --bootstrap 5 {WORKERS} --out @/study
-study-samples: study samples --quick --limit 1 --steps 1 --queries 2 --bootstrap 5 {WORKERS} --out @/study
-study-transfer: study transfer --quick --limit 1 --steps 1 --bootstrap 5 {WORKERS} --out @/study
+study-multi: study multi --quick {TINY} --limit 1 --steps 1 --bootstrap 5 {WORKERS} --out @/study
+study-samples: study samples --quick {TINY} --limit 1 --steps 1 --queries 2 --bootstrap 5 {WORKERS}\
+ --out @/study
+study-transfer: study transfer --quick {TINY} --limit 1 --steps 1 --bootstrap 5 {WORKERS} --out @/study
 study-retrain: study retrain --quick --limit 2 --fresh 1 --benign-frames 2 --steps 3 --train-steps 2\
  --bootstrap 5 {WORKERS} --out @/study
 derender-demo: derender --limit 1 --sheet {WORKERS} --out @/scenes
 derender-kitti: derender {SMALL} {WORKERS} --limit 1 --sheet --out @/scenes
-derender-photo: derender @small/training/image_2/000000.png --focal 360 --fast {WORKERS} --out @/scenes
+derender-photo: derender @small/training/image_2/000001.png --focal 360 --fast {WORKERS} --out @/scenes
 render: render {SCENE} -o @/render.png
 edit: edit {SCENE} --set objects[0].translate=0.5m,0m --set objects[1].color=0.3,0,0,0,0 --set weather=fog\
  --remove 2 -o @/edit.png --save @/scene
@@ -119,7 +120,7 @@ report-study: report @study-samples/study --out @/report.html
 check: check --detector squeezedet --size 96x64 --json
 check-yolov3: check --detector yolov3-slim --size 96x64
 anchors: anchors --root {SET} --count 3
-gradcheck: gradcheck --dataset kitti --root @tiny --no-fit --directions 1 {WORKERS} --out @/gradcheck
+gradcheck: gradcheck {TINY} --directions 1 {WORKERS} --out @/gradcheck
 train: train --root @small --held-out @small --steps 3 --batch 2 --window 96x64 --checkpoint-every 2\
  --evaluate-every 2 --semantic 0.25 {WORKERS} --out @/run
 train-yolov3: train --detector yolov3-slim --root @small --steps 2 --batch 2 --window 96x64 --optimiser sgd\
@@ -292,7 +293,7 @@ def copy_part(source: Path, target: Path, name: str, scale: float, window: tuple
 
 def make_small(folder: Path, work: Path) -> None:
     """Two generated frames at half their size."""
-    for name in ("000000", "000001"):
+    for name in ("000001", "000002"):
         copy_part(work / "synth-kitti/set/training", folder / "training", name, 0.5, (0, 0, 621, 187), slice(None))
 
 
