@@ -11,7 +11,6 @@ from hypothesis import settings
 QUICK = [
     "architecture",
     "scene_ir/test_geometry.py",
-    "scene_ir/test_ffd.py",
     "scene_ir/test_types.py",
     "scene_ir/test_files.py",
     "scene_ir/raster/test_raster_layout.py",
