@@ -44,7 +44,8 @@ class Rule:
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
 _JOINED = ("drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
-_BELOW_RUN = ("attack", "scenes", "data", "evaluation", "report", "settings")
+_BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "synth")
+_BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings")
 MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
 """Questions that are made of others."""
 RULES = (
@@ -64,6 +65,7 @@ RULES = (
         ("torch", "numpy", "pycocotools", "faster_coco_eval"),
         never=("scene_ir", "drivesem.attack"),
     ),
+    Rule("drivesem.truth", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_TRUTH)), None),
     Rule("drivesem.run", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_RUN)), None),
     Rule(
         "drivesem.questions",

@@ -1,0 +1,40 @@
+"""What every second renderer is: it draws states of one scene, and labels what it drew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from detectors.types import Targets
+from scene_ir.errors import SceneError
+from scene_ir.types import SceneIR
+
+
+@dataclass(frozen=True, slots=True)
+class Redrawn:
+    """One picture of a second renderer. image: (3, H, W) RGB in [0, 1], on the 8-bit grid; targets: labels among
+    `CLASSES`, the first N rows the scene's objects in order (ignored where the renderer has no counterpart of one),
+    then regions in which no detection counts; shown_xyxy: (N, 4) px, the box of what shows of each object, zeros
+    where nothing does.
+    """
+
+    image: Tensor
+    targets: Targets
+    shown_xyxy: Tensor
+
+
+class SecondRenderer(Protocol):
+    """A renderer of one frame's scene, before and after any change. name: of what draws, for people."""
+
+    @property
+    def name(self) -> str: ...
+
+    def redraw(self, changed: SceneIR) -> Redrawn:
+        """A state of the scene. Raises SceneError where the change cannot be drawn."""
+        ...
+
+
+class NoSecondRendererError(SceneError):
+    """Nothing on this machine can draw the scene a second time; the message says what to install."""
