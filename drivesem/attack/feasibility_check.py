@@ -55,6 +55,24 @@ COLUMNS = 64
 """Plumb lines each way over the ground that two cars may share."""
 MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
+WEATHER_TOLERANCE = 0.01
+"""Of codes, and of what they are compared with."""
+RAIN_BESIDE_SUN = 0.5
+"""Code of rain up to which there may be a sky as bright as photographed: a shower."""
+DAYLIGHT_LX, TWILIGHT_LX = 15_000.0, 3.4
+"""In the shade at noon; at the end of civil twilight (RCA Electro-Optics Handbook, 1974)."""
+EXTINCTION_PER_M = (0.03, 0.006)
+"""Of fog 1 and rain 1: what these codes mean."""
+DIMMING = 0.8
+"""Of display values at time 1, in powers of e."""
+AIRLIGHT = 0.82
+"""Display value of the air where no sky is photographed: a bright haze."""
+JUST_SEEN = 0.05
+"""Contrast at which a thing is just seen (CIE S 017, 17-31-019); and light, of white's, that a screen adds."""
+CONTRAST_TOLERANCE = 2.5
+"""Factor on it: all of a car's box in the photograph is looked at, which need not be its own."""
+JUDGED_PX = 25.0
+"""Height of boxes of which it is asked whether they are seen: KITTI judges no lower ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +109,14 @@ def judge_at_hand() -> JudgeName:
     return "outlines" if _open3d() is None else "open3d"
 
 
-def check_scene(base: SceneIR, perturbed: SceneIR, by: JudgeName | None = None) -> list[str]:
+def check_scene(
+    base: SceneIR, perturbed: SceneIR, by: JudgeName | None = None, joint_weather: bool = True
+) -> list[str]:
     """What is violated, one line each, such as `objects[3]: collision with objects[1], 0.52 m2 (0.00 before)`.
 
     by: whose judgement counts, by default that of `judge_at_hand`, which also stands in where Open3D is asked for
-    and missing. Nothing counts that was as bad in `base`. Empty where the change is feasible.
+    and missing. joint_weather: whether weather is looked at beyond its bounds: what comes together, and whom it
+    hides. Nothing counts that was as bad in `base`. Empty where the change is feasible.
     """
     judge = _Outlines() if by == "outlines" else _judge()
     if len(base.objects) != len(perturbed.objects):
@@ -109,7 +130,7 @@ def check_scene(base: SceneIR, perturbed: SceneIR, by: JudgeName | None = None) 
         found += [f"objects[{i}]: {line}" for line in lines + _frame(base, old, new)]
     found += _collisions(dict(enumerate(before)), dict(enumerate(after)), judge)
     found += _hidden(base, before, after, judge)
-    return found
+    return found + (_weather(base, perturbed) + _unseen(base, perturbed, after) if joint_weather else [])
 
 
 def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list[str]:
@@ -240,6 +261,65 @@ def _codes(scene: SceneIR, reach: Reach) -> list[str]:
         for name, (code, low, high) in ranges.items()
         if code.numel() and not (low - 1e-6 <= float(code.min()) and float(code.max()) <= high + 1e-6)
     ]
+
+
+def _weather(base: SceneIR, perturbed: SceneIR) -> list[str]:
+    """What hardly ever comes together, and does so more than before."""
+    before, after = (_Sky(*scene.environment.weather.tolist()) for scene in (base, perturbed))
+    found = []
+    if after.fog + after.rain > max(1.0, before.fog + before.rain) + WEATHER_TOLERANCE:
+        found.append(f"weather: fog {after.fog:.2f} is washed out by rain {after.rain:.2f}")
+    if after.rain - after.overcast > max(RAIN_BESIDE_SUN, before.rain - before.overcast) + WEATHER_TOLERANCE:
+        found.append(f"weather: rain {after.rain:.2f} out of a sky covered {after.overcast:.2f}")
+    if after.light_lx < min(TWILIGHT_LX, before.light_lx) * (1 - 5 * WEATHER_TOLERANCE):
+        found.append(f"weather: {after.light_lx:.1f} lx, darker than at the end of civil twilight")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Sky:
+    """Weather by its codes."""
+
+    fog: float
+    rain: float
+    time: float
+    overcast: float
+
+    @property
+    def light_lx(self) -> float:
+        """What falls on the road. A cover takes nine tenths, fog is one too, and strong rain's takes more."""
+        dusk = (TWILIGHT_LX / DAYLIGHT_LX) ** self.time
+        return DAYLIGHT_LX * dusk * 0.1 ** (self.fog + self.rain + self.overcast)
+
+    def dimmed(self, tones: Array, air: float, away_m: float) -> Array:
+        """Display values as they look so far away, where the air is as bright as `air`."""
+        clear = math.exp(-away_m * (EXTINCTION_PER_M[0] * self.fog + EXTINCTION_PER_M[1] * self.rain))
+        return (clear * tones + (1 - clear) * air) * math.exp(-DIMMING * self.time**2)
+
+
+def _unseen(base: SceneIR, perturbed: SceneIR, cars: list[_Car]) -> list[str]:
+    """Cars that the photograph shows, and of which air and dusk leave hardly a tone: what is in their boxes there,
+    behind as much haze as there is now between them and the camera (Koschmieder's law), and as dim."""
+    before, after = (_Sky(*scene.environment.weather.tolist()) for scene in (base, perturbed))
+    photograph = base.photograph.double().numpy().mean(axis=0)
+    sky = base.environment.sky.numpy() > 0.5
+    air = float(photograph[sky].mean()) if sky.any() else AIRLIGHT
+    found = []
+    for i, car in enumerate(cars):
+        x0, y0, x1, y1 = (max(round(value), 0) for value in base.objects.box2d[i].tolist())
+        tones = photograph[y0 : y1 + 1, x0 : x1 + 1]
+        if y1 - y0 < JUDGED_PX or not tones.size:
+            continue
+        then, now = (_contrast(sky.dimmed(tones, air, float(car.position[2]))) for sky in (before, after))
+        if then >= JUST_SEEN and now < JUST_SEEN / CONTRAST_TOLERANCE:
+            found.append(f"objects[{i}]: out of sight, contrast {now:.3f} ({then:.2f} before)")
+    return found
+
+
+def _contrast(tones: Array) -> float:
+    """Deviation of the light of display values, over its mean and what a screen adds to it."""
+    light = tones**2.2
+    return float(light.std() / (light.mean() + JUST_SEEN))
 
 
 def _height(base: SceneIR, old: _Car, new: _Car) -> list[str]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.types import CLASSES, Targets
+from drivesem.attack.contrast import LEAST_CONTRAST, contrasts
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import place, to_clip, yaw_matrix
@@ -43,11 +44,14 @@ _OPAQUE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Difficulty:
-    """Which objects are judged; the others are ignored, neither missed nor hit. Defaults: KITTI's "moderate"."""
+    """Which objects are judged; the others are ignored, neither missed nor hit. Defaults: KITTI's "moderate", and
+    what a person can see (`contrast`), as far as there are pictures; a min_contrast of 0 leaves that out.
+    """
 
     min_height_px: float = 25.0
     max_occlusion: int = 1
     max_truncation: float = 0.3
+    min_contrast: float = LEAST_CONTRAST
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +91,7 @@ class MovedLabels:
 class Labeller:
     """Labels scenes that differ from `base` by theta only. Carries no gradient: what a loss aims at is constant.
 
-    base_render: the benign re-render; without it occlusion is taken as unchanged.
+    base_render: the benign re-render; without it occlusion is taken as unchanged, and all is taken to be seen.
     """
 
     def __init__(
@@ -108,7 +112,7 @@ class Labeller:
         self._box2d = objects.box2d.detach().cpu().numpy()
         self._truncation = objects.truncation.detach().cpu().numpy()
         self._occlusion = objects.occlusion.cpu().numpy()
-        self._ignore = self._too_hard(self._box2d, self._truncation, self._occlusion)
+        self._ignore = self._too_hard(self._box2d, self._truncation, self._occlusion) | self._faint(base_render)
         # Moved boxes stay in the image, or where the benign box lies if that is outside of it.
         self._lowest = np.minimum(self._box2d, 0)
         self._highest = np.maximum(self._limit.astype(self._box2d.dtype), self._box2d)
@@ -148,7 +152,7 @@ class Labeller:
             occlusion = _new_occlusion(self._occlusion, self._hidden, hidden)
             gone = (hidden >= 1) & (self._hidden < 1)
             out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS)
-        hard = self._too_hard(boxes, truncation, occlusion) | gone
+        hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render)
         device = self._paper.boxes_xyxy.device
         return MovedLabels(
             mode="moved",
@@ -183,6 +187,12 @@ class Labeller:
             | (truncation > self.difficulty.max_truncation)
         )
 
+    def _faint(self, render: Render | None) -> NDArray[np.bool_]:
+        """(N,) bool: what a person can hardly see in a render."""
+        if self._hidden is None or render is None or self.difficulty.min_contrast == 0:
+            return np.zeros(len(self._box2d), np.bool_)
+        return contrasts(render) < self.difficulty.min_contrast
+
     def _project(self, scene: SceneIR) -> Array:
         """Tight boxes (N, 4) px of the deformed meshes, cut at the near plane, not at the image border."""
         objects = scene.objects
@@ -205,7 +215,7 @@ def targets(
 ) -> MovedLabels:
     """Labels of a perturbed scene, for a single call; keep a `Labeller` where one scene is labelled more often.
 
-    Not differentiable. Without the two renders occlusion is taken as unchanged.
+    Not differentiable. Without the two renders occlusion is taken as unchanged, and all is taken to be seen.
     """
     return Labeller(base_scene, base_render, difficulty).labels(mode, perturbed_scene, render)
 

@@ -13,11 +13,13 @@ from detectors.base import Detector, Predictor, RawPredictions, predict
 from detectors.types import Detections, Targets
 from drivesem.attack import detection_loss, goals
 from drivesem.attack.aims import EVERYTHING, Aim
+from drivesem.attack.fading import Fading
+from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.space import ParameterSpace
+from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.evaluation import failures
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor, render_batch
@@ -48,8 +50,9 @@ class Objective:
 
     label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
     away from the label. They are constant in the gradient. term: one of `goals.GOALS`, or a key of
-    `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. t_star: score from which a detection
-    counts; by default the detector's own. aim: what counts as a failure, and is raised; by default everything.
+    `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. difficulty: what is judged. t_star:
+    score from which a detection counts; by default the detector's own. aim: what counts as a failure, and is
+    raised; by default everything.
     Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
     RangeError where it has no such term.
     """
@@ -73,9 +76,10 @@ class Objective:
         self.t_star = t_star_of(detector, t_star)
         self.judged = JudgedClasses.of(detector)
         self.aim = aim
+        self.difficulty = difficulty or Difficulty()
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0))
-        self._labeller = Labeller(space.scene, base_render, difficulty)
+        self._labeller = Labeller(space.scene, base_render, self.difficulty)
         self._benign = self._judged(space.scene, base_render)
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
         self._scores: dict[bytes, Score] = {}
@@ -161,6 +165,15 @@ class Objective:
             success_paper=self._failures(self._labeller.paper(), detections).success and not hidden,
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
+
+    def feasible_set(self, limits: Limits | None = None) -> FeasibleSet:
+        """What can be, and is seen through the weather as far as difficulty asks for it."""
+        fades, least = None, self.difficulty.min_contrast
+        if least > 0 and Parameter.WEATHER in self.space.params:
+            seen = ~self._labeller.paper().ignore.cpu().numpy()
+            environment = self.space.scene.environment
+            fades = Fading(self._benign.render, environment, self.compositor.air, seen, least)
+        return FeasibleSet(self.space, limits, fades)
 
     def problem(self, feasible: FeasibleSet) -> Problem:
         """This objective as attacks see it."""

@@ -14,7 +14,6 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
-from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import LabelMode, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.base import AttackResult
@@ -84,7 +83,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         t_star=settings.t_star,
         aim=settings.aim,
     )
-    feasible = FeasibleSet(space)
+    feasible = objective.feasible_set()
     search = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
     return AttackedScene(
         identifier=identifier,
@@ -140,6 +139,8 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
         checked_by=judge_at_hand(),
+        min_contrast=objective.difficulty.min_contrast,
+        joint_weather=True,
     )
 
 

@@ -60,7 +60,8 @@ class FrameResult:
     """One frame of a run. Lists of boxes are in the frame's pixels; `seconds` is the only field that may differ
     between two runs with the same configuration. violated_at_start: constraints that the photographed scene does
     not meet, and that may only not get worse. checked_by: what the second feasibility check judged with, open3d or
-    (as before there was a choice) outlines.
+    (as before there was a choice) outlines. min_contrast: below it objects were ignored, 0 where that was no rule;
+    joint_weather: whether that check bounded weather codes together, too. Both have the values of earlier runs.
     """
 
     identifier: str
@@ -83,6 +84,8 @@ class FrameResult:
     seconds: float
     violated_at_start: tuple[str, ...] = ()
     checked_by: Literal["open3d", "outlines"] = "outlines"
+    min_contrast: float = 0.0
+    joint_weather: bool = False
 
     @property
     def feasible(self) -> bool:

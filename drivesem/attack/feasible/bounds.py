@@ -19,7 +19,8 @@ class Limits:
     """What counts as feasible. strain: range of the deformation's singular values; clearance_m: between
     footprints; road_loss: share of a footprint that may leave the road; height_kept: visible height, as a share
     of the start's; area_kept, in_frame: least visible and least unclipped share of a car's image box (or the
-    start's); minimum_px: least width and height of the clipped box; near_m: least distance from the camera plane.
+    start's); minimum_px: least width and height of the clipped box; near_m: least distance from the camera plane;
+    joint_weather: whether weather codes are bounded together.
     """
 
     strain: tuple[float, float] = (0.7, 1.4)
@@ -30,6 +31,7 @@ class Limits:
     in_frame: float = 0.5
     minimum_px: float = 8.0
     near_m: float = 1.0
+    joint_weather: bool = True
 
 
 class Surroundings:

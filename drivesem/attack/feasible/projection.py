@@ -1,9 +1,9 @@
 """The way back to what can be: after every step of an attack, theta is projected onto the feasible set.
 Feasible means: inside the bounds; the mesh is not inverted and only moderately strained, its lowest lattice layer
 fixed vertically, nothing below its wheels; cars stay on the kind of surface they stood on, do not pass through
-each other, and stay in the picture and visible. No constraint may be violated more than at theta = 0 (real labels
-overlap and park on kerbs), so theta = 0 is always feasible. The pose stays on the ground plane by construction of
-`ParameterSpace.apply`.
+each other, and stay in the picture and visible; weather is one that there is, and cars show through it. No
+constraint may be violated more than at theta = 0 (real labels overlap and park on kerbs), so theta = 0 is always
+feasible. The pose stays on the ground plane by construction of `ParameterSpace.apply`.
 
 `drivesem.attack.feasibility_check` judges finished scenes a second time and shares no code with this module.
 """
@@ -21,6 +21,7 @@ from drivesem.attack.feasible.bounds import Bounds, Limits, Surroundings, Violat
 from drivesem.attack.feasible.cars import TOLERANCE, Array, Cars, Flags, Indices, Values, array, turn_of
 from drivesem.attack.feasible.strain import StrainBound
 from drivesem.attack.feasible.surfaces import CarSurfaces, extents, lowest
+from drivesem.attack.feasible.weather import Fading, WeatherSet
 from drivesem.attack.space import Parameter, ParameterSpace, ground_axes
 from scene_ir.errors import RangeError
 
@@ -38,11 +39,16 @@ _HALVINGS = 5
 
 
 class FeasibleSet:
-    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond."""
+    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond.
 
-    def __init__(self, space: ParameterSpace, limits: Limits | None = None) -> None:
+    fades: who is lost from sight in which weather; by default nobody.
+    """
+
+    def __init__(self, space: ParameterSpace, limits: Limits | None = None, fades: Fading | None = None) -> None:
         self.space = space
         self.limits = limits or Limits()
+        where = space.slice_of(Parameter.WEATHER)
+        self._weather = None if where is None else WeatherSet(space, where, self.limits.joint_weather, fades)
         objects = space.scene.objects
         self._lower = array(space.lower)
         self._upper = array(space.upper)
@@ -75,9 +81,10 @@ class FeasibleSet:
     def project(self, theta: Tensor) -> Projected:
         """The nearest feasible theta (D,) we can find; `theta` itself where it is feasible.
 
-        Deterministic and idempotent. First the bounds, then the strain of each mesh, scaled back car by car; then
-        the cars that violate something go back to the photograph and take mesh, rotation and translation up again,
-        each as far as all constraints allow. Raises ShapeError; RangeError naming a coordinate that is not finite.
+        Deterministic and idempotent. First the bounds, then weather, then the strain of each mesh, scaled back car
+        by car; then the cars that violate something go back to the photograph and take mesh, rotation and
+        translation up again, each as far as all constraints allow. Raises ShapeError; RangeError naming a
+        coordinate that is not finite.
         """
         self.space.unflatten(theta)
         values = theta.detach().cpu().numpy()
@@ -93,6 +100,7 @@ class FeasibleSet:
         """What theta (D,) violates, as `objects[3]: collision`; empty where it is feasible."""
         values = theta.detach().cpu().numpy()
         found = self._out_of_bounds(values, self._box(values))
+        found += [] if self._weather is None else self._weather.violations(values)
         if self.space.count == 0:
             return tuple(found)
         mesh = self._block(values, Parameter.MESH)
@@ -106,6 +114,8 @@ class FeasibleSet:
     def _project(self, values: Values) -> tuple[Values, list[str]]:
         boxed = self._box(values)
         active = self._out_of_bounds(values, boxed)
+        if self._weather is not None:
+            active += self._weather.bound(boxed, values)
         if self.space.count == 0:
             return boxed, active
         mesh, surface = self._block(boxed, Parameter.MESH), None

@@ -16,7 +16,8 @@ from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
 from drivesem.attack.aims import Aim
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.labels import Difficulty
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Parameter, ParameterSpace
@@ -116,7 +117,7 @@ def explain_frame(
     result = load_frame(folder / RESULT)
     objective, theta = rebuild(result, folder, attack, params, detector)
     space = objective.space
-    judge = Judge(objective.problem(FeasibleSet(space)))
+    judge = Judge(objective.problem(objective.feasible_set(Limits(joint_weather=result.joint_weather))))
     everything = torch.ones_like(theta, dtype=torch.bool)
     found = judge.outcome(theta, everything)
     if not found.success:
@@ -140,7 +141,7 @@ def explain_frame(
         contributions=tuple(contributions),
         exact=tuple(kind for kind in KINDS if len(teams[kind]) <= MOST_EXACT),
         sizes=tuple(players.sizes(space, theta)),
-        least=_least(objective, judge, theta, shortened, least),
+        least=_least(objective, judge, theta, shortened, least, result.joint_weather),
         sensitivity={name: _shares(*view) for name, view in views.items()},
         renders=judge.renders,
         seconds=round(time.perf_counter() - start, 3),
@@ -166,7 +167,8 @@ def rebuild(
     compositor = Compositor(scene, RenderSettings(backend=attack.backend))
     labels, term = attack.objective_labels, attack.objective
     aim = Aim.of(attack.target_objects, attack.target_classes)
-    return Objective(compositor, space, detector, labels, term, t_star=attack.t_star, aim=aim), theta
+    difficulty = Difficulty(min_contrast=result.min_contrast)
+    return Objective(compositor, space, detector, labels, term, difficulty, attack.t_star, aim), theta
 
 
 def weigh(
@@ -236,7 +238,9 @@ def _blocks(
     return blocks + [block for size, block in sorted(parts, key=lambda part: part[0]) if size > 0]
 
 
-def _least(objective: Objective, judge: Judge, theta: Tensor, shortened: Minimal, rendered: Rendered) -> Least:
+def _least(
+    objective: Objective, judge: Judge, theta: Tensor, shortened: Minimal, rendered: Rendered, joint_weather: bool
+) -> Least:
     space, small = objective.space, shortened.theta
     return Least(
         scan=shortened.scan,
@@ -248,7 +252,7 @@ def _least(objective: Objective, judge: Judge, theta: Tensor, shortened: Minimal
         norm_whole=judge.size(shortened.shortened),
         norm=judge.size(small),
         outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
-        violations=tuple(check_scene(space.scene, rendered.scene)),
+        violations=tuple(check_scene(space.scene, rendered.scene, joint_weather=joint_weather)),
         sizes=tuple(players.sizes(space, small)),
         failures=failure_records(objective, rendered),
         theta=tuple(

@@ -88,6 +88,6 @@ def check_feasibility(
     log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
 ) -> None:
     """What the second check finds in the saved scene, and whether the poses in it lie within the run's budget."""
-    found = check_scene(base, perturbed, result.checked_by)
+    found = check_scene(base, perturbed, result.checked_by, result.joint_weather)
     log.same("feasibility", "violations", list(result.violations), found)
     log.same("feasibility", "budget", [], check_reach(base, perturbed, Reach(**asdict(budget))))

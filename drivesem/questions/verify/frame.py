@@ -15,7 +15,7 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import Aim
 from drivesem.attack.judging import JudgedClasses
-from drivesem.attack.labels import Labeller, MovedLabels, to_kitti_labels
+from drivesem.attack.labels import Difficulty, Labeller, MovedLabels, to_kitti_labels
 from drivesem.attack.space import Budget, Parameter
 from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
@@ -104,7 +104,8 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     size = (base.camera.height, base.camera.width)
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
-        levels, labels = _render(log, pictures, base, perturbed, given.backend)
+        difficulty = Difficulty(min_contrast=result.min_contrast)
+        levels, labels = _render(log, pictures, _Scenes(base, perturbed), difficulty, given.backend)
         seen = {
             name: detections_in(given.detector, as_picture(image, given.device))
             for name, image in pictures.items()
@@ -125,20 +126,24 @@ class _Scenes:
 
 
 def _render(
-    log: CheckLog, pictures: Mapping[str, np.ndarray], base: SceneIR, perturbed: SceneIR, backend: str
+    log: CheckLog, pictures: Mapping[str, np.ndarray], scenes: _Scenes, difficulty: Difficulty, backend: str
 ) -> tuple[dict[str, Level], dict[str, MovedLabels]]:
-    """The three pictures against the scene; labels of the scene by mode."""
-    compositor = Compositor(base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
-    before, after = compositor.render(base), compositor.render(perturbed)
-    drawn = {BENIGN: base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
+    """The three pictures against the scene; labels of the scene by mode, and contrasts by the pictures."""
+    compositor = Compositor(scenes.base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
+    before, after = compositor.render(scenes.base), compositor.render(scenes.perturbed)
+    drawn = {BENIGN: scenes.base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
     levels: dict[str, Level] = {}
     for name, image in drawn.items():
         apart = np.abs(pictures[name].astype(np.int16) - to_uint8(image)).max(axis=2)
         levels[name] = Level(int(apart.max()), float((apart > 0).mean()))
         found = f"up to {levels[name].largest} levels off, in {100 * levels[name].share:.3g} % of the pixels"
         log.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
-    labeller = Labeller(base, before)
-    return levels, {"paper": labeller.paper(), "moved": labeller.moved(perturbed, after)}
+    shown = [
+        replace(render, image=as_picture(pictures[name], "cpu"))
+        for render, name in ((before, RERENDER), (after, COUNTEREXAMPLE))
+    ]
+    labeller = Labeller(scenes.base, shown[0], difficulty)
+    return levels, {"paper": labeller.paper(), "moved": labeller.moved(scenes.perturbed, shown[1])}
 
 
 def _judge(

@@ -18,10 +18,10 @@ EASY = Difficulty(min_height_px=1.0, max_occlusion=3, max_truncation=1.0)
 
 
 def _render(scene, ids, opacities):
-    """A Render with given object ids (H, W) and full-frame opacities (N, H, W)."""
+    """A Render with given object ids (H, W) and full-frame opacities (N, H, W): white cars on black ground."""
     h, w = scene.camera.height, scene.camera.width
     return Render(
-        image=torch.zeros(3, h, w),
+        image=(ids > 0).float().expand(3, h, w),
         depth=torch.ones(h, w),
         object_id=ids,
         opacity=tuple(Crop(o[None], 0, 0) for o in opacities),

@@ -19,7 +19,7 @@ from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, Render
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0))
-EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1)
+EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1, min_contrast=0)
 
 
 class StubCompositor:
