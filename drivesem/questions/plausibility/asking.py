@@ -1,4 +1,4 @@
-"""How common a run's vehicles are, before and after the attack."""
+"""How common a run's vehicles are, before and after the attack, and its weather."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from drivesem.data.kitti import read_labels
 from drivesem.questions.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
+from drivesem.questions.plausibility.weather import CODES, Weather, weather_of
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from drivesem.run.finished import Run, load_runs
+from drivesem.run.finished import Frame, Run, load_runs
 from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Plausibility as Config
 from drivesem.settings.errors import UsageError
@@ -24,25 +25,27 @@ _DECIMALS = 2
 _NOTE = (
     "Percentile: two-sided share of the vehicles in KITTI's 7,481 label files that are at least as unusual; 100 "
     "is the median (for yaw the commonest heading), 0 is never seen. Each figure by itself: distributions are "
-    f"marginal, over Car, Van and Truck. Lowest: of a vehicle's figures. Unusual: below {UNUSUAL:g}."
+    f"marginal, over Car, Van and Truck. Lowest: of a vehicle's figures. Unusual: below {UNUSUAL:g}. Weather "
+    "above 100 % of what there may be together is one that hardly ever is."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class FramePair:
-    """One frame's vehicles before and after the attack."""
+    """One frame's vehicles before and after the attack, and its weather, where that was changed."""
 
     identifier: str
     kinds: tuple[str, ...]
     before: Plausibility
     after: Plausibility
+    weather: Weather | None = None
 
 
 def plausibility_run(config: Config) -> Answer:
     """Look up all vehicles of a run, and write what is said. Raises UsageError or SceneError for bad input."""
     (run,) = load_runs([config.run or ""], config.limit)
     out = folder_of(config.out, run.folder / "plausibility")
-    pairs = [_pair(run, frame.result.identifier) for frame in run.frames]
+    pairs = [_pair(run, frame) for frame in run.frames]
     if not any(pair.kinds for pair in pairs):
         raise UsageError("--run", "a run with vehicles", run.folder)
     data = {"run": str(run.folder), **summary(pairs)}
@@ -54,8 +57,12 @@ def plausibility_run(config: Config) -> Answer:
         heading="Plausibility",
         data=data,
         tables={"plausibility": _vehicles(pairs)},
-        sheets=[figures, Sheet("least common vehicle of each frame", ("frame", "before", "after"), least)],
-        printed=[figures],
+        sheets=[
+            figures,
+            Sheet("least common vehicle of each frame", ("frame", "before", "after"), least),
+            *_weather_sheet(pairs),
+        ],
+        printed=[figures, *_weather_sheet(pairs)],
         notes=[_NOTE],
         only_json=True,
     )
@@ -63,12 +70,13 @@ def plausibility_run(config: Config) -> Answer:
     return answer
 
 
-def _pair(run: Run, identifier: str) -> FramePair:
+def _pair(run: Run, frame: Frame) -> FramePair:
+    identifier = frame.result.identifier
     folder = run.folder / "frames" / identifier
     before, after = (read_labels(folder / name) for name in (_BEFORE, _AFTER))
     if before.kind != after.kind:
         raise ShapeError(str(folder / _AFTER), f"the {len(before.kind)} vehicles of {_BEFORE}", len(after.kind))
-    return FramePair(identifier, before.kind, plausibility(before), plausibility(after))
+    return FramePair(identifier, before.kind, plausibility(before), plausibility(after), weather_of(frame.result))
 
 
 def _figures(found: Plausibility) -> dict[str, np.ndarray]:
@@ -76,8 +84,9 @@ def _figures(found: Plausibility) -> dict[str, np.ndarray]:
 
 
 def summary(pairs: Sequence[FramePair]) -> dict[str, Any]:
-    """JSON's form: a row a figure over all vehicles, and each frame's least common vehicle; fractions of 1 for
-    shares, percentiles in [0, 100], None where nothing is known."""
+    """JSON's form: a row a figure over all vehicles, each frame's least common vehicle, and how near its weather
+    comes to what hardly ever is; fractions of 1 for shares, percentiles in [0, 100], None where nothing is known.
+    """
     rows = []
     for name in (LOWEST, *NAMES):
         before, after = (
@@ -98,9 +107,16 @@ def summary(pairs: Sequence[FramePair]) -> dict[str, Any]:
             }
         )
     frames = [
-        {"frame": pair.identifier, "before": _least(pair.before), "after": _least(pair.after)} for pair in pairs
+        {
+            "frame": pair.identifier,
+            "before": _least(pair.before),
+            "after": _least(pair.after),
+            "weather": None if pair.weather is None else _rounded(pair.weather.share),
+        }
+        for pair in pairs
     ]
-    return {"frames": len(pairs), "rows": rows, "by_frame": frames}
+    beyond = [pair.identifier for pair in pairs if pair.weather is not None and pair.weather.beyond]
+    return {"frames": len(pairs), "rows": rows, "by_frame": frames, "weather_beyond": beyond}
 
 
 def _least(found: Plausibility) -> float | None:
@@ -124,6 +140,18 @@ def _vehicles(pairs: Sequence[FramePair]) -> list[dict[str, Any]]:
                 | {f"{n}_{when}": _rounded(side[n][i]) for n in (LOWEST, *NAMES) for when, side in sides.items()}
             )
     return lines
+
+
+def _weather_sheet(pairs: Sequence[FramePair]) -> list[Sheet]:
+    """A line a frame whose weather was changed, the least likely first; no sheet where none was."""
+    known = [(pair.identifier, pair.weather) for pair in pairs if pair.weather is not None]
+    known.sort(key=lambda frame: -frame[1].share)
+    rows = tuple(
+        (name, *(f"{code:.2f}" for code in weather.codes), _shown(weather.share, 100), weather.rule)
+        for name, weather in known
+    )
+    columns = ("frame", *CODES, "of what there may be, %", "by")
+    return [Sheet("weather, and what of it comes together", columns, rows)] if rows else []
 
 
 def _sheet(data: dict[str, Any]) -> Sheet:

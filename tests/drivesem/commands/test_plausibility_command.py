@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 
 from drivesem.cli import main
 from drivesem.data.kitti import write_labels
-from drivesem.run.results import FrameResult, dump_frame
+from drivesem.run.results import Coordinate, FrameResult, dump_frame
 from drivesem.settings.commands import Attack
 from drivesem.settings.text import to_yaml
 from scene_ir import files
@@ -81,6 +82,7 @@ def test_before_and_after(run: Path, capsys: pytest.CaptureFixture[str]) -> None
     one, two = data["by_frame"]
     assert one["before"] > 5 > one["after"]
     assert two["before"] == two["after"]
+    assert (one["weather"], data["weather_beyond"]) == (None, [])
     cars = list(csv.DictReader((out / "plausibility.csv").read_text().splitlines()))
     assert [(car["frame"], car["object"]) for car in cars] == [("a", "0"), ("a", "1"), ("b", "0")]
     assert cars[2]["spacing_m_before"] == ""
@@ -92,6 +94,18 @@ def test_a_table_for_people(run: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["plausibility", "--run", str(run), "--limit", "1", "--out", str(tmp_path / "p")]) == 0
     assert "1 frames: percentiles by KITTI's labels" in capsys.readouterr().out
     assert len((tmp_path / "p" / "plausibility.csv").read_text().splitlines()) == 3
+
+
+def test_weather_and_what_of_it_comes_together(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {"weather.fog": 0.75, "weather.rain": 0.75, "weather.time_of_day": 0.0, "weather.overcast": 0.5}
+    theta = tuple(Coordinate(name, "code", value, 0.0, 1.0, "") for name, value in codes.items())
+    files.write_text(run / "frames" / "a" / "result.json", dump_frame(replace(result("a"), theta=theta)))
+    assert main(["plausibility", "--run", str(run), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert [frame["weather"] for frame in data["by_frame"]] == [1.5, None]
+    assert data["weather_beyond"] == ["a"]
+    written = (run / "plausibility" / "plausibility.md").read_text()
+    assert "| a | 0.75 | 0.75 | 0.00 | 0.50 | 150.0 | fog in rain |" in written
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

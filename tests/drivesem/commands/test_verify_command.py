@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,17 @@ import pytest
 import torch
 
 from detectors.types import CLASSES, Detections
+from drivesem.attack import objective
+from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.labels import Difficulty
 from drivesem.attack.space import ParameterSpace
 from drivesem.cli import main
 from drivesem.questions.verify.differences import CHECKS
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
+from drivesem.run import frame as run_frame
 from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.io import load_scene
@@ -105,6 +111,38 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
     # Another number of threads may round a pixel otherwise.
     assert data["rendered_again"]["counterexample.png"]["largest_share"] < 1e-4
     assert json.loads((run / "verify.json").read_text()) == data
+
+
+@pytest.fixture
+def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run as it was before contrast counted and weather was bounded together, and results had fields for that."""
+    monkeypatch.setattr(objective, "Difficulty", lambda: Difficulty(min_contrast=0))
+    free = Limits(joint_weather=False)
+    monkeypatch.setattr(objective.Objective, "feasible_set", lambda self: FeasibleSet(self.space, free))
+    monkeypatch.setattr(run_frame, "check_scene", partial(check_scene, joint_weather=False))
+    out = tmp_path / "earlier"
+    words = ("--method", "random", "--queries", "2", "--budget", "translate=0.05m", "--out", str(out))
+    assert main(["attack", *WORDS, *words]) == 0
+    change(
+        out / FRAME / "result.json", lambda data: [data.pop(name) for name in ("min_contrast", "joint_weather")]
+    )
+    monkeypatch.undo()
+    monkeypatch.setattr(run_folder, "load_predictor", lambda *_: Drifting())
+    return out
+
+
+def test_an_earlier_run_is_judged_by_the_rules_of_its_time(
+    earlier: Path, verify: Callable[..., dict[str, Any]]
+) -> None:
+    result = load_frame(earlier / FRAME / "result.json")
+    assert (result.min_contrast, result.joint_weather) == (0.0, False)
+    codes = {c.name: c.value for c in result.theta}
+    assert codes["weather.fog"] + codes["weather.rain"] > 1  # else there is nothing to be judged otherwise
+    verify(earlier, code=0)
+    change(earlier / FRAME / "result.json", lambda data: data.update(joint_weather=True))
+    assert told(verify(earlier))["violations"]["check"] == "feasibility"
+    change(earlier / FRAME / "result.json", lambda data: data.update(joint_weather=False, min_contrast=9.0))
+    assert checks(verify(earlier)) == {"labels"}
 
 
 def test_for_people_and_elsewhere(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
