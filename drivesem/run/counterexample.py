@@ -60,6 +60,11 @@ class AttackOptions(TypedDict, total=False):
     precision: Literal["float32", "bfloat16", "float16"]
     t_star: float
     tiles: Literal["auto", "off"]
+    draws: int
+    nuisances: str
+    confirm: bool
+    witness: str
+    peer: str
     device: str
     seed: int
 

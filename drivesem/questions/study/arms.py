@@ -11,7 +11,7 @@ from pathlib import Path
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.settings.blocks import Attacking, Sharing, shared
+from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 
 QUICK_FRAMES, FRAMES = 6, 200
@@ -42,7 +42,7 @@ class Arm:
 def attack_of(study: Study) -> Attack:
     """The attack that a study's arms vary."""
     limit = study.limit or (QUICK_FRAMES if study.quick else FRAMES)
-    alike = shared(study, Attacking) | shared(study, Sharing)
+    alike = shared(study, Attacking) | shared(study, Grading) | shared(study, Sharing)
     return Attack(**alike | {"limit": limit, "method": study.method})
 
 
