@@ -21,7 +21,7 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.tally import boxes_of, tally
+from drivesem.run.tally import boxes_of, graded, tally
 from drivesem.settings.commands import COMBO_NUMBERS, GRADIENT_FREE, Attack, Report
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import command_line
@@ -291,9 +291,20 @@ def _summary(path: Path) -> RunSummary:
             attacked_moved=_scores(data["attacked"]["moved"]),
             lost_objects=dict(data["lost_objects_by_class"]),
             phantoms=dict(data["phantoms_by_class"]),
+            **_grades(data),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(str(path), "the figures of a run", error) from error
+
+
+def _grades(data: dict[str, Any]) -> dict[str, Any]:
+    """How sure the failures of a run are; of one that was written before anybody asked, that nobody knows."""
+    if "grades" in data:
+        return {name: data[name] for name in ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")}
+    return graded([]) | {
+        "grades": {**graded([])["grades"], "threshold": data["lost_objects"] + data["phantoms"]},
+        "frames_ungraded": data["frames"],
+    }
 
 
 def _scores(data: dict[str, Any]) -> Scores:

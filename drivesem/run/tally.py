@@ -28,6 +28,18 @@ def at_least(grade: Grade) -> Callable[[Failure], bool]:
     return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
 
 
+def graded(results: Sequence[FrameResult]) -> dict[str, Any]:
+    """Those of the fields that say how sure the failures are, and what the search cost."""
+    failures = [failure for r in results for failure in r.failures]
+    return {
+        "passes": sum(r.passes or 0 for r in results),
+        "grades": {str(grade): sum(map(at_least(grade), failures)) for grade in Grade},
+        "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
+        "frames_ungraded": sum(not r.graded for r in results),
+        "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
+    }
+
+
 def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, headline: str) -> dict[str, Any]:
     """Those fields of `RunSummary` that follow from its frames, by name."""
 
@@ -38,7 +50,6 @@ def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, 
         labels = [failure.label for r in results for failure in r.failures if failure.kind == kind]
         return {name: labels.count(name) for name in judged.names}
 
-    failures = [failure for r in results for failure in r.failures]
     return {
         "frames": len(results),
         "objects": sum(r.objects for r in results),
@@ -52,9 +63,5 @@ def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, 
         "successes_moved": sum(r.success_moved for r in results),
         "feasible_fraction": sum(r.feasible for r in results) / len(results) if results else None,
         "queries": sum(r.queries for r in results),
-        "passes": sum(r.passes or 0 for r in results),
-        "grades": {str(grade): sum(map(at_least(grade), failures)) for grade in Grade},
-        "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
-        "frames_ungraded": sum(not r.graded for r in results),
-        "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
+        **graded(results),
     }
