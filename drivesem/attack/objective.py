@@ -173,8 +173,8 @@ class Objective:
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
-    def problem(self, feasible: FeasibleSet) -> Problem:
-        """This objective as attacks see it."""
+    def problem(self, feasible: FeasibleSet, keep_last: bool = False) -> Problem:
+        """This objective as attacks see it. keep_last: as of `Problem`."""
         return Problem(
             loss_and_grad=self.loss_and_grad,
             project=feasible.project,
@@ -184,6 +184,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
             preview=self.preview,
+            keep_last=keep_last,
         )
 
     @property

@@ -182,6 +182,8 @@ class Worker:
             budget=budget_of(config.budget),
             aim=aim,
             grader=self.grader,
+            keep_last=config.keep == "last",
+            only_bounds=config.project == "bounds",
         )
         try:
             return attack_scene(identifier, scene, self.detector, settings)

@@ -54,6 +54,8 @@ class AttackOptions(TypedDict, total=False):
     early_stop: bool
     objective_labels: Literal["moved", "paper"]
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"]
+    keep: Literal["best", "last"]
+    project: Literal["feasible", "bounds"]
     target_objects: str
     target_classes: str
     backend: Literal["warp", "reference"]

@@ -48,7 +48,8 @@ class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
-    how sure its failures are, None to leave them ungraded.
+    how sure its failures are, None to leave them ungraded. keep_last,
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`.
     """
 
     attack: AttackMethod
@@ -61,6 +62,8 @@ class FrameSettings:
     budget: Budget | None = None
     aim: Aim = EVERYTHING
     grader: Grader | None = None
+    keep_last: bool = False
+    only_bounds: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +102,9 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         t_star=settings.t_star,
         aim=settings.aim,
     )
-    feasible = FeasibleSet(space)
-    search = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
+    feasible = FeasibleSet(space, only_bounds=settings.only_bounds)
+    problem = objective.problem(feasible, settings.keep_last)
+    search = settings.attack(problem, space.theta0, settings.seed)
     rendered = objective.evaluate(search.theta)
     benign = objective.detect(scene.photograph)
     passes = objective.passes + 1

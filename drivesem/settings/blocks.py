@@ -249,6 +249,11 @@ class Attacking(Threshold, Precision, Scenes):
     true objects; confidence: SqueezeDet's as published, with the IoU of the predicted box; total: its whole loss;
     hide: objects fall below t*; phantom: something rises to t* where nothing is; failure: both; localisation:
     boxes leave their objects."""
+    keep: Literal["best", "last"] = "best"
+    """Which iterate is handed back: the best of all, by failures, then by the objective; or the last, whatever it
+    does, as in the paper."""
+    project: Literal["feasible", "bounds"] = "feasible"
+    """What each step is brought back to: what is feasible; or the bounds alone, as in the paper."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
 

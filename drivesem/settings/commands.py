@@ -148,8 +148,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Draw what is certain by a second renderer too; single, multi, labels: and have the generator draw each
-    attack's pictures again (generated frames only)."""
+    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
+    certain is drawn by a second renderer in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
