@@ -125,13 +125,16 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
 
     name: Annotated[
-        tyro.conf.Positional[Literal["single", "multi", "samples", "steps", "labels", "transfer", "retrain"]],
-        tyro.conf.arg(metavar="{single,multi,samples,steps,labels,transfer,retrain}"),
+        tyro.conf.Positional[
+            Literal["single", "multi", "grades", "samples", "steps", "labels", "transfer", "retrain"]
+        ],
+        tyro.conf.arg(metavar="{single,multi,grades,samples,steps,labels,transfer,retrain}"),
     ]
-    """single: the six parameters, each alone; multi: the combinations 1 to 4; samples: success against queries for
-    each algorithm; steps: success against number and size of steps; labels: what labels that stay behind make of
-    an attack; transfer: counterexamples of combination 2 before other detectors; retrain: detectors trained on
-    with counterexamples, before benign frames, known and fresh counterexamples."""
+    """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
+    gradient, sampling and placebo; samples: success against queries for each algorithm; steps: success against
+    number and size of steps; labels: what labels that stay behind make of an attack; transfer: counterexamples of
+    combination 2 before other detectors; retrain: detectors trained on with counterexamples, before benign frames,
+    known and fresh counterexamples."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""

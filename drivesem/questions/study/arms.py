@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from drivesem.attack.objective import GRADIENT_PASSES
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
@@ -59,6 +60,8 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
             longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
             multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
         return _controlled(multi, out) if study.controls else multi
+    if study.name == "grades":
+        return _grades(base, out)
     if study.name == "samples":
         return _samples(replace(base, combo=DEFAULT_COMBO), study)
     if study.name == "transfer":
@@ -107,6 +110,25 @@ def _sources(base: Attack, study: Study) -> list[Arm]:
         arm = _combo(replace(base, detector=source), DEFAULT_COMBO)
         folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
         arms.append(replace(arm, name=short, folder=folder))
+    return arms
+
+
+def _grades(base: Attack, out: Path) -> list[Arm]:
+    """How sure failures are: si-FGSM, Auto-PGD with time for its steps to grow short, samples that take as many
+    passes as si-FGSM's gradients, and a placebo as large as either attack, for three sets of parameters.
+    """
+    sets = {
+        f"combo {DEFAULT_COMBO}": replace(base, combo=DEFAULT_COMBO),
+        "weather": replace(base, params=Parameter.WEATHER.value),
+        "all six": replace(base, params=",".join(p.value for p in Parameter)),
+    }
+    arms: list[Arm] = []
+    for name, config in sets.items():
+        apgd = replace(config, method="apgd", steps=_LONGER * base.steps)
+        halton = replace(config, method="halton", queries=GRADIENT_PASSES * base.steps)
+        arms += _controlled([_arm(name, replace(config, method="si-fgsm"))], out, (PLACEBO,))
+        arms += _controlled([_arm(f"{name}, apgd", apgd)], out, (PLACEBO,))
+        arms.append(_arm(f"{name}, halton", halton))
     return arms
 
 
