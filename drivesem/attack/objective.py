@@ -25,6 +25,8 @@ from scene_ir.types import Render, SceneIR
 
 OF_DETECTIONS = ("objectness", *goals.GOALS)
 """Terms that need no more than detections."""
+GRADIENT_PASSES = 3
+"""What a gradient counts, where a forward pass of the detector counts 1."""
 _REMEMBERED = 3
 """Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
 
@@ -52,6 +54,8 @@ class Objective:
     counts; by default the detector's own. aim: what counts as a failure, and is raised; by default everything.
     Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
     RangeError where it has no such term.
+
+    passes: of the detector so far, a gradient counted as GRADIENT_PASSES; the benign picture's is the first.
     """
 
     def __init__(
@@ -77,9 +81,15 @@ class Objective:
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, difficulty)
         self._benign = self._judged(space.scene, base_render)
+        self.passes = 1
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
+
+    @property
+    def labeller(self) -> Labeller:
+        """What labels the scene's states."""
+        return self._labeller
 
     @property
     def benign(self) -> Rendered:
@@ -113,6 +123,7 @@ class Objective:
             if torch.equal(theta, known):
                 return rendered
         scene = self.space.apply(self.space.scene, theta)
+        self.passes += 1
         rendered = self._judged(scene, self.compositor.render(scene))
         self._recent.append((theta.clone(), rendered))
         return rendered
@@ -162,8 +173,8 @@ class Objective:
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
-    def problem(self, feasible: FeasibleSet) -> Problem:
-        """This objective as attacks see it."""
+    def problem(self, feasible: FeasibleSet, keep_last: bool = False) -> Problem:
+        """This objective as attacks see it. keep_last: as of `Problem`."""
         return Problem(
             loss_and_grad=self.loss_and_grad,
             project=feasible.project,
@@ -173,6 +184,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
             preview=self.preview,
+            keep_last=keep_last,
         )
 
     @property
@@ -275,6 +287,7 @@ def _losses_and_gradients(
     losses = _losses(objectives, leaves)
     gradients = torch.autograd.grad(losses, leaves)
     for objective, gradient in zip(objectives, gradients, strict=True):
+        objective.passes += GRADIENT_PASSES
         bad = (~torch.isfinite(gradient)).nonzero()
         if len(bad):
             i = int(bad[0])

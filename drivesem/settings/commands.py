@@ -26,6 +26,7 @@ from drivesem.settings.blocks import (
     FinishedRun,
     Flag,
     FrameCommand,
+    Grading,
     LabelMode,
     NotNegative,
     Repeated,
@@ -57,7 +58,7 @@ Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attack(Tiles, Attacking, FrameCommand):
+class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Find feasible changes of driving scenes that a detector gets wrong."""
 
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
@@ -120,7 +121,7 @@ class Attack(Tiles, Attacking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study(Bootstrap, Attacking, FrameCommand):
+class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
 
     name: Annotated[
@@ -147,7 +148,8 @@ class Study(Bootstrap, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only)."""
+    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
+    certain is drawn by a second renderer in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None

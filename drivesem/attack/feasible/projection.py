@@ -38,10 +38,14 @@ _HALVINGS = 5
 
 
 class FeasibleSet:
-    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond."""
+    """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond.
 
-    def __init__(self, space: ParameterSpace, limits: Limits | None = None) -> None:
+    only_bounds: `project` keeps to the bounds and asks for nothing else, as the paper does.
+    """
+
+    def __init__(self, space: ParameterSpace, limits: Limits | None = None, only_bounds: bool = False) -> None:
         self.space = space
+        self.only_bounds = only_bounds
         self.limits = limits or Limits()
         objects = space.scene.objects
         self._lower = array(space.lower)
@@ -106,7 +110,7 @@ class FeasibleSet:
     def _project(self, values: Values) -> tuple[Values, list[str]]:
         boxed = self._box(values)
         active = self._out_of_bounds(values, boxed)
-        if self.space.count == 0:
+        if self.space.count == 0 or self.only_bounds:
             return boxed, active
         mesh, surface = self._block(boxed, Parameter.MESH), None
         if mesh is not None:

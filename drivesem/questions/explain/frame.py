@@ -250,7 +250,9 @@ def _least(objective: Objective, judge: Judge, theta: Tensor, shortened: Minimal
         outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
         violations=tuple(check_scene(space.scene, rendered.scene)),
         sizes=tuple(players.sizes(space, small)),
-        failures=failure_records(objective, rendered),
+        failures=failure_records(
+            objective.judged, rendered.moved.targets, rendered.detections, objective.failures(rendered, "moved")
+        ),
         theta=tuple(
             Coordinate(name=name, **facts)  # pyright: ignore[reportArgumentType]
             for name, facts in space.theta_by_name(small).items()

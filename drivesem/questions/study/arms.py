@@ -11,7 +11,7 @@ from pathlib import Path
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.settings.blocks import Attacking, Sharing, shared
+from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 
 QUICK_FRAMES, FRAMES = 6, 200
@@ -42,8 +42,9 @@ class Arm:
 def attack_of(study: Study) -> Attack:
     """The attack that a study's arms vary."""
     limit = study.limit or (QUICK_FRAMES if study.quick else FRAMES)
-    alike = shared(study, Attacking) | shared(study, Sharing)
-    return Attack(**alike | {"limit": limit, "method": study.method})
+    alike = shared(study, Attacking) | shared(study, Grading) | shared(study, Sharing)
+    # A study that confirms asks `drivesem confirm` of its arms; what is certain is confirmed anyway.
+    return Attack(**alike | {"limit": limit, "method": study.method, "confirm": Attack.confirm})
 
 
 def arms_of(study: Study, out: Path) -> list[Arm]:
@@ -56,7 +57,7 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
         multi = [_combo(base, number) for number in COMBO_NUMBERS]
         if study.method == "si-fgsm":
             longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
-            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer, PAPER_COMBOS[DEFAULT_COMBO]))
+            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
         return _controlled(multi, out) if study.controls else multi
     if study.name == "samples":
         return _samples(replace(base, combo=DEFAULT_COMBO), study)
@@ -72,7 +73,9 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
 
 
 def _arm(name: str, config: Attack, reference: float | None = None) -> Arm:
-    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference)
+    """reference: the paper's figure; it stands beside the paper's method and detector only."""
+    theirs = config.method == "si-fgsm" and config.detector == "squeezedet"
+    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if theirs else None)
 
 
 def _combo(base: Attack, number: int) -> Arm:

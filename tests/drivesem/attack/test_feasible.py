@@ -114,6 +114,16 @@ def test_bounds_are_named(street):
     assert FeasibleSet(space).violations(theta) == ("objects[2].yaw: bounds",)
 
 
+def test_only_bounds_leaves_all_else_as_it_is(street):
+    """As the paper does: cars may collide then."""
+    scene = street()
+    space = ParameterSpace(scene, ("translate",))
+    theta = torch.where(torch.arange(space.dim) % 4 < 2, space.upper, space.lower)
+    free = FeasibleSet(space, only_bounds=True).project(3 * theta)
+    assert torch.equal(free.theta, theta)
+    assert not torch.equal(FeasibleSet(space).project(3 * theta).theta, theta)
+
+
 def test_strain_and_the_lowest_layer(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
