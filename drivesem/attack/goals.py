@@ -57,7 +57,7 @@ def _hidden(found: Candidates, targets: Targets, threshold: float, known: Sequen
     for label, objects in _objects(targets).items():
         placed = found.boxes_of(label)
         meets = boxes.iou_matrix(objects.to(placed), placed.detach()) >= IOU
-        logit = _logit(found.log_scores[:, label]).expand_as(meets).masked_fill(~meets, -math.inf)
+        logit = logits_of(found.log_scores[:, label]).expand_as(meets).masked_fill(~meets, -math.inf)
         best = logit.amax(1) if logit.shape[1] else logit.new_full((len(objects),), -math.inf)
         total = total + (threshold - best).clamp_max(CERTAIN).sum()
     return total
@@ -78,7 +78,7 @@ def _phantoms(found: Candidates, targets: Targets, threshold: float, known: Sequ
         if len(regions):
             silent &= ~(boxes.ioa_matrix(placed, regions) >= IOU).any(1)
         silent &= boxes.area(placed) > 0
-        heard.append(_logit(found.log_scores[:, label][silent]))
+        heard.append(logits_of(found.log_scores[:, label][silent]))
     logit = torch.cat(heard) if heard else found.log_scores[:0, 0]
     if not len(logit):
         return _nothing(found) - CERTAIN
@@ -114,7 +114,7 @@ def _objects(targets: Targets) -> dict[int, Tensor]:
     return {label: targets.boxes_xyxy[kept][labels == label] for label in sorted(set(labels.tolist()))}
 
 
-def _logit(log_score: Tensor) -> Tensor:
+def logits_of(log_score: Tensor) -> Tensor:
     """log(s / (1 - s)) of log(s), exact near s = 0 and s = 1."""
     held = log_score.clamp_max(_LARGEST_LOG)
     return held - torch.log(-torch.expm1(held))

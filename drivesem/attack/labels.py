@@ -225,6 +225,19 @@ def hidden_share(render: Render) -> Tensor:
     return torch.from_numpy(_hidden_shares(render)).to(render.object_id.device)
 
 
+def shown_boxes(render: Render) -> Tensor:
+    """The box (N, 4) px of what shows of each object; zeros where nothing does."""
+    ids = render.object_id.cpu().numpy()
+    boxes = np.zeros((len(render.opacity), 4), dtype=np.float32)
+    for i, crop in enumerate(render.opacity):
+        height, width = crop.values.shape[1:]
+        seen = ids[crop.y0 : crop.y0 + height, crop.x0 : crop.x0 + width] == i + 1
+        columns, rows = seen.any(axis=0).nonzero()[0], seen.any(axis=1).nonzero()[0]
+        if len(rows):
+            boxes[i] = (crop.x0 + columns[0], crop.y0 + rows[0], crop.x0 + columns[-1], crop.y0 + rows[-1])
+    return torch.from_numpy(boxes).to(render.object_id.device)
+
+
 def _hidden_shares(render: Render) -> Array:
     ids = render.object_id.cpu().numpy()
     shares: list[float] = []

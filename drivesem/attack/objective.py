@@ -27,6 +27,8 @@ from scene_ir.types import Render, SceneIR
 
 OF_DETECTIONS = ("objectness", *goals.GOALS)
 """Terms that need no more than detections."""
+GRADIENT_PASSES = 3
+"""What a gradient counts, where a forward pass of the detector counts 1."""
 _REMEMBERED = 3
 """Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
 
@@ -55,6 +57,8 @@ class Objective:
     raised; by default everything.
     Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
     RangeError where it has no such term.
+
+    passes: of the detector so far, a gradient counted as GRADIENT_PASSES; the benign picture's is the first.
     """
 
     def __init__(
@@ -81,9 +85,15 @@ class Objective:
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, self.difficulty)
         self._benign = self._judged(space.scene, base_render)
+        self.passes = 1
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
+
+    @property
+    def labeller(self) -> Labeller:
+        """What labels the scene's states."""
+        return self._labeller
 
     @property
     def benign(self) -> Rendered:
@@ -117,6 +127,7 @@ class Objective:
             if torch.equal(theta, known):
                 return rendered
         scene = self.space.apply(self.space.scene, theta)
+        self.passes += 1
         rendered = self._judged(scene, self.compositor.render(scene))
         self._recent.append((theta.clone(), rendered))
         return rendered
@@ -166,17 +177,17 @@ class Objective:
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
-    def feasible_set(self, limits: Limits | None = None) -> FeasibleSet:
+    def feasible_set(self, limits: Limits | None = None, only_bounds: bool = False) -> FeasibleSet:
         """What can be, and is seen through the weather as far as difficulty asks for it."""
         fades, least = None, self.difficulty.min_contrast
         if least > 0 and Parameter.WEATHER in self.space.params:
             seen = ~self._labeller.paper().ignore.cpu().numpy()
             environment = self.space.scene.environment
             fades = Fading(self._benign.render, environment, self.compositor.air, seen, least)
-        return FeasibleSet(self.space, limits, fades)
+        return FeasibleSet(self.space, limits, only_bounds, fades)
 
-    def problem(self, feasible: FeasibleSet) -> Problem:
-        """This objective as attacks see it."""
+    def problem(self, feasible: FeasibleSet, keep_last: bool = False) -> Problem:
+        """This objective as attacks see it. keep_last: as of `Problem`."""
         return Problem(
             loss_and_grad=self.loss_and_grad,
             project=feasible.project,
@@ -186,6 +197,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
             preview=self.preview,
+            keep_last=keep_last,
         )
 
     @property
@@ -288,6 +300,7 @@ def _losses_and_gradients(
     losses = _losses(objectives, leaves)
     gradients = torch.autograd.grad(losses, leaves)
     for objective, gradient in zip(objectives, gradients, strict=True):
+        objective.passes += GRADIENT_PASSES
         bad = (~torch.isfinite(gradient)).nonzero()
         if len(bad):
             i = int(bad[0])

@@ -44,11 +44,23 @@ def _print(summary: RunSummary, console: Console) -> None:
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(
         f"{summary.frames} frames, {summary.objects} vehicles: {sum(summary.lost_objects.values())} lost, "
-        f"{sum(summary.phantoms.values())} phantoms, {summary.successes_moved} frames broken; "
+        f"{sum(summary.phantoms.values())} phantoms by threshold, {summary.successes_moved} frames broken; "
         f"feasible {feasible}; {summary.queries} queries in {summary.seconds:.0f} s"
     )
+    console.print(told_grades(summary))
+    for note, frames in summary.grade_notes.items():
+        console.print(f"{frames} frames: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
         console.print(f"{summary.frames_without_vehicles} frames without vehicles passed over")
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)
+
+
+def told_grades(summary: RunSummary) -> str:
+    """How many failures hold, and of which kinds all are."""
+    grades, kinds = summary.grades, {name: count for name, count in summary.kinds.items() if count}
+    told = ", ".join(f"{count} {name}" for name, count in kinds.items()) or "none of a kind"
+    held = ", ".join(f"{count} {name}" for name, count in grades.items() if name != "threshold")
+    unknown = f"; {summary.frames_ungraded} frames of unknown grade" if summary.frames_ungraded else ""
+    return f"failures: {held} of {grades['threshold']} ({told}){unknown}"

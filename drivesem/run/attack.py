@@ -6,11 +6,12 @@ import importlib.metadata
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.registry import ONNX, load_detector, load_predictor
@@ -42,11 +43,16 @@ from drivesem.settings.blocks import FrameCommand
 from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
+from drivesem.truth.certificate import Rule
+from drivesem.truth.grading import Grader, witness_of
+from drivesem.truth.nuisances import Nuisances
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR
 
+PEERS = ("yolov3-slim", "squeezedet")
+"""Shipped detectors of different architectures: what is confirmed of one is shown to another."""
 WRITTEN = ("metrics.json", "manifest.json", "report.html", FRAMES)
 _PACKAGES = (
     "drivesem",
@@ -127,6 +133,7 @@ class Worker:
     method: AttackMethod
     source: SceneSource
     detector: Predictor
+    grader: Grader
 
     @classmethod
     def of(cls, config: Attack, detector: Predictor | None = None) -> Worker:
@@ -137,7 +144,7 @@ class Worker:
         source, method = open_source(config), attack_method(config)
         detector = _load(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
-        return cls(config, _params(config), method, source, detector)
+        return cls(config, _params(config), method, source, detector, grader_of(config, detector))
 
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""
@@ -174,6 +181,9 @@ class Worker:
             t_star=config.t_star,
             budget=budget_of(config.budget),
             aim=aim,
+            grader=self.grader,
+            keep_last=config.keep == "last",
+            only_bounds=config.project == "bounds",
         )
         try:
             return attack_scene(identifier, scene, self.detector, settings)
@@ -216,6 +226,42 @@ def _from_theta0(config: Attack) -> AttackMethod:
             return CMAES(queries, _reach(config), early_stop)
         case "random" | "halton" | "sobol":
             return Sampling(queries, _reach(config), early_stop, config.method)
+
+
+def grader_of(config: Attack, detector: Predictor) -> Grader:
+    """What grades the failures of a run with these settings. Raises UsageError for settings that cannot be."""
+    return Grader(
+        detector=detector,
+        t_star=t_star_of(detector, config.t_star),
+        nuisances=Nuisances.of(config.nuisances),
+        rule=Rule(config.draws),
+        seed=config.seed,
+        peer=_peer(config),
+        witness=None if config.witness is None else _witness(config, config.witness),
+    )
+
+
+def _peer(config: Attack) -> Callable[[], Predictor] | None:
+    """What loads the detector of another architecture; None where nobody is to be asked."""
+    if config.peer == "off" or not config.confirm:
+        return None
+    others = [name for name in PEERS if name != config.detector]
+    name = others[0] if config.peer == "auto" else config.peer
+    if config.peer == "auto":
+        return cache(partial(load_predictor, name, config.device, config.tiles))
+    try:
+        peer = load_predictor(name, config.device, config.tiles)
+        JudgedClasses.of(peer)
+    except DetectorError as error:
+        raise UsageError("--peer", "auto, off, or a detector", error) from error
+    return lambda: peer
+
+
+def _witness(config: Attack, name: str) -> Callable[[Tensor], Tensor]:
+    try:
+        return witness_of(load_predictor(name, config.device, config.tiles))
+    except DetectorError as error:
+        raise UsageError("--witness", "a detector", error) from error
 
 
 def _placebo(run: Path, identifier: str) -> Placebo:

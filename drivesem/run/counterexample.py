@@ -54,12 +54,19 @@ class AttackOptions(TypedDict, total=False):
     early_stop: bool
     objective_labels: Literal["moved", "paper"]
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"]
+    keep: Literal["best", "last"]
+    project: Literal["feasible", "bounds"]
     target_objects: str
     target_classes: str
     backend: Literal["warp", "reference"]
     precision: Literal["float32", "bfloat16", "float16"]
     t_star: float
     tiles: Literal["auto", "off"]
+    draws: int
+    nuisances: str
+    confirm: bool
+    witness: str
+    peer: str
     device: str
     seed: int
 

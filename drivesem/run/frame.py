@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,19 +16,28 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
-from drivesem.attack.labels import LabelMode, to_kitti_labels
+from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.labels import LabelMode, MovedLabels, shown_boxes, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.base import AttackResult
+from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.data import kitti
+from drivesem.evaluation.failures import Failures
 from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.truth.certificate import with_regions
+from drivesem.truth.grades import Grade
+from drivesem.truth.grading import Case, Graded, Grader, Grades
+from drivesem.truth.kinds import View
+from drivesem.truth.redraw.compositor import CompositorDraw
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import SceneIR
+from scene_ir.types import Render, SceneIR
 
 RESULT = "result.json"
 """The file that marks a frame as done."""
@@ -36,7 +47,9 @@ RESULT = "result.json"
 class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
-    budget: how far theta may go, by default as far as the paper's; aim: what the attack is after.
+    budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
+    how sure its failures are, None to leave them ungraded. keep_last,
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`.
     """
 
     attack: AttackMethod
@@ -48,12 +61,15 @@ class FrameSettings:
     t_star: float | None = None
     budget: Budget | None = None
     aim: Aim = EVERYTHING
+    grader: Grader | None = None
+    keep_last: bool = False
+    only_bounds: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class AttackedScene:
     """What an attack on one scene found, in memory. search: what the attack handed back; rendered: the scene at
-    its theta, judged; benign: detections on the photograph; seconds: the search took.
+    its theta, judged; benign: detections on the photograph; failures: of `rendered`, graded; seconds: it all took.
     """
 
     identifier: str
@@ -62,6 +78,9 @@ class AttackedScene:
     rendered: Rendered
     benign: Detections
     violated_at_start: tuple[str, ...]
+    failures: tuple[Failure, ...]
+    grade_notes: tuple[str, ...]
+    passes: int
     seconds: float
 
 
@@ -83,15 +102,23 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         t_star=settings.t_star,
         aim=settings.aim,
     )
-    feasible = objective.feasible_set()
-    search = settings.attack(objective.problem(feasible), space.theta0, settings.seed)
+    feasible = objective.feasible_set(only_bounds=settings.only_bounds)
+    problem = objective.problem(feasible, settings.keep_last)
+    search = settings.attack(problem, space.theta0, settings.seed)
+    rendered = objective.evaluate(search.theta)
+    benign = objective.detect(scene.photograph)
+    passes = objective.passes + 1
+    failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
     return AttackedScene(
         identifier=identifier,
         objective=objective,
         search=search,
-        rendered=objective.evaluate(search.theta),
-        benign=objective.detect(scene.photograph),
+        rendered=rendered,
+        benign=benign,
         violated_at_start=feasible.violated_at_start,
+        failures=failures,
+        grade_notes=notes,
+        passes=passes,
         seconds=time.perf_counter() - start,
     )
 
@@ -131,7 +158,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         detections_benign=detection_records(attacked.benign, names),
         detections_rerendered=detection_records(objective.benign.detections, names),
         detections_attacked=detection_records(rendered.detections, names),
-        failures=failure_records(objective, rendered),
+        failures=attacked.failures,
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
         success_paper=search.success_paper,
         success_moved=search.success_moved,
@@ -139,6 +166,8 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
         checked_by=judge_at_hand(),
+        passes=attacked.passes,
+        grade_notes=attacked.grade_notes,
         min_contrast=objective.difficulty.min_contrast,
         joint_weather=True,
     )
@@ -169,24 +198,103 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
     files.write_text(part / RESULT, dump_frame(result))
 
 
-def failure_records(objective: Objective, rendered: Rendered) -> tuple[Failure, ...]:
-    """What the detector gets wrong in `rendered`, by moved labels, as records: lost objects, then phantoms."""
-    names = objective.judged.names
-    found = objective.failures(rendered, "moved")
-    moved, detections = rendered.moved.targets, rendered.detections
+def _graded(
+    identifier: str,
+    objective: Objective,
+    feasible: FeasibleSet,
+    search: AttackResult,
+    rendered: Rendered,
+    settings: FrameSettings,
+) -> tuple[tuple[Failure, ...], tuple[str, ...]]:
+    """What the detector gets wrong in `rendered`, as graded records; and why a grade could not be reached."""
+    failures = objective.failures(rendered, "moved")
+    if settings.grader is None or not failures.success:
+        return failure_records(objective.judged, rendered.moved.targets, rendered.detections, failures), ()
+
+    def placebo() -> SceneIR:
+        edit = Placebo(tuple(search.theta.tolist()))(
+            objective.problem(feasible), objective.space.theta0, settings.seed
+        )
+        return objective.space.apply(objective.space.scene, edit.theta)
+
+    case = case_of(
+        identifier,
+        CompositorDraw(objective.compositor, objective.labeller),
+        objective.judged,
+        State(objective.space.scene, objective.benign.render, objective.benign.paper, objective.benign.detections),
+        State(rendered.scene, rendered.render, rendered.moved, rendered.detections),
+        placebo,
+    )
+    grades = settings.grader.grade(case, failures)
+    records = failure_records(objective.judged, rendered.moved.targets, rendered.detections, failures, grades)
+    return records, grades.notes
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A scene as it was judged: rendered, labelled, looked at. detections: labels among the judged classes."""
+
+    scene: SceneIR
+    render: Render
+    labels: MovedLabels
+    detections: Detections
+
+
+def case_of(
+    identifier: str,
+    renderer: CompositorDraw,
+    judged: JudgedClasses,
+    benign: State,
+    now: State,
+    placebo: Callable[[], SceneIR] | None = None,
+) -> Case:
+    """What a grader is to look at. placebo: as of `Case`."""
+
+    def view(state: State) -> View:
+        targets = judged.targets(state.labels.targets)
+        return View(targets, with_regions(shown_boxes(state.render), targets), state.detections)
+
+    return Case(identifier, benign.scene, now.scene, renderer, view(benign), view(now), placebo)
+
+
+def failure_records(
+    judged: JudgedClasses,
+    moved: Targets,
+    detections: Detections,
+    failures: Failures,
+    grades: Grades | None = None,
+) -> tuple[Failure, ...]:
+    """Failures as records: lost objects, then phantoms. moved: labels among CLASSES; detections: among the judged
+    classes; grades: of these failures, None where nobody asked.
+    """
     lost = [
-        Failure("lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i) for i in found.lost
+        Failure(
+            "lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i, **_of(grades, "lost", i)
+        )
+        for i in failures.lost
     ]
     phantoms = [
         Failure(
             "phantom",
-            names[int(detections.labels[i])],
+            judged.names[int(detections.labels[i])],
             _xyxy(detections.boxes_xyxy[i]),
             score=float(detections.scores[i]),
+            **_of(grades, "phantoms", i),
         )
-        for i in found.phantoms
+        for i in failures.phantoms
     ]
     return (*lost, *phantoms)
+
+
+def _of(grades: Grades | None, which: Literal["lost", "phantoms"], index: int) -> dict[str, Any]:
+    """The fields of a failure's record that say what it is and how sure."""
+    if grades is None:
+        return {}
+    graded: Graded | None = getattr(grades, which).get(index)
+    if graded is None:
+        return {"grade": str(Grade.THRESHOLD)}
+    fields = {"error": str(graded.fault.kind), "grade": str(graded.grade), "count": graded.count}
+    return fields | {"second": graded.second, "peer": graded.peer}
 
 
 def target_records(targets: Targets, names: tuple[str, ...], objects: int) -> tuple[BoxRecord, ...]:

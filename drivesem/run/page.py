@@ -21,8 +21,8 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.tally import boxes_of, tally
-from drivesem.settings.commands import COMBO_NUMBERS, GRADIENT_FREE, Attack, Report
+from drivesem.run.tally import boxes_of, graded, tally
+from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import command_line
 from scene_ir import files
@@ -34,8 +34,8 @@ PICTURES = 200
 """Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
 _NOT_TOLD = ("out", "json", "resume", "workers")
 """Settings that change nothing in the result: left out of the report's command line."""
-_NOT_THE_PAPERS = (*GRADIENT_FREE, "placebo")
-"""Methods beside which the paper's figures for attacks by gradient say nothing."""
+_THE_PAPERS = ("si-fgsm", "squeezedet")
+"""Method and detector beside which the paper's figures stand; of others they say nothing."""
 _MOST_LINES = 7
 """Of a chart: as many as there are colours."""
 
@@ -230,7 +230,7 @@ def _shown(
         method=config.method,
         command=command_line("attack", config, _NOT_TOLD),
         weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
-        paper=None if config.method in _NOT_THE_PAPERS else _paper(summary.params),
+        paper=_paper(summary.params) if (config.method, config.detector) == _THE_PAPERS else None,
     )
 
 
@@ -291,9 +291,20 @@ def _summary(path: Path) -> RunSummary:
             attacked_moved=_scores(data["attacked"]["moved"]),
             lost_objects=dict(data["lost_objects_by_class"]),
             phantoms=dict(data["phantoms_by_class"]),
+            **_grades(data),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(str(path), "the figures of a run", error) from error
+
+
+def _grades(data: dict[str, Any]) -> dict[str, Any]:
+    """How sure the failures of a run are; of one that was written before anybody asked, that nobody knows."""
+    if "grades" in data:
+        return {name: data[name] for name in ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")}
+    return graded([]) | {
+        "grades": {**graded([])["grades"], "threshold": data["lost_objects"] + data["phantoms"]},
+        "frames_ungraded": data["frames"],
+    }
 
 
 def _scores(data: dict[str, Any]) -> Scores:

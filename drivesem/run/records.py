@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 _hints = functools.cache(get_type_hints)
@@ -17,6 +18,9 @@ def from_json(kind: Any, value: Any) -> Any:
         return kind(**{name: from_json(_hints(kind)[name], part) for name, part in value.items()})  # pyright: ignore[reportCallIssue]
     if get_origin(kind) is tuple:
         return tuple(from_json(get_args(kind)[0], part) for part in value)
+    if isinstance(kind, UnionType):
+        whole = next((part for part in get_args(kind) if dataclasses.is_dataclass(part)), None)
+        return value if whole is None or value is None else from_json(whole, value)
     if get_origin(kind) is dict:
         return {name: from_json(get_args(kind)[1], part) for name, part in value.items()}
     return value

@@ -10,9 +10,11 @@ from typing import Any, Literal
 
 from drivesem.evaluation.coco import Scores
 from drivesem.run.records import from_json
+from drivesem.truth.grades import Agreement, Count
 from scene_ir.errors import FormatError
 
-SCHEMA = 1
+SCHEMA = 2
+"""Of what is written; 1, which knew no grades, is still read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +46,12 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing the detector got wrong only after the change. kind: lost or phantom; label: class name;
-    xyxy: the true box that was lost, or the detection that nothing supports; index: the lost object.
+    """One thing the detector got wrong only after the change, by threshold. kind: lost or phantom; label: class
+    name; xyxy: the true box that was lost, or the detection that nothing supports; index: the lost object, or the
+    one that is reported twice. error: its kind as `truth.kinds` names it, None where it is none (found as far as
+    it shows; on a real object; suspect before the change). grade: how sure it is, None where nobody asked (runs of
+    earlier versions). count: the draws of its certificate; second, peer: what another renderer and another
+    architecture say.
     """
 
     kind: str
@@ -53,6 +59,11 @@ class Failure:
     xyxy: tuple[float, float, float, float]
     index: int | None = None
     score: float | None = None
+    error: str | None = None
+    grade: str | None = None
+    count: Count | None = None
+    second: Agreement | None = None
+    peer: Agreement | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +72,9 @@ class FrameResult:
     between two runs with the same configuration. violated_at_start: constraints that the photographed scene does
     not meet, and that may only not get worse. checked_by: what the second feasibility check judged with, open3d or
     (as before there was a choice) outlines. min_contrast: below it objects were ignored, 0 where that was no rule;
-    joint_weather: whether that check bounded weather codes together, too. Both have the values of earlier runs.
+    joint_weather: whether that check bounded weather codes together, too; both as in earlier runs by default.
+    passes: of the detector, a gradient counted as 3, without what grading took. grade_notes: why a grade could not
+    be reached.
     """
 
     identifier: str
@@ -86,11 +99,18 @@ class FrameResult:
     checked_by: Literal["open3d", "outlines"] = "outlines"
     min_contrast: float = 0.0
     joint_weather: bool = False
+    passes: int | None = None
+    grade_notes: tuple[str, ...] = ()
 
     @property
     def feasible(self) -> bool:
         """Whether the independent check found nothing violated."""
         return not self.violations
+
+    @property
+    def graded(self) -> bool:
+        """Whether somebody asked how sure its failures are; a frame without failures leaves nothing to ask."""
+        return all(failure.grade is not None for failure in self.failures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +137,11 @@ class RunSummary:
     successes_moved: int
     feasible_fraction: float | None
     queries: int
+    passes: int
+    grades: dict[str, int]
+    kinds: dict[str, int]
+    frames_ungraded: int
+    grade_notes: dict[str, int]
     seconds: float
 
     def to_json(self) -> dict[str, Any]:
@@ -148,8 +173,8 @@ def load_frame(path: Path) -> FrameResult:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FormatError(str(path), "a frame's result as JSON", error) from error
-    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
-        raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
+    if not isinstance(data, dict) or data.pop("schema", None) not in (1, SCHEMA):
+        raise FormatError(f"{path}: schema", f"1 or {SCHEMA}", "another one")
     try:
         return from_json(FrameResult, data)
     except (AttributeError, KeyError, TypeError) as error:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.judging import JudgedClasses
 from drivesem.evaluation import coco
 from drivesem.run.frame import as_detections, as_targets
-from drivesem.run.results import FrameResult
+from drivesem.run.results import Failure, FrameResult
+from drivesem.truth.grades import Grade, Kind
 
 
 def boxes_of(
@@ -18,6 +20,24 @@ def boxes_of(
     """Targets and detections of each frame. labels: benign or moved; seen: benign, rerendered or attacked."""
     targets = [judged.targets(as_targets(getattr(r, f"targets_{labels}"), CLASSES)) for r in results]
     return targets, [as_detections(getattr(r, f"detections_{seen}"), judged.names) for r in results]
+
+
+def at_least(grade: Grade) -> Callable[[Failure], bool]:
+    """Whether a failure has that grade or a higher one; every failure has that of the threshold."""
+    higher = list(Grade)[list(Grade).index(grade) :]
+    return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
+
+
+def graded(results: Sequence[FrameResult]) -> dict[str, Any]:
+    """Those of the fields that say how sure the failures are, and what the search cost."""
+    failures = [failure for r in results for failure in r.failures]
+    return {
+        "passes": sum(r.passes or 0 for r in results),
+        "grades": {str(grade): sum(map(at_least(grade), failures)) for grade in Grade},
+        "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
+        "frames_ungraded": sum(not r.graded for r in results),
+        "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
+    }
 
 
 def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, headline: str) -> dict[str, Any]:
@@ -43,4 +63,5 @@ def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, 
         "successes_moved": sum(r.success_moved for r in results),
         "feasible_fraction": sum(r.feasible for r in results) / len(results) if results else None,
         "queries": sum(r.queries for r in results),
+        **graded(results),
     }

@@ -35,6 +35,8 @@ DATASETS = ("kitti", "vkitti1", "vkitti2", "coco", "yolo")
 SOURCES = (DEMO, *DATASETS)
 """What --dataset takes: the embedded scenes, and the readers."""
 
+CERTIFYING_DRAWS = 16
+"""What the rule of certificates needs at least (`truth.certificate`)."""
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
 
@@ -247,8 +249,34 @@ class Attacking(Threshold, Precision, Scenes):
     true objects; confidence: SqueezeDet's as published, with the IoU of the predicted box; total: its whole loss;
     hide: objects fall below t*; phantom: something rises to t* where nothing is; failure: both; localisation:
     boxes leave their objects."""
+    keep: Literal["best", "last"] = "best"
+    """Which iterate is handed back: the best of all, by failures, then by the objective; or the last, whatever it
+    does, as in the paper."""
+    project: Literal["feasible", "bounds"] = "feasible"
+    """What each step is brought back to: what is feasible; or the bounds alone, as in the paper."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grading(Options):
+    """How sure failures must be: certificates and who else is asked."""
+
+    draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
+    """Draws before a change and after it, in which a failure must hold to be certain: right in 15 of 16, then
+    wrong in 12 of 16."""
+    nuisances: str = "default"
+    """What a draw changes: default, off, or NAME=NUMBER with commas (shift_px, scale, gain, gamma, noise, blur_px,
+    jpeg, position_m, angle_deg, size, code); 0 switches one off (docs/grades.md)."""
+    confirm: bool = True
+    """Draw the scene of what is certain by a second renderer too."""
+    witness: str | None = None
+    """A detector that is asked what it sees in the photograph: no phantom is where it sees an object, of any
+    class.
+    """
+    peer: str = "auto"
+    """Whom confirmed failures are shown to: a detector of another architecture; auto is yolov3-slim, or squeezedet
+    where that is attacked; off."""
 
 
 @dataclass(frozen=True, kw_only=True)

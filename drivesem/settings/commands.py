@@ -26,6 +26,7 @@ from drivesem.settings.blocks import (
     FinishedRun,
     Flag,
     FrameCommand,
+    Grading,
     LabelMode,
     NotNegative,
     Repeated,
@@ -57,7 +58,7 @@ Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attack(Tiles, Attacking, FrameCommand):
+class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Find feasible changes of driving scenes that a detector gets wrong."""
 
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
@@ -120,17 +121,20 @@ class Attack(Tiles, Attacking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study(Bootstrap, Attacking, FrameCommand):
+class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
 
     name: Annotated[
-        tyro.conf.Positional[Literal["single", "multi", "samples", "steps", "labels", "transfer", "retrain"]],
-        tyro.conf.arg(metavar="{single,multi,samples,steps,labels,transfer,retrain}"),
+        tyro.conf.Positional[
+            Literal["single", "multi", "grades", "samples", "steps", "labels", "transfer", "retrain"]
+        ],
+        tyro.conf.arg(metavar="{single,multi,grades,samples,steps,labels,transfer,retrain}"),
     ]
-    """single: the six parameters, each alone; multi: the combinations 1 to 4; samples: success against queries for
-    each algorithm; steps: success against number and size of steps; labels: what labels that stay behind make of
-    an attack; transfer: counterexamples of combination 2 before other detectors; retrain: detectors trained on
-    with counterexamples, before benign frames, known and fresh counterexamples."""
+    """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
+    gradient, sampling and placebo; samples: success against queries for each algorithm; steps: success against
+    number and size of steps; labels: what labels that stay behind make of an attack; transfer: counterexamples of
+    combination 2 before other detectors; retrain: detectors trained on with counterexamples, before benign frames,
+    known and fresh counterexamples."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
@@ -147,7 +151,8 @@ class Study(Bootstrap, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only)."""
+    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
+    certain is drawn by a second renderer in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None

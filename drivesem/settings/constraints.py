@@ -32,9 +32,9 @@ class Within:
         refuse(not (above and below), setting, self.expected or interval, value)
 
 
-def at_least(low: int) -> Within:
-    """A number that is not below `low`."""
-    return Within(low, expected=f"at least {low}")
+def at_least(low: int, why: str = "") -> Within:
+    """A number that is not below `low`. why: what an error adds."""
+    return Within(low, expected=f"at least {low}{why and f', {why}'}")
 
 
 POSITIVE = Within(0, ends="(]", expected="a number above 0")

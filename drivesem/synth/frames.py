@@ -420,18 +420,38 @@ def boxes_alone(plan: Plan) -> list[Truth]:
     return measure(plan.actors, soups, see(join(soups), view).owner, view)
 
 
+@dataclass(frozen=True, slots=True)
+class Street:
+    """What stands in a plan's street besides its actors. soup: in camera axes about the centre of projection;
+    used: what it was made of, by name.
+    """
+
+    soup: Soup
+    used: dict[str, list[int]]
+
+
+def street_of(plan: Plan) -> Street:
+    """The surroundings of a plan: a matter of its origin, road, view and foliage, and not of its actors."""
+    seed, street, attempt = plan.origin
+    rng = stream(seed, street, plan.split, 16 * attempt + 3)
+    static, used = surroundings(plan.setting.road, POOLS[plan.split], rng)
+    return Street(_into_camera(leaved(static, plan.foliage), plan.setting.view), used)
+
+
 def render_frame(
-    plan: Plan, with_background: bool = False, accept: Callable[[Sequence[Truth]], bool] | None = None
+    plan: Plan,
+    with_background: bool = False,
+    accept: Callable[[Sequence[Truth]], bool] | None = None,
+    surround: Street | None = None,
 ) -> SynthFrame | None:
     """Render a plan; with_background: also the street without its actors and their shadows. None where
-    `accept` is given and turns the truths down, which is known before anything is shaded.
+    `accept` is given and turns the truths down, which is known before anything is shaded. surround: the plan's,
+    where it is at hand.
     """
     setting, view = plan.setting, plan.setting.view
-    seed, street, attempt = plan.origin
-    static, used = surroundings(
-        setting.road, POOLS[plan.split], stream(seed, street, plan.split, 16 * attempt + 3)
-    )
-    street = _into_camera(leaved(static, plan.foliage), view)
+    seed, _, attempt = plan.origin
+    surround = surround or street_of(plan)
+    street = surround.soup
     soups = actor_soups(plan)
     shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
     world = join([street, *soups])
@@ -469,7 +489,7 @@ def render_frame(
             "variation": plan.variation,
             "time_s": round(plan.time_s, 6),
             "vehicles": sorted(vehicles),
-            **used,
+            **surround.used,
         },
     )
 

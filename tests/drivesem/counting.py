@@ -7,6 +7,7 @@ from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation import coco
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult, RunSummary
+from drivesem.run.tally import graded
 from drivesem.settings.commands import Attack
 
 T_STAR = 0.5
@@ -46,5 +47,6 @@ def summary_of(config: Attack, results: Sequence[FrameResult]) -> RunSummary:
         successes_moved=sum(r.success_moved for r in results),
         feasible_fraction=1.0,
         queries=sum(r.queries for r in results),
+        **graded(results),
         seconds=0.0,
     )

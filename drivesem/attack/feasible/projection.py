@@ -41,11 +41,19 @@ _HALVINGS = 5
 class FeasibleSet:
     """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond.
 
-    fades: who is lost from sight in which weather; by default nobody.
+    only_bounds: `project` keeps to the bounds and asks for nothing else, as the paper does. fades: who is lost from
+    sight in which weather; by default nobody.
     """
 
-    def __init__(self, space: ParameterSpace, limits: Limits | None = None, fades: Fading | None = None) -> None:
+    def __init__(
+        self,
+        space: ParameterSpace,
+        limits: Limits | None = None,
+        only_bounds: bool = False,
+        fades: Fading | None = None,
+    ) -> None:
         self.space = space
+        self.only_bounds = only_bounds
         self.limits = limits or Limits()
         where = space.slice_of(Parameter.WEATHER)
         self._weather = None if where is None else WeatherSet(space, where, self.limits.joint_weather, fades)
@@ -114,6 +122,8 @@ class FeasibleSet:
     def _project(self, values: Values) -> tuple[Values, list[str]]:
         boxed = self._box(values)
         active = self._out_of_bounds(values, boxed)
+        if self.only_bounds:
+            return boxed, active
         if self._weather is not None:
             active += self._weather.bound(boxed, values)
         if self.space.count == 0:

@@ -78,7 +78,8 @@ class Problem:
     the feasible set. score: re-render and judge, without a gradient; what was judged once is not rendered again.
     step (D,): the step alpha of each coordinate, 0 where it is held; lower, upper (D,): its bounds. groups: the
     blocks of theta, which cover it; by default it is one. preview: what the gradient pass at theta saw, roughly
-    what `score` will say and without a cost; None where there was no such pass.
+    what `score` will say and without a cost; None where there was no such pass. keep_last: the last iterate is
+    handed back, whatever it does.
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
@@ -89,6 +90,7 @@ class Problem:
     upper: Tensor
     groups: tuple[Group, ...] = (Group("theta", slice(None)),)
     preview: Callable[[Tensor], Score | None] = _unseen
+    keep_last: bool = False
 
     def in_steps(self, theta: Tensor) -> Tensor:
         """theta (D,) in steps alpha; 0 where a coordinate is held. Differentiable."""
@@ -191,7 +193,8 @@ class Attack(ABC):
         generator = torch.Generator(device="cpu").manual_seed(seed)
         proposals = self._propose(problem, theta0, generator)
         projected: list[Projected] = []
-        for candidate in (theta0, *proposals.thetas):
+        candidates = (theta0, *proposals.thetas)
+        for candidate in candidates[-1:] if problem.keep_last else candidates:
             feasible = problem.project(candidate.detach())
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.confirm.frame import confirm_frame
-from drivesem.questions.confirm.plans import open_plans
 from drivesem.questions.confirm.report import Confirmation, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, load
 from drivesem.report.answer import Answer
@@ -17,6 +16,7 @@ from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector
 from drivesem.run.frame import RESULT
 from drivesem.settings.commands import Confirm
 from drivesem.settings.errors import UsageError
+from drivesem.truth.redraw.plans import open_plans
 from scene_ir import files
 
 _WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)

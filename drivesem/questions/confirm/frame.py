@@ -12,9 +12,7 @@ import numpy as np
 from detectors.base import Predictor
 from detectors.types import CLASSES
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.carry import carried
-from drivesem.questions.confirm.judge import exact_labels, findings, stands
-from drivesem.questions.confirm.plans import Plans
+from drivesem.questions.confirm.judge import findings, stands
 from drivesem.questions.confirm.results import Confirmed, dump
 from drivesem.questions.confirm.sheet import sheet_of
 from drivesem.run.finished import Frame
@@ -23,6 +21,9 @@ from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import BoxRecord
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, render_frame
+from drivesem.truth.redraw.carry import carried
+from drivesem.truth.redraw.exact import exact_labels
+from drivesem.truth.redraw.plans import Plans
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene

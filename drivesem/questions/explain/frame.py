@@ -117,7 +117,8 @@ def explain_frame(
     result = load_frame(folder / RESULT)
     objective, theta = rebuild(result, folder, attack, params, detector)
     space = objective.space
-    judge = Judge(objective.problem(objective.feasible_set(Limits(joint_weather=result.joint_weather))))
+    limits, only_bounds = Limits(joint_weather=result.joint_weather), attack.project == "bounds"
+    judge = Judge(objective.problem(objective.feasible_set(limits, only_bounds)))
     everything = torch.ones_like(theta, dtype=torch.bool)
     found = judge.outcome(theta, everything)
     if not found.success:
@@ -254,7 +255,9 @@ def _least(
         outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
         violations=tuple(check_scene(space.scene, rendered.scene, joint_weather=joint_weather)),
         sizes=tuple(players.sizes(space, small)),
-        failures=failure_records(objective, rendered),
+        failures=failure_records(
+            objective.judged, rendered.moved.targets, rendered.detections, objective.failures(rendered, "moved")
+        ),
         theta=tuple(
             Coordinate(name=name, **facts)  # pyright: ignore[reportArgumentType]
             for name, facts in space.theta_by_name(small).items()

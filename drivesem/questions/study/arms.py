@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from drivesem.attack.objective import GRADIENT_PASSES
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.settings.blocks import Attacking, Sharing, shared
+from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 
 QUICK_FRAMES, FRAMES = 6, 200
@@ -42,8 +43,9 @@ class Arm:
 def attack_of(study: Study) -> Attack:
     """The attack that a study's arms vary."""
     limit = study.limit or (QUICK_FRAMES if study.quick else FRAMES)
-    alike = shared(study, Attacking) | shared(study, Sharing)
-    return Attack(**alike | {"limit": limit, "method": study.method})
+    alike = shared(study, Attacking) | shared(study, Grading) | shared(study, Sharing)
+    # A study that confirms asks `drivesem confirm` of its arms; what is certain is confirmed anyway.
+    return Attack(**alike | {"limit": limit, "method": study.method, "confirm": Attack.confirm})
 
 
 def arms_of(study: Study, out: Path) -> list[Arm]:
@@ -56,8 +58,10 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
         multi = [_combo(base, number) for number in COMBO_NUMBERS]
         if study.method == "si-fgsm":
             longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
-            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer, PAPER_COMBOS[DEFAULT_COMBO]))
+            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
         return _controlled(multi, out) if study.controls else multi
+    if study.name == "grades":
+        return _grades(base, out)
     if study.name == "samples":
         return _samples(replace(base, combo=DEFAULT_COMBO), study)
     if study.name == "transfer":
@@ -72,7 +76,9 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
 
 
 def _arm(name: str, config: Attack, reference: float | None = None) -> Arm:
-    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference)
+    """reference: the paper's figure; it stands beside the paper's method and detector only."""
+    theirs = config.method == "si-fgsm" and config.detector == "squeezedet"
+    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if theirs else None)
 
 
 def _combo(base: Attack, number: int) -> Arm:
@@ -104,6 +110,25 @@ def _sources(base: Attack, study: Study) -> list[Arm]:
         arm = _combo(replace(base, detector=source), DEFAULT_COMBO)
         folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
         arms.append(replace(arm, name=short, folder=folder))
+    return arms
+
+
+def _grades(base: Attack, out: Path) -> list[Arm]:
+    """How sure failures are: si-FGSM, Auto-PGD with time for its steps to grow short, samples that take as many
+    passes as si-FGSM's gradients, and a placebo as large as either attack, for three sets of parameters.
+    """
+    sets = {
+        f"combo {DEFAULT_COMBO}": replace(base, combo=DEFAULT_COMBO),
+        "weather": replace(base, params=Parameter.WEATHER.value),
+        "all six": replace(base, params=",".join(p.value for p in Parameter)),
+    }
+    arms: list[Arm] = []
+    for name, config in sets.items():
+        apgd = replace(config, method="apgd", steps=_LONGER * base.steps)
+        halton = replace(config, method="halton", queries=GRADIENT_PASSES * base.steps)
+        arms += _controlled([_arm(name, replace(config, method="si-fgsm"))], out, (PLACEBO,))
+        arms += _controlled([_arm(f"{name}, apgd", apgd)], out, (PLACEBO,))
+        arms.append(_arm(f"{name}, halton", halton))
     return arms
 
 

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.confirm.asking import confirm_run
-from drivesem.questions.confirm.plans import open_plans
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study import report, retrain, retrain_report, transfer
 from drivesem.questions.study.arms import arms_of
@@ -30,6 +29,7 @@ from drivesem.report.answer import Answer
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line
+from drivesem.truth.redraw.plans import open_plans
 
 _PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
 _TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")

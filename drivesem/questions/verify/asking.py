@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,13 @@ from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import t_star_of
 from drivesem.attack.space import parse_params
 from drivesem.questions.verify.differences import CHECKS, CheckLog, Disagreement
-from drivesem.questions.verify.frame import BOX_PX, LABEL, LEVELS, SCORE, Checked, Given, check_frame
+from drivesem.questions.verify.frame import BOX_PX, DRAWS, LABEL, LEVELS, SCORE, Checked, Given, check_frame
 from drivesem.run.ask import Bar, ask
+from drivesem.run.attack import grader_of
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import FRAMES, attack_of, detector_of
 from drivesem.run.results import FrameResult
+from drivesem.run.tally import graded
 from drivesem.settings.commands import Verify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -61,6 +63,7 @@ class VerifyWorker:
             aim=Aim.of(attack.target_objects, attack.target_classes),
             t_star=t_star_of(detector, attack.t_star),
             hashes=_hashes(run),
+            grader=grader_of(replace(attack, confirm=False), detector),
         )
 
     def __call__(self, name: str) -> Checked:
@@ -79,7 +82,8 @@ def _totals(run: Run, t_star: float) -> CheckLog:
     """metrics.json against what all frames of the run hold."""
     results = [frame.result for frame in run.frames]
     log, metrics = CheckLog(), files.read_json(run.folder / METRICS)
-    for name, found in {**_added_up(results), "t_star": t_star}.items():
+    grades = graded(results) if "grades" in metrics else {}
+    for name, found in {**_added_up(results), **grades, "t_star": t_star}.items():
         log.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
     return log
 
@@ -131,7 +135,7 @@ def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[s
             }
             for name in sorted(pictures)
         },
-        "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL},
+        "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL, "draws": DRAWS},
         "differences": [{"frame": name, **asdict(d)} for name, d in differences],
         "frames_failed": failed,
     }

@@ -11,6 +11,7 @@ CHECKS: Mapping[str, str] = {
     "detections": "the detector finds in the three pictures what is recorded",
     "labels": "the saved scene gives both label files and the recorded targets",
     "success": "lost, phantoms, and success under both label modes, from label files and detections",
+    "grades": "the draws of each certificate, taken again, say the same; grades follow from what they rest on",
     "feasibility": "the second check says the same of the saved scene, and all lies within the budget",
     "theta": "theta.json, result.json and the saved scene say the same change",
     "totals": "metrics.json adds up what the frames hold",

@@ -21,15 +21,27 @@ from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.questions.verify.change import check_change, check_feasibility
 from drivesem.questions.verify.differences import CheckLog, Disagreement
-from drivesem.run.frame import RESULT, as_targets, detection_records, target_records
+from drivesem.run.frame import (
+    RESULT,
+    State,
+    as_targets,
+    case_of,
+    detection_records,
+    failure_records,
+    target_records,
+)
 from drivesem.run.looking import as_picture, detections_in
-from drivesem.run.results import BoxRecord, FrameResult, load_frame
+from drivesem.run.results import BoxRecord, Failure, FrameResult, load_frame
+from drivesem.truth.certificate import Rule
+from drivesem.truth.grades import Count, Grade
+from drivesem.truth.grading import Grader
+from drivesem.truth.redraw.compositor import CompositorDraw
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Labels, SceneIR
+from scene_ir.types import Labels, Render, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"
 LEVELS = 1
@@ -38,6 +50,8 @@ BOX_PX, SCORE = 0.05, 1e-3
 """By how much a detection may differ: another number of threads adds up in another order."""
 LABEL = 1e-3
 """Of numbers in label files, which have three decimals, and of recorded targets, in the label's units."""
+DRAWS = 1
+"""By how many draws a certificate may differ, whose scores lie that near to t*."""
 _DETECTIONS = {
     BENIGN: "detections_benign",
     RERENDER: "detections_rerendered",
@@ -50,7 +64,7 @@ _LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "size_l
 @dataclass(frozen=True)
 class Given:
     """What the run's settings say. hashes: of files in frames' folders, by frame and name, as the manifest has
-    them; t_star: score from which a detection counts.
+    them; t_star: score from which a detection counts; grader: of certificates alone.
     """
 
     detector: Predictor
@@ -61,6 +75,7 @@ class Given:
     aim: Aim
     t_star: float
     hashes: Mapping[str, Mapping[str, str]]
+    grader: Grader
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +120,7 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
         difficulty = Difficulty(min_contrast=result.min_contrast)
-        levels, labels = _render(log, pictures, _Scenes(base, perturbed), difficulty, given.backend)
+        drawn = _render(log, pictures, _Scenes(base, perturbed), difficulty, given.backend)
         seen = {
             name: detections_in(given.detector, as_picture(image, given.device))
             for name, image in pictures.items()
@@ -113,8 +128,10 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     names = JudgedClasses.of(given.detector).names
     for name, field in _DETECTIONS.items():
         _compare_boxes(log, "detections", field, getattr(result, field), detection_records(seen[name], names))
-    _judge(log, folder, result, labels, _Scenes(base, perturbed), seen, given)
-    return Checked(identifier, log.compared, tuple(log.differences), levels)
+    _judge(log, folder, result, drawn.labels, _Scenes(base, perturbed), seen, given)
+    if result.graded:
+        _grades(log, result, drawn, _Scenes(base, perturbed), seen, given)
+    return Checked(identifier, log.compared, tuple(log.differences), drawn.levels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +142,20 @@ class _Scenes:
     perturbed: SceneIR
 
 
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The scene before and after the change, rendered again. labels: by mode; levels: as of `Checked`."""
+
+    renderer: CompositorDraw
+    before: Render
+    after: Render
+    labels: dict[str, MovedLabels]
+    levels: dict[str, Level]
+
+
 def _render(
     log: CheckLog, pictures: Mapping[str, np.ndarray], scenes: _Scenes, difficulty: Difficulty, backend: str
-) -> tuple[dict[str, Level], dict[str, MovedLabels]]:
+) -> _Drawn:
     """The three pictures against the scene; labels of the scene by mode, and contrasts by the pictures."""
     compositor = Compositor(scenes.base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
     before, after = compositor.render(scenes.base), compositor.render(scenes.perturbed)
@@ -143,7 +171,59 @@ def _render(
         for render, name in ((before, RERENDER), (after, COUNTEREXAMPLE))
     ]
     labeller = Labeller(scenes.base, shown[0], difficulty)
-    return levels, {"paper": labeller.paper(), "moved": labeller.moved(scenes.perturbed, shown[1])}
+    labels = {"paper": labeller.paper(), "moved": labeller.moved(scenes.perturbed, shown[1])}
+    return _Drawn(CompositorDraw(compositor, labeller), before, after, labels, levels)
+
+
+def _grades(
+    log: CheckLog,
+    result: FrameResult,
+    drawn: _Drawn,
+    scenes: _Scenes,
+    seen: Mapping[str, Detections],
+    given: Given,
+) -> None:
+    """Kinds and certificates of the recorded failures against draws that are taken again, and grades against what
+    they rest on.
+    """
+    judged = JudgedClasses.of(given.detector)
+    benign = State(scenes.base, drawn.before, drawn.labels["paper"], seen[RERENDER])
+    now = State(scenes.perturbed, drawn.after, drawn.labels["moved"], seen[COUNTEREXAMPLE])
+    case = case_of(result.identifier, drawn.renderer, judged, benign, now)
+    moved = now.labels.targets
+    found = failures.find(
+        judged.targets(benign.labels.targets),
+        benign.detections,
+        judged.targets(moved),
+        now.detections,
+        given.t_star,
+    )
+    found = given.aim.failures(found, moved, now.detections, judged.names)
+    again = failure_records(judged, moved, now.detections, found, given.grader.grade(case, found))
+    if len(again) != len(result.failures):
+        log.told("grades", "failures", len(result.failures), len(again), agrees=False)
+        return
+    for i, (recorded, failure) in enumerate(zip(result.failures, again, strict=True)):
+        log.same("grades", f"failures[{i}].error", recorded.error, failure.error)
+        ours, theirs = _draws(recorded), _draws(failure)
+        near = all(abs(a - b) <= DRAWS for a, b in zip(ours, theirs, strict=True))
+        log.told("grades", f"failures[{i}].count", ours, theirs, agrees=near)
+        log.same("grades", f"failures[{i}].grade", recorded.grade, str(_follows(recorded, given.grader.rule)))
+
+
+def _draws(failure: Failure) -> tuple[int, int]:
+    """Draws that count, before and after; of those that were not all taken as few as speak against it."""
+    count = failure.count or Count()
+    return count.before_draws - count.before, count.after_draws - count.after
+
+
+def _follows(failure: Failure, rule: Rule) -> Grade:
+    """The grade that the recorded draws give."""
+    if failure.count is None or not rule.holds(failure.count):
+        return Grade.THRESHOLD
+    if failure.second is None or not failure.second.agrees:
+        return Grade.CERTAIN
+    return Grade.SHARED if failure.peer is not None and failure.peer.agrees else Grade.CONFIRMED
 
 
 def _judge(

@@ -14,10 +14,11 @@ from scene_ir.types import SceneIR
 
 @dataclass(frozen=True, slots=True)
 class Redrawn:
-    """One picture of a second renderer. image: (3, H, W) RGB in [0, 1], on the 8-bit grid; targets: labels among
-    `CLASSES`, the first N rows the scene's objects in order (ignored where the renderer has no counterpart of one),
-    then regions in which no detection counts; shown_xyxy: (N, 4) px, the box of what shows of each object, zeros
-    where nothing does.
+    """One picture of a second renderer.
+
+    image: (3, H, W) RGB in [0, 1], on the 8-bit grid. targets: labels among `CLASSES`; the first N rows are the
+    scene's objects in order, ignored where the renderer has no counterpart; then regions in which no detection
+    counts. shown_xyxy: (N, 4) px, the box of what shows of each object, zeros where nothing does.
     """
 
     image: Tensor

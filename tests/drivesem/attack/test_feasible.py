@@ -144,6 +144,8 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
     assert 0.04 < gap < 0.4
     assert float(result.theta[4]) == pytest.approx(0.2)
     assert set(result.active) == {"objects[0]: collision", "objects[1]: collision"}
+    # With the bounds alone, as in the paper, they do collide.
+    assert torch.equal(FeasibleSet(space, only_bounds=True).project(theta).theta, theta)
 
 
 def test_a_kerb_stops_the_car_across_but_not_along(street):

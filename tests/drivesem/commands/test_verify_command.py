@@ -115,10 +115,10 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
 
 @pytest.fixture
 def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run as it was before contrast counted and weather was bounded together, and results had fields for that."""
+    """A run as it was before contrast counted and weather was bounded together; its results have no such fields."""
     monkeypatch.setattr(objective, "Difficulty", lambda: Difficulty(min_contrast=0))
     free = Limits(joint_weather=False)
-    monkeypatch.setattr(objective.Objective, "feasible_set", lambda self: FeasibleSet(self.space, free))
+    monkeypatch.setattr(objective.Objective, "feasible_set", lambda self, **_: FeasibleSet(self.space, free))
     monkeypatch.setattr(run_frame, "check_scene", partial(check_scene, joint_weather=False))
     out = tmp_path / "earlier"
     words = ("--method", "random", "--queries", "2", "--budget", "translate=0.05m", "--out", str(out))

@@ -79,10 +79,11 @@ def test_shipped_presets_parse(preset: Path) -> None:
 
 
 def test_papers_preset_is_for_attacks_and_studies() -> None:
+    theirs = {"objective": "confidence", "objective_labels": "paper", "keep": "last", "project": "bounds"}
     attack = parse(["attack", "--config", str(CONFIGS / "paper.yaml")])
     study = parse(["study", "multi", "--config", str(CONFIGS / "paper.yaml"), "--steps", "3"])
-    assert attack == Attack(combo=2, objective="confidence", objective_labels="paper")
-    assert study == Study(name="multi", steps=3, objective="confidence", objective_labels="paper")
+    assert attack == Attack(combo=2, **theirs)
+    assert study == Study(name="multi", steps=3, **theirs)
     with pytest.raises(UsageError, match=r"paper\.yaml: expected a preset for drivesem retrain, found one"):
         preset_words(str(CONFIGS / "paper.yaml"), "retrain")
 

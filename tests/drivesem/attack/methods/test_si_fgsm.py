@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 
@@ -54,6 +56,20 @@ def test_steps_follow_the_sign_and_stay_feasible():
     assert result.active_constraints == ("1: bounds",)
     assert result.success_moved
     assert not result.success_paper
+
+
+def test_the_last_iterate_is_kept_on_request_whatever_it_does():
+    world = Analytic()
+    start = torch.tensor([0.38, 0.5, 0.0])  # the first step of theta[0] leads away from its goal
+    best, last = (
+        SiFGSM(steps=2)(dataclasses.replace(world.problem, keep_last=keep), start) for keep in (False, True)
+    )
+    assert last.theta.tolist() == pytest.approx([0.38, 0.1, 0.0])
+    assert last.score.loss <= best.score.loss or torch.equal(last.theta, best.theta)
+    away = dataclasses.replace(world.problem, keep_last=True, loss_and_grad=lambda theta: (0.0, -torch.ones(3)))
+    assert SiFGSM(steps=1)(away, torch.full((3,), 0.3)).theta[0] == pytest.approx(0.2)
+    kept = dataclasses.replace(away, keep_last=False)
+    assert SiFGSM(steps=1)(kept, torch.full((3,), 0.3)).theta[0] == pytest.approx(0.3)
 
 
 def test_early_stop_ends_at_the_first_success():

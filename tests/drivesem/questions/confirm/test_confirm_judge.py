@@ -10,8 +10,9 @@ import torch
 
 from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.judge import exact_labels, findings, stands
+from drivesem.questions.confirm.judge import findings, stands
 from drivesem.run.results import BoxRecord, Failure
+from drivesem.truth.redraw.exact import exact_labels
 
 T_STAR = 0.5
 BOX = (100.0, 100.0, 160.0, 140.0)

@@ -38,7 +38,7 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
     arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7), OUT)}
     assert len(arms) == 3 * count
     for arm in [a for a in arms.values() if a.control is None]:
-        assert arm.reference is not None
+        assert (arm.reference is None) == (arm.config.method != "si-fgsm")
         samples, edit = arms[f"{arm.name} {RANDOM}"], arms[f"{arm.name} {PLACEBO}"]
         assert samples.of == edit.of == arm.name
         assert (samples.config.method, samples.config.range, samples.config.queries) == (
@@ -56,12 +56,24 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
 def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
     arms = arms_of(Study(name="multi", steps=7, controls=False), OUT)
     assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
-    assert (arms[-1].config.combo, arms[-1].reference) == (2, arms[1].reference)
+    assert (arms[-1].config.combo, arms[-1].reference) == (2, None)
+    assert arms_of(Study(name="multi", detector="yolov3-slim", controls=False), OUT)[1].reference is None
     alone = arms_of(Study(name="multi", method="apgd", controls=False), OUT)
     assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
 
 
-@pytest.mark.parametrize("name", ["samples", "steps"])
+def test_grades_compare_methods_at_the_same_cost() -> None:
+    arms = {arm.name: arm for arm in arms_of(Study(name="grades", steps=7), OUT)}
+    assert len(arms) == 15
+    for name in ("combo 2", "weather", "all six"):
+        gradient, longer, samples = (arms[key].config for key in (name, f"{name}, apgd", f"{name}, halton"))
+        assert (gradient.steps, longer.steps, samples.queries) == (7, 28, 21)
+        assert gradient.params == longer.params == samples.params
+        assert arms[f"{name}, apgd placebo"].of == f"{name}, apgd"
+    assert all(arm.config.confirm for arm in arms.values())
+
+
+@pytest.mark.parametrize("name", ["samples", "steps", "grades"])
 def test_these_name_their_own_methods(name: str) -> None:
     assert arms_of(Study(name=name), OUT) == arms_of(Study(name=name, method="apgd"), OUT)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.questions.confirm.carry import carried
-from drivesem.questions.confirm.plans import Planned
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import Plan, SynthSettings, plan_frame, yaw_in_camera
 from drivesem.synth.layout import Actor, LayoutSettings
+from drivesem.truth.redraw.carry import carried
+from drivesem.truth.redraw.plans import Planned
 from scene_ir import ffd
 from scene_ir.geometry import yaw_matrix
 from scene_ir.types import LATTICE, SceneIR

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.questions.confirm.plans import Planned
 from drivesem.settings.edits import FrameEdit, ObjectEdit
 from drivesem.synth.frames import yaw_in_camera
 from drivesem.synth.layout import Actor
 from drivesem.synth.view import View
+from drivesem.truth.redraw.plans import Planned
 from scene_ir import ffd
 from scene_ir.types import LATTICE, SceneIR
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from drivesem.data.kitti import read_labels
-from drivesem.questions.confirm.plans import DemoPlans, FolderPlans, open_plans
 from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.synth.frames import render_frame
 from drivesem.synth.write import Order, synthesise
+from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, open_plans
 from scene_ir import files
 from scene_ir.errors import FormatError
 

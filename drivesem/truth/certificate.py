@@ -1,0 +1,173 @@
+"""Certificates: does a failure hold when the same scene is photographed again and again?
+
+A fault is looked at in draws of `nuisances` that no search has seen. It is certain where all is right in at least
+15 of 16 draws of the scene before the change, and wrong in at least 12 of 16 after it: the Wilson interval (95 %)
+of 12 of 16 begins above one half.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from detectors import boxes
+from detectors.base import Predictor, predict
+from detectors.types import Targets
+from drivesem.attack import goals
+from drivesem.attack.judging import JudgedClasses
+from drivesem.settings.blocks import CERTIFYING_DRAWS
+from drivesem.truth import margin
+from drivesem.truth.grades import Count, Kind
+from drivesem.truth.kinds import OF_OBJECTS, SAME_PLACE, Fault, Judged, View, judge
+from drivesem.truth.nuisances import Draw, Nuisances
+from drivesem.truth.redraw.base import SecondRenderer
+from scene_ir.errors import RangeError
+from scene_ir.types import SceneIR
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Of `draws` draws before the change, and as many after it, how many must be right, and wrong. RangeError for
+    fewer draws than that needs.
+    """
+
+    draws: int = CERTIFYING_DRAWS
+    right_before: float = 15 / 16
+    wrong_after: float = 12 / 16
+
+    def __post_init__(self) -> None:
+        if self.draws < CERTIFYING_DRAWS:
+            raise RangeError("draws", f"at least {CERTIFYING_DRAWS}, which a certificate's rule needs", self.draws)
+
+    @property
+    def before(self) -> int:
+        return math.ceil(self.right_before * self.draws)
+
+    @property
+    def after(self) -> int:
+        return math.ceil(self.wrong_after * self.draws)
+
+    def holds(self, count: Count) -> bool:
+        """Whether a fault with these draws is certain."""
+        return count.before >= self.before and count.after >= self.after
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One draw of one state, as a detector sees it. judged: by `threshold`; classes: how many are judged."""
+
+    view: View
+    judged: Judged
+    threshold: float
+    draw: Draw
+    classes: int
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Looks at states of one scene through a renderer and a detector. stream: name of the draws, which follow from
+    it and their number alone.
+    """
+
+    renderer: SecondRenderer
+    detector: Predictor
+    t_star: float
+    nuisances: Nuisances
+    stream: str
+
+    @torch.no_grad()
+    def look(self, state: SceneIR, number: int, ignore: Tensor) -> Look:
+        """The number-th draw of a state. ignore: (N,) bool, the objects that are not judged in it."""
+        draw = self.nuisances.draw(self.stream, number, state)
+        redrawn = self.renderer.redraw(draw.scene(state))
+        truth, known, count = redrawn.targets, redrawn.shown_xyxy, len(ignore)
+        judged = JudgedClasses.of(self.detector)
+        skipped = torch.cat([truth.ignore[:count] | ignore.to(truth.ignore), truth.ignore[count:]])
+        targets = judged.targets(Targets(draw.boxes(truth.boxes_xyxy), truth.labels, skipped))
+        shown = torch.where(boxes.area(known)[:, None] > 0, draw.boxes(known), torch.zeros_like(known))
+        detections = judged.detections(predict(self.detector, draw.picture(redrawn.image)[None])[0])
+        view = View(targets, with_regions(shown, targets), detections)
+        return Look(view, judge(view, self.t_star), self.t_star, draw, len(judged.names))
+
+
+def with_regions(shown_xyxy: Tensor, targets: Targets) -> Tensor:
+    """Boxes of what shows of the objects (N, 4), as many as there are targets (M, 4): zeros for regions."""
+    return torch.cat([shown_xyxy, shown_xyxy.new_zeros(len(targets) - len(shown_xyxy), 4)])
+
+
+def certify(
+    faults: Sequence[Fault],
+    places_xyxy: Tensor,
+    before: Callable[[int], Look],
+    after: Callable[[int], Look],
+    rule: Rule,
+) -> tuple[Count, ...]:
+    """Count draws for each fault until no more can change whether it is certain: first after the change, then, of
+    what still may be, before it.
+
+    places_xyxy: (F, 4) px of each fault, in the picture without a draw; it matters for background. before, after:
+    the number-th look at either state. Looks are shared by all faults: at most 2 * rule.draws of them.
+    """
+    wrong: list[list[bool]] = [[] for _ in faults]
+    right: list[list[bool]] = [[] for _ in faults]
+    beyond: list[tuple[list[float | None], list[float | None]]] = [([], []) for _ in faults]
+    for outcomes, side, needed, state in ((wrong, 1, rule.after, after), (right, 0, rule.before, before)):
+        # What has failed the first half is not asked again.
+        candidates = [f for f in range(len(faults)) if side == 1 or sum(wrong[f]) >= rule.after]
+        for number in range(rule.draws):
+            if all(outcomes[f].count(False) > rule.draws - needed for f in candidates):
+                break
+            look = state(number)
+            for f in candidates:
+                fails = has(faults[f], places_xyxy[f], look)
+                holds = fails if side == 1 else is_right(faults[f], places_xyxy[f], look)
+                outcomes[f].append(holds)
+                beyond[f][side].append(margin_of(faults[f], places_xyxy[f], look))
+    return tuple(
+        Count(sum(right[f]), len(right[f]), sum(wrong[f]), len(wrong[f]), _mean(beyond[f][0]), _mean(beyond[f][1]))
+        for f in range(len(faults))
+    )
+
+
+def has(fault: Fault, place_xyxy: Tensor, look: Look) -> bool:
+    """Whether a look shows this fault: an object not found, or reported twice; something on nothing there."""
+    if fault.kind in OF_OBJECTS:
+        return not bool(look.judged.found[fault.target])
+    if fault.kind is Kind.TWICE:
+        return fault.target in look.judged.twice
+    at = look.view.detections.boxes_xyxy[list(look.judged.background)]
+    return bool((_overlap(place_xyxy, look, at) >= SAME_PLACE).any())
+
+
+def is_right(fault: Fault, place_xyxy: Tensor, look: Look) -> bool:
+    """Whether all is right in a look where the fault may be: the object found, once; nothing reported there."""
+    if fault.kind is Kind.BACKGROUND:
+        at = look.view.detections.boxes_xyxy[look.view.detections.scores >= look.threshold]
+        return not bool((_overlap(place_xyxy, look, at) >= SAME_PLACE).any())
+    found = bool(look.judged.found[fault.target])
+    return found and (fault.kind is not Kind.TWICE or fault.target not in look.judged.twice)
+
+
+def margin_of(fault: Fault, place_xyxy: Tensor, look: Look) -> float | None:
+    """The fault's margin in a look, in logits, of what suppression left; None of what is reported twice."""
+    if fault.kind is Kind.TWICE:
+        return None
+    candidates = goals.of_detections(look.view.detections, look.classes)
+    if fault.kind is Kind.BACKGROUND:
+        return float(margin.of_places(candidates, look.draw.boxes(place_xyxy[None]), look.threshold)[0])
+    target, view = slice(fault.target, fault.target + 1), look.view
+    box, label = view.targets.boxes_xyxy[target], view.targets.labels[target]
+    return float(margin.of_objects(candidates, box, label, view.shown_xyxy[target], look.threshold)[0])
+
+
+def _overlap(place_xyxy: Tensor, look: Look, at_xyxy: Tensor) -> Tensor:
+    return boxes.iou_matrix(look.draw.boxes(place_xyxy[None]).to(at_xyxy), at_xyxy)[0]
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known), 4) if known else None
