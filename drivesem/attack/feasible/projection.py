@@ -41,8 +41,8 @@ _HALVINGS = 5
 class FeasibleSet:
     """The feasible set of one scene's `ParameterSpace`; prepared once, then `project` takes a millisecond.
 
-    only_bounds: `project` keeps to the bounds and asks for nothing else, as the paper does. fades: who is lost from
-    sight in which weather; by default nobody.
+    only_bounds: `project` keeps to the bounds and asks for nothing else, as the paper does. fades: who is lost
+    from sight in which weather; by default nobody.
     """
 
     def __init__(

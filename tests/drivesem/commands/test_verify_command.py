@@ -115,7 +115,7 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
 
 @pytest.fixture
 def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run as it was before contrast counted and weather was bounded together; its results have no such fields."""
+    """A run as it was before contrast counted and weather was bounded together, without fields for that."""
     monkeypatch.setattr(objective, "Difficulty", lambda: Difficulty(min_contrast=0))
     free = Limits(joint_weather=False)
     monkeypatch.setattr(objective.Objective, "feasible_set", lambda self, **_: FeasibleSet(self.space, free))
@@ -123,9 +123,8 @@ def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     out = tmp_path / "earlier"
     words = ("--method", "random", "--queries", "2", "--budget", "translate=0.05m", "--out", str(out))
     assert main(["attack", *WORDS, *words]) == 0
-    change(
-        out / FRAME / "result.json", lambda data: [data.pop(name) for name in ("min_contrast", "joint_weather")]
-    )
+    for field in ("min_contrast", "joint_weather"):
+        change(out / FRAME / "result.json", lambda data, field=field: data.pop(field))
     monkeypatch.undo()
     monkeypatch.setattr(run_folder, "load_predictor", lambda *_: Drifting())
     return out
