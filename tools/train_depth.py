@@ -276,8 +276,8 @@ CARD = """# Depth of photographs' surroundings, trained on generated streets
 
 ## Figures
 
-Held out: {held_out} frames of the generator without vehicles (shapes and streets that no training frame has); depth
-up to {far:.0f} m. Relative error is the mean of |d - d*| / d*; within 1.25 is the share of pixels whose ratio to
+Held out: {held_out} frames of the generator without vehicles (shapes and streets that no training frame has), up
+to {far:.0f} m. Relative error is the mean of |d - d*| / d*; within 1.25 is the share of pixels whose ratio to
 the truth is smaller. What a scene keeps is the mean of both, in logarithms.
 
 {table}

@@ -639,12 +639,14 @@ def _environment(
 
 
 def _behind_m(cuts: list[_Cut], camera: Camera) -> Array:
-    """Depth (H, W) m that what stands behind the vehicles has at least; 0 where none stands."""
-    nearest = np.zeros((camera.height, camera.width), np.float32)
+    """Depth (H, W) m that what stands behind the vehicles has at least, that of their middle; 0 where none
+    stands."""
+    middle = np.zeros((camera.height, camera.width), np.float32)
     for cut in cuts:
-        corner = np.float32(front.nearest_corner(cut.placement, camera))
-        nearest = np.where(cut.outline, np.maximum(nearest, corner), nearest)
-    return nearest
+        place = cut.placement.translation.detach()[None]
+        depth = float(to_clip(place, camera.matrix.to(place))[0, 2])
+        middle = np.where(cut.outline, np.maximum(middle, np.float32(depth)), middle)
+    return middle
 
 
 def _objects(labels: Labels, cuts: list[_Cut]) -> tuple[Objects, tuple[Mesh, ...]]:
