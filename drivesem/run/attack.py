@@ -46,6 +46,7 @@ from drivesem.settings.errors import UsageError
 from drivesem.truth.certificate import Rule
 from drivesem.truth.grading import Grader, witness_of
 from drivesem.truth.nuisances import Nuisances
+from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
@@ -236,6 +237,7 @@ def grader_of(config: Attack, detector: Predictor) -> Grader:
         nuisances=Nuisances.of(config.nuisances),
         rule=Rule(config.draws),
         seed=config.seed,
+        second=SecondRenderers(config.dataset, config.root).of if config.confirm else None,
         peer=_peer(config),
         witness=None if config.witness is None else _witness(config, config.witness),
     )

@@ -24,6 +24,9 @@ from drivesem.truth.redraw.base import SecondRenderer
 from scene_ir.errors import SceneError
 from scene_ir.types import SceneIR
 
+_SECOND_DRAWS = range(SECOND[1])
+"""Draws that a second renderer and another detector see."""
+
 
 @dataclass(frozen=True, slots=True)
 class Graded:
@@ -79,7 +82,7 @@ class Grader:
     second: Callable[[str, SceneIR], SecondRenderer] | None = None
     peer: Callable[[], Predictor] | None = None
     witness: Callable[[Tensor], Tensor] | None = None
-    _kept: tuple[Tensor, dict[int, Look]] | None = None
+    _kept: tuple[Tensor, dict[tuple[str, int], Look]] | None = None
 
     def faults(self, case: Case, failures: Failures) -> tuple[Fault, ...]:
         """Those failures by threshold that are of a kind, in the order of `kinds.find`."""
@@ -105,21 +108,26 @@ class Grader:
 
     def certificates(self, case: Case, faults: tuple[Fault, ...]) -> tuple[Count, ...]:
         """Of faults, by draws of the case's own renderer."""
-        objects = len(case.base.objects)
         camera = self._camera(case, case.renderer, self.detector, self.t_star)
-        if self._kept is None or self._kept[0] is not case.base.photograph:
-            self._kept = (case.base.photograph, {})
-        kept = self._kept[1]
 
         def before(number: int) -> Look:
-            if number not in kept:
-                kept[number] = camera.look(case.base, number, case.benign.targets.ignore[:objects])
-            return kept[number]
+            return self._before(case, camera, number)
 
         def after(number: int) -> Look:
-            return camera.look(case.changed, number, case.now.targets.ignore[:objects])
+            return _after(case, camera, number)
 
         return certify(faults, _places(case, faults), before, after, self.rule)
+
+    def _before(self, case: Case, camera: Camera, number: int) -> Look:
+        """The number-th look at the scene before the change. Kept as long as the frame stays: attacks on it differ
+        in what comes after.
+        """
+        if self._kept is None or self._kept[0] is not case.base.photograph:
+            self._kept = (case.base.photograph, {})
+        kept, key = self._kept[1], (camera.stream, number)
+        if key not in kept:
+            kept[key] = _look(case.base, case.benign, camera, number)
+        return kept[key]
 
     def _graded(self, case: Case, faults: tuple[Fault, ...]) -> tuple[list[Graded], tuple[str, ...]]:
         counts = self.certificates(case, faults)
@@ -133,7 +141,8 @@ class Grader:
         try:
             renderer = self.second(case.identifier, case.base)
             camera = self._camera(case, renderer, self.detector, self.t_star, "second")
-            second = _agreements(case, camera, [g.fault for g in certain], case.base, renderer.name)
+            before = [self._before(case, camera, number) for number in _SECOND_DRAWS]
+            second = _agreements(case, camera, [g.fault for g in certain], before, renderer.name)
         except SceneError as error:
             return graded, (f"no second renderer: {error}",)
         confirmed = [fault for fault, agreement in second.items() if agreement.agrees]
@@ -141,7 +150,9 @@ class Grader:
         if confirmed and self.peer is not None and case.placebo is not None:
             peer = self.peer()
             camera = self._camera(case, case.renderer, peer, t_star_of(peer), "peer")
-            peers = _agreements(case, camera, confirmed, case.placebo(), peer.name)
+            placebo = case.placebo()
+            before = [_look(placebo, case.benign, camera, number) for number in _SECOND_DRAWS]
+            peers = _agreements(case, camera, confirmed, before, peer.name)
 
         def told(g: Graded) -> Graded:
             by_second, by_peer = second.get(g.fault), peers.get(g.fault)
@@ -158,20 +169,27 @@ class Grader:
         return Camera(renderer, detector, t_star, self.nuisances, f"{which}:{case.identifier}:{self.seed}")
 
 
+def _look(state: SceneIR, view: View, camera: Camera, number: int) -> Look:
+    """view: says which of the scene's objects are not judged in that state."""
+    return camera.look(state, number, view.targets.ignore[: len(state.objects)])
+
+
+def _after(case: Case, camera: Camera, number: int) -> Look:
+    return _look(case.changed, case.now, camera, number)
+
+
 def _agreements(
-    case: Case, camera: Camera, faults: list[Fault], right: SceneIR, name: str
+    case: Case, camera: Camera, faults: list[Fault], before: list[Look], name: str
 ) -> dict[Fault, Agreement]:
-    """What a camera of four draws says of faults. right: the state in which all is to be right."""
-    objects, places = len(case.base.objects), _places(case, tuple(faults))
-    numbers = range(SECOND[1])
-    before = [camera.look(right, n, case.benign.targets.ignore[:objects]) for n in numbers]
-    after = [camera.look(case.changed, n, case.now.targets.ignore[:objects]) for n in numbers]
+    """What a camera says of faults. before: its looks at the state in which all is to be right."""
+    places = _places(case, tuple(faults))
+    after = [_after(case, camera, number) for number in _SECOND_DRAWS]
     return {
         fault: Agreement(
             name,
             sum(is_right(fault, place, look) for look in before),
             sum(has(fault, place, look) for look in after),
-            len(numbers),
+            len(after),
         )
         for fault, place in zip(faults, places, strict=True)
     }

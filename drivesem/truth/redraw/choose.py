@@ -1,0 +1,50 @@
+"""Which second renderer draws a frame again: the generator, where it made the frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from drivesem.settings.blocks import DEMO
+from drivesem.settings.errors import UsageError
+from drivesem.truth.redraw.base import NoSecondRendererError, SecondRenderer
+from drivesem.truth.redraw.generator import GeneratorRedraw
+from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
+from scene_ir.errors import FormatError
+from scene_ir.types import SceneIR
+
+
+class SecondRenderers:
+    """Second renderers of one data set's frames. dataset, root: as a run's settings name it.
+
+    An embedded scene is known by its provenance, whatever the data set: in Python a scene may come from anywhere.
+    """
+
+    def __init__(self, dataset: str, root: str | None) -> None:
+        self._folder = _folder_plans(dataset, root)
+        self._last: tuple[Tensor, SecondRenderer] | None = None
+
+    def of(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+        """What draws a frame again. scene: any state of it; attacks on the same scene, one after the other, share
+        the renderer. Raises SceneError where nothing can.
+        """
+        if self._last is None or self._last[0] is not scene.photograph:
+            self._last = (scene.photograph, self._made(identifier, scene))
+        return self._last[1]
+
+    def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+        plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
+        if plans is not None:
+            return GeneratorRedraw(identifier, scene, plans)
+        raise NoSecondRendererError(f"frame {identifier}", "a generated frame", "a photograph")
+
+
+def _folder_plans(dataset: str, root: str | None) -> Plans | None:
+    """Of a folder that the generator wrote; None where it did not, or where it is not known how."""
+    if dataset != "kitti":
+        return None
+    try:
+        return FolderPlans(Path(root or ""))
+    except (UsageError, FormatError):
+        return None
