@@ -39,7 +39,7 @@ def graded(frame: FrameResult, *grades: str, error: str = "missed") -> FrameResu
 
 @pytest.fixture
 def run(tmp_path: Path, frame: Callable[..., FrameResult], make_run: Callable[..., Path]) -> Path:
-    """Of five frames one fails by threshold, two for certain, one for a second renderer too, and one not at all."""
+    """Of five frames one fails by threshold, two for certain, one for a second renderer too, one not at all."""
     frames = [
         graded(frame("a", lost=True, phantom=True), "threshold", "threshold"),
         graded(frame("b", lost=True), "certain", error="placed"),
