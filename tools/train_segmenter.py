@@ -36,7 +36,7 @@ from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.soup import Material, Semantic
 from drivesem.synth.variations import MIXED, VARIATIONS
 from scene_ir import files
-from scene_ir.derender import segment
+from scene_ir.derender import segment, unet
 from scene_ir.derender.segment import Class, SegmentNet
 
 STREAM = 0x5E6
@@ -80,15 +80,16 @@ def classes_of(frame: SynthFrame) -> np.ndarray:
     return found
 
 
-def street(seed: int, index: int, split: str) -> SynthFrame:
-    """Frame `index` of a stream: any weather, any season, from turned cameras too."""
+def street(seed: int, index: int, split: str, with_background: bool = False) -> SynthFrame:
+    """Frame `index` of a stream: any weather, any season, from turned cameras too. with_background: also the
+    street without its actors."""
     rng = np.random.default_rng([STREAM, seed, index, split == "train"])
     layout = LayoutSettings(variants=VARIANTS[split], people=True)
     plan = plan_frame(seed, index, split, SynthSettings(layout=layout, bent=True))
     name = MIXED if rng.random() < MIXED_SHARE else str(rng.choice(VARIATIONS))
     leaves = tuple(float(rng.uniform(*reach)) for reach in LEAVES)
     plan = replace(variation_of(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
-    frame = render_frame(plan)
+    frame = render_frame(plan, with_background)
     assert frame is not None
     return frame
 
@@ -106,7 +107,7 @@ def shrunk(classes: np.ndarray) -> np.ndarray:
 class Store:
     """Frames of a stream at the size `STORE_HW`, made as far as they are not there yet.
 
-    images (N, h, w, 3) uint8, classes (N, h, w) uint8, elevation (N, h, w) float16: see `segment.elevation`.
+    images (N, h, w, 3) uint8, classes (N, h, w) uint8, elevation (N, h, w) float16: see `unet.elevation`.
     """
 
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
@@ -120,7 +121,7 @@ class Store:
         for index in range(found["frames"], frames):
             frame = street(seed, index, split)
             image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-            height_of = segment.elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
+            height_of = unet.elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
             files.write_npz(
                 folder / f"{index:05d}.npz",
                 {"image": image, "classes": shrunk(classes_of(frame)), "elevation": height_of},
@@ -150,25 +151,31 @@ def _smooth(rng: np.random.Generator, cells: int) -> np.ndarray:
     return cv2.resize(grid, CROP_HW[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def cropped(store: Store, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A part of a frame, zoomed, mirrored or not: image (h, w, 3) in [0, 1], classes (h, w), elevation (h, w)."""
+def window(rng: np.random.Generator) -> np.ndarray:
+    """The map (2, 3) of a kept frame's pixels to those of a part of it, zoomed, mirrored or not."""
     height, width = CROP_HW
     whole_height, whole_width = STORE_HW
-    down = _draw(rng, *ZOOM) * segment.INPUT_FOCAL_PX / STORE_FOCAL_PX
+    down = _draw(rng, *ZOOM) * unet.INPUT_FOCAL_PX / STORE_FOCAL_PX
     across = down * _draw(rng, 0.9, 1.1)
     y0 = _draw(rng, 0, whole_height * down - height)
     x0 = _draw(rng, 0, whole_width * across - width)
-    mirror = rng.random() < 0.5
     matrix = np.array([[across, 0, -x0], [0, down, -y0]])
-    if mirror:
+    if rng.random() < 0.5:
         matrix[0] = -matrix[0] + np.array([0, 0, width - 1])
+    return matrix
 
-    def taken(values: np.ndarray, how: int) -> np.ndarray:
-        return cv2.warpAffine(values, matrix, (width, height), flags=how, borderMode=cv2.BORDER_REPLICATE)
 
-    image = taken(store.images[index], cv2.INTER_LINEAR).astype(np.float32) / 255
-    classes = taken(store.classes[index], cv2.INTER_NEAREST)
-    return image, classes, taken(store.elevation[index].astype(np.float32), cv2.INTER_LINEAR)
+def taken(values: np.ndarray, part: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """A part of what is known of a kept frame. part (2, 3): see `window`; how: OpenCV's interpolation."""
+    return cv2.warpAffine(values, part, CROP_HW[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
+
+
+def cropped(store: Store, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A part of a frame, zoomed, mirrored or not: image (h, w, 3) in [0, 1], classes (h, w), elevation (h, w)."""
+    part = window(rng)
+    image = taken(store.images[index], part).astype(np.float32) / 255
+    classes = taken(store.classes[index], part, cv2.INTER_NEAREST)
+    return image, classes, taken(store.elevation[index].astype(np.float32), part)
 
 
 def other_surfaces(
@@ -178,7 +185,13 @@ def other_surfaces(
 
     What the generator draws always alike must not be what the network goes by.
     """
-    height, width = classes.shape
+    other_colours(image, classes, elevation, rng)
+    unknown_things(image, classes, rng)
+    other_light(image, classes, rng)
+
+
+def other_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
+    """Each kind of thing in colours of its own, other skies; in place."""
     if rng.random() < 0.4:
         gains = np.exp(rng.normal(0, 0.25, (len(Class), 1)) + rng.normal(0, 0.06, (len(Class), 3)))
         image *= cv2.blur(gains.astype(np.float32)[classes], (5, 5))
@@ -204,6 +217,11 @@ def other_surfaces(
             drawn = drawn + (_draw(rng, 0.75, 1.1) - drawn) * clouds
         opacity = cv2.blur(sky.astype(np.float32)[..., 0], (3, 3))[..., None]
         image += (drawn - image) * opacity
+
+
+def unknown_things(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
+    """What no generated street has, in the way; in place."""
+    height, width = classes.shape
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.35 else 0):
         h, w = int(_draw(rng, 6, 70)), int(_draw(rng, 3, 70))
         y, x = int(rng.integers(0, height - h)), int(rng.integers(0, width - w))
@@ -211,6 +229,11 @@ def other_surfaces(
         grain = 1 + 0.25 * _smooth(rng, int(rng.integers(2, 24)))[y : y + h, x : x + w, None]
         image[y : y + h, x : x + w] = colour * grain
         classes[y : y + h, x : x + w] = Class.OTHER
+
+
+def other_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
+    """Grain on the ground, shade from what is not in the picture; in place."""
+    sky = (classes == Class.SKY)[..., None]
     ground = np.isin(classes, (Class.ROAD, Class.GROUND, Class.GRASS, Class.OTHER))[..., None]
     if rng.random() < 0.4:
         image *= 1 + ground * _draw(rng, 0.05, 0.3) * _smooth(rng, int(rng.integers(8, 60)))[..., None]
@@ -441,7 +464,7 @@ def main() -> None:
     run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
-        focal=segment.INPUT_FOCAL_PX,
+        focal=unet.INPUT_FOCAL_PX,
         classes=", ".join(kind.name.lower() for kind in Class),
         file=arguments.out.name,
         frames=len(store),

@@ -104,6 +104,12 @@ class Figure:
         return Figure(self.name, tuple(a.beside(b) for a, b in pairs))  # pyright: ignore[reportArgumentType]
 
 
+def rate(name: str, hits: Floats, of: Floats) -> Figure:
+    """So many `hits` (F,) a frame of so many (F,): a share, or another ratio of sums over frames."""
+    count = len(hits)
+    return Figure(name, (Recalled(Tally(np.ones(count), np.arange(count), hits, np.zeros(count), of)),))
+
+
 def _beside(a: Tally, b: Tally) -> Tally:
     score = np.concatenate([a.score, b.score])
     order = np.argsort(-score, kind="stable")

@@ -15,6 +15,7 @@ from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study import report, retrain, retrain_report, transfer
 from drivesem.questions.study.arms import arms_of
+from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
 from drivesem.questions.study.lessons import CACHE, FRAMES, RETRAINED
@@ -104,14 +105,15 @@ _STUDIES = {"transfer": _transfer, "retrain": _retrain}
 
 def _findings(config: Study, ran: Ran) -> Findings:
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    rows = rows_of(ran.runs, draws, config.seed)
+    grades = [grades_of(one, draws, config.seed) for one in ran.runs]
+    found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
     if config.name == "labels":
-        return Findings(config, draws, ran, rows, label_sets=[label_sets(one) for one in ran.runs])
+        return replace(found, label_sets=[label_sets(one) for one in ran.runs])
     if config.name not in ("samples", "steps"):
-        return Findings(config, draws, ran, rows)
-    curves = [curve_of(one, draws, config.seed) for one in ran.runs]
+        return found
+    found = replace(found, curves=[curve_of(one, draws, config.seed) for one in ran.runs])
     if config.name == "steps":
-        return Findings(config, draws, ran, rows, curves)
+        return found
     first = ran.runs[0]
     beside = {one.arm.name: against(first, config.steps, one, draws, config.seed) for one in ran.runs}
-    return Findings(config, draws, ran, rows, curves, beside, config.steps)
+    return replace(found, beside=beside, within=config.steps)

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivesem.evaluation.resampling import Interval
+from drivesem.questions.study.arms import PLACEBO
+from drivesem.questions.study.grades import ArmGrades
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.report import Findings
 from drivesem.questions.study.rows import StudyRow
 from drivesem.questions.study.success import Curve
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.report.plots import COLOURS, LINES, STYLE
+from drivesem.truth.grades import Grade
 from scene_ir import files
 
 if TYPE_CHECKING:
@@ -33,7 +36,8 @@ def write_plot(path: Path, found: Findings) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    groups = 0 if found.curves else len(found.label_sets or found.rows)
+    sure = found.grades if found.study.name == "grades" else ()
+    groups = 0 if found.curves else len(sure or found.label_sets or found.rows)
     width = max(_LEAST_WIDTH_IN, _GROUP_IN * groups)
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=(width, _HEIGHT_IN), layout="constrained")
@@ -42,6 +46,8 @@ def write_plot(path: Path, found: Findings) -> None:
             _success(axes, found.curves)
         elif found.label_sets:
             _label_sets(axes, found.label_sets)
+        elif sure:
+            _grades(axes, sure)
         else:
             _falls(axes, found.rows)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, fontsize=9)
@@ -70,6 +76,16 @@ def _falls(axes: Axes, rows: Sequence[StudyRow]) -> None:
     axes.set_xticks(range(len(rows)), [row.name for row in rows])
     axes.set_ylabel("fall of AP50, points")
     axes.set_title("What the attack takes from AP50; lines: 95 % of draws of frames", loc="left", fontsize=11)
+
+
+def _grades(axes: Axes, grades: Sequence[ArmGrades]) -> None:
+    """Bars of failures by arm and grade."""
+    shown = (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)
+    bars(axes, {str(grade): [one.rates[grade] for one in grades] for grade in shown})
+    names = [one.name.replace(", ", "\n").replace(f" {PLACEBO}", f"\n{PLACEBO}") for one in grades]
+    axes.set_xticks(range(len(grades)), names)
+    axes.set_ylabel("failures, % of objects")
+    axes.set_title("Failures by grade; lines: 95 % of draws of frames", loc="left", fontsize=11)
 
 
 def place_of(group: int, series: int, count: int) -> float:

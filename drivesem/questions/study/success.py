@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.instances import Floats
-from drivesem.evaluation.resampling import Difference, Figure, Interval, Recalled, differences, intervals
+from drivesem.evaluation.resampling import Difference, Figure, Interval, differences, intervals, rate
 from drivesem.questions.study.running import ArmRun
 from drivesem.run.results import FrameResult
 
@@ -76,6 +75,4 @@ def against(run: ArmRun, queries: int, other: ArmRun, draws: int, seed: int) -> 
 
 def _share(broken: np.ndarray) -> Figure:
     """The share of frames (F,) bool, to be weighed by frames."""
-    count = len(broken)
-    tally = Tally(np.ones(count), np.arange(count), broken.astype(np.float64), np.zeros(count), np.ones(count))
-    return Figure("share", (Recalled(tally),))
+    return rate("share", broken.astype(np.float64), np.ones(len(broken)))

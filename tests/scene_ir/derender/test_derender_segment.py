@@ -10,7 +10,7 @@ import torch
 
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import SynthFrame, SynthSettings, generate_frame
-from scene_ir.derender import segment
+from scene_ir.derender import segment, unet
 from scene_ir.derender.segment import Class, Segmentation
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.types import Camera, Frame
@@ -75,7 +75,7 @@ def test_no_sky_below_the_horizon_and_no_ground_above(street, image):
         return lambda _: (shares, ("sky", "road", "tree"))
 
     ground, camera = street.environment.ground, street.camera
-    height = segment.elevation(ground, camera, image.shape[:2])
+    height = unet.elevation(ground, camera, image.shape[:2])
     sky = segment.segment(image, ground, camera, all_of("sky")).sky
     road = segment.segment(image, ground, camera, all_of("road")).road
     assert sky[height < -0.02].max() == 0
@@ -85,10 +85,10 @@ def test_no_sky_below_the_horizon_and_no_ground_above(street, image):
 
 
 def test_elevation_is_zero_at_the_horizon_and_the_rays_angle_elsewhere():
-    height = segment.elevation(LEVEL, CAMERA, (200, 480))
+    height = unet.elevation(LEVEL, CAMERA, (200, 480))
     assert np.abs(height[88]).max() < 1e-6
     assert height[20, 239] == pytest.approx(np.sin(np.arctan(68 / 380)), abs=1e-4)
-    small = segment.elevation(LEVEL, CAMERA, (100, 240))
+    small = unet.elevation(LEVEL, CAMERA, (100, 240))
     assert small[10, 100] == pytest.approx(height[20:22, 200:202].mean(), abs=1e-4)
 
 
