@@ -74,7 +74,13 @@ RULES = (
     ),
     Rule(
         "drivesem.report",
-        ("drivesem.run.results", "drivesem.evaluation", "scene_ir.errors", "scene_ir.files"),
+        (
+            "drivesem.run.results",
+            "drivesem.truth.grades",
+            "drivesem.evaluation",
+            "scene_ir.errors",
+            "scene_ir.files",
+        ),
         None,
         never=("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster"),
     ),
