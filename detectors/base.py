@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self, runtime_checkable
@@ -40,6 +40,15 @@ class Plantable(Protocol):
 
     def planted(self, box_xyxy: Tensor, label: int) -> Any:
         """The same, but silent about all images except for one certain prediction in each: a box (4,) px."""
+        ...
+
+
+@runtime_checkable
+class Lowerable(Protocol):
+    """Raw predictions whose scores of one class can be lowered: what faults are planted into."""
+
+    def lowered(self, label: int, by: Callable[[Tensor], Tensor]) -> Any:
+        """The same, scores of that class lowered; differentiable. by: boxes (B, A, 4) px to logits (B, A)."""
         ...
 
 
@@ -91,6 +100,17 @@ class RawPredictions:
         classes[:, 0, label] = CERTAIN
         confidence[:, 0] = CERTAIN
         return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
+
+    def lowered(self, label: int, by: Callable[[Tensor], Tensor]) -> RawPredictions:
+        """The same, but less confident where `label` is the likeliest class; see `Lowerable`."""
+        amount = by(self.boxes_xyxy)
+        likeliest = self.class_logits.argmax(-1) == label
+        return replace(self, confidence_logits=self.confidence_logits - torch.where(likeliest, amount, 0.0))
+
+
+def lowered_probability(probability: Tensor, by: Tensor) -> Tensor:
+    """Probabilities (...) whose logits are lowered by so much (...); exact near 0 and 1."""
+    return probability * torch.exp(-by) / (1 + probability * torch.expm1(-by))
 
 
 @dataclass(frozen=True, slots=True)
