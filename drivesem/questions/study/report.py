@@ -48,7 +48,7 @@ class Told:
 class Findings:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
     within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
-    the generator's pictures say, by arm. grades: how sure failures are, of every arm, controls included.
+    second renderers' pictures say, by arm. grades: how sure failures are, of every arm, controls included.
     """
 
     study: Study
@@ -152,7 +152,7 @@ def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
         lines.append(tuple(cells))
     names = next(iter(confirmed.values())).shares
     return Sheet(
-        "Failures that survive the generator's renderer, %",
+        "Failures that survive a second renderer, %",
         (_ARM, "drawn", *(s.name for s in names)),
         tuple(lines),
     )
@@ -278,8 +278,8 @@ def notes(found: Findings) -> list[str]:
         )
     if found.confirmed:
         told.append(
-            "Survive: the same change, drawn by the generator and with exact labels, fails the detector too; in "
-            "brackets Wilson's 95 %. Generator only: of frames that did not fail before."
+            "Survive: the same change, drawn by a second renderer and with its labels, fails the detector too; in "
+            "brackets Wilson's 95 %. Second only: of frames that did not fail before."
         )
     if found.grades:
         told.append(
