@@ -122,7 +122,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Bootstrap, Grading, Attacking, FrameCommand):
-    """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
+    """The paper's experiments, and others: every arm an attack on the same frames."""
 
     name: Annotated[
         tyro.conf.Positional[

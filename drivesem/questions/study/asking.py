@@ -1,4 +1,4 @@
-"""The paper's experiments on frames of one's own, its figures beside ours."""
+"""The paper's experiments, and others, on frames of one's own."""
 
 from __future__ import annotations
 
