@@ -57,7 +57,7 @@ def to_symmetric(offsets: Tensor) -> Tensor:
 
 
 def low_modes() -> Tensor:
-    """Symmetric offsets (15, 96), at most 1, that bend a vehicle in the large: along its length and up by x, y, x^2,
+    """Symmetric offsets (15, 96), at most 1, that bend a vehicle in the large: along and up by x, y, x^2,
     xy, y^2 of where a lattice point lies along and up; across by z times 1, x, y, x^2, y^2. None is a move.
     """
     x, y, z = (torch.linspace(-1, 1, n) for n in LATTICE)
