@@ -44,8 +44,9 @@ class DrawnViews:
 
     @property
     def differentiable(self) -> bool:
-        """See `Views`."""
-        return isinstance(self.objective.detector, Detector)
+        """See `Views`. A detector that does not tell its candidates has no gradient of margins."""
+        detector = self.objective.detector
+        return isinstance(detector, Detector) and type(detector).candidates is not Detector.candidates
 
     @property
     def passes(self) -> int:
@@ -57,24 +58,26 @@ class DrawnViews:
         """See `Views`."""
         draw, scene, render = self._drawn(theta, number)
         self.objective.passes += 1
-        image = draw.picture(render.image)
-        return self._margins(self._candidates(image), draw, scene, render, None)
+        return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, None)
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Views`. RangeError for a detector without a gradient."""
-        detector = self.objective.differentiable
+        """See `Views`; the gradient is that of soft margins. RangeError for a detector without a gradient."""
         leaf = theta.detach().clone().requires_grad_(True)
-        draw, scene, render = self._drawn(leaf, number)
+        soft = self.soft(leaf, number)
         self.objective.passes += GRADIENT_PASSES
-        candidates = detector.candidates(detector(draw.picture(render.image)[None]))
-        soft = self._margins(candidates, draw, scene, render, SHARPNESS)
         counts = torch.isfinite(soft)
         total = (weights[counts].to(soft) * soft[counts]).sum()
         if not total.requires_grad:  # nothing counts there
             return soft.detach(), torch.zeros_like(theta)
         (gradient,) = torch.autograd.grad(total, leaf)
-        with torch.no_grad():
-            return self._margins(candidates, draw, scene, render, None), gradient
+        return soft.detach(), gradient
+
+    def soft(self, theta: Tensor, number: int) -> Tensor:
+        """Margins (N,) by a soft maximum over candidates, of a picture that is not rounded to 8 bits where theta
+        (D,) carries a gradient; differentiable.
+        """
+        draw, scene, render = self._drawn(theta, number)
+        return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, SHARPNESS)
 
     def _drawn(self, theta: Tensor, number: int) -> tuple[Draw, SceneIR, Render]:
         space = self.objective.space
@@ -84,8 +87,8 @@ class DrawnViews:
 
     def _candidates(self, image: Tensor) -> Candidates:
         detector, judged = self.objective.detector, self.objective.judged
-        if isinstance(detector, Detector):
-            return detector.candidates(detector(image[None]))
+        if self.differentiable:
+            return self.objective.differentiable.candidates(self.objective.differentiable(image[None]))
         return goals.of_detections(judged.detections(predict(detector, image[None])[0]), len(judged.names))
 
     def _margins(
@@ -97,7 +100,7 @@ class DrawnViews:
             still = replace(render, image=render.image.detach())
             moved = objective.labeller.moved(scene, still).targets
             targets = objective.judged.targets(moved)
-            if isinstance(objective.detector, Detector):
+            if self.differentiable:
                 targets = objective.judged.own_targets(targets)
             rows = (self.judged & ~targets.ignore[:count].to(self.judged.device)).nonzero()[:, 0]
             placed, shown = draw.boxes(targets.boxes_xyxy[rows]), shown_boxes(still)[rows]
