@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self, runtime_checkable
@@ -47,8 +47,8 @@ class Plantable(Protocol):
 class Lowerable(Protocol):
     """Raw predictions whose scores of one class can be lowered: what faults are planted into."""
 
-    def lowered(self, label: int, by: Callable[[Tensor], Tensor]) -> Any:
-        """The same, scores of that class lowered; differentiable. by: boxes (B, A, 4) px to logits (B, A)."""
+    def lowered(self, label: int, by: Tensor) -> Any:
+        """The same, scores of that class lowered by logits (B, A), row by row of the candidates."""
         ...
 
 
@@ -101,11 +101,10 @@ class RawPredictions:
         confidence[:, 0] = CERTAIN
         return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
 
-    def lowered(self, label: int, by: Callable[[Tensor], Tensor]) -> RawPredictions:
+    def lowered(self, label: int, by: Tensor) -> RawPredictions:
         """The same, but less confident where `label` is the likeliest class; see `Lowerable`."""
-        amount = by(self.boxes_xyxy)
         likeliest = self.class_logits.argmax(-1) == label
-        return replace(self, confidence_logits=self.confidence_logits - torch.where(likeliest, amount, 0.0))
+        return replace(self, confidence_logits=self.confidence_logits - torch.where(likeliest, by, 0.0))
 
 
 def lowered_probability(probability: Tensor, by: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
 """Detectors that are blind by construction: a failure that is known judges what looks for failures.
 
-A planted fault is told from the image alone. Each prediction of a car has features: of its own box, and of the
-picture inside of it. Where all of a fault's features lie in their bands, the prediction's logit is lowered. The
-bands have soft edges, so that the fault is differentiable to the image, through boxes and through pixels.
+A planted fault is told from the image alone. Predictions of a car that lie on each other are about one car. It has
+features, of their mean box and of the picture inside of it. Where all of a fault's features lie in their bands, the
+logits of these predictions are lowered. Bands have soft edges, so that the fault is differentiable to the image,
+through boxes, scores and pixels.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ DEPTH = 8.0
 SOFTNESS = 0.1
 """Scale of a band's logistic edges, as a share of its width: the middle of the band is lowered by 0.987 of the
 depth, its edges by half of it, and one width outside by 5e-5 of it."""
+
+FLOOR = 0.05
+"""Predictions of lower scores stay as they are: nothing is found by them."""
+SAME_CAR_IOU = 0.3
+"""From here on, a prediction is about the same car as a better one."""
 
 _LUMA = (0.299, 0.587, 0.114)
 """Of display colours (ITU-R BT.601)."""
@@ -137,6 +143,36 @@ def _light(images: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenCars:
+    """Cars as predictions tell of them. rows (R,) int64: the predictions that count; car (R,) int64: which of the
+    K cars each is about; boxes_xyxy (K, 4) px: their means.
+    """
+
+    rows: Tensor
+    car: Tensor
+    boxes_xyxy: Tensor
+
+
+def seen_cars(boxes_xyxy: Tensor, scores: Tensor) -> SeenCars:
+    """Group predictions of cars with boxes (A, 4) px and scores (A,), by `FLOOR` and `SAME_CAR_IOU`.
+
+    A car's box is the mean of its predictions', weighted by squares of their scores: the best one alone would jump
+    from one to the next. Differentiable, the grouping taken as constant.
+    """
+    rows = (scores.detach() >= FLOOR).nonzero()[:, 0]
+    placed, weights = boxes_xyxy[rows], scores[rows].square()
+    still = placed.detach()
+    best = boxes.nms(still, scores[rows].detach(), SAME_CAR_IOU)
+    overlap = boxes.iou_matrix(still, still[best])
+    # A box without an area overlaps nothing, not even itself.
+    overlap[best, torch.arange(len(best), device=best.device)] = 1
+    shares = weights[:, None] * (overlap >= SAME_CAR_IOU)
+    means = (shares.T @ placed) / shares.sum(0)[:, None]
+    car = overlap.argmax(1) if len(best) else rows
+    return SeenCars(rows, car, means)
+
+
+@dataclass(frozen=True, slots=True)
 class Band:
     """One feature from `low` to `high`."""
 
@@ -221,15 +257,21 @@ class PlantedFault:
         ]
         return torch.stack(inside).all(0)
 
-    def lowers(self, images: Tensor, boxes_xyxy: Tensor) -> Tensor:
-        """Logits (B, A) by which predictions with boxes (B, A, 4) px are lowered; differentiable to both."""
-        return self.depth * self.share(features(images, boxes_xyxy, self.names))
+    def lowers(self, image: Tensor, boxes_xyxy: Tensor, scores: Tensor) -> Tensor:
+        """Logits (A,) by which predictions of cars in an image (3, H, W) are lowered, with boxes (A, 4) px and
+        scores (A,); differentiable to all three.
+        """
+        cars = seen_cars(boxes_xyxy, scores)
+        values = features(image[None], cars.boxes_xyxy[None], self.names)[:, 0]
+        by = self.depth * self.share(values)
+        return torch.zeros_like(scores).index_put((cars.rows,), by[cars.car])
 
 
 class PlantedDetector(Detector):
     """`inner` with a planted fault; all else is inner's. Raises DetectorError where it knows no cars.
 
-    Its raw predictions must be `Lowerable`, as those of all detectors of this package are.
+    It must tell its candidates, and its raw predictions must be `Lowerable`, as those of all detectors of this
+    package are.
     """
 
     def __init__(self, inner: Detector, fault: PlantedFault) -> None:
@@ -249,7 +291,11 @@ class PlantedDetector(Detector):
                 f"detector {self.inner.name}: expected raw predictions that can be lowered, found "
                 f"{type(raw).__name__}"
             )
-        return raw.lowered(self._label, lambda placed: self.fault.lowers(images, placed))
+        return raw.lowered(self._label, torch.stack([self._by(image, raw, i) for i, image in enumerate(images)]))
+
+    def _by(self, image: Tensor, raw: Any, index: int) -> Tensor:
+        told = self.inner.candidates(raw.one(index))
+        return self.fault.lowers(image, told.boxes_of(self._label), told.log_scores[:, self._label].exp())
 
     def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
         """Inner's."""
@@ -295,13 +341,14 @@ class PlantedPredictor:
     def decode(self, raw: _Seen) -> list[Detections]:
         """Inner's, best first by the lowered scores."""
         return [
-            self._lowered(image[None], found)
+            self._lowered(image, found)
             for image, found in zip(raw.images, self.inner.decode(raw.said), strict=True)
         ]
 
     def _lowered(self, image: Tensor, found: Detections) -> Detections:
-        by = self.fault.lowers(image.to(found.boxes_xyxy), found.boxes_xyxy[None])[0]
-        scores = torch.where(found.labels == self._label, lowered_probability(found.scores, by), found.scores)
+        cars = found.labels == self._label
+        by = self.fault.lowers(image.to(found.boxes_xyxy), found.boxes_xyxy, torch.where(cars, found.scores, 0.0))
+        scores = lowered_probability(found.scores, by)
         order = torch.sort(scores, descending=True, stable=True).indices
         return Detections(found.boxes_xyxy[order], found.labels[order], scores[order])
 

@@ -7,7 +7,7 @@ family are attacked for the same thing; training needs the family's own.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -69,10 +69,9 @@ class DensePredictions:
         probabilities[:, 0, label] = 1
         return replace(self, boxes_xyxy=placed, probabilities=probabilities)
 
-    def lowered(self, label: int, by: Callable[[Tensor], Tensor]) -> DensePredictions:
+    def lowered(self, label: int, by: Tensor) -> DensePredictions:
         """The same, but for the class's probabilities; see `detectors.base.Lowerable`."""
-        amount = by(self.boxes_xyxy[:, :, label if self.boxes_xyxy.shape[2] > 1 else 0])
-        own = lowered_probability(self.probabilities[..., label], amount)
+        own = lowered_probability(self.probabilities[..., label], by)
         column = torch.arange(self.probabilities.shape[-1], device=own.device) == label
         return replace(self, probabilities=torch.where(column, own[..., None], self.probabilities))
 

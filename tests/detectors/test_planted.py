@@ -10,17 +10,19 @@ from hypothesis import strategies as st
 from torch import nn
 
 from detectors.adapters.dense import DenseDetector, DensePredictions
-from detectors.base import Detector, DetectorError, RawPredictions, predict
+from detectors.base import Detector, DetectorError, predict
 from detectors.check import check_detector
 from detectors.planted import (
     DEPTH,
     FEATURES,
+    FLOOR,
     Band,
     PlantedDetector,
     PlantedFault,
     PlantedPredictor,
     features,
     parts_of,
+    seen_cars,
     with_fault,
 )
 from detectors.registry import load_detector, load_predictor
@@ -156,42 +158,68 @@ def test_a_pair_asks_for_both() -> None:
     assert fault.contains(values).tolist() == [True, False, False]
 
 
-def heights_of(raw: DensePredictions | RawPredictions) -> torch.Tensor:
-    placed = raw.boxes_xyxy[0, :, 0] if isinstance(raw, DensePredictions) else raw.boxes_xyxy[0]
-    return features(picture(), placed[None], ("height_px",))[0, 0]
+class Fixed(DenseDetector):
+    """Two cars, each told of twice, and a bus on one of them; nothing of it is in the picture."""
+
+    boxes = torch.tensor([[5.0, 5, 25, 25], [5, 5, 27, 30], [50, 5, 80, 45], [50, 7, 80, 45], [50, 5, 80, 45]])
+
+    def __init__(self) -> None:
+        super().__init__("fixed", ("Car", "bus"), 0.5)
+
+    def predict(self, images: torch.Tensor) -> DensePredictions:
+        scores = torch.tensor([[0.9, 0], [0.6, 0], [0.8, 0], [0.7, 0], [0, 0.9]]).to(images)
+        count = len(images)
+        return DensePredictions(self.boxes[:, None].expand(count, -1, -1, -1), scores.expand(count, -1, -1), HW)
 
 
-def test_of_a_dense_detector_only_cars_in_the_band_are_lowered() -> None:
-    inner = Cells().requires_grad_(False)
-    fault = PlantedFault.of("height_px=24:30,softness=0.02")
-    before, after = inner(picture()), with_fault(inner, fault).forward(picture())
-    height = heights_of(before)
-    within, without = (height > 25) & (height < 29), (height < 23) | (height > 31)
-    assert within.any()
-    assert without.any()
-    fallen = before.probabilities.logit() - after.probabilities.logit()
-    torch.testing.assert_close(fallen[0, within, 0], torch.full((int(within.sum()),), DEPTH), rtol=0, atol=0.01)
-    unlike = after.probabilities[0, without] - before.probabilities[0, without]
-    assert float(unlike.abs().max()) < 1e-4
-    assert torch.equal(after.probabilities[..., 1], before.probabilities[..., 1])
+def test_predictions_that_lie_on_each_other_are_one_car() -> None:
+    cars = seen_cars(Fixed.boxes, torch.tensor([0.9, 0.6, 0.8, 0.7, 0.01]))
+    assert cars.rows.tolist() == [0, 1, 2, 3]
+    assert cars.car.tolist() == [0, 0, 1, 1]
+    mean = (0.81 * 25 + 0.36 * 30) / (0.81 + 0.36)
+    torch.testing.assert_close(cars.boxes_xyxy[0, 3], torch.tensor(mean))
+    nothing = seen_cars(Fixed.boxes, torch.zeros(5))
+    assert (len(nothing.rows), tuple(nothing.boxes_xyxy.shape)) == (0, (0, 4))
+    point = seen_cars(torch.tensor([[3.0, 3, 3, 3]]), torch.tensor([0.5]))
+    assert point.boxes_xyxy.tolist() == [[3, 3, 3, 3]]
+
+
+def test_all_that_is_said_of_a_car_in_the_band_is_lowered_and_nothing_else() -> None:
+    """The first car's mean box is 21.5 px high, its second prediction's own is 25."""
+    inner = Fixed()
+    before = inner(picture())
+    after = with_fault(inner, PlantedFault.of("height_px=18:23,softness=0.02")).forward(picture())
+    fallen = before.probabilities[0, :, 0].logit() - after.probabilities[0, :, 0].logit()
+    assert fallen[:2].tolist() == pytest.approx([DEPTH, DEPTH], abs=1e-2)
+    torch.testing.assert_close(after.probabilities[0, 2:], before.probabilities[0, 2:])
     assert torch.equal(after.boxes_xyxy, before.boxes_xyxy)
+    (found,) = with_fault(inner, PlantedFault.of("height_px=18:23")).decode(after)
+    assert found.labels[found.scores > 0.5].tolist() == [1, 0]
+
+
+def test_a_bus_stays_in_a_car_s_band() -> None:
+    inner = Fixed()
+    after = with_fault(inner, PlantedFault.of("height_px=30:50,softness=0.02")).forward(picture())
+    assert after.probabilities[0, :, 0].tolist() == pytest.approx([0.9, 0.6, 0.0013, 0.0008, 0], abs=1e-4)
+    assert after.probabilities[0, 4, 1] == inner(picture()).probabilities[0, 4, 1]
 
 
 def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
     inner = squeezedet()
-    fault = PlantedFault.of("height_px=20:60,softness=0.02")
-    before, after = inner(picture()), with_fault(inner, fault).forward(picture())
-    height, car = heights_of(before), before.class_logits[0].argmax(-1) == 0
+    before = inner(picture())
+    after = with_fault(inner, PlantedFault.of("height_px=10:100,softness=0.02")).forward(picture())
     fallen = (before.confidence_logits - after.confidence_logits)[0]
-    middle = (height > 25) & (height < 55)
-    assert (middle & car).any()
-    assert (middle & ~car).any()
-    torch.testing.assert_close(
-        fallen[middle & car], torch.full_like(fallen[middle & car], DEPTH), rtol=0, atol=0.1
-    )
-    assert not fallen[~car].any()
-    candidates = with_fault(inner, fault).candidates(after)  # type: ignore[attr-defined]
-    assert torch.equal(candidates.log_scores, inner.candidates(after).log_scores)
+    candidates = inner.candidates(before)
+    counts = candidates.log_scores[:, 0].exp() >= FLOOR
+    car = before.class_logits[0].argmax(-1) == 0
+    assert (counts & car).any()
+    assert (counts & ~car).any()
+    within = fallen[counts & car]
+    assert float(torch.minimum(within, (within - DEPTH).abs()).abs().quantile(0.9)) < 0.1
+    assert float(within.max()) == pytest.approx(DEPTH, abs=0.1)
+    assert not fallen[~(counts & car)].any()
+    told = with_fault(inner, PlantedFault.of("aspect=1:2")).candidates(after)  # type: ignore[attr-defined]
+    assert torch.equal(told.log_scores, inner.candidates(after).log_scores)
 
 
 @pytest.mark.parametrize("inner", [Cells, squeezedet])
