@@ -285,6 +285,7 @@ def _run_row(run: ShownRun, papers: bool) -> _Row:
     return _Row(
         run.name,
         (
+            *_graded_cells(run),
             _percent(before.ap50),
             _percent(moved.ap50),
             _points(before.ap50, moved.ap50),
@@ -292,7 +293,6 @@ def _run_row(run: ShownRun, papers: bool) -> _Row:
             *((_percent(run.paper.after if run.paper else None),) if papers else ()),
             _percent(moved.recall_at_t_star),
             str(summary.successes_moved),
-            *_graded_cells(run),
             str(lost),
             str(phantoms),
             _percent(summary.feasible_fraction),
