@@ -1,4 +1,4 @@
-"""The paper's experiments on frames of one's own, its figures beside ours."""
+"""The paper's experiments, and others, on frames of one's own."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ _STUDIES = {"transfer": _transfer, "retrain": _retrain}
 
 def _findings(config: Study, ran: Ran) -> Findings:
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    grades = [grades_of(one, draws, config.seed) for one in ran.runs]
+    grades = [grades_of(one, draws, config.seed) for one in ran.runs if not one.summary.frames_ungraded]
     found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
     if config.name == "labels":
         return replace(found, label_sets=[label_sets(one) for one in ran.runs])
