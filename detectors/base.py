@@ -43,6 +43,15 @@ class Plantable(Protocol):
         ...
 
 
+@runtime_checkable
+class Lowerable(Protocol):
+    """Raw predictions whose scores of one class can be lowered: what faults are planted into."""
+
+    def lowered(self, label: int, by: Tensor) -> Any:
+        """The same, scores of that class lowered by logits (B, A), row by row of the candidates."""
+        ...
+
+
 CERTAIN = 20.0
 """A logit that is as good as certain: its sigmoid differs from 1 by 2e-9."""
 
@@ -91,6 +100,16 @@ class RawPredictions:
         classes[:, 0, label] = CERTAIN
         confidence[:, 0] = CERTAIN
         return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
+
+    def lowered(self, label: int, by: Tensor) -> RawPredictions:
+        """The same, but less confident where `label` is the likeliest class; see `Lowerable`."""
+        likeliest = self.class_logits.argmax(-1) == label
+        return replace(self, confidence_logits=self.confidence_logits - torch.where(likeliest, by, 0.0))
+
+
+def lowered_probability(probability: Tensor, by: Tensor) -> Tensor:
+    """Probabilities (...) whose logits are lowered by so much (...); exact near 0 and 1."""
+    return probability * torch.exp(-by) / (1 + probability * torch.expm1(-by))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from detectors import planted
 from detectors.adapters import choose
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
@@ -44,6 +45,9 @@ def load_predictor(
     `detectors.adapters.onnx`). Raises DetectorError as `load_detector` does, and for a file that is no graph, a
     graph of no known kind, or where ONNX Runtime is missing.
     """
+    if str(name_or_path).startswith(planted.PREFIX):
+        fault, inner = planted.parts_of(str(name_or_path))
+        return planted.with_fault(load_predictor(inner, device, tiling), fault)
     if str(name_or_path).startswith(ONNX):
         return choose.open_predictor(str(name_or_path), tiling)
     return load_detector(name_or_path, device)
@@ -55,7 +59,8 @@ def load_detector(
     gradient_precision: torch.dtype | None = None,
 ) -> Detector:
     """The shipped detector of that name, or the one in a `.safetensors` file, or `darknet:FILE.cfg,FILE.weights`;
-    frozen, eval mode, channels-last. Or one from elsewhere (see `detectors.adapters.choose`), always in float32.
+    frozen, eval mode, channels-last. Or one from elsewhere (see `detectors.adapters.choose`), always in float32;
+    or any of these with a fault that is known, `planted:FAULT@DETECTOR` (see `detectors.planted`).
 
     gradient_precision: torch.bfloat16 or, on GPUs, torch.float16, for passes that a gradient follows; without it,
     all compute in float32. Detections and losses that are judged always do.
@@ -63,6 +68,11 @@ def load_detector(
     Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
     to another architecture; the message names the file, what was expected and what was found.
     """
+    if str(name_or_path).startswith(planted.PREFIX):
+        fault, inner = planted.parts_of(str(name_or_path))
+        return planted.PlantedDetector(load_detector(inner, device, gradient_precision), fault).requires_grad_(
+            False
+        )
     if choose.kind_of(str(name_or_path)) is not None:
         if gradient_precision is not None:
             raise DetectorError(f"{name_or_path}: expected float32 for its gradients, found {gradient_precision}")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from detectors import boxes
-from detectors.base import Candidates, Detector
+from detectors.base import Candidates, Detector, lowered_probability
 from detectors.grid import IGNORE_OVERLAP, MEETING_IOU
 from detectors.squeezedet import WEIGHT_CONFIDENCE_NEGATIVE, WEIGHT_CONFIDENCE_POSITIVE
 from detectors.types import CLASSES, Detections, Targets
@@ -68,6 +68,12 @@ class DensePredictions:
         placed[:, 0] = box_xyxy.to(placed)
         probabilities[:, 0, label] = 1
         return replace(self, boxes_xyxy=placed, probabilities=probabilities)
+
+    def lowered(self, label: int, by: Tensor) -> DensePredictions:
+        """The same, but for the class's probabilities; see `detectors.base.Lowerable`."""
+        own = lowered_probability(self.probabilities[..., label], by)
+        column = torch.arange(self.probabilities.shape[-1], device=own.device) == label
+        return replace(self, probabilities=torch.where(column, own[..., None], self.probabilities))
 
     def boxes_of(self, image: int, label: int) -> Tensor:
         """Boxes (A, 4) px of one image for one class."""

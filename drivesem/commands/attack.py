@@ -9,9 +9,11 @@ from rich.table import Table
 
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.report.answer import print_json
+from drivesem.report.grading import KINDS, NO_KIND
 from drivesem.run.attack import attack_run
 from drivesem.run.results import RunSummary
 from drivesem.settings.commands import Attack
+from drivesem.truth.grades import Grade, Kind
 
 
 def run(config: Attack) -> int:
@@ -59,8 +61,16 @@ def _print(summary: RunSummary, console: Console) -> None:
 
 def told_grades(summary: RunSummary) -> str:
     """How many failures hold, and of which kinds all are."""
-    grades, kinds = summary.grades, {name: count for name, count in summary.kinds.items() if count}
-    told = ", ".join(f"{count} {name}" for name, count in kinds.items()) or "none of a kind"
-    held = ", ".join(f"{count} {name}" for name, count in grades.items() if name != "threshold")
+    grades = summary.grades
+    failures, certain = grades[Grade.THRESHOLD], grades[Grade.CERTAIN]
+    if not failures:
+        return "no failure"
+    kinds = {KINDS[Kind(name)]: count for name, count in summary.kinds.items() if count}
+    without = failures - sum(kinds.values())
     unknown = f"; {summary.frames_ungraded} frames of unknown grade" if summary.frames_ungraded else ""
-    return f"failures: {held} of {grades['threshold']} ({told}){unknown}"
+    kinds |= {NO_KIND: without} if without and not unknown else {}
+    told = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""
+    if not certain:
+        return f"no certain failure: {failures} by threshold, which chance may explain{told}{unknown}"
+    held = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"
+    return f"failures: {held}, of {failures} by threshold{told}{unknown}"

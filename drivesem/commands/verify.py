@@ -8,6 +8,7 @@ from rich.console import Console
 
 from drivesem.questions.verify.asking import verify_run
 from drivesem.report.answer import print_json
+from drivesem.report.grading import UNKNOWN
 from drivesem.report.tables import Sheet
 from drivesem.run.ask import say_end
 from drivesem.settings.commands import Verify
@@ -45,6 +46,8 @@ def _print(data: dict[str, Any], console: Console) -> None:
     left = len(data["differences"]) - _MOST_SHOWN
     if left > 0:
         console.print(f"and {left} more")
+    if ungraded := data["frames_ungraded"]:
+        console.print(f"{ungraded} frame{'' if ungraded == 1 else 's'}: {UNKNOWN}")
     for name, reason in data["frames_failed"].items():
         console.print(f"frame {name} could not be checked: {reason}", soft_wrap=True, markup=False)
     console.print("all agree" if data["agree"] else "the run is not what it says it is")

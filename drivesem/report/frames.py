@@ -7,10 +7,11 @@ import io
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivesem.report import grading
 from drivesem.report.page import ShownRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
 from scene_ir.errors import FormatError
@@ -59,7 +60,7 @@ _NEAR = 0.2
 @dataclass(frozen=True, slots=True)
 class Mark:
     """A box to be drawn. kind: true, ignored, found, lost or phantom; x, y, width, height: px; left, top, bottom:
-    percent of the picture; text: of its label.
+    percent of the picture; text: of its label; unsure: a failure that chance may explain.
     """
 
     kind: str
@@ -71,6 +72,7 @@ class Mark:
     top: float
     bottom: float
     text: str
+    unsure: bool = False
 
     @property
     def label_below(self) -> bool:
@@ -88,11 +90,15 @@ class Mark:
 @dataclass(frozen=True, slots=True)
 class CloseUp:
     """A failure, cut out of both pictures. view: x, y, width, height, px, of what is shown; text: what happened;
-    scores: what the detector said of it before and after.
+    grade: how sure that is, "" where nobody asked; rank: of it, as of `grading.rank`; evidence: draws, and what a
+    second renderer and another detector say; scores: what the detector said of it before and after.
     """
 
     kind: str
     text: str
+    grade: str
+    rank: int
+    evidence: tuple[str, ...]
     scores: str
     view: tuple[float, float, float, float]
     before: str
@@ -107,6 +113,19 @@ class Change:
 
     owner: str
     parts: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FailureRow:
+    """A failure as text. margin: in logits, before and after; score: the detector's, before and after."""
+
+    text: str
+    grade: str
+    draws: str
+    margin: str
+    second: str
+    peer: str
+    score: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,11 +144,33 @@ class Outcome:
     turned: str
     risen: float
     changes: tuple[Change, ...]
+    rows: tuple[FailureRow, ...]
 
     @property
     def failures(self) -> int:
         """Lost objects and phantoms."""
         return self.lost + self.phantoms
+
+    @property
+    def rank(self) -> int:
+        """Of its surest failure, as of `grading.rank`."""
+        return max(map(grading.rank, self.result.failures), default=0)
+
+    @property
+    def surest(self) -> int:
+        """Failures of the highest grade."""
+        return sum(grading.rank(f) == self.rank for f in self.result.failures) if self.rank else 0
+
+    @property
+    def sure(self) -> int:
+        """Failures that are certain, or more than that."""
+        return sum(map(grading.is_sure, self.result.failures))
+
+    @property
+    def grade(self) -> str:
+        """The highest; "" without a failure, or where nobody asked."""
+        ranks = {grading.rank(f): f.grade or "" for f in self.result.failures}
+        return ranks[max(ranks)] if ranks else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +210,21 @@ class Card:
         return sum(one.failures for one in self.outcomes)
 
     @property
+    def rank(self) -> int:
+        """Of the surest failure in any run, as of `grading.rank`."""
+        return max(one.rank for one in self.outcomes)
+
+    @property
+    def grade(self) -> str:
+        """The highest in any run; "" without a failure, or where nobody asked."""
+        return max(self.outcomes, key=lambda one: one.rank).grade
+
+    @property
+    def surest(self) -> int:
+        """Failures of the highest grade, of all runs."""
+        return sum(one.surest for one in self.outcomes if one.rank == self.rank)
+
+    @property
     def lost(self) -> int:
         """The most that a run lost."""
         return max(one.lost for one in self.outcomes)
@@ -190,8 +246,8 @@ class Card:
 
 
 def cards_of(runs: Sequence[ShownRun], gallery: int) -> list[Card]:
-    """All frames, worst first: most failures, then the smallest change that was enough; pictures for the first
-    `gallery` of them. Raises FormatError where a picture is missing.
+    """All frames, worst first: by the highest grade, then most failures of it, then most of any, then the smallest
+    change that was enough; pictures for the first `gallery`. Raises FormatError where a picture is missing.
     """
     plain = [
         Card(
@@ -202,7 +258,7 @@ def cards_of(runs: Sequence[ShownRun], gallery: int) -> list[Card]:
         )
         for place, results in enumerate(zip(*(run.frames for run in runs), strict=True))
     ]
-    plain.sort(key=lambda card: (-card.failures, card.size, card.identifier))
+    plain.sort(key=lambda card: (-card.rank, -card.surest, -card.failures, card.size, card.identifier))
     # decoding and encoding run outside the interpreter's lock
     with ThreadPoolExecutor(_THREADS) as pool:
         return [*pool.map(_with_pictures, plain[:gallery]), *plain[gallery:]]
@@ -223,7 +279,28 @@ def _outcome(run: ShownRun, result: FrameResult) -> Outcome:
         turned=_greatest(changed, "rotate"),
         risen=trace[-1] - trace[0] if trace else 0.0,
         changes=_changes(changed),
+        rows=tuple(_row(result, failure) for failure in _surest_first(result.failures)),
     )
+
+
+def _surest_first(failures: Sequence[Failure]) -> list[Failure]:
+    return sorted(failures, key=lambda failure: -grading.rank(failure))
+
+
+def _row(result: FrameResult, failure: Failure) -> FailureRow:
+    return FailureRow(
+        text=_named(failure),
+        grade=failure.grade or "",
+        draws=grading.draws(failure),
+        margin=grading.margins(failure.count),
+        second=grading.says(failure, failure.second),
+        peer=grading.says(failure, failure.peer),
+        score=_scores(result, failure, _before_it_moved(result, failure)),
+    )
+
+
+def _named(failure: Failure) -> str:
+    return grading.what(failure) + ("" if failure.index is None else f", object {failure.index}")
 
 
 def _parameter(coordinate: Coordinate) -> str:
@@ -309,7 +386,10 @@ def _with_pictures(card: Card) -> Card:
         for place, (one, picture) in enumerate(zip(card.outcomes, pictures, strict=True))
     ]
     close_ups = tuple(
-        tuple(_close_up(one, failure, photograph, picture) for failure in one.result.failures[:_CLOSE_UPS])
+        tuple(
+            _close_up(one, failure, photograph, picture)
+            for failure in _surest_first(one.result.failures)[:_CLOSE_UPS]
+        )
         for one, picture in zip(card.outcomes, pictures, strict=True)
     )
     return Card(
@@ -325,11 +405,14 @@ def _with_pictures(card: Card) -> Card:
 
 
 def told(one: Outcome) -> str:
-    """`1 lost, 2 phantoms`."""
+    """`1 certain of 1 lost, 2 phantoms`."""
     parts = [f"{one.lost} lost"] if one.lost else []
     if one.phantoms:
         parts.append(f"{one.phantoms} phantom{'s' if one.phantoms > 1 else ''}")
-    return ", ".join(parts) or "withstood"
+    if not parts:
+        return "withstood"
+    sure = f"{one.surest} {one.grade} of " if one.sure else ""
+    return sure + ", ".join(parts)
 
 
 def _told_before(one: Outcome) -> str:
@@ -351,7 +434,14 @@ def _before(one: Outcome, size: tuple[int, int]) -> tuple[Mark, ...]:
 
 def _after(one: Outcome, size: tuple[int, int]) -> tuple[Mark, ...]:
     result, threshold = one.result, one.run.summary.t_star
-    failures = tuple(_mark(f.kind, f.xyxy, f"{f.kind} {f.label}", size) for f in result.failures)
+    failures = tuple(
+        replace(
+            _mark(f.kind, f.xyxy, f"{grading.what(f)}{f': {f.grade}' if grading.is_sure(f) else ''}", size),
+            unsure=f.grade is not None and not grading.is_sure(f),
+        )
+        # What is surest is drawn last, over the others.
+        for f in reversed(_surest_first(result.failures))
+    )
     return (
         *_true(result.targets_moved, size),
         *_found(result.detections_attacked, threshold, size),
@@ -393,13 +483,16 @@ def _mark(kind: str, xyxy: tuple[float, float, float, float], text: str, size: t
 
 def _close_up(one: Outcome, failure: Failure, photograph: Image, picture: Image) -> CloseUp:
     size = photograph.size
-    before = _of_object(one.result.targets_benign, failure) or failure.xyxy
+    before = _before_it_moved(one.result, failure)
     view = _view(_hull(before, failure.xyxy), size)
-    owner = "" if failure.index is None else f", object {failure.index}"
+    row = _row(one.result, failure)
     return CloseUp(
         kind=failure.kind,
-        text=f"{failure.kind} {failure.label}{owner}",
-        scores=_scores(one, failure, before),
+        text=row.text,
+        grade=row.grade,
+        rank=grading.rank(failure),
+        evidence=tuple(words for words in (row.draws, row.second, row.peer) if words),
+        scores=row.score,
         view=view,
         before=_cut(photograph, view),
         after=_cut(picture, view),
@@ -408,19 +501,21 @@ def _close_up(one: Outcome, failure: Failure, photograph: Image, picture: Image)
     )
 
 
-def _of_object(targets: Sequence[BoxRecord], failure: Failure) -> tuple[float, float, float, float] | None:
-    """Where the lost object was before it moved."""
+def _before_it_moved(result: FrameResult, failure: Failure) -> tuple[float, float, float, float]:
+    """Where the lost object was; of a phantom, where it is."""
     mine = (
-        t.xyxy for t in targets if t.index is not None and t.index == failure.index and t.label == failure.label
+        t.xyxy
+        for t in result.targets_benign
+        if t.index is not None and t.index == failure.index and t.label == failure.label
     )
-    return next(mine, None) if failure.kind == "lost" else None
+    return next(mine, failure.xyxy) if failure.kind == "lost" else failure.xyxy
 
 
-def _scores(one: Outcome, failure: Failure, before: tuple[float, float, float, float]) -> str:
+def _scores(result: FrameResult, failure: Failure, before: tuple[float, float, float, float]) -> str:
     """What the detector said there, of that class: the best score before and after."""
     best = (
-        _best(one.result.detections_benign, before, failure.label),
-        _best(one.result.detections_attacked, failure.xyxy, failure.label),
+        _best(result.detections_benign, before, failure.label),
+        _best(result.detections_attacked, failure.xyxy, failure.label),
     )
     return " → ".join("nothing" if score is None else f"{score:.2f}" for score in best)
 

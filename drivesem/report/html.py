@@ -14,10 +14,12 @@ from urllib.parse import quote
 import jinja2
 from markupsafe import Markup
 
+from drivesem.report import grading
 from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
 from drivesem.report.page import Page, ShownRun
 from drivesem.run.results import RunSummary
+from drivesem.truth.grades import Grade
 
 _COLUMNS = {
     "AP50": "ap50",
@@ -29,6 +31,7 @@ _COLUMNS = {
 _GLANCE = 4
 """Failures at the head of the page."""
 _LARGEST_SIZE = 100
+_FROM_CERTAIN = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
 _NONE = "–"
 
 
@@ -70,10 +73,11 @@ def render_report(page: Page, at: Path) -> str:
         runs=runs,
         several=several,
         gradient=first.summary.queries > 0,
-        headline=_comparison(runs) if several else _verdict(first.summary),
+        headline=_comparison(runs) if several else _verdict(first),
+        how_sure="" if several else _how_sure(first),
         lead=_lead(runs),
         tiles=[] if several else _tiles(first),
-        rows=[_run_row(run) for run in runs] if several else _figure_rows(first),
+        rows=[_run_row(run, any(r.paper for r in runs)) for run in runs] if several else _figure_rows(first),
         columns=tuple(_COLUMNS),
         frames=len(cards),
         left_out=page.left_out,
@@ -88,7 +92,15 @@ def render_report(page: Page, at: Path) -> str:
             }
             for chart in page.charts
         ],
-        at_a_glance=list(islice(_glance(cards), _GLANCE)),
+        at_a_glance=(glance := list(islice(_glance(cards), _GLANCE))),
+        glance_title=_glance_title([shot for _, _, shot in glance]),
+        graded=[run for run in runs if grading.is_known(run.summary, run.frames)],
+        failures=any(result.failures for run in runs for result in run.frames),
+        kinds=[] if several else grading.table(first.frames),
+        grades=[str(grade) for grade in reversed(Grade)],
+        rules=grading.rules(first.asked),
+        unknown=grading.UNKNOWN,
+        grade_notes=_notes(runs),
         cards=cards,
         gallery=[card for card in cards if card.layers],
         params=sorted({param for card in cards for param in card.params}),
@@ -124,10 +136,18 @@ def _totals(summary: RunSummary) -> tuple[int, int]:
     return sum(summary.lost_objects.values()), sum(summary.phantoms.values())
 
 
-def _verdict(summary: RunSummary) -> str:
+def _verdict(run: ShownRun) -> str:
+    summary = run.summary
     lost, phantoms = _totals(summary)
     if not lost and not phantoms:
         return f"{summary.detector} withstood in all of {_count(summary.frames, 'frame')}"
+    if grading.is_known(summary, run.frames):
+        grade = grading.highest(summary)
+        if grade is None:
+            return f"No certain failure: {_count(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
+        frames = sum(any(f.grade == grade for f in r.failures) for r in run.frames)
+        failures = _count(summary.grades[str(grade)], f"{grade} failure")
+        return f"{failures} of {summary.detector}, in {frames} of {_count(summary.frames, 'frame')}"
     parts = [f"loses {_count(lost, 'object')}"] if lost else []
     if phantoms:
         parts.append(f"makes up {phantoms if lost else _count(phantoms, 'object')}")
@@ -135,10 +155,49 @@ def _verdict(summary: RunSummary) -> str:
     return f"{summary.detector} {' and '.join(parts)}, in {frames}"
 
 
+def _how_sure(run: ShownRun) -> str:
+    """Failures by highest grade and kind, in a sentence each; "" without any."""
+    failures = [failure for result in run.frames for failure in result.failures]
+    if not failures:
+        return ""
+    if not grading.is_known(run.summary, run.frames):
+        return (
+            f"{grading.UNKNOWN[0].upper()}{grading.UNKNOWN[1:]}. They are failures by threshold, {grading.CHANCE}."
+        )
+    told = []
+    for grade in reversed(Grade):
+        mine = [failure for failure in failures if failure.grade == grade]
+        if mine and grade is Grade.THRESHOLD:
+            others = "More by threshold only" if told else "By threshold only"
+            told.append(f"{others}: {grading.summed(mine)}.")
+        elif mine:
+            word = f"only {grade}" if told else str(grade)
+            told.append(f"{word[0].upper()}{word[1:]}: {grading.summed(mine)}.")
+    unknown = sum(failure.grade is None for failure in failures)
+    return " ".join([*told, *([f"{unknown} of unknown grade."] if unknown else [])])
+
+
 def _comparison(runs: Sequence[ShownRun]) -> str:
+    frames = _count(runs[0].summary.frames, "frame")
+    head = f"{len(runs)} runs on {frames}"
+    if all(grading.is_known(run.summary, run.frames) for run in runs):
+        surest = max(runs, key=lambda run: tuple(run.summary.grades[str(g)] for g in _FROM_CERTAIN))
+        sure, failures = (surest.summary.grades[str(g)] for g in (Grade.CERTAIN, Grade.THRESHOLD))
+        if not sure:
+            return f"{head}: no certain failure in any"
+        return f"{head}: {surest.name} has most certain failures, {sure} of {failures} by threshold"
     most = max(runs, key=lambda run: run.summary.successes_moved)
-    broken, frames = most.summary.successes_moved, most.summary.frames
-    return f"{len(runs)} runs on {_count(frames, 'frame')}: {most.name} breaks most, {broken} of {frames}"
+    return f"{head}: {most.name} breaks most by threshold, {most.summary.successes_moved}"
+
+
+def _notes(runs: Sequence[ShownRun]) -> list[str]:
+    """Why grades could not be reached."""
+    several = len(runs) > 1
+    return [
+        f"{f'{run.name}: ' if several else ''}{note} ({_count(frames, 'frame')})"
+        for run in runs
+        for note, frames in run.summary.grade_notes.items()
+    ]
 
 
 def _lead(runs: Sequence[ShownRun]) -> str:
@@ -148,8 +207,8 @@ def _lead(runs: Sequence[ShownRun]) -> str:
         return f"The same {data}, each run beside the others."
     changed = " + ".join(summary.params)
     return (
-        f"{changed} changed by {runs[0].method} within what is feasible, on {data}. Everything lost or made up "
-        "was right before the change, and is judged by labels that moved with the cars."
+        f"{changed} changed by {runs[0].method} within what is feasible, on {data}. Everything that fails was "
+        "right before the change, and is judged by labels that moved with the cars."
     )
 
 
@@ -163,19 +222,30 @@ def _tiles(run: ShownRun) -> list[_Tile]:
     by_labels = f"by benign labels {_percent(stay)}"
     share = f"{100 * summary.successes_moved / summary.frames:.0f} % of the frames" if summary.frames else ""
     return [
+        *_graded_tile(run),
         _Tile(
             f"AP50 of {summary.headline}, %",
             f"{_percent(before)} → {_percent(moved)}",
             f"{_points(before, moved)} points less; {by_labels}" + (f"; {paper}" if paper else ""),
         ),
-        _Tile("frames broken", f"{summary.successes_moved} of {summary.frames}", share),
-        _Tile("lost and made up", f"{lost} + {phantoms}", _by_class(summary)),
+        _Tile("frames broken, by threshold", f"{summary.successes_moved} of {summary.frames}", share),
+        _Tile("lost and made up, by threshold", f"{lost} + {phantoms}", _by_class(summary)),
         _Tile(
             "feasible, %",
             _percent(summary.feasible_fraction),
             f"by the independent check; {_count(summary.queries, 'query', 'queries')}",
         ),
     ]
+
+
+def _graded_tile(run: ShownRun) -> list[_Tile]:
+    grades, failures = run.summary.grades, sum(_totals(run.summary))
+    if not failures:
+        return []
+    if not grading.is_known(run.summary, run.frames):
+        return [_Tile("certain failures", "unknown", "run of an older version")]
+    more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only"
+    return [_Tile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 
 
 def _by_class(summary: RunSummary) -> str:
@@ -207,18 +277,20 @@ def _figure_rows(run: ShownRun) -> list[_Row]:
     return found
 
 
-def _run_row(run: ShownRun) -> _Row:
+def _run_row(run: ShownRun, papers: bool) -> _Row:
+    """papers: whether there is a column of the paper's figures."""
     summary = run.summary
     before, moved = summary.benign.headline, summary.attacked_moved.headline
     lost, phantoms = _totals(summary)
     return _Row(
         run.name,
         (
+            *_graded_cells(run),
             _percent(before.ap50),
             _percent(moved.ap50),
             _points(before.ap50, moved.ap50),
             _percent(summary.attacked_paper.headline.ap50),
-            _percent(run.paper.after if run.paper else None),
+            *((_percent(run.paper.after if run.paper else None),) if papers else ()),
             _percent(moved.recall_at_t_star),
             str(summary.successes_moved),
             str(lost),
@@ -228,6 +300,13 @@ def _run_row(run: ShownRun) -> _Row:
         ),
         words=(run.name, f"{run.method} on {summary.detector}: {' + '.join(summary.params)}"),
     )
+
+
+def _graded_cells(run: ShownRun) -> tuple[str, ...]:
+    """Failures of each grade and above, from certain on."""
+    if not grading.is_known(run.summary, run.frames):
+        return (_NONE,) * len(_FROM_CERTAIN)
+    return tuple(str(run.summary.grades[str(grade)]) for grade in _FROM_CERTAIN)
 
 
 def _falls(runs: Sequence[ShownRun]) -> Markup | None:
@@ -253,7 +332,7 @@ def _falls(runs: Sequence[ShownRun]) -> Markup | None:
 
 
 def _glance(cards: Sequence[Card]) -> Iterator[tuple[Card, str, CloseUp]]:
-    """Close-ups of the worst frames: the first of each frame, then the second, and so on."""
+    """Close-ups of the worst frames, surest first; of a grade the first of each frame, then the second, ..."""
     shots = [
         [
             (card, one.run.name, shot)
@@ -263,5 +342,15 @@ def _glance(cards: Sequence[Card]) -> Iterator[tuple[Card, str, CloseUp]]:
         for card in cards
         if card.layers
     ]
-    for turn in zip_longest(*shots):
-        yield from (shot for shot in turn if shot is not None)
+    in_turn = [shot for turn in zip_longest(*shots) for shot in turn if shot is not None]
+    yield from sorted(in_turn, key=lambda shot: -shot[2].rank)
+
+
+def _glance_title(shots: Sequence[CloseUp]) -> str:
+    """Of the close-ups at the head of the page: no more sure than the surest of them is."""
+    if not shots or not any(shot.grade for shot in shots):
+        return "What went wrong, close up"
+    surest = max(shots, key=lambda shot: shot.rank)
+    if surest.rank > grading.rank_of(Grade.THRESHOLD):
+        return "What went wrong, close up, surest first"
+    return "What went wrong by threshold, close up: none of it is certain"

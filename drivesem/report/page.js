@@ -53,6 +53,7 @@ function wanted(element) {
   const on = (name) => filters.elements[name]?.checked;
   const failed = on("lost") || on("phantoms");
   return (!failed || (on("lost") && number(element, "lost") > 0) || (on("phantoms") && number(element, "phantoms") > 0)) &&
+    number(element, "grade") >= Number(value("grade")) &&
     (!value("param") || element.dataset.params.split(" ").includes(value("param"))) &&
     (!value("weather") || element.dataset.weather === value("weather")) &&
     number(element, "size") <= Number(value("size")) + 1e-9 &&

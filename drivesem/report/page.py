@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivesem.report.grading import Asked
 from drivesem.run.results import FrameResult, RunSummary
 
 Point = tuple[float, float]
@@ -23,7 +24,8 @@ class PaperFigure:
 class ShownRun:
     """One run of the page. name: unique among them; folder: holds `frames/<name>/`; frames: of all runs the same,
     in one order; summary: of these frames; method: the attack's name; command: what repeats the run; weathers: by
-    frame, of data sets that say it; paper: where the paper has the same parameters.
+    frame, of data sets that say it; asked: how sure its failures had to be; paper: where the run keeps to the
+    paper's protocol, and the paper has the same parameters.
     """
 
     name: str
@@ -33,6 +35,7 @@ class ShownRun:
     method: str
     command: str
     weathers: tuple[str | None, ...]
+    asked: Asked
     paper: PaperFigure | None = None
 
 

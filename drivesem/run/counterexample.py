@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Predictor
-from drivesem.report import pictures
+from drivesem.report import grading, pictures
 from drivesem.run.attack import Worker
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.results import Failure, FrameResult
+from drivesem.run.tally import graded
 from drivesem.scenes.scene import Scene, png
 from drivesem.settings.commands import Attack
 from drivesem.settings.devices import check_device
@@ -40,9 +41,12 @@ class AttackOptions(TypedDict, total=False):
 
     combo: int
     params: str
-    method: Literal["si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es"]
+    method: Literal[
+        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "climb"
+    ]
     steps: int
     queries: int
+    passes: int
     step_form: Literal["raw", "l2"]
     rate: float
     momentum: float
@@ -107,6 +111,11 @@ class Counterexample:
         return self.result.failures
 
     @property
+    def grades(self) -> dict[str, int]:
+        """How many failures are of at least each grade: threshold, certain, confirmed, shared (docs/grades.md)."""
+        return graded([self.result])["grades"]
+
+    @property
     def success(self) -> bool:
         """Whether the attack broke the detector, by labels that moved along."""
         return self.result.success_moved
@@ -119,6 +128,10 @@ class Counterexample:
     def rows(self) -> list[dict[str, Any]]:
         """Theta as flat dicts, for `pandas.DataFrame`: name, unit, value, lower, upper, display."""
         return [asdict(coordinate) for coordinate in self.result.theta]
+
+    def failure_rows(self) -> list[dict[str, Any]]:
+        """Failures as flat dicts, for `pandas.DataFrame`: kind, grade, draws, second opinions, box."""
+        return [failure.flat() for failure in self.failures]
 
     def save(self, folder: str | Path) -> None:
         """Write the folder that `drivesem attack` writes of a frame; in place of an earlier one."""
@@ -141,15 +154,21 @@ class Counterexample:
         lines = "".join(f"<li>{escape(_told(failure))}</li>" for failure in result.failures)
         lines = lines or "<li>nothing fails</li>"
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
-        head = f"{self.scene.name}: {feasible}, {result.queries} queries"
+        grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count) or "no failure"
+        head = f"{self.scene.name}: {grades}; {feasible}, {result.queries} queries"
         return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{shown}</div><ul>{lines}</ul></div>'
 
 
 def _told(failure: Failure) -> str:
+    """Its grade in front, then what it is and where, and what says so."""
     place = ", ".join(f"{value:.0f}" for value in failure.xyxy)
-    which = "" if failure.index is None else f" objects[{failure.index}]"
-    score = "" if failure.score is None else f", score {failure.score:.2f}"
-    return f"{failure.kind} {failure.label}{which} at {place} px{score}"
+    which = "" if failure.index is None else f", objects[{failure.index}]"
+    score = "" if failure.score is None else f"score {failure.score:.2f}"
+    opinions = (grading.says(failure, agreement) for agreement in (failure.second, failure.peer))
+    said = [words for words in (score, grading.draws(failure), *opinions) if words]
+    return f"{failure.grade}: {grading.what(failure)}{which} at {place} px" + "".join(
+        f"; {words}" for words in said
+    )
 
 
 def attack(

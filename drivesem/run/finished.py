@@ -13,8 +13,10 @@ import yaml
 from drivesem.run.folder import CONFIG
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult, load_frame
+from drivesem.run.tally import graded
 from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
+from drivesem.truth.grades import Grade
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -47,6 +49,14 @@ class Run:
         """One flat dict a frame, for `pandas.DataFrame`."""
         return [_row(frame) for frame in self.frames]
 
+    def failure_rows(self) -> list[dict[str, Any]]:
+        """One flat dict a failure: its frame, kind, grade, draws, second opinions, box."""
+        return [
+            {"frame": frame.result.identifier, **failure.flat()}
+            for frame in self.frames
+            for failure in frame.result.failures
+        ]
+
     def _repr_html_(self) -> str:
         """A table of the frames, for a notebook."""
         rows = self.rows()
@@ -67,6 +77,8 @@ def _row(frame: Frame) -> dict[str, Any]:
         "success_paper": result.success_paper,
         "lost": kinds.count("lost"),
         "phantoms": kinds.count("phantom"),
+        **_grades(result),
+        "passes": result.passes,
         "feasible": result.feasible,
         "queries": result.queries,
         "loss_first": result.loss_trace[0] if result.loss_trace else None,
@@ -75,6 +87,14 @@ def _row(frame: Frame) -> dict[str, Any]:
         "seconds": result.seconds,
         "picture": str(frame.pictures["attacked"]),
     }
+
+
+def _grades(result: FrameResult) -> dict[str, int | None]:
+    """Failures of at least each grade from certain on, and by kind; None where they are unknown."""
+    told = graded([result])
+    counts = {grade: count for grade, count in told["grades"].items() if grade != Grade.THRESHOLD}
+    counts |= told["kinds"]
+    return counts if result.graded else dict.fromkeys(counts)
 
 
 def load_run(folder: str | Path, limit: int | None = None) -> Run:

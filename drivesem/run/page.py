@@ -15,16 +15,19 @@ from drivesem.data.label_table import WEATHERS
 from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.outcome import Outcome
+from drivesem.report.grading import Asked
 from drivesem.report.html import render_report
 from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
+from drivesem.run.protocol import follows_paper
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, graded, tally
 from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report
 from drivesem.settings.errors import UsageError
 from drivesem.settings.text import command_line
+from drivesem.truth.certificate import Rule
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -34,8 +37,6 @@ PICTURES = 200
 """Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
 _NOT_TOLD = ("out", "json", "resume", "workers")
 """Settings that change nothing in the result: left out of the report's command line."""
-_THE_PAPERS = ("si-fgsm", "squeezedet")
-"""Method and detector beside which the paper's figures stand; of others they say nothing."""
 _MOST_LINES = 7
 """Of a chart: as many as there are colours."""
 
@@ -93,6 +94,12 @@ def _data(out: Path, size: int, shown: list[ShownRun], left_out: int) -> dict[st
             "frame": results[0].identifier,
             "failures": {
                 one.name: [f.kind for f in result.failures] for one, result in zip(shown, results, strict=True)
+            },
+            "kinds": {
+                one.name: [f.error for f in result.failures] for one, result in zip(shown, results, strict=True)
+            },
+            "grades": {
+                one.name: [f.grade for f in result.failures] for one, result in zip(shown, results, strict=True)
             },
         }
         for results in zip(*(one.frames for one in shown), strict=True)
@@ -230,8 +237,14 @@ def _shown(
         method=config.method,
         command=command_line("attack", config, _NOT_TOLD),
         weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
-        paper=_paper(summary.params) if (config.method, config.detector) == _THE_PAPERS else None,
+        asked=_asked(config),
+        paper=_paper(summary.params) if follows_paper(config) else None,
     )
+
+
+def _asked(config: Attack) -> Asked:
+    rule = Rule(config.draws)
+    return Asked(rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.peer != "off")
 
 
 def _paper(params: tuple[str, ...]) -> PaperFigure | None:

@@ -65,6 +65,21 @@ class Failure:
     second: Agreement | None = None
     peer: Agreement | None = None
 
+    def flat(self) -> dict[str, Any]:
+        """A flat dict: kind (as `truth.kinds`), grade, draws and second opinions; boxes in px; None where unknown.
+
+        by_threshold is lost or phantom; right_before, wrong_after are draws, of draws_before, draws_after.
+        """
+        count, (x0, y0, x1, y1) = self.count or Count(), self.xyxy
+        row: dict[str, Any] = {"kind": self.error, "grade": self.grade, "by_threshold": self.kind}
+        row |= {"label": self.label, "object": self.index, "score": self.score}
+        row |= {"right_before": count.before, "draws_before": count.before_draws}
+        row |= {"wrong_after": count.after, "draws_after": count.after_draws}
+        row |= {"margin_before": count.margin_before, "margin_after": count.margin_after}
+        for name, agreement in (("second", self.second), ("peer", self.peer)):
+            row |= {name: agreement and agreement.by, f"{name}_agrees": agreement and agreement.agrees}
+        return row | {"x0": x0, "y0": y0, "x1": x1, "y1": y1}
+
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:

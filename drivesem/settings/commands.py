@@ -36,7 +36,7 @@ from drivesem.settings.blocks import (
     Tiles,
     Training,
 )
-from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within
+from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within, at_least
 from drivesem.settings.errors import refuse
 from drivesem.settings.values import class_map, numbers
 
@@ -47,6 +47,8 @@ SYNTH = "synth"
 """What --dataset takes for training: frames that the generator makes."""
 GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
 """Attacks that ask a detector only what it finds."""
+LEAST_PASSES = 24
+"""Of --passes: with fewer, searches have nothing left after a look around."""
 COUNTED = (*GRADIENT_FREE, "scw", "subsets")
 """Attacks that end after --queries."""
 RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
@@ -66,11 +68,26 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
     method: Literal[
-        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
+        "si-fgsm",
+        "apgd",
+        "fgsm",
+        "sgd",
+        "scw",
+        "subsets",
+        "random",
+        "halton",
+        "sobol",
+        "cma-es",
+        "climb",
+        "placebo",
     ] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
-    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds."""
+    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
+    each object's margin is on average over draws of --nuisances, and finds failures that hold."""
+    passes: Annotated[Count, at_least(LEAST_PASSES, "which the search needs")] | None = None
+    """Passes of the detector that a frame may take, a gradient counted as 3: methods take as many steps or queries
+    as fit, whatever --steps says. By default only climb counts them, 90."""
     queries: Annotated[Count, Of(COUNTED)] | None = None
     """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
     step_form: Annotated[Literal["raw", "l2"], Of(("sgd",))] = "l2"
@@ -111,6 +128,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         refuse(free and self.precision != "float32", "--precision", none, self.precision)
         single = self.early_stop and self.method in ("fgsm", "placebo")
         refuse(single, "--early-stop", "a method of several steps or queries", self.method)
+        both = self.passes is not None and self.queries is not None
+        refuse(both, "--queries", "no --passes beside it", f"--passes {self.passes}")
         subsets = self.method == "subsets"
         refuse(
             self.early_stop and subsets, "--early-stop", "a method that may end at the first success", self.method
@@ -122,7 +141,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Bootstrap, Grading, Attacking, FrameCommand):
-    """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
+    """The paper's experiments, and others: every arm an attack on the same frames."""
 
     name: Annotated[
         tyro.conf.Positional[
@@ -151,8 +170,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
-    certain is drawn by a second renderer in any case."""
+    """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
+    What is certain is drawn by it in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
@@ -247,11 +266,10 @@ class Explain(Bootstrap, FinishedRun, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Confirm(FinishedRun, FrameCommand):
-    """Draw a run's counterexamples again by the scene generator: which failures survive another renderer?"""
+    """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
 
     run: Run = None
-    """Folder of a run of drivesem attack on generated frames: the embedded scenes, or drivesem synth's in KITTI's
-    layout."""
+    """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
     root: str | None = None
     """Folder of the run's data set, where it is no longer where the run found it."""
 

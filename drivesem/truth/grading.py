@@ -144,7 +144,7 @@ class Grader:
             before = [self._before(case, camera, number) for number in _SECOND_DRAWS]
             second = _agreements(case, camera, [g.fault for g in certain], before, renderer.name)
         except SceneError as error:
-            return graded, (f"no second renderer: {error}",)
+            return graded, (f"no second renderer: expected {error.expected}, found {error.actual}",)
         confirmed = [fault for fault, agreement in second.items() if agreement.agrees]
         peers: Mapping[Fault, Agreement] = {}
         if confirmed and self.peer is not None and case.placebo is not None:

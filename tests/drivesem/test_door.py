@@ -22,10 +22,11 @@ import torch
 import drivesem as ds
 from drivesem.cli import main
 from drivesem.run.counterexample import AttackOptions
-from drivesem.run.results import load_frame
+from drivesem.run.results import Failure, load_frame
 from drivesem.scenes.scene import image_of
 from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
+from drivesem.truth.grades import Agreement, Count
 from scene_ir.errors import FormatError, RangeError, SceneError
 from scene_ir.files import read_image
 from scene_ir.types import Frame
@@ -200,6 +201,42 @@ def test_a_counterexample_shows_and_tells_itself(counterexample: ds.Counterexamp
         assert picture_of(base64.b64decode(data)).shape == counterexample.picture.shape
     further = counterexample.scene.edit(weather="rain")  # what was found is a scene like any other
     assert further.render().shape == counterexample.picture.shape
+
+
+def test_failures_tell_kind_grade_and_draws(counterexample: ds.Counterexample, small_run: Path) -> None:
+    box, count = (1.0, 2.0, 30.0, 40.0), Count(16, 16, 13, 16, 1.5, -0.5)
+    failures = (
+        Failure("lost", "Car", box, 0, None, "placed", "confirmed", count, Agreement("generator", 4, 3, 4)),
+        Failure("phantom", "Car", box, score=0.7, grade="threshold"),
+    )
+    result = replace(counterexample.result, failures=failures)
+    found = replace(counterexample, result=result)
+    assert found.grades == {"threshold": 2, "certain": 1, "confirmed": 1, "shared": 0}
+    lost, phantom = found.failure_rows()
+    assert (lost["kind"], lost["grade"], lost["object"]) == ("placed", "confirmed", 0)
+    assert (lost["right_before"], lost["wrong_after"], lost["draws_after"]) == (16, 13, 16)
+    assert (lost["second"], lost["second_agrees"], lost["peer"]) == ("generator", True, None)
+    assert (phantom["kind"], phantom["grade"], phantom["score"]) == (None, "threshold", 0.7)
+    assert json.loads(json.dumps(found.failure_rows())) == [lost, phantom]
+    told = tags_of(found._repr_html_()).text
+    assert "2 threshold, 1 certain, 1 confirmed; feasible" in told
+    assert "confirmed: Car badly placed, objects[0] at 1, 2, 30, 40 px; found in 16/16 draws before" in told
+    run = ds.load_run(small_run)
+    (frame,) = run.frames
+    run = replace(run, frames=(replace(frame, result=result),))
+    assert run.failure_rows() == [{"frame": "demo-000", **row} for row in (lost, phantom)]
+    (row,) = run.rows()
+    assert (row["certain"], row["confirmed"], row["shared"]) == (1, 1, 0)
+    assert (row["placed"], row["missed"], row["passes"]) == (1, 0, result.passes)
+
+
+def test_failures_of_earlier_runs_are_of_unknown_grade(small_run: Path) -> None:
+    run = ds.load_run(small_run)
+    (frame,) = run.frames
+    lost = Failure("lost", "Car", (1.0, 2.0, 3.0, 4.0), index=0)
+    (row,) = replace(run, frames=(replace(frame, result=replace(frame.result, failures=(lost,))),)).rows()
+    assert (row["lost"], row["certain"], row["missed"]) == (1, None, None)
+    assert lost.flat()["grade"] is None
 
 
 def test_names_are_escaped(counterexample: ds.Counterexample) -> None:

@@ -137,5 +137,6 @@ def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[s
         },
         "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL, "draws": DRAWS},
         "differences": [{"frame": name, **asdict(d)} for name, d in differences],
+        "frames_ungraded": sum(not frame.result.graded for frame in run.frames),
         "frames_failed": failed,
     }

@@ -1,4 +1,4 @@
-"""Which second renderer draws a frame again: the generator, where it made the frame."""
+"""Which second renderer draws a frame again: the generator, where it made the frame; else pyrender."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from torch import Tensor
 
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.errors import UsageError
-from drivesem.truth.redraw.base import NoSecondRendererError, SecondRenderer
+from drivesem.truth.redraw.base import SecondRenderer
 from drivesem.truth.redraw.generator import GeneratorRedraw
+from drivesem.truth.redraw.photograph import PhotographRedraw
 from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
+from drivesem.truth.redraw.screen import shared_screen
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR
 
@@ -22,6 +24,7 @@ class SecondRenderers:
     """
 
     def __init__(self, dataset: str, root: str | None) -> None:
+        self._dataset = dataset
         self._folder = _folder_plans(dataset, root)
         self._last: tuple[Tensor, SecondRenderer] | None = None
 
@@ -33,11 +36,16 @@ class SecondRenderers:
             self._last = (scene.photograph, self._made(identifier, scene))
         return self._last[1]
 
+    def check(self) -> None:
+        """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
+        if self._folder is None and self._dataset != DEMO:
+            shared_screen()
+
     def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
         if plans is not None:
             return GeneratorRedraw(identifier, scene, plans)
-        raise NoSecondRendererError(f"frame {identifier}", "a generated frame", "a photograph")
+        return PhotographRedraw(identifier, scene)
 
 
 def _folder_plans(dataset: str, root: str | None) -> Plans | None:

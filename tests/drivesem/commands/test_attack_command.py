@@ -11,12 +11,13 @@ from typing import Any, get_args, get_type_hints
 import pytest
 import torch
 
-from detectors.types import Detections
+from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run.results import load_frame
 from drivesem.settings.commands import GRADIENT_FREE, Attack
+from drivesem.synth.demo import demo_scene
 from drivesem.synth.write import Order, synthesise
 from scene_ir.io import load_scene
 
@@ -187,6 +188,92 @@ def test_searches_run_on_a_detector_without_gradient(
     assert len(result.loss_trace) == 3
     assert [d.label for d in result.detections_attacked] == ["Car"]
     assert ("cma" in json.loads((tmp_path / "manifest.json").read_text())["versions"]) == (method == "cma-es")
+
+
+MISSED, CLASS, PLACED, TWICE = 4, 3, 5, 2
+"""Cars of the first embedded scene, and what becomes of them."""
+
+
+class Timid:
+    """Finds these cars while the picture is as bright as the photograph; else errs in each way that there is."""
+
+    name, classes = "timid", CLASSES
+
+    def __init__(self) -> None:
+        scene = demo_scene(0, 0)
+        self.right = scene.objects.box2d[[MISSED, CLASS, PLACED, TWICE]]
+        self.bright = float(scene.photograph.mean())
+        half = 0.5 * (self.right[2, 2] - self.right[2, 0])
+        beside = self.right[2] + half * torch.tensor([1, 0, 1, 0])
+        nothing = torch.tensor([2.0, 2.0, 60.0, 40.0])
+        again = self.right[3] + torch.tensor([0.0, 0.0, -20.0, 0.0])
+        self.wrong = torch.stack([self.right[1], beside, self.right[3], again, nothing])
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+    def decode(self, raw: torch.Tensor) -> list[Detections]:
+        return [self.seen(abs(float(mean) - self.bright) < 2e-3) for mean in raw]
+
+    def seen(self, right: bool) -> Detections:
+        boxes = self.right if right else self.wrong
+        labels = torch.zeros(len(boxes), dtype=torch.int64)
+        labels[0] = 0 if right else CLASSES.index("Truck")
+        return Detections(boxes, labels, torch.linspace(0.9, 0.6, len(boxes)))
+
+
+def test_failures_have_kinds_and_grades(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timid = Timid()
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: timid)
+    words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--params", "weather"]
+    words += ["--method", "random", "--queries", "2", "--nuisances", "off", "--budget", "weather=0.2"]
+    figures = attack([*words, "--json", "--out", str(tmp_path / "run")], capsys)
+    grades, kinds = figures["grades"], figures["kinds"]
+    assert list(grades) == ["threshold", "certain", "confirmed", "shared"]
+    assert grades["threshold"] == figures["lost_objects"] + figures["phantoms"]
+    assert grades["threshold"] >= grades["certain"] >= grades["confirmed"] >= grades["shared"]
+    assert kinds == {"missed": 1, "class": 1, "placed": 1, "twice": 1, "background": 1}
+    assert grades["certain"] == sum(kinds.values())  # what is none of a kind is certain of nothing
+    # The generator's picture of the changed weather is as dark; another detector that errs under any change
+    # is not right under a placebo.
+    assert (grades["confirmed"], grades["shared"]) == (5, 0)
+    assert figures["passes"] >= figures["queries"] == 2
+    assert figures["frames_ungraded"] == 0
+    result = load_frame(tmp_path / "run" / "frames" / "demo-000" / "result.json")
+    assert {f.index: f.error for f in result.failures if f.kind == "lost"} == {
+        MISSED: "missed",
+        CLASS: "class",
+        PLACED: "placed",
+    }
+    assert {f.grade for f in result.failures if f.error is None} == {"threshold"}
+    assert all((f.count.before, f.count.after) == (16, 16) for f in result.failures if f.error and f.count)
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"failures: 5 certain, 5 confirmed, 0 shared, of {grades['threshold']} by threshold" in told
+    assert "1 missed, 1 wrong class, 1 badly placed, 1 found twice, 1 on nothing" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--draws", "8"], "--draws: expected at least 16, which a certificate's rule needs, found 8"),
+        (["--nuisances", "wind=3"], "--nuisances: expected default, off, or NAME=NUMBER with commas"),
+        (["--nuisances", "jpeg=99"], "--nuisances: jpeg: expected a number of at least 0, at most 95, found 99"),
+        (["--witness", "blind"], "--witness: expected a detector, found"),
+        (["--peer", "blind"], "--peer: expected auto, off, or a detector, found"),
+    ],
+)
+def test_what_cannot_grade_is_refused(
+    words: list[str], message: str, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Blind(Blinking):
+        classes = ("dog",)
+
+    known = run_attack.load_predictor
+    monkeypatch.setattr(run_attack, "load_predictor", lambda n, *w: Blind() if n == "blind" else known(n, *w))
+    assert refused("attack", "--limit", "1", *words).startswith(f"drivesem: {message}")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -225,6 +226,55 @@ def test_failures_detections_and_targets_that_are_others(run: Path, verify: Call
     assert (found["lost"]["expected"], found["lost"]["found"]) == ("objects[1]", "none")
     assert found["targets_moved[1]"]["check"] == "labels"
     assert "detections_rerendered" in found
+
+
+def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    path = run / FRAME / "result.json"
+    (failure,) = load_frame(path).failures
+    assert (failure.error, failure.grade) == ("background", "threshold")
+    assert failure.count is not None
+
+    def spoil(**fields: Any) -> dict[str, dict[str, Any]]:
+        whole = path.read_text()
+        change(path, lambda data: data["failures"][0].update(fields))
+        data = verify(run)
+        path.write_text(whole)
+        return told(data)
+
+    found = spoil(grade="certain")
+    assert set(found) == {"failures[0].grade", "metrics.json: grades"}
+    assert (found["failures[0].grade"]["expected"], found["failures[0].grade"]["found"]) == (
+        "certain",
+        "threshold",
+    )
+    found = spoil(error="missed")
+    assert set(found) == {"failures[0].error", "metrics.json: kinds"}
+    # As many draws as a certificate needs, and the grade that would follow from them.
+    held = {"before": 16, "before_draws": 16, "after": 16, "after_draws": 16}
+    found = spoil(count={**asdict(failure.count), **held}, grade="certain")
+    assert set(found) == {"failures[0].count", "metrics.json: grades"}
+    verify(run, code=0)
+
+
+def test_a_run_of_the_first_schema_has_no_grades_to_check(
+    run: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def older(data: dict[str, Any]) -> None:
+        data["schema"] = 1
+        for name in ("passes", "grade_notes", "grades", "kinds", "frames_ungraded"):
+            data.pop(name, None)
+        for failure in data.get("failures", ()):
+            for name in ("error", "grade", "count", "second", "peer"):
+                del failure[name]
+
+    for path in (run / FRAME / "result.json", run / "metrics.json"):
+        change(path, older)
+    data = verify(run, code=0)
+    assert data["frames_ungraded"] == 1
+    assert {row["name"]: row["compared"] for row in data["checks"]}["grades"] == 0
+    capsys.readouterr()
+    assert main(["verify", "--run", str(run), "--workers", "1"]) == 0
+    assert "1 frame: grades unknown: run of an older version" in " ".join(capsys.readouterr().out.split())
 
 
 def shift(data: dict[str, Any], metres: float) -> None:
