@@ -56,6 +56,23 @@ def to_symmetric(offsets: Tensor) -> Tensor:
     return grid[..., : LATTICE[2] // 2, :].reshape(*offsets.shape[:-2], SYMMETRIC_DIM)
 
 
+def low_modes() -> Tensor:
+    """Symmetric offsets (15, 96), at most 1, that bend a vehicle in the large: along and up by x, y, x^2,
+    xy, y^2 of where a lattice point lies along and up; across by z times 1, x, y, x^2, y^2. None is a move.
+    """
+    x, y, z = (torch.linspace(-1, 1, n) for n in LATTICE)
+    x, y, z = (axis.reshape(-1) for axis in torch.meshgrid(x, y, z, indexing="ij"))
+    along_and_up = (x, y, x * x, x * y, y * y)
+    across = (z, z * x, z * y, z * x * x, z * y * y)  # odd, lest left and right part
+    modes = []
+    for axis, terms in enumerate((along_and_up, along_and_up, across)):
+        for term in terms:
+            offsets = torch.zeros(LATTICE_POINTS, 3)
+            offsets[:, axis] = term
+            modes.append(to_symmetric(offsets))
+    return torch.stack(modes)
+
+
 def jacobian(unit: Tensor, offsets: Tensor) -> Tensor:
     """Jacobian (..., V, 3, 3) of the deformation at unit-box points (V, 3), offsets (..., 64, 3).
 

@@ -18,9 +18,10 @@ from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attack.methods.base import Group, Problem, Score, Views
+from drivesem.attack.space import SPECS, Parameter, ParameterSpace
 from drivesem.evaluation import failures
+from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.types import Render, SceneIR
@@ -186,8 +187,8 @@ class Objective:
             fades = Fading(self._benign.render, environment, self.compositor.air, seen, least)
         return FeasibleSet(self.space, limits, only_bounds, fades)
 
-    def problem(self, feasible: FeasibleSet, keep_last: bool = False) -> Problem:
-        """This objective as attacks see it. keep_last: as of `Problem`."""
+    def problem(self, feasible: FeasibleSet, keep_last: bool = False, views: Views | None = None) -> Problem:
+        """This objective as attacks see it. keep_last, views: as of `Problem`."""
         return Problem(
             loss_and_grad=self.loss_and_grad,
             project=feasible.project,
@@ -195,10 +196,17 @@ class Objective:
             step=self.space.step,
             lower=self.space.lower,
             upper=self.space.upper,
-            groups=tuple(Group(name.value, where) for name, where in self.space.blocks.items()),
+            groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
             preview=self.preview,
             keep_last=keep_last,
+            views=views,
         )
+
+    def _group(self, parameter: Parameter, where: slice) -> Group:
+        owners = self.space.count if SPECS[parameter].per_object else 0
+        modes = ffd.low_modes() if parameter is Parameter.MESH else None
+        smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE)
+        return Group(parameter.value, where, owners, modes, smooth)
 
     @property
     def differentiable(self) -> Detector:

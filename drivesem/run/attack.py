@@ -19,7 +19,9 @@ from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of, written
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
 from drivesem.attack.methods.apgd import APGD
+from drivesem.attack.methods.base import LOOKED_AT
 from drivesem.attack.methods.base import Attack as AttackMethod
+from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.cma_es import CMAES
 from drivesem.attack.methods.fgsm import FGSM
 from drivesem.attack.methods.placebo import Placebo
@@ -30,7 +32,7 @@ from drivesem.attack.methods.scw import SCW
 from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
-from drivesem.attack.objective import OF_DETECTIONS
+from drivesem.attack.objective import GRADIENT_PASSES, OF_DETECTIONS
 from drivesem.attack.space import Parameter, combo, parse_params
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import FRAMES, claim
@@ -54,6 +56,8 @@ from scene_ir.types import SceneIR
 
 PEERS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures: what is confirmed of one is shown to another."""
+_AROUND = 3
+"""Passes of a frame in which no method has a say."""
 WRITTEN = ("metrics.json", "manifest.json", "report.html", FRAMES)
 _PACKAGES = (
     "drivesem",
@@ -207,7 +211,8 @@ def attack_method(config: Attack) -> AttackMethod:
 
 
 def _from_theta0(config: Attack) -> AttackMethod:
-    steps, early_stop, queries = config.steps, config.early_stop, config.queries or DEFAULT_QUERIES
+    early_stop = config.early_stop
+    steps, queries = _afforded(config)
     match config.method:
         case "si-fgsm":
             return SiFGSM(steps, early_stop, config.momentum, config.rate)
@@ -219,6 +224,8 @@ def _from_theta0(config: Attack) -> AttackMethod:
             return SGD(steps, early_stop, config.momentum, config.rate, config.step_form)
         case "scw":
             return SCW(queries, steps, config.norm, config.rate, early_stop)
+        case "climb":
+            return Climb(config.passes or Climb().passes)
         case "placebo":
             return Placebo()
         case "subsets":
@@ -227,6 +234,21 @@ def _from_theta0(config: Attack) -> AttackMethod:
             return CMAES(queries, _reach(config), early_stop)
         case "random" | "halton" | "sobol":
             return Sampling(queries, _reach(config), early_stop, config.method)
+
+
+def _afforded(config: Attack) -> tuple[int, int]:
+    """Steps, and queries, as many as --passes allows where it is given. Beside them a frame takes a few passes:
+    the photograph, its re-render, and the re-scoring of what was found. Methods that count both as queries may
+    take a gradient and a render for each.
+    """
+    if config.passes is None:
+        return config.steps, config.queries or DEFAULT_QUERIES
+    if config.method in GRADIENT_FREE:
+        return config.steps, max(config.passes - _AROUND, 1)
+    a_step = GRADIENT_PASSES + (config.early_stop or config.method in ("scw", "subsets"))
+    left = config.passes - _AROUND - config.scouts - (LOOKED_AT + 1) * (config.restarts + 1)
+    afforded = max(left // (a_step * (config.restarts + 1)), 2)
+    return afforded, afforded
 
 
 def grader_of(config: Attack, detector: Predictor) -> Grader:

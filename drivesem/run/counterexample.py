@@ -41,9 +41,12 @@ class AttackOptions(TypedDict, total=False):
 
     combo: int
     params: str
-    method: Literal["si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es"]
+    method: Literal[
+        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "climb"
+    ]
     steps: int
     queries: int
+    passes: int
     step_form: Literal["raw", "l2"]
     rate: float
     momentum: float

@@ -32,7 +32,9 @@ from drivesem.truth.certificate import with_regions
 from drivesem.truth.grades import Grade
 from drivesem.truth.grading import Case, Graded, Grader, Grades
 from drivesem.truth.kinds import View
+from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.redraw.compositor import CompositorDraw
+from drivesem.truth.views import DrawnViews
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.render.compositor import Compositor
@@ -103,7 +105,9 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         aim=settings.aim,
     )
     feasible = objective.feasible_set(only_bounds=settings.only_bounds)
-    problem = objective.problem(feasible, settings.keep_last)
+    nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
+    views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
+    problem = objective.problem(feasible, settings.keep_last, views)
     search = settings.attack(problem, space.theta0, settings.seed)
     rendered = objective.evaluate(search.theta)
     benign = objective.detect(scene.photograph)

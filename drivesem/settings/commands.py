@@ -36,7 +36,7 @@ from drivesem.settings.blocks import (
     Tiles,
     Training,
 )
-from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within
+from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within, at_least
 from drivesem.settings.errors import refuse
 from drivesem.settings.values import class_map, numbers
 
@@ -47,6 +47,8 @@ SYNTH = "synth"
 """What --dataset takes for training: frames that the generator makes."""
 GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
 """Attacks that ask a detector only what it finds."""
+LEAST_PASSES = 24
+"""Of --passes: with fewer, searches have nothing left after a look around."""
 COUNTED = (*GRADIENT_FREE, "scw", "subsets")
 """Attacks that end after --queries."""
 RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
@@ -66,11 +68,26 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
     method: Literal[
-        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "placebo"
+        "si-fgsm",
+        "apgd",
+        "fgsm",
+        "sgd",
+        "scw",
+        "subsets",
+        "random",
+        "halton",
+        "sobol",
+        "cma-es",
+        "climb",
+        "placebo",
     ] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
-    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds."""
+    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
+    each object's margin is on average over draws of --nuisances, and finds failures that hold."""
+    passes: Annotated[Count, at_least(LEAST_PASSES, "which the search needs")] | None = None
+    """Passes of the detector that a frame may take, a gradient counted as 3: methods take as many steps or queries
+    as fit, whatever --steps says. By default only climb counts them, 90."""
     queries: Annotated[Count, Of(COUNTED)] | None = None
     """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
     step_form: Annotated[Literal["raw", "l2"], Of(("sgd",))] = "l2"
@@ -111,6 +128,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         refuse(free and self.precision != "float32", "--precision", none, self.precision)
         single = self.early_stop and self.method in ("fgsm", "placebo")
         refuse(single, "--early-stop", "a method of several steps or queries", self.method)
+        both = self.passes is not None and self.queries is not None
+        refuse(both, "--queries", "no --passes beside it", f"--passes {self.passes}")
         subsets = self.method == "subsets"
         refuse(
             self.early_stop and subsets, "--early-stop", "a method that may end at the first success", self.method

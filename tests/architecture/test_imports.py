@@ -66,6 +66,19 @@ RULES = (
         never=("scene_ir", "drivesem.attack"),
     ),
     Rule("drivesem.truth", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_TRUTH)), None),
+    # the second renderer of photographs shares nothing with the first one but the scene that both read
+    *(
+        Rule(
+            f"drivesem.truth.redraw.{name}",
+            (
+                *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.truth.redraw"),
+                *("drivesem.attack.contrast", "drivesem.attack.labels.Difficulty"),
+            ),
+            ("torch", "numpy", "scipy", "cv2", "pyrender"),
+            never=("drivesem.truth.redraw.compositor",),
+        )
+        for name in ("photograph", "baking", "placing", "screen", "shadows", "weathering")
+    ),
     Rule("drivesem.run", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_RUN)), None),
     Rule(
         "drivesem.questions",

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, final
+from typing import TYPE_CHECKING, ClassVar, Protocol, final
 
 import torch
 from torch import Tensor
@@ -63,11 +63,43 @@ def _unseen(theta: Tensor) -> Score | None:
 @dataclass(frozen=True, slots=True)
 class Group:
     """A block of theta that belongs together: one parameter of the scene, or of all its cars. where: its
-    coordinates.
+    coordinates; owners: how many objects it holds, one after the other, 0 for a parameter of the scene; modes:
+    (K, M) directions in an object's M coordinates along which to look where there are too many of these, None for
+    each coordinate by itself; smooth: whether a gradient at a point says what a step of the bounds' size does.
     """
 
     name: str
     where: slice
+    owners: int = 0
+    modes: Tensor | None = None
+    smooth: bool = True
+
+
+class Views(Protocol):
+    """Margins of a scene's objects, in logits, in what a camera sees of it from time to time.
+
+    number: of the view; the same number sees different thetas alike. passes: of the detector so far.
+    differentiable: whether the detector has a gradient.
+    """
+
+    @property
+    def differentiable(self) -> bool: ...
+
+    @property
+    def judged(self) -> Tensor:
+        """(N,) bool: objects that are found as photographed, and count."""
+        ...
+
+    @property
+    def passes(self) -> int: ...
+
+    def margins(self, theta: Tensor, number: int) -> Tensor:
+        """(N,) at theta (D,): below 0 an object is lost; infinite where it does not count there. Costs a pass."""
+        ...
+
+    def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and the gradient (D,) of their sum weighed by weights (N,). Costs 3 passes."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +111,7 @@ class Problem:
     step (D,): the step alpha of each coordinate, 0 where it is held; lower, upper (D,): its bounds. groups: the
     blocks of theta, which cover it; by default it is one. preview: what the gradient pass at theta saw, roughly
     what `score` will say and without a cost; None where there was no such pass. keep_last: the last iterate is
-    handed back, whatever it does.
+    handed back, whatever it does. views: margins of objects, for searches that ask for more than the loss.
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
@@ -91,6 +123,7 @@ class Problem:
     groups: tuple[Group, ...] = (Group("theta", slice(None)),)
     preview: Callable[[Tensor], Score | None] = _unseen
     keep_last: bool = False
+    views: Views | None = None
 
     def in_steps(self, theta: Tensor) -> Tensor:
         """theta (D,) in steps alpha; 0 where a coordinate is held. Differentiable."""

@@ -1,4 +1,4 @@
-"""Which second renderer draws a frame again: the generator, where it made the frame."""
+"""Which second renderer draws a frame again: the generator, where it made the frame; else pyrender."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from torch import Tensor
 
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.errors import UsageError
-from drivesem.truth.redraw.base import NoSecondRendererError, SecondRenderer
+from drivesem.truth.redraw.base import SecondRenderer
 from drivesem.truth.redraw.generator import GeneratorRedraw
+from drivesem.truth.redraw.photograph import PhotographRedraw
 from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR
@@ -37,7 +38,7 @@ class SecondRenderers:
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
         if plans is not None:
             return GeneratorRedraw(identifier, scene, plans)
-        raise NoSecondRendererError(f"frame {identifier}", "a generated frame", "a photograph")
+        return PhotographRedraw(identifier, scene)
 
 
 def _folder_plans(dataset: str, root: str | None) -> Plans | None:

@@ -56,7 +56,25 @@ class Slope:
 
     @property
     def problem(self) -> Problem:
-        return Problem(self.loss_and_grad, self.project, self.score, STEP, LOWER, UPPER, GROUPS)
+        views = SlopeViews(self)
+        return Problem(self.loss_and_grad, self.project, self.score, STEP, LOWER, UPPER, GROUPS, views=views)
+
+
+class SlopeViews:
+    """One object, whose margin falls as the loss rises, a little more in some views than in others."""
+
+    def __init__(self, world: Slope) -> None:
+        self.world = world
+        self.judged, self.differentiable, self.passes = torch.tensor([True]), True, 0
+
+    def margins(self, theta: Tensor, number: int) -> Tensor:
+        self.passes += 1
+        return ((self.world.need - self.world.loss(theta)) / 10 + 0.01 * number)[None]
+
+    def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+        margins = self.margins(theta, number)
+        self.passes += 2
+        return margins, -weights[0] * SLOPE / STEP / 10
 
 
 @pytest.fixture

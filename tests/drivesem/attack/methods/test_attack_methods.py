@@ -85,6 +85,31 @@ def test_methods_that_follow_the_gradient(
     assert any(c.value != 0 for c in result.theta)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["--early-stop"],
+        ["--restarts", "1", "--scouts", "4"],
+        ["--method", "apgd"],
+        ["--method", "sgd"],
+        ["--method", "scw"],
+        ["--method", "subsets"],
+        ["--method", "halton"],
+        ["--method", "cma-es"],
+        ["--method", "climb"],
+    ],
+    ids=" ".join,
+)
+def test_no_method_takes_more_passes_than_it_may(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = attack(["--params", "weather", "--passes", "40", *words], tmp_path, capsys)
+    assert 0 < figures["passes"] <= 40
+    if words in ([], ["--method", "halton"]):
+        assert figures["passes"] > 30
+
+
 def test_subsets_name_the_one_parameter_that_is_enough(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = attack(["--method", "subsets", "--queries", "14"], tmp_path, capsys)
     assert figures["params"] == ["color", "weather", "foliage", "translate", "rotate", "mesh"]
@@ -141,6 +166,8 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
             "--restarts: expected --method si-fgsm, apgd, fgsm, sgd, scw beside it",
         ),
         (["--method", "sgd", "--queries", "9"], "--queries: expected --method random, halton, sobol, cma-es, scw"),
+        (["--method", "halton", "--queries", "9", "--passes", "50"], "--queries: expected no --passes beside it"),
+        (["--passes", "10"], "--passes: expected at least 24, which the search needs, found 10"),
         (["--method", "subsets", "--queries", "1"], "--queries: expected at least 2 with subsets, found 1"),
         (["--method", "subsets", "--early-stop"], "--early-stop: expected a method that may end at the first"),
         (["--budget", "parkng"], "--budget: expected paper, parking, a YAML file, or NAME=VALUE with commas"),

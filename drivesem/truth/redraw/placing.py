@@ -1,0 +1,115 @@
+"""Where a photograph's vehicles stand, in plain numpy and by the conventions alone: the second renderer's own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_ir.types import LATTICE, Camera, Mesh, Objects, Source
+
+Array = NDArray[np.float32]
+
+NEAR_M = 0.1
+"""Triangles are cut at this distance from the camera's plane before they are projected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """intrinsics: (3, 3) px; shift_m: (3,), from the conventions' axes to those of the picture's own camera."""
+
+    intrinsics: Array
+    shift_m: Array
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, camera: Camera) -> Lens:
+        """Of a projection K (x + shift)."""
+        matrix = numbers(camera.matrix).astype(np.float64)
+        shift = np.linalg.solve(matrix[:, :3], matrix[:, 3])
+        return cls(matrix[:, :3].astype(np.float32), shift.astype(np.float32), camera.height, camera.width)
+
+    def pixels(self, points: Array) -> Array:
+        """(..., 2) px of points (..., 3) m in the camera's own axes; those behind it are taken at its plane."""
+        seen = points @ self.intrinsics.T
+        return (seen[..., :2] / np.maximum(seen[..., 2:], NEAR_M)).astype(np.float32)
+
+    def box(self, corners: Array) -> Array:
+        """The tight box (4,) px of triangles (F, 3, 3) m, cut at the near plane, not at the picture's border; NaN
+        behind it."""
+        start, end = corners, np.roll(corners, -1, axis=1)
+        crosses = (start[..., 2] >= NEAR_M) != (end[..., 2] >= NEAR_M)
+        a, b = start[crosses], end[crosses]
+        cut = a + ((NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
+        seen = self.pixels(np.concatenate([corners[corners[..., 2] >= NEAR_M], cut]).astype(np.float32))
+        if not len(seen):
+            return np.full(4, np.nan, np.float32)
+        return np.concatenate([seen.min(axis=0), seen.max(axis=0)])
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """One vehicle's geometry, with the conventions' meaning."""
+
+    translation: Array
+    yaw: float
+    size_lhw: Array
+    lattice: Array
+
+    @classmethod
+    def of(cls, objects: Objects, i: int) -> Pose:
+        return cls(
+            numbers(objects.translation[i]),
+            float(objects.yaw[i]),
+            numbers(objects.size_lhw[i]),
+            numbers(objects.ffd[i]),
+        )
+
+    @classmethod
+    def photographed(cls, source: Source) -> Pose:
+        return cls(numbers(source.translation), float(source.yaw), numbers(source.size_lhw), numbers(source.ffd))
+
+    def rotation(self) -> Array:
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
+
+
+class Body:
+    """A mesh, corner by corner. unit: (F, 3, 3) in the unit box; part: (F,) a `Part`."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._vertices = numbers(mesh.vertices)
+        self._faces = mesh.faces.cpu().numpy()
+        self._weights = _bernstein_weights(self._vertices)
+        self.unit = self._vertices[self._faces]
+        self.part = mesh.part.cpu().numpy()
+        self.colours = None if mesh.colours is None else numbers(mesh.colours)[self._faces].mean(axis=1)
+
+    def placed(self, pose: Pose, lens: Lens, mirrored: bool = False) -> Array:
+        """Triangles (F, 3, 3) m in the camera's own axes. mirrored: each where its counterpart on the vehicle's
+        other side is."""
+        bent = self._vertices + self._weights @ pose.lattice
+        if mirrored:
+            # The lattice is symmetric, or nearly: the mirror image of the bent mesh stands for the other side.
+            bent = bent * np.array([1, 1, -1], np.float32)
+        placed = (bent * pose.size_lhw) @ pose.rotation().T + pose.translation + lens.shift_m
+        return placed.astype(np.float32)[self._faces]
+
+
+def numbers(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().numpy().astype(np.float32)
+
+
+def _bernstein_weights(unit: Array) -> Array:
+    """(V, 64): length outermost, then height from the roof, then width."""
+    at = unit + np.array([0.5, 1.0, 0.5], np.float32)
+    axes = []
+    for t, count in zip(at.T, LATTICE, strict=True):
+        order = count - 1
+        axes.append([math.comb(order, k) * t**k * (1 - t) ** (order - k) for k in range(count)])
+    weights = [x * y * z for x in axes[0] for y in axes[1] for z in axes[2]]
+    return np.stack(weights, axis=1).astype(np.float32)

@@ -1,0 +1,160 @@
+"""The search on margins, on objects whose margins are known: budgets of passes, wide differences, noise, modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from drivesem.attack.feasible.projection import Projected
+from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.methods.climb import LEAST_PASSES, Climb
+from scene_ir.errors import RangeError
+
+CARS, PASSES = 4, 90
+PLACE, PAINT, WEATHER = slice(0, 2 * CARS), slice(2 * CARS, 3 * CARS), slice(3 * CARS, 3 * CARS + 2)
+DIM = 3 * CARS + 2
+BLIND_AT = torch.tensor([[-0.8, 0.6], [0.7, 0.7], [-0.6, -0.9], [0.9, -0.5]])
+"""Where each car is to stand, of bounds from -1 to 1, to be lost."""
+
+
+@dataclass
+class Street:
+    """Cars that are lost near a place of their own, the more so dark and in fog. ripple: how much a car's margin
+    goes up and down with the place, many times within the bounds, as the phase of edges in pixels does; its
+    gradient is then of no use.
+    """
+
+    ripple: float = 0.0
+    judged: Tensor = field(default_factory=lambda: torch.ones(CARS, dtype=torch.bool))
+    differentiable: bool = True
+    passes: int = 0
+
+    def _margins(self, theta: Tensor, number: int) -> Tensor:
+        place, paint, weather = theta[PLACE].reshape(CARS, 2), theta[PAINT], theta[WEATHER]
+        away = ((place - BLIND_AT) ** 2).sum(dim=1)
+        wave = self.ripple * torch.sin(40 * place + number).sum(dim=1)
+        return 3 * away - 1.0 + 0.5 * paint - 0.3 * weather[0] + wave + 0.05 * (number % 3)
+
+    def margins(self, theta: Tensor, number: int) -> Tensor:
+        self.passes += 1
+        return self._margins(theta, number)
+
+    def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+        self.passes += 3
+        leaf = theta.clone().requires_grad_(True)
+        margins = self._margins(leaf, number)
+        (gradient,) = torch.autograd.grad((weights * margins).sum(), leaf)
+        return margins.detach(), gradient
+
+    def problem(self, smooth_place: bool = False) -> Problem:
+        upper = torch.ones(DIM)
+        lower = -upper
+        lower[WEATHER] = 0.0
+
+        def score(theta: Tensor) -> Score:
+            lost = int((self._margins(theta, 0) < 0).sum())
+            return Score(0.0, lost, 0, lost > 0, False)
+
+        return Problem(
+            loss_and_grad=lambda theta: (0.0, torch.zeros_like(theta)),
+            project=lambda theta: Projected(theta.clamp(lower, upper), ()),
+            score=score,
+            step=torch.full((DIM,), 0.1),
+            lower=lower,
+            upper=upper,
+            groups=(
+                Group("place", PLACE, CARS, None, smooth_place),
+                Group("paint", PAINT, CARS),
+                Group("weather", WEATHER),
+            ),
+            views=self,
+        )
+
+
+def found(street: Street, climb: Climb | None = None, seed: int = 0) -> tuple[Tensor, int]:
+    """Margins (CARS,) where the search ended, without ripples; passes it took."""
+    result = (climb or Climb(PASSES))(street.problem(), torch.zeros(DIM), seed)
+    return replace(street, ripple=0.0)._margins(result.theta, 0), result.queries
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_car_is_brought_to_its_own_place(seed: int) -> None:
+    margins, _ = found(Street(), seed=seed)
+    assert (margins < 0).all(), margins
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ripples_do_not_lead_astray(seed: int) -> None:
+    """A gradient at a point is 40 times the slope here, of either sign."""
+    margins, _ = found(Street(ripple=0.3), seed=seed)
+    assert (margins < 0.3).sum() >= CARS - 1, margins
+
+
+def test_differences_find_what_gradients_of_ripples_do_not() -> None:
+    """The same search that trusts the gradient of places, on the same street."""
+    street, trusting = Street(ripple=0.5), []
+    for seed in range(8):
+        result = Climb(PASSES)(street.problem(smooth_place=True), torch.zeros(DIM), seed)
+        trusting.append(replace(street, ripple=0.0)._margins(result.theta, 0))
+    wide = [found(street, seed=seed)[0] for seed in range(8)]
+    assert torch.cat(wide).mean() < torch.cat(trusting).mean()
+
+
+def test_a_detector_without_a_gradient() -> None:
+    street = Street(differentiable=False)
+    street.margins_and_grad = None  # pyright: ignore[reportAttributeAccessIssue]
+    margins, _ = found(street)
+    assert (margins < 0).sum() >= CARS - 1, margins
+
+
+@pytest.mark.parametrize("passes", [LEAST_PASSES, 41, 90, 200])
+@pytest.mark.parametrize("gradient", [True, False])
+def test_passes_are_kept_to_and_used(passes: int, gradient: bool) -> None:
+    street = Street()
+    _, spent = found(street, Climb(passes, gradient))
+    assert spent == street.passes
+    assert 0.8 * passes - 4 <= spent <= passes - 4
+
+
+def test_objects_that_do_not_count_are_no_aim() -> None:
+    """Infinite margins, as of objects that are hidden on the way, change nothing for others."""
+
+    class Hidden(Street):
+        def _margins(self, theta: Tensor, number: int) -> Tensor:
+            margins = super()._margins(theta, number)
+            return torch.where(torch.arange(CARS) == 1, torch.inf, margins)
+
+    street = Hidden(judged=torch.tensor([True, False, True, True]))
+    result = Climb(PASSES)(street.problem(), torch.zeros(DIM), 0)
+    assert bool(torch.isfinite(result.theta).all())
+    assert (street._margins(result.theta, 0)[[0, 2, 3]] < 0).all()
+
+
+def test_nothing_to_lose() -> None:
+    street = Street(judged=torch.zeros(CARS, dtype=torch.bool))
+    result = Climb(PASSES)(street.problem(), torch.zeros(DIM), 0)
+    assert street.passes == 0
+    assert not bool(result.theta.any())
+
+
+def test_modes_are_what_is_searched() -> None:
+    """A group of many coordinates moves along its modes only, as far as the bounds go."""
+    modes = torch.tensor([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    street = Street()
+    base = street.problem()
+    groups = (Group("bent", slice(0, 8), 2, modes), Group("rest", slice(8, DIM)))
+    result = Climb(PASSES)(replace(base, groups=groups), torch.zeros(DIM), 0)
+    bent = result.theta[:8].reshape(2, 4)
+    assert bool(bent.any())
+    torch.testing.assert_close(bent[:, 0], bent[:, 1])
+    torch.testing.assert_close(bent[:, 2], -bent[:, 3])
+
+
+def test_what_cannot_be() -> None:
+    with pytest.raises(RangeError, match="passes"):
+        Climb(LEAST_PASSES - 1)
+    with pytest.raises(RangeError, match="views"):
+        Climb()(replace(Street().problem(), views=None), torch.zeros(DIM), 0)
