@@ -1,27 +1,23 @@
 """Faults planted for one frame: no car is in their bands as photographed, and theta can bring one into them.
 
-Bands lie between features that theta was seen to reach. Of many that are drawn, the one whose share of Halton's draws
-is nearest to what was asked for is kept.
+Bands lie between features that theta was seen to reach. Of many that are drawn, and that chance hits as rarely as
+was asked for, the one is kept inside of which theta can bring a car most surely.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from detectors.planted import FEATURES, Band, PlantedFault
 from drivesem.bench.planted.survey import Survey
 
 Rarity = Literal["easy", "rare"]
-LEAST_EASY, MOST_RARE = 0.10, 0.02
-"""Shares of Halton's draws that hit a fault: easy ones above the first, rare ones below the second."""
-_WANTED: dict[Rarity, float] = {"easy": 0.2, "rare": 0.01}
+HITS: dict[Rarity, tuple[float, float]] = {"easy": (0.1, 0.4), "rare": (0.0, 0.02)}
+"""Shares of Halton's draws that hit a fault: of easy ones from a tenth on, of rare ones at most one in fifty."""
 _TRIALS = 1500
 """Bands that are drawn for a fault."""
 _DIGITS = 4
@@ -39,28 +35,16 @@ class FaultKind:
         return f"{'+'.join(self.features)} {self.rarity}"
 
 
-KINDS = tuple(
-    FaultKind(tuple(words.split("+")), rarity)
-    for rarity, faults in (
-        (
-            "easy",
-            ("height_px", "aspect", "across", "lightness", "contrast", "aspect+lightness", "height_px+contrast"),
-        ),
-        (
-            "rare",
-            (
-                "lightness",
-                "contrast",
-                "aspect+lightness",
-                "aspect+contrast",
-                "height_px+aspect",
-                "across+lightness",
-            ),
-        ),
-    )
-    for words in faults
+_EASY = ("height_px", "aspect", "across", "lightness", "contrast", "aspect+lightness", "height_px+contrast")
+_RARE = (
+    *("contrast", "aspect+lightness", "aspect+contrast", "across+lightness", "across+contrast"),
+    "lightness+contrast",
 )
-"""The faults of the yardstick."""
+KINDS = (
+    *(FaultKind(tuple(words.split("+")), "easy") for words in _EASY),
+    *(FaultKind(tuple(words.split("+")), "rare") for words in _RARE),
+)
+"""The faults of the yardstick: those that could be planted in at least four of six frames of stream 101."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,49 +60,46 @@ class Planting:
 
 
 def plant(survey: Survey, kind: FaultKind, seed: int) -> Planting | None:
-    """A fault for this frame; None where theta cannot bring a car into such bands. Equal arguments, equal faults."""
-    cars = survey.cars.nonzero()[:, 0].tolist()
-    if not cars:
+    """A fault for this frame; None where theta brings no car into such bands. Equal arguments, equal faults."""
+    cars = survey.seen.judged.nonzero()[:, 0].tolist()
+    aims = [i for i, car in enumerate(cars) if survey.seen.sure[car]]
+    if not aims:
         return None
     rows = [FEATURES.index(name) for name in kind.features]
-    reached = [values[:, rows][:, :, cars].double().numpy() for values in (survey.halton, survey.corners)]
-    drawn, extreme = reached  # (K, F, N), (C, F, N)
-    benign = survey.benign[rows][:, cars].double().numpy()
-    slack = survey.seen.slack[rows][:, cars].double().numpy()
+    benign, farthest, mostly = (
+        of[rows][:, cars].double().numpy() for of in (survey.benign, survey.seen.farthest, survey.seen.mostly)
+    )
+    drawn, extreme = (of[:, rows][:, :, cars].double().numpy() for of in (survey.halton, survey.corners))
+    reached = np.concatenate([drawn, extreme])
     rng = np.random.default_rng([seed, *kind.text.encode()])
-    best: tuple[float, Planting] | None = None
+    least, most = HITS[kind.rarity]
+    best: tuple[int, Planting] | None = None
     for _ in range(_TRIALS):
-        car = int(rng.integers(len(cars)))
-        bands = _bands(np.concatenate(reached)[:, :, car], slack[:, car], rng)
-        if _within(benign[None], bands, slack).any():
+        car = int(rng.choice(aims))
+        bands = _bands(reached[:, :, car], mostly[:, car], rng)
+        hit = float(_within(drawn, bands, 0 * mostly).any(1).mean())
+        if not least <= hit <= most or _within(benign[None], bands, farthest).any():
             continue
-        hit = _within(drawn, bands, 0 * slack).any(1).mean()
-        sure = _within(drawn, bands, -slack).any(1).mean()
-        reachable = sure > 0 or bool(_within(extreme, bands, -slack).any())
-        if not reachable or not _fits(hit, kind.rarity):
-            continue
-        apart = abs(math.log((hit + 1 / len(drawn)) / (_WANTED[kind.rarity] + 1 / len(drawn))))
-        if best is None or apart < best[0]:
-            fault = PlantedFault(
-                tuple(Band(n, *band) for n, band in zip(kind.features, bands.tolist(), strict=True))
-            )
-            best = apart, Planting(kind, fault, float(hit), float(sure))
+        sure = _within(reached, bands, -mostly)[:, aims].any(1)
+        if sure.any() and (best is None or sure.sum() > best[0]):
+            named = zip(kind.features, bands.tolist(), strict=True)
+            fault = PlantedFault(tuple(Band(name, low, high) for name, (low, high) in named))
+            best = int(sure.sum()), Planting(kind, fault, hit, float(sure[: len(drawn)].mean()))
     return None if best is None else best[1]
 
 
-def _fits(hit: float, rarity: Rarity) -> bool:
-    return hit > LEAST_EASY if rarity == "easy" else hit < MOST_RARE
-
-
 def _bands(
-    reached: NDArray[np.float64], slack: NDArray[np.float64], rng: np.random.Generator
+    reached: NDArray[np.float64], room: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Low and high (F, 2), drawn among what a car reaches (K, F), and beyond its extremes by its slack (F,)."""
+    """Low and high (F, 2), drawn among what a car reaches (K, F), and twice its room (F,) beyond its extremes."""
     bands = []
-    for values, room in zip(reached.T, slack, strict=True):
-        edges = np.sort(np.concatenate([values, [values.min() - 2 * room, values.max() + 2 * room]]))
+    for values, beyond in zip(reached.T, 2 * room, strict=True):
+        edges = np.sort(np.concatenate([values, [values.min() - beyond, values.max() + beyond]]))
         low, high = np.sort(rng.choice(len(edges), 2, replace=False))
-        bands.append([_rounded(edges[low]), _rounded(edges[high])])
+        # Half of the bands are open: what is rare mostly lies at an end of what is reached.
+        side = rng.random()
+        low, high = (0 if side < 0.25 else low), (len(edges) - 1 if side > 0.75 else high)
+        bands.append([_rounded(float(edges[low])), _rounded(float(edges[high]))])
     return np.array(bands)
 
 
@@ -127,7 +108,7 @@ def _within(
 ) -> NDArray[np.bool_]:
     """Whether features (K, F, N) lie in all bands (F, 2), grown by so much (F, N) on both sides: (K, N)."""
     low, high = bands[:, :1] - more, bands[:, 1:] + more
-    return ((values >= low) & (values <= high)).all(1)
+    return np.all((values >= low) & (values <= high), axis=1)
 
 
 def _rounded(value: float) -> float:

@@ -33,12 +33,14 @@ _BY_FACTOR = ("height_px", "aspect")
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """How a detector sees the cars of a frame before any change. cars (N,) bool: judged, and found as one car in
-    all looks; factor, shift (F, N): of FEATURES, what makes those of the detector's boxes of those of the labels'
-    boxes; farthest, mostly (F, N): how far single looks are off what that gives, at most, and in `MOSTLY` of them.
+    """How a detector sees the cars of a frame before any change. judged (N,) bool: the cars; sure (N,) bool: of
+    these, the ones found in all looks, mostly by one box; factor, shift (F, N): of FEATURES, what makes those of
+    the detector's boxes of those of the labels' boxes; farthest, mostly (F, N): how far single looks are off what
+    that gives, at most, and in `MOSTLY` of them.
     """
 
-    cars: Tensor
+    judged: Tensor
+    sure: Tensor
     factor: Tensor
     shift: Tensor
     farthest: Tensor
@@ -52,21 +54,27 @@ class Seen:
         paper, scene = objective.benign.paper, objective.space.scene
         renderer = CompositorDraw(objective.compositor, objective.labeller)
         base = FeaturesOf(objective).plain(objective.space.theta0)
-        cars = ~paper.ignore & (paper.category == CLASSES.index(BLIND_TO))
-        pairs = []
+        judged = ~paper.ignore & (paper.category == CLASSES.index(BLIND_TO))
+        labelled, seen, single = [], [], []
         for number in range(LOOKS):
             draw = Nuisances().draw(f"planted:{name}:{seed}", number, scene)
             redrawn = renderer.redraw(draw.scene(scene))
             image = draw.picture(redrawn.image)
-            labels = draw.boxes(redrawn.targets.boxes_xyxy[: len(cars)]).to(image)
-            pairs.append((features(image[None], labels[None])[:, 0], _as_seen(objective, image, labels)))
-        labelled, seen = (torch.stack(side) for side in zip(*pairs, strict=True))  # (LOOKS, F, N)
-        cars &= torch.isfinite(seen).all(0).all(0)
+            labels = draw.boxes(redrawn.targets.boxes_xyxy[: len(judged)]).to(image)
+            labelled.append(features(image[None], labels[None])[:, 0])
+            values, alone = _as_seen(objective, image, labels)
+            seen.append(values)
+            single.append(alone)
+        by_label, by_box = torch.stack(labelled), torch.stack(seen)  # (LOOKS, F, N)
+        found = torch.isfinite(by_box).all(1)
+        mostly_single = torch.stack(single).double().mean(0) >= MOSTLY
         by_factor = torch.tensor([feature in _BY_FACTOR for feature in FEATURES])[:, None]
-        off = torch.where(by_factor, seen / labelled, seen - labelled).nan_to_num(1.0).median(0).values
-        factor, shift = torch.where(by_factor, off, 1.0), torch.where(by_factor, 0.0, off)
-        off = (seen - (factor * base + shift)).abs().nan_to_num(0.0)
-        return cls(cars, factor, shift, off.amax(0), off.quantile(MOSTLY, 0))
+        off = torch.where(by_factor, by_box / by_label, by_box - by_label).nanmedian(0).values
+        factor = torch.where(by_factor, off, 1.0).nan_to_num(1.0)
+        shift = torch.where(by_factor, 0.0, off).nan_to_num(0.0)
+        apart = (by_box - (factor * base + shift)).abs().nan_to_num(0.0)
+        sure = judged & found.all(0) & mostly_single
+        return cls(judged, sure, factor, shift, apart.amax(0), apart.quantile(MOSTLY, 0))
 
 
 class FeaturesOf:
@@ -115,21 +123,16 @@ class Survey:
             as_seen(corners(feasible, CORNERS, seed)),
         )
 
-    @property
-    def cars(self) -> Tensor:
-        """(N,) bool: those that faults are planted for."""
-        return self.seen.cars
-
     def inside(self, fault: PlantedFault, theta: Tensor) -> Tensor:
         """Whether each object (N,) is a car inside of the fault's region at a feasible theta (D,)."""
         rows = [FEATURES.index(name) for name in fault.names]
         values = self.seen.factor[rows] * self.of.plain(theta, fault.names) + self.seen.shift[rows]
-        return self.cars & fault.contains(values)
+        return self.seen.judged & fault.contains(values)
 
     def rarity(self, fault: PlantedFault) -> float:
         """Share of Halton's draws in which a car is inside of the fault's region."""
         values = self.halton[:, [FEATURES.index(name) for name in fault.names]]
-        hit = fault.contains(values.transpose(0, 1)) & self.cars
+        hit = fault.contains(values.transpose(0, 1)) & self.seen.judged
         return float(hit.any(1).double().mean())
 
 
@@ -142,21 +145,22 @@ def halton(feasible: FeasibleSet, count: int, seed: int) -> Iterator[Tensor]:
 
 
 def corners(feasible: FeasibleSet, count: int, seed: int) -> Iterator[Tensor]:
-    """Feasible thetas (D,) near corners of the bounds; each parameter is held in half of them."""
+    """Feasible thetas (D,) near corners of the bounds; about half of the parameters are held, never all."""
     space = feasible.space
     rng = np.random.default_rng([seed, 1])
     for _ in range(count):
         theta = torch.where(torch.from_numpy(rng.random(space.dim) < 0.5), space.lower, space.upper)
-        for where in space.blocks.values():
-            if rng.random() < 0.5:
+        held = rng.random(len(space.blocks)) < 0.5
+        for where, still in zip(space.blocks.values(), held, strict=True):
+            if still and not held.all():
                 theta[where] = 0
         yield feasible.project(theta).theta
 
 
 @torch.no_grad()
-def _as_seen(objective: Objective, image: Tensor, labels_xyxy: Tensor) -> Tensor:
-    """Features (F, N) of cars with labels (N, 4) px in a picture (3, H, W), by the detector's boxes; nan where it
-    finds none, or several.
+def _as_seen(objective: Objective, image: Tensor, labels_xyxy: Tensor) -> tuple[Tensor, Tensor]:
+    """Features (F, N) of cars with labels (N, 4) px in a picture (3, H, W), by the box of the detector's best
+    prediction that meets each; nan where none does. And (N,) bool: whether all that meet it are about one car.
     """
     detector = objective.differentiable
     label = detector.classes.index(BLIND_TO)
@@ -167,8 +171,10 @@ def _as_seen(objective: Objective, image: Tensor, labels_xyxy: Tensor) -> Tensor
     meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
     meets &= scores[cars.rows] >= objective.t_star
     seen = torch.full((len(FEATURES), len(labels_xyxy)), torch.nan)
-    for i in range(len(labels_xyxy)):
-        about = cars.car[meets[i]].unique()
-        if len(about) == 1:
-            seen[:, i] = values[:, about[0]]
-    return seen
+    single = torch.zeros(len(labels_xyxy), dtype=torch.bool)
+    for i, own in enumerate(meets):
+        if bool(own.any()):
+            best = scores[cars.rows].where(own, 0.0).argmax()
+            seen[:, i] = values[:, cars.car[best]]
+            single[i] = len(cars.car[own].unique()) == 1
+    return seen, single
