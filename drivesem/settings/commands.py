@@ -141,7 +141,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Bootstrap, Grading, Attacking, FrameCommand):
-    """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
+    """The paper's experiments, and others: every arm an attack on the same frames."""
 
     name: Annotated[
         tyro.conf.Positional[
@@ -170,8 +170,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
-    certain is drawn by a second renderer in any case."""
+    """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
+    What is certain is drawn by it in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
@@ -266,11 +266,10 @@ class Explain(Bootstrap, FinishedRun, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Confirm(FinishedRun, FrameCommand):
-    """Draw a run's counterexamples again by the scene generator: which failures survive another renderer?"""
+    """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
 
     run: Run = None
-    """Folder of a run of drivesem attack on generated frames: the embedded scenes, or drivesem synth's in KITTI's
-    layout."""
+    """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
     root: str | None = None
     """Folder of the run's data set, where it is no longer where the run found it."""
 

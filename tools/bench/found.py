@@ -112,14 +112,14 @@ def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[
 
 def _source(config: BenchTool) -> SceneSource:
     asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
-    return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
+    return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
 def _names(config: BenchTool) -> list[str]:
     return list(_source(config).identifiers())[: config.limit]
 
 
-class _Folder:
+class SceneFolder:
     """Scenes that `drivesem derender` wrote, wherever below a folder they lie."""
 
     def __init__(self, folder: Path) -> None:

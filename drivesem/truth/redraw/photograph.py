@@ -77,6 +77,11 @@ class PhotographRedraw:
         self._shares = before.shares
         self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), before)
 
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """Nothing is left out."""
+        del changed
+        return ()
+
     @torch.no_grad()
     def redraw(self, changed: SceneIR) -> Redrawn:
         """A state of the scene. Labels: the photograph's, moved as the boxes of the meshes move. Ignored are
