@@ -214,7 +214,8 @@ def _frames(rows: Sequence[StudyRow]) -> Sheet:
     for row in rows:
         flat = row.flat()
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
-        lines.append((row.name, *(str(flat[key]) for key in ("frames", *keys, "queries"))))
+        # An arm may have none of the controls that another has.
+        lines.append((row.name, *(str(flat.get(key, "-")) for key in ("frames", *keys, "queries"))))
     columns = (_ARM, "frames", *MODES, *controls, "queries")
     return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
 

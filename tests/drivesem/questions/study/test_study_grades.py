@@ -40,6 +40,7 @@ def runs(frame, arm_run, arm) -> list:
     return [
         arm_run(arm("combo 2"), frames),
         arm_run(arm("combo 2 placebo", control=(PLACEBO, "combo 2")), control),
+        arm_run(arm("combo 2, halton", method="halton"), frames[:1] + control[1:]),
     ]
 
 
@@ -93,6 +94,7 @@ def test_told_to_people(runs: list, tmp_path: Path) -> None:
     assert by_grade.rows[1][4:8] == ("4", "0", "0", "0")
     assert by_grade.rows[1][-1] == "-"
     assert dict(zip(by_kind.columns, by_kind.rows[0], strict=True))["missed"] == "3 / 2 / 1"
+    assert sheets(found)[-1].rows[1][-2:] == ("-", "40")  # which has no placebo
     assert any(note.startswith("Certain:") for note in notes(found))
     assert found.to_json()["grades"][0]["survive"] == pytest.approx(2 / 3)
     write_plot(tmp_path / "study.png", found)
