@@ -89,7 +89,8 @@ def test_told_to_people(runs: list, tmp_path: Path) -> None:
         rows_of(runs, DRAWS, 0),
         grades=[grades_of(run, DRAWS, 0) for run in runs],
     )
-    by_grade, by_kind = sheets(found, whole=False)[:2]
+    by_grade, by_kind = sheets(found)[:2]
+    assert sheets(found, whole=False)[0].rows[0][:3] == ("combo 2", "4 / 3 / 2 / 1", "8")
     assert by_grade.rows[0][:8] == ("combo 2", "4", "8", "120", "4", "3", "2", "1")
     assert by_grade.rows[1][4:8] == ("4", "0", "0", "0")
     assert by_grade.rows[1][-1] == "-"
