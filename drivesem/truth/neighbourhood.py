@@ -57,9 +57,7 @@ class Neighbourhood:
         self._own = ((self._box.owner == index) | (self._box.owner < 0)).nonzero()[:, 0]
         mine = (self._box.holder == index) | (self._box.holder < 0)
         self._mine = mine.to(theta.device)
-        span = reach * (objective.space.upper - objective.space.lower)
-        self._low = torch.maximum(theta - span, objective.space.lower)
-        self._high = torch.minimum(theta + span, objective.space.upper)
+        self._span = reach * (objective.space.upper - objective.space.lower)
         renderer = CompositorDraw(objective.compositor, objective.labeller)
         self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"hole:{name}")
         self._sequence = qmc.Halton(
@@ -67,24 +65,26 @@ class Neighbourhood:
         )
         self._places: list[Tensor] = []
 
-    def sample(self, number: int) -> Sample | None:
-        """The number-th state, seen once; None where the object does not count there."""
-        scene = self._objective.space.apply(self._objective.space.scene, self.theta(number))
+    def sample(self, number: int, part: float = 1.0) -> Sample | None:
+        """The number-th state, seen once; None where the object does not count there. part: of the reach."""
+        scene = self._objective.space.apply(self._objective.space.scene, self.theta(number, part))
         ignore = torch.zeros(len(scene.objects), dtype=torch.bool)
         exposure = self._camera.expose(scene, number, ignore)
         if bool(exposure.targets.ignore[self.index]):
             return None
         return Sample(exposure, self._features(scene, exposure))
 
-    def theta(self, number: int) -> Tensor:
-        """Of the number-th state (D,), feasible."""
+    def theta(self, number: int, part: float = 1.0) -> Tensor:
+        """Of the number-th state (D,), feasible. part: of the reach, in which states lie closer together."""
         while len(self._places) <= number:
             self._places.append(torch.from_numpy(self._sequence.random(1)[0]))
         place = self._box.start.clone()
         place[self._own] = self._places[number].to(place)
-        wanted = torch.where(self._mine, self._box.theta(place), self._theta)
-        wanted = torch.minimum(torch.maximum(wanted, self._low), self._high)
-        return self._feasible.project(wanted).theta
+        away = torch.where(self._mine, self._box.theta(place) - self._theta, 0)
+        if part < 1:
+            away = part * away
+        away = torch.minimum(torch.maximum(away, -part * self._span), part * self._span)
+        return self._feasible.project(self._theta + away).theta
 
     def fails(self, sample: Sample, camera: Camera | None = None) -> bool:
         """Whether the object is not found, by the objective's detector, or another camera's. Costs a pass."""

@@ -26,6 +26,8 @@ from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.rules import Floats, contains, fit
 from scene_ir import files
 
+_NEAR = 0.3
+"""Part of the reach in which the second half of the samples lies."""
 _TRIES = 6
 """States that may be looked at for each fresh sample inside of a rule."""
 
@@ -86,10 +88,11 @@ def look_around(
 
 
 def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
-    asked, _ = _seen(near, range(effort.samples), effort.samples, {})
-    where = fit(asked.columns(), asked.failing).where if asked.fails else {}
-    further = range(effort.samples, effort.samples + _TRIES * effort.fresh)
-    fresh, tried = _seen(near, further, effort.fresh if asked.fails else 0, where)
+    half, last = effort.samples // 2, effort.samples + _TRIES * effort.fresh
+    asked, _ = _seen(near, range(half), half, {})
+    close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, _NEAR)
+    where = _rule(asked, close)
+    fresh, tried = _seen(near, range(effort.samples, last), effort.fresh if asked.fails else 0, where)
     assert failure.index is not None
     return Around(
         index=failure.index,
@@ -97,17 +100,30 @@ def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
         error=failure.error or "",
         grade=failure.grade or "",
         asked=asked,
+        near=close,
         where=where,
         fresh=fresh,
         tried=tried,
     )
 
 
+def _rule(asked: Samples, close: Samples) -> dict[str, tuple[float, float]]:
+    both = [samples for samples in (asked, close) if samples.fails]
+    if not both:
+        return {}
+    columns = {name: np.concatenate([samples.columns()[name] for samples in both]) for name in both[0].names}
+    return fit(columns, np.concatenate([samples.failing for samples in both])).where
+
+
 def _seen(
-    near: Neighbourhood, numbers: Iterable[int], enough: int, where: Mapping[str, tuple[float, float]]
+    near: Neighbourhood,
+    numbers: Iterable[int],
+    enough: int,
+    where: Mapping[str, tuple[float, float]],
+    part: float = 1.0,
 ) -> tuple[Samples, int]:
     """Up to `enough` samples inside of a rule, in which the object counts, before the detector; and how many were
-    tried for them.
+    tried for them. part: of the neighbourhood's reach.
     """
     rows: list[dict[str, float]] = []
     fails: list[bool] = []
@@ -116,7 +132,7 @@ def _seen(
         if len(rows) == enough:
             break
         tried += 1
-        sample = near.sample(number)
+        sample = near.sample(number, part)
         if sample is None or not contains(where, _columns(sample), 1)[0]:
             continue
         rows.append(sample.features)

@@ -143,8 +143,14 @@ def of_kitti(where: Mapping[str, tuple[float, float]]) -> dict[str, float]:
         if name not in _OF_KITTI:
             continue
         theirs, unit = _OF_KITTI[name]
-        edges = np.asarray(QUANTITIES[theirs].edges, float)
-        below = np.concatenate([[0.0], np.cumsum(reference().shares[theirs])])
-        share = np.interp([low * unit, high * unit], edges, below / below[-1])
-        found[name] = round(float(share[1] - share[0]), 4)
+        found[name] = round(_below(theirs, high * unit) - _below(theirs, low * unit), 4)
     return found
+
+
+def _below(name: str, value: float) -> float:
+    """Share of KITTI's vehicles below a value; an angle adds one for each turn."""
+    quantity = QUANTITIES[name]
+    edges = np.asarray(quantity.edges, float)
+    below = np.concatenate([[0.0], np.cumsum(reference().shares[name])])
+    turns, rest = divmod(value - edges[0], 2 * np.pi) if quantity.angle else (0.0, value - edges[0])
+    return float(turns + np.interp(edges[0] + rest, edges, below / below[-1]))

@@ -39,9 +39,10 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """Around one certain failure. index: of the object; error, grade: of the failure; asked: samples from which a
-    rule is made; fresh: further ones, which it is held against; where: the rule of `asked` alone; tried: states
-    that were looked at for `fresh`, of which some lie outside of the rule.
+    """Around one certain failure. index: of the object; error, grade: of the failure; asked: samples of the whole
+    neighbourhood; near: of the part of it around the failure, as a hole may be small; where: the rule of both;
+    fresh: further ones of the whole, inside of the rule, which it is held against; tried: states that were looked
+    at for these.
     """
 
     index: int
@@ -49,6 +50,7 @@ class Around:
     error: str
     grade: str
     asked: Samples
+    near: Samples
     where: dict[str, tuple[float, float]]
     fresh: Samples
     tried: int
