@@ -18,10 +18,13 @@ from drivesem.settings.values import numbers
 class BenchTool(Tiles, DataSource, FrameCommand):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
-    what: tyro.conf.Positional[Literal["derender", "found", "label-free", "synth", "rivals", "eval"]] = "derender"
+    what: tyro.conf.Positional[Literal["derender", "found", "label-free", "redraw", "synth", "rivals", "eval"]] = (
+        "derender"
+    )
     """derender: de-rendered generated frames beside the generator's truth; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
-    those labels; synth: the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
+    those labels; redraw: the second renderer of photographs beside the photograph and ours; synth: the
+    scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
     eval of many frames beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions or frames."""
@@ -38,14 +41,16 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that was trained
-    elsewhere."""
+    """Of found and redraw: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that
+    was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Of found and label-free: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    """Of found, label-free and redraw: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or
+    yolo."""
     root: str | None = None
-    """Of found and label-free: folder of the data set, such as KITTI's with training/image_2, label_2, calib."""
+    """Of found, label-free and redraw: folder of the data set, such as KITTI's with training/image_2, label_2,
+    calib."""
     scenes: str | None = None
-    """Of found: a folder of scenes that drivesem derender wrote, instead of a data set."""
+    """Of found and redraw: a folder of scenes that drivesem derender wrote, instead of a data set."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 
