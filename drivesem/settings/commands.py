@@ -474,14 +474,15 @@ class Synth(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench(FrameCommand):
-    """Measure: one attack step, the renderer, memory, detectors."""
+class Bench(Scenes, FrameCommand):
+    """Measure: one attack step, the renderer, memory, detectors, and what attacks find of known faults."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "planted"]] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
-    memory above the detector's own; detector: forward, backward and decoding of each detector."""
+    memory above the detector's own; detector: forward, backward and decoding of each detector; planted: how many
+    faults that were planted into the detector each attack finds (docs/planted.md), minutes a frame."""
     quick: Flag = False
-    """Fewer repetitions: some 50 s."""
+    """Fewer repetitions: some 50 s; planted: two faults a frame."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
     """How many cars, 1 to 16, with commas."""
     triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
@@ -492,6 +493,19 @@ class Bench(FrameCommand):
     """Name of a shipped detector, or a .safetensors file of one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
+    methods: str = "climb,si-fgsm,halton,cma-es"
+    """Planted: attacks to judge, with commas (drivesem attack --method)."""
+    passes: Annotated[int, at_least(LEAST_PASSES)] = 90
+    """Planted: passes of the detector that each attack may take for a fault, a gradient counted as 3."""
+    params: str = "color,weather,foliage,translate,rotate,mesh"
+    """Planted: what attacks may move, with commas."""
+    limit: Count | None = None
+    """Planted: the first N frames; by default 3."""
+
+    def check(self) -> None:
+        super().check()
+        only = "--dataset demo, but for bench planted"
+        refuse(self.what != "planted" and self.dataset != DEMO, "--dataset", only, self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from drivesem.bench.tables import Section
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
-from tools.bench import derender, evaluation, found, label_free, redraw, rivals, synth
+from tools.bench import depth, derender, evaluation, found, label_free, redraw, rivals, synth
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -47,6 +47,7 @@ def run(config: BenchTool) -> int:
     config.check()
     measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
         "derender": _derender,
+        "depth": _depth,
         "found": _found,
         "label-free": _label_free,
         "redraw": _redraw,
@@ -64,6 +65,14 @@ def _derender(config: BenchTool, console: Console) -> Measured:
     rows = list(watched(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)
+
+
+def _depth(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = _frames(config, depth)
+    measured = depth.measure(config, frames, _sheets(config))
+    rows = [row for found in watched(measured, depth.count(config, frames), console) for row in found]
+    return _measured(depth, {"rows": [asdict(row) for row in rows], "summary": depth.summary(rows)})
 
 
 def _found(config: BenchTool, console: Console) -> Measured:

@@ -113,7 +113,7 @@ def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[
 def source_of(config: BenchTool) -> SceneSource:
     """The scenes that are asked for: of a data set, or a folder of them."""
     asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
-    return _Folder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
+    return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
 def names_of(config: BenchTool) -> list[str]:
@@ -121,7 +121,7 @@ def names_of(config: BenchTool) -> list[str]:
     return list(source_of(config).identifiers())[: config.limit]
 
 
-class _Folder:
+class SceneFolder:
     """Scenes that `drivesem derender` wrote, wherever below a folder they lie."""
 
     def __init__(self, folder: Path) -> None:

@@ -43,8 +43,8 @@ COLUMNS: Columns = {
 }  # fmt: skip
 METHOD = (
     "Cars (KITTI's Car and Van) that became objects, at least 25 px high, at most partly occluded by label. "
-    "Apart: mean absolute difference, in levels of 255, of pyrender's unchanged picture from the "
-    "photograph, over the pixels that are a vehicle's in ours (opacity of at least one half), and over all others; "
+    "Apart: mean absolute difference, in levels of 255, of pyrender's unchanged picture from the photograph, over "
+    "the pixels that are a vehicle's in ours (opacity of at least one half), and over all others; "
     "PSNR over the former. Moved: cars by 0.5 m along their headings and by 10 degrees, signs by seed, as bench "
     "found moves them; PSNR of pyrender's picture to ours over the pixels that are a vehicle's in ours. Found: a "
     "detection of class Car with a score above 0.3 and an IoU of at least 0.5 with the label, each for one car "

@@ -107,7 +107,7 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     if found.label_sets:
         tables += [_label_sets(found.label_sets), _counterexamples(found.label_sets)]
     if found.grades and (whole or found.study.name == "grades"):
-        tables += [_grades(found.grades), _kinds(found.grades)]
+        tables += [_grades(found.grades) if whole else _grades_short(found.grades), _kinds(found.grades)]
     tables.append(_precision(found.rows))
     if any(row.controls for row in found.rows):
         tables.append(_controls(found.rows))
@@ -182,6 +182,17 @@ def _grades(grades: Sequence[ArmGrades]) -> Sheet:
     return Sheet("Failures by grade, each with those above it", columns, tuple(lines))
 
 
+def _grades_short(grades: Sequence[ArmGrades]) -> Sheet:
+    """The same for a terminal: counts in one column."""
+    lines = []
+    for one in grades:
+        survive = f"{bounded(one.survive)} of {one.asked}" if one.asked else "-"
+        counts = _by_grade([one.counts[grade] for grade in Grade])
+        lines.append((one.name, counts, str(one.objects), bounded(one.rates[Grade.CERTAIN]), survive))
+    columns = (_ARM, "failures", "objects", "certain, % of objects", "confirmed, % of certain")
+    return Sheet(f"Failures by grade: {' / '.join(Grade)}", columns, tuple(lines))
+
+
 def _kinds(grades: Sequence[ArmGrades]) -> Sheet:
     told = (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)
     lines = [
@@ -214,7 +225,8 @@ def _frames(rows: Sequence[StudyRow]) -> Sheet:
     for row in rows:
         flat = row.flat()
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
-        lines.append((row.name, *(str(flat[key]) for key in ("frames", *keys, "queries"))))
+        # An arm may have none of the controls that another has.
+        lines.append((row.name, *(str(flat.get(key, "-")) for key in ("frames", *keys, "queries"))))
     columns = (_ARM, "frames", *MODES, *controls, "queries")
     return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
 
@@ -270,9 +282,12 @@ def notes(found: Findings) -> list[str]:
         )
     elif found.study.name in ("single", "multi"):
         told.append(OWN_PROTOCOL)
+    if any(RANDOM in row.controls for row in found.rows):
+        told.append(
+            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead."
+        )
     if any(row.controls for row in found.rows):
         told.append(
-            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead. "
             "Placebo: one random edit as large as the attack's, through the same pipeline; its size beside the "
             "attack's, which projection onto what is feasible may lessen. The attack's effect is what it lowers "
             "AP50 by more than the placebo."
