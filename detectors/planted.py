@@ -1,7 +1,7 @@
 """Detectors that are blind by construction: a failure that is known judges what looks for failures.
 
 A planted fault is told from the image alone. Predictions of a car that lie on each other are about one car. It has
-features, of their mean box and of the picture inside of it. Where all of a fault's features lie in their bands, the
+features, of their mean box and of the picture inside of it. Where all features of a fault lie in their bands, the
 logits of these predictions are lowered. Bands have soft edges, so that the fault is differentiable to the image,
 through boxes, scores and pixels.
 """

@@ -26,6 +26,7 @@ from torch import Tensor
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
     VARIANTS,
+    Plan,
     SynthFrame,
     SynthSettings,
     plan_frame,
@@ -80,16 +81,19 @@ def classes_of(frame: SynthFrame) -> np.ndarray:
     return found
 
 
-def street(seed: int, index: int, split: str, with_background: bool = False) -> SynthFrame:
-    """Frame `index` of a stream: any weather, any season, from turned cameras too. with_background: also the
-    street without its actors."""
+def planned(seed: int, index: int, split: str) -> Plan:
+    """What frame `index` of a stream shows: any weather, any season, from turned cameras too."""
     rng = np.random.default_rng([STREAM, seed, index, split == "train"])
     layout = LayoutSettings(variants=VARIANTS[split], people=True)
     plan = plan_frame(seed, index, split, SynthSettings(layout=layout, bent=True))
     name = MIXED if rng.random() < MIXED_SHARE else str(rng.choice(VARIATIONS))
     leaves = tuple(float(rng.uniform(*reach)) for reach in LEAVES)
-    plan = replace(variation_of(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
-    frame = render_frame(plan, with_background)
+    return replace(variation_of(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
+
+
+def street(seed: int, index: int, split: str) -> SynthFrame:
+    """Frame `index` of a stream."""
+    frame = render_frame(planned(seed, index, split))
     assert frame is not None
     return frame
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -12,13 +13,20 @@ from rich.console import Console
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.bench import detector, memory, render, step
+from drivesem.bench.planted import summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
+from drivesem.run.ask import Bar, ask
+from drivesem.run.attack import select_frames
 from drivesem.settings.commands import Bench
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 
+_SECONDS_A_PASS = 0.15
+"""Of an attack on a frame as large as KITTI's, certificates among them."""
+_PLANTED_FRAMES = 3
+"""Frames of `bench planted`, where nobody says how many."""
 _SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0), "detector": (20.0, 90.0)}
 """Seconds for measuring, with --quick and without; imports and scenes take some more."""
 
@@ -33,6 +41,7 @@ def run(config: Bench) -> int:
         "render": _render,
         "memory": _memory,
         "detector": _detector,
+        "planted": _planted,
     }
     return conduct(config, "drivesem bench", measure[config.what])
 
@@ -82,6 +91,35 @@ def _detector(config: Bench, console: Console) -> Measured:
     except DetectorError as error:
         raise UsageError("--detector", "a detector with gradients", error) from error
     return Measured({"rows": rows, "method": detector.METHOD}, [Section(detector.TITLE, detector.COLUMNS, rows)])
+
+
+def _planted(config: Bench, console: Console) -> Measured:
+    config = replace(config, limit=config.limit or _PLANTED_FRAMES)
+    judge = yardstick.Yardstick.of(config)
+    names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
+    methods = yardstick.methods_of(config)
+    count = len(names) * len(judge.kinds) * len(methods)
+    console.print(f"{count} attacks of {config.passes} passes: about {_minutes(count * config.passes)}")
+    asked = ask(names, judge.judge, partial(yardstick.judge_of, config), config, Bar("frames", remaining=True))
+    judged = [asked.results[name] for name in names if name in asked.results]
+    rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
+    return Measured(
+        {
+            "rows": rows,
+            "kinds": kinds,
+            "attempts": [asdict(attempt) for frame in judged for attempt in frame.attempts],
+            "failed": failed | asked.failed,
+            "method": summary.METHOD,
+        },
+        [
+            Section(summary.TITLE, summary.COLUMNS, rows),
+            Section(summary.KINDS_TITLE, summary.kind_columns(methods), kinds),
+        ],
+    )
+
+
+def _minutes(passes: int) -> str:
+    return f"{passes * _SECONDS_A_PASS / 60:.0f} minutes of one core"
 
 
 def _sizes(config: Bench) -> tuple[list[int], list[int]]:

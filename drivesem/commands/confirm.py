@@ -1,4 +1,4 @@
-"""`drivesem confirm`: counterexamples of a run on generated frames, drawn again by the generator."""
+"""`drivesem confirm`: counterexamples of a run, drawn again by a second renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`drivesem study`: the paper's experiments on frames of one's own, its figures beside ours."""
+"""`drivesem study`: the paper's experiments, and others, on frames of one's own."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def render_report(page: Page, at: Path) -> str:
         how_sure="" if several else _how_sure(first),
         lead=_lead(runs),
         tiles=[] if several else _tiles(first),
-        rows=[_run_row(run) for run in runs] if several else _figure_rows(first),
+        rows=[_run_row(run, any(r.paper for r in runs)) for run in runs] if several else _figure_rows(first),
         columns=tuple(_COLUMNS),
         frames=len(cards),
         left_out=page.left_out,
@@ -277,21 +277,22 @@ def _figure_rows(run: ShownRun) -> list[_Row]:
     return found
 
 
-def _run_row(run: ShownRun) -> _Row:
+def _run_row(run: ShownRun, papers: bool) -> _Row:
+    """papers: whether there is a column of the paper's figures."""
     summary = run.summary
     before, moved = summary.benign.headline, summary.attacked_moved.headline
     lost, phantoms = _totals(summary)
     return _Row(
         run.name,
         (
+            *_graded_cells(run),
             _percent(before.ap50),
             _percent(moved.ap50),
             _points(before.ap50, moved.ap50),
             _percent(summary.attacked_paper.headline.ap50),
-            _percent(run.paper.after if run.paper else None),
+            *((_percent(run.paper.after if run.paper else None),) if papers else ()),
             _percent(moved.recall_at_t_star),
             str(summary.successes_moved),
-            *_graded_cells(run),
             str(lost),
             str(phantoms),
             _percent(summary.feasible_fraction),

@@ -21,6 +21,7 @@ from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
+from drivesem.run.protocol import follows_paper
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, graded, tally
 from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report
@@ -36,8 +37,6 @@ PICTURES = 200
 """Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
 _NOT_TOLD = ("out", "json", "resume", "workers")
 """Settings that change nothing in the result: left out of the report's command line."""
-_THE_PAPERS = ("si-fgsm", "squeezedet")
-"""Method and detector beside which the paper's figures stand; of others they say nothing."""
 _MOST_LINES = 7
 """Of a chart: as many as there are colours."""
 
@@ -239,7 +238,7 @@ def _shown(
         command=command_line("attack", config, _NOT_TOLD),
         weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
         asked=_asked(config),
-        paper=_paper(summary.params) if (config.method, config.detector) == _THE_PAPERS else None,
+        paper=_paper(summary.params) if follows_paper(config) else None,
     )
 
 

@@ -141,7 +141,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Bootstrap, Grading, Attacking, FrameCommand):
-    """The paper's experiments, its figures beside ours: every arm an attack on the same frames."""
+    """The paper's experiments, and others: every arm an attack on the same frames."""
 
     name: Annotated[
         tyro.conf.Positional[
@@ -170,8 +170,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     confirm: Flag = False
-    """Single, multi, labels: have the generator draw each attack's pictures again (generated frames only). What is
-    certain is drawn by a second renderer in any case."""
+    """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
+    What is certain is drawn by it in any case."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
@@ -266,11 +266,10 @@ class Explain(Bootstrap, FinishedRun, FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Confirm(FinishedRun, FrameCommand):
-    """Draw a run's counterexamples again by the scene generator: which failures survive another renderer?"""
+    """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
 
     run: Run = None
-    """Folder of a run of drivesem attack on generated frames: the embedded scenes, or drivesem synth's in KITTI's
-    layout."""
+    """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
     root: str | None = None
     """Folder of the run's data set, where it is no longer where the run found it."""
 
@@ -489,14 +488,15 @@ class Synth(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench(FrameCommand):
-    """Measure: one attack step, the renderer, memory, detectors."""
+class Bench(Scenes, FrameCommand):
+    """Measure: one attack step, the renderer, memory, detectors, and what attacks find of known faults."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "planted"]] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
-    memory above the detector's own; detector: forward, backward and decoding of each detector."""
+    memory above the detector's own; detector: forward, backward and decoding of each detector; planted: how many
+    faults that were planted into the detector each attack finds (docs/planted.md), minutes a frame."""
     quick: Flag = False
-    """Fewer repetitions: some 50 s."""
+    """Fewer repetitions: some 50 s; planted: two faults a frame."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
     """How many cars, 1 to 16, with commas."""
     triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
@@ -507,6 +507,19 @@ class Bench(FrameCommand):
     """Name of a shipped detector, or a .safetensors file of one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
+    methods: str = "climb,si-fgsm,halton,cma-es"
+    """Planted: attacks to judge, with commas (drivesem attack --method)."""
+    passes: Annotated[int, at_least(LEAST_PASSES)] = 90
+    """Planted: passes of the detector that each attack may take for a fault, a gradient counted as 3."""
+    params: str = "color,weather,foliage,translate,rotate,mesh"
+    """Planted: what attacks may move, with commas."""
+    limit: Count | None = None
+    """Planted: the first N frames; by default 3."""
+
+    def check(self) -> None:
+        super().check()
+        only = "--dataset demo, but for bench planted"
+        refuse(self.what != "planted" and self.dataset != DEMO, "--dataset", only, self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)

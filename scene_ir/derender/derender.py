@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import background as fills
 from scene_ir.derender import cutout as cutouts
+from scene_ir.derender import depth as depths
 from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand, street, upright
 from scene_ir.derender import widen as wide
 from scene_ir.derender.cutout import Cutout
@@ -261,8 +262,9 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         # What stands behind the vehicles no classes tell.
         behind = segment.segment(background, ground, camera, settings.segmenter)
         seen = segment.of_frame(frame, behind).within((background != image).any(-1), behind)
-    flat = maps.with_footprints(seen.ground, labels, _posed_rows(labels), ground, camera)
-    environment, depth = _environment(seen, flat, ground, sun, horizon, camera, vehicles)
+    stood = maps.footprints(labels, _posed_rows(labels), ground, camera)
+    ties = depths.Ties(seen.sky, seen.ground, stood, _behind_m(cuts, camera))
+    depth = torch.from_numpy(depths.surroundings(background, ground, camera, ties))
     if frame.depth is not None:
         # What stands behind the vehicles was never measured: there the estimate stays.
         depth = torch.where(torch.from_numpy(vehicles), depth, frame.depth.float())
@@ -277,7 +279,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         camera,
         meshes,
         objects,
-        environment,
+        _environment(seen, ground, sun, vehicles),
         frame.photograph.float(),
         picture,
         depth,
@@ -622,26 +624,29 @@ def _not_copied(surroundings: _Surroundings, unknown: Mask) -> Mask:
 
 
 def _environment(
-    seen: segment.Segmentation,
-    flat: Array,
-    ground: torch.Tensor,
-    sun: torch.Tensor,
-    horizon: float,
-    camera: Camera,
-    vehicles: Mask,
-) -> tuple[Environment, torch.Tensor]:
-    """Maps and depth of the background. flat (H, W): where there is ground."""
-    depth = maps.depth_map(maps.plane_depth(ground, camera), flat, seen.sky, horizon)
+    seen: segment.Segmentation, ground: torch.Tensor, sun: torch.Tensor, vehicles: Mask
+) -> Environment:
+    """Maps of the background; codes 0."""
     # Weather changes the finished picture: a vehicle before the sky is none. Leaves change before it is drawn.
     sky = np.where(vehicles, 0, seen.sky)
-    environment = Environment(
+    return Environment(
         torch.zeros(WEATHER_DIM),
         torch.zeros(FOLIAGE_DIM),
         sun,
         ground,
         *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, seen.foliage, seen.road)),
     )
-    return environment, torch.from_numpy(depth)
+
+
+def _behind_m(cuts: list[_Cut], camera: Camera) -> Array:
+    """Depth (H, W) m that what stands behind the vehicles has at least, that of their middle; 0 where none
+    stands."""
+    middle = np.zeros((camera.height, camera.width), np.float32)
+    for cut in cuts:
+        place = cut.placement.translation.detach()[None]
+        depth = float(to_clip(place, camera.matrix.to(place))[0, 2])
+        middle = np.where(cut.outline, np.maximum(middle, np.float32(depth)), middle)
+    return middle
 
 
 def _objects(labels: Labels, cuts: list[_Cut]) -> tuple[Objects, tuple[Mesh, ...]]:

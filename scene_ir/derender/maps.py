@@ -1,4 +1,4 @@
-"""The surroundings' geometry by simple, documented rules: ground plane, horizon, depth, sun."""
+"""The surroundings' geometry by simple, documented rules: ground plane, horizon, walls on its end, sun."""
 
 from __future__ import annotations
 
@@ -89,29 +89,30 @@ def horizon_row(ground: torch.Tensor, camera: Camera) -> float:
     return float(-(across[0] * (camera.width - 1) / 2 + across[2]) / across[1])
 
 
-def with_footprints(flat: Array, labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
-    """`flat` (H, W) in [0, 1], and 1 where something labelled stands, and a little to its sides: whatever the
-    pixels look like, there is ground, and what is seen around it stands no nearer.
-    """
+def footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
+    """1 where something labelled stands on the ground, else 0 (H, W): whatever the pixels look like, there is
+    ground."""
     corners = box_corners(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows])[:, :4].double()
     normal = ground.double()
     y = -(corners[..., 0] * normal[0] + corners[..., 2] * normal[2] + normal[3]) / normal[1]
     clip = to_clip(torch.stack([corners[..., 0], y, corners[..., 2]], dim=-1), camera.matrix.double())
     in_view = (clip[..., 2] > _NEAR_M).all(dim=1)
-    stands = np.zeros(flat.shape, np.uint8)
+    stands = np.zeros((camera.height, camera.width), np.float32)
     for polygon in (clip[in_view, :, :2] / clip[in_view, :, 2:]).numpy():
         cv2.fillConvexPoly(stands, np.rint(polygon.clip(-_FAR_OUT_PX, _FAR_OUT_PX)).astype(np.int32), 1)
-    beside = 2 * round(_BESIDE * flat.shape[1]) + 1
-    return np.where(cv2.dilate(stands, np.ones((1, beside), np.uint8)) > 0, np.float32(1), flat)
+    return stands
 
 
-def depth_map(ground_depth: Array, flat: Array, sky: Array, horizon: float) -> Array:
-    """(H, W) m of the background: the plane's depth (H, W) where there is ground, upright walls on its upper end,
-    inf in the sky. flat, sky (H, W) in [0, 1]: where there is ground, and where sky.
+def walls(ground_depth: Array, flat: Array, stood: Array, sky: Array, horizon: float) -> Array:
+    """Depth (H, W) m by rule: the plane's (H, W) where there is ground, upright walls on its upper end, inf in the
+    sky. flat, sky (H, W) in [0, 1]: where ground is seen, and where sky; stood (H, W): see `footprints`: there is
+    ground too, and a little to its sides, and what is seen around it stands no nearer.
 
     Each column's wall stands where its lowest stretch of ground ends, at most `FAR` away.
     """
     height, width = flat.shape
+    beside = 2 * round(_BESIDE * width) + 1
+    flat = np.where(cv2.dilate(stood, np.ones((1, beside), np.uint8)) > 0, np.float32(1), flat)
     ground = cv2.morphologyEx((flat > 0.5).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)) > 0
     rows = np.arange(height)[:, None]
     below = rows > horizon + 2

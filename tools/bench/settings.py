@@ -18,10 +18,14 @@ from drivesem.settings.values import numbers
 class BenchTool(Tiles, DataSource, FrameCommand):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
-    what: tyro.conf.Positional[Literal["derender", "found", "label-free", "synth", "rivals", "eval"]] = "derender"
-    """derender: de-rendered generated frames beside the generator's truth; found: whether a detector finds removed
+    what: tyro.conf.Positional[
+        Literal["derender", "depth", "found", "label-free", "redraw", "synth", "rivals", "eval"]
+    ] = "derender"
+    """derender: de-rendered generated frames beside the generator's truth; depth: how far surroundings are, beside
+    the generator's truth, a laser, and in fog; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
-    those labels; synth: the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
+    those labels; redraw: the second renderer of photographs beside the photograph and ours; synth: the
+    scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
     eval of many frames beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions or frames."""
@@ -31,21 +35,24 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     """Of rivals: triangles a car, with commas."""
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
-    100, with --quick 12; that label-free looks at, by default 60, with --quick 12; or that eval counts, by default
-    20,000, with --quick 1,000."""
+    100, with --quick 12; that depth does, by default 40, with --quick 6; that label-free looks at, by default 60,
+    with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that was trained
-    elsewhere."""
+    """Of found and redraw: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that
+    was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Of found and label-free: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    """Of found, label-free, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2,
+    coco or yolo."""
     root: str | None = None
-    """Of found and label-free: folder of the data set, such as KITTI's with training/image_2, label_2, calib."""
+    """Of found, label-free, redraw and depth: the data set's folder, such as KITTI's with training/image_2,
+    label_2, calib."""
     scenes: str | None = None
-    """Of found: a folder of scenes that drivesem derender wrote, instead of a data set."""
+    """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
+    besides one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 
@@ -54,5 +61,5 @@ class BenchTool(Tiles, DataSource, FrameCommand):
         fewest = 10 if self.what == "synth" else 1
         few = self.frames is not None and self.frames < fewest
         refuse(few, "--frames", f"at least {fewest}", self.frames)
-        both = self.scenes is not None and self.dataset != DEMO
+        both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
         refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")

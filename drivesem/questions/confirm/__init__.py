@@ -1,1 +1,1 @@
-"""Counterexamples rendered again by the scene generator, the second renderer."""
+"""Counterexamples drawn again by a second renderer."""

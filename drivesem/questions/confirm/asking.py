@@ -1,4 +1,4 @@
-"""Counterexamples of a run on generated frames, drawn again by the generator, frame by frame."""
+"""Counterexamples of a run, drawn again by a second renderer, frame by frame."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from functools import partial
 from pathlib import Path
 
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.frame import confirm_frame
+from drivesem.questions.confirm.frame import CONFIRMED, confirm_frame
 from drivesem.questions.confirm.report import Confirmation, answer_of, summarise
 from drivesem.questions.confirm.results import Confirmed, load
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import METRICS, Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of
-from drivesem.run.frame import RESULT
+from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import Confirm
 from drivesem.settings.errors import UsageError
-from drivesem.truth.redraw.plans import open_plans
+from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 
 _WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)
@@ -24,7 +24,7 @@ _WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)
 
 def confirm_run(config: Confirm) -> tuple[Confirmation, Answer]:
     """Confirm a run's frames, or go on with it, and write what is said of them: the figures, and all of it. Raises
-    UsageError or SceneError for bad input.
+    UsageError or SceneError for bad input, NoSecondRendererError before anything is written.
     """
     (run,) = load_runs([config.run or ""], config.limit)
     out = Path(config.out) if config.out else run.folder / "confirm"
@@ -32,7 +32,7 @@ def confirm_run(config: Confirm) -> tuple[Confirmation, Answer]:
     worker = build()
     # Frames are kept by the result they belong to, so that another name of the run's folder is not in the way.
     claim(out, config, _WRITTEN, (*PRESENTATION, "run", "root", "seed"))
-    frames = KeptFrames(run, out, RESULT, load)
+    frames = KeptFrames(run, out, CONFIRMED, load)
     names = [frame.result.identifier for frame in run.frames]
     confirmed, failed = frames.ask(names, worker, build, config, Bar("drawing frames again", stays=False))
     if not confirmed:
@@ -57,7 +57,10 @@ class ConfirmWorker:
         attack = attack_of(run.folder)
         self.run, self.out = run, out
         self.frames = {frame.result.identifier: frame for frame in run.frames}
-        self.plans = open_plans(attack, config.root)
+        if attack.dataset == DEMO and config.root is not None:
+            raise UsageError("--root", "none for the embedded scenes", config.root)
+        self.second = SecondRenderers(attack.dataset, config.root or attack.root)
+        self.second.check()
         self.detector = detector_of(attack, config.device)
         self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
 
@@ -65,4 +68,4 @@ class ConfirmWorker:
         """One frame of the run, into its folder."""
         source, folder = self.run.folder / FRAMES / name, self.out / FRAMES / name
         frame = self.frames[name]
-        return confirm_frame(frame, source, self.plans, self.detector, self.device, self.t_star, folder)
+        return confirm_frame(frame, source, self.second, self.detector, self.device, self.t_star, folder)

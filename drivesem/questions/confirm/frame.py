@@ -1,95 +1,72 @@
-"""One frame: the change drawn by the generator, the detector asked before and after, its folder on disk."""
+"""One frame: the change drawn by a second renderer, the detector asked before and after, its folder on disk."""
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from detectors.base import Predictor
 from detectors.types import CLASSES
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.judge import findings, stands
+from drivesem.questions.confirm.judge import findings, rows_of, stands
 from drivesem.questions.confirm.results import Confirmed, dump
 from drivesem.questions.confirm.sheet import sheet_of
 from drivesem.run.finished import Frame
 from drivesem.run.frame import RESULT, detection_records, target_records
 from drivesem.run.looking import as_picture, detections_in
-from drivesem.run.results import BoxRecord
-from drivesem.synth.edits import apply_edit
-from drivesem.synth.frames import Plan, SynthFrame, render_frame
-from drivesem.truth.redraw.carry import carried
-from drivesem.truth.redraw.exact import exact_labels
-from drivesem.truth.redraw.plans import Plans
+from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
-from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, to_uint8
 
-PICTURE, SHEET = "generator.png", "sheet.png"
-_ROUNDING = 1
-"""Levels of 255 by which the same picture may differ from one processor to another."""
+SHEET, CONFIRMED = "sheet.png", "confirmed.json"
+
+
+def picture_of(renderer: str) -> str:
+    """The file of a second renderer's picture of the change."""
+    return f"{renderer}.png"
 
 
 def confirm_frame(
-    frame: Frame, source: Path, plans: Plans, detector: Predictor, device: str, t_star: float, folder: Path
+    frame: Frame,
+    source: Path,
+    second: SecondRenderers,
+    detector: Predictor,
+    device: str,
+    t_star: float,
+    folder: Path,
 ) -> Confirmed:
     """Draw one frame of a run again and write `folder`, whole or not at all. source: the frame's folder in the
     run; t_star: score from which a detection counts.
 
-    Raises FormatError where the plan is not that of the frame, as its picture without the change tells.
+    Raises SceneError where no second renderer draws the frame, or not as the photograph shows it.
     """
     start = time.perf_counter()
     changed = load_scene(source / "scene")
-    still = changed.as_photographed()
-    identifier = frame.result.identifier
-    planned = plans.planned(identifier, changed)
-    before = _rendered(planned.plan)
-    _check_same(frame.pictures["benign"], before.image)
-    change = carried(still, changed, planned)
-    after = _rendered(apply_edit(planned.plan, change.edit, f"frame {identifier}"))
-    exact = exact_labels(before, after)
-    seen = [detections_in(detector, as_picture(image, device)) for image in (before.image, after.image)]
-    found = findings(frame.result, planned.tracks, exact, seen, JudgedClasses.of(detector), t_star)
-    targets = [target_records(t, CLASSES, len(exact.tracks)) for t in (exact.benign, exact.changed)]
-    names = JudgedClasses.of(detector).names
+    identifier, still = frame.result.identifier, changed.as_photographed()
+    renderer = second.of(identifier, changed)
+    before, after = renderer.redraw(still), renderer.redraw(changed)
+    rows = rows_of(before, after, len(changed.objects))
+    judged = JudgedClasses.of(detector)
+    pictures = [to_uint8(drawn.image) for drawn in (before, after)]
+    seen = [detections_in(detector, as_picture(picture, device)) for picture in pictures]
+    found = findings(frame.result, rows, seen, judged, t_star)
+    count, names = len(changed.objects), judged.names
     result = Confirmed(
         identifier=identifier,
         source=files.digest(source / RESULT),
+        renderer=renderer.name,
         compositor=found[0],
-        generator=found[1],
-        stands=stands(frame.result, planned.tracks, exact, before, after),
-        targets_benign=_by_track(targets[0], exact.tracks),
-        targets_changed=_by_track(targets[1], exact.tracks),
+        second=found[1],
+        stands=stands(frame.result, rows, count),
+        targets_benign=target_records(rows.benign, CLASSES, count),
+        targets_changed=target_records(rows.changed, CLASSES, count),
         detections_benign=detection_records(seen[0], names),
         detections_changed=detection_records(seen[1], names),
-        not_carried=change.missing,
+        not_carried=renderer.not_carried(changed),
         seconds=round(time.perf_counter() - start, 3),
     )
     with files.whole_folder(folder) as part:
-        files.write_png(part / PICTURE, after.image)
-        files.write_png(part / SHEET, sheet_of(frame, result, after.image, t_star))
-        files.write_text(part / RESULT, dump(result))
+        files.write_png(part / picture_of(renderer.name), pictures[1])
+        files.write_png(part / SHEET, sheet_of(frame, result, pictures[1], t_star))
+        files.write_text(part / CONFIRMED, dump(result))
     return result
-
-
-def _rendered(plan: Plan) -> SynthFrame:
-    frame = render_frame(plan)
-    assert frame is not None
-    return frame
-
-
-def _check_same(path: Path, image: np.ndarray) -> None:
-    """Raises FormatError where the run's photograph is not the picture that the generator makes."""
-    given = files.read_image(path, image.shape[:2])
-    apart = int(np.abs(given.astype(np.int16) - image).max(initial=0))
-    if apart > _ROUNDING:
-        raise FormatError(
-            str(path), "the picture that the generator makes of this frame", f"one {apart} levels off"
-        )
-
-
-def _by_track(records: Sequence[BoxRecord], tracks: Sequence[int]) -> tuple[BoxRecord, ...]:
-    return tuple(r if r.index is None else dataclasses.replace(r, index=tracks[r.index]) for r in records)

@@ -22,11 +22,11 @@ SURVIVE, SAME, LOST, PHANTOMS, NEW = (
     "frames, same failure",
     "lost",
     "phantoms",
-    "frames, generator only",
+    "frames, second only",
 )
-"""Of the frames that fail in the compositor's picture: those that fail in the generator's, by any failure or by
-one that both have. The same of lost vehicles and of phantoms, one by one. Of the frames that do not fail in the
-compositor's: those that do in the generator's."""
+"""Of the frames that fail in the compositor's picture: those that fail in the second renderer's, by any failure or
+by one that both have. The same of lost vehicles and of phantoms, one by one. Of the frames that do not fail in the
+compositor's: those that do in the second renderer's."""
 
 _OVERLAP = ("mean", "least", "boxes")
 
@@ -90,11 +90,11 @@ def summarise(
         return [f.survives for one in failed for f in one.compositor if f.kind == kind]
 
     shares = (
-        Share.of(SURVIVE, [bool(one.generator) for one in failed]),
+        Share.of(SURVIVE, [bool(one.second) for one in failed]),
         Share.of(SAME, [any(f.survives for f in one.compositor) for one in failed]),
         Share.of(LOST, survival("lost")),
         Share.of(PHANTOMS, survival("phantom")),
-        Share.of(NEW, [bool(one.generator) for one in whole if not one.compositor]),
+        Share.of(NEW, [bool(one.second) for one in whole if not one.compositor]),
     )
     ious = [s.iou for one in whole for s in one.stands if s.judged and s.iou is not None]
     return Confirmation(
@@ -111,9 +111,9 @@ def _scores(
 ) -> dict[str, coco.Scores]:
     columns = {
         "photograph": [(r.targets_benign, r.detections_benign) for _, r in pairs],
-        "photograph, exact labels": [(c.targets_benign, c.detections_benign) for c, _ in pairs],
+        "second renderer, unchanged": [(c.targets_benign, c.detections_benign) for c, _ in pairs],
         "compositor": [(r.targets_moved, r.detections_attacked) for _, r in pairs],
-        "generator, exact labels": [(c.targets_changed, c.detections_changed) for c, _ in pairs],
+        "second renderer": [(c.targets_changed, c.detections_changed) for c, _ in pairs],
     }
     if not pairs:
         return {}
@@ -146,10 +146,10 @@ def sheets(report: Confirmation) -> list[Sheet]:
 def notes(report: Confirmation) -> list[str]:
     """What the figures mean, and what they leave out."""
     told = [
-        "Survive: the detector fails in the generator's picture of the same change too, by exact labels. Frames: "
-        "by any failure, or by one that both have; lost: the same vehicle; phantoms: one of the class at an IoU "
-        "of at least 0.5. Generator only: of the frames that do not fail in the compositor's picture, those that "
-        "do in the generator's. Intervals: Wilson.",
+        "Survive: the detector fails in the second renderer's picture of the same change too, by its own labels. "
+        "Frames: by any failure, or by one that both have; lost: the same vehicle; phantoms: one of the class at "
+        "an IoU of at least 0.5. Second only: of the frames that do not fail in the compositor's picture, those "
+        "that do in the second renderer's. Intervals: Wilson.",
     ]
     if report.overlap is not None:
         mean, least, count = report.overlap
@@ -183,15 +183,16 @@ def answer_of(
 def _row(one: Confirmed) -> dict[str, Any]:
     row: dict[str, Any] = {
         "frame": one.identifier,
+        "second": one.renderer,
         "fails_compositor": bool(one.compositor),
-        "fails_generator": bool(one.generator),
-        "survives": bool(one.compositor and one.generator),
+        "fails_second": bool(one.second),
+        "survives": bool(one.compositor and one.second),
     }
     for kind, title in (("lost", "lost"), ("phantom", "phantoms")):
         ours = [f for f in one.compositor if f.kind == kind]
         row |= {
             f"{title}_compositor": len(ours),
-            f"{title}_generator": sum(f.kind == kind for f in one.generator),
+            f"{title}_second": sum(f.kind == kind for f in one.second),
             f"{title}_both": sum(f.survives for f in ours),
         }
     ious = [s.iou for s in one.stands if s.judged and s.iou is not None]

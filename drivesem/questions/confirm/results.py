@@ -13,20 +13,21 @@ from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Confirmed:
-    """What came of one frame. source: fingerprint of the run's result. compositor, generator: failures in either
-    picture; targets, detections: in the generator's pictures, boxes with their track as index; not_carried: what
-    of the change the plan has no counterpart for. `seconds` alone may differ between two calls.
+    """What came of one frame. source: fingerprint of the run's result. renderer: the second one's name.
+    compositor, second: failures in either picture; targets, detections: in the second renderer's; not_carried:
+    what of the change it left out. `seconds` alone may differ between two calls.
     """
 
     identifier: str
     source: str
+    renderer: str
     compositor: tuple[RendererFailure, ...]
-    generator: tuple[RendererFailure, ...]
+    second: tuple[RendererFailure, ...]
     stands: tuple[Stand, ...]
     targets_benign: tuple[BoxRecord, ...]
     targets_changed: tuple[BoxRecord, ...]

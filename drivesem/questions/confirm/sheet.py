@@ -1,4 +1,4 @@
-"""Both pictures of a counterexample on one sheet: the compositor's above the generator's, and cars enlarged."""
+"""Both pictures of a counterexample on one sheet: the compositor's, the second renderer's, and cars enlarged."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ _LINE_PX = TEXT_PX + 8
 
 
 def sheet_of(frame: Frame, confirmed: Confirmed, image: np.ndarray, t_star: float) -> np.ndarray:
-    """The sheet (h, w, 3) uint8. image (H, W, 3) uint8: the generator's picture of the change."""
+    """The sheet (h, w, 3) uint8. image (H, W, 3) uint8: the second renderer's picture of the change."""
     composed = files.read_image(frame.pictures["attacked"])
     result = frame.result
     ours = _marked(composed, result.targets_moved, result.detections_attacked, confirmed.compositor, t_star)
-    theirs = _marked(image, confirmed.targets_changed, confirmed.detections_changed, confirmed.generator, t_star)
+    theirs = _marked(image, confirmed.targets_changed, confirmed.detections_changed, confirmed.second, t_star)
     titles = (
         f"{confirmed.identifier}, compositor: {_told(confirmed.compositor)}",
-        f"{confirmed.identifier}, generator: {_told(confirmed.generator)}",
+        f"{confirmed.identifier}, {confirmed.renderer}: {_told(confirmed.second)}",
     )
-    strip = _strip(composed, image, _places(confirmed, result.targets_moved), composed.shape[1])
+    names = ("compositor", confirmed.renderer)
+    strip = _strip(names, (composed, image), _places(confirmed, result.targets_moved), composed.shape[1])
     height, width = composed.shape[:2]
     canvas = np.empty(
         (2 * (height + _LINE_PX) + strip.shape[0] + 4 * MARGIN_PX, width + 2 * MARGIN_PX, 3), np.uint8
@@ -69,7 +70,7 @@ def _told(found: Sequence[RendererFailure]) -> str:
 
 def _places(confirmed: Confirmed, moved: Sequence[BoxRecord]) -> list[tuple[float, ...]]:
     """Boxes worth a closer look: failures, then the largest of the scene's cars that count."""
-    places: list[tuple[float, ...]] = [f.xyxy for f in (*confirmed.compositor, *confirmed.generator)]
+    places: list[tuple[float, ...]] = [f.xyxy for f in (*confirmed.compositor, *confirmed.second)]
     cars = sorted((t for t in moved if t.index is not None and not t.ignore), key=lambda t: t.xyxy[1] - t.xyxy[3])
     for box in (t.xyxy for t in cars):
         if all(abs(box[0] - p[0]) + abs(box[1] - p[1]) > 8 for p in places):
@@ -77,20 +78,25 @@ def _places(confirmed: Confirmed, moved: Sequence[BoxRecord]) -> list[tuple[floa
     return places[:_ENLARGED]
 
 
-def _strip(composed: np.ndarray, image: np.ndarray, places: Sequence[tuple[float, ...]], width: int) -> np.ndarray:
+def _strip(
+    names: tuple[str, str],
+    pictures: tuple[np.ndarray, np.ndarray],
+    places: Sequence[tuple[float, ...]],
+    width: int,
+) -> np.ndarray:
     """Pairs of enlarged windows, the compositor's left, side by side in `width` px."""
     cell = (width - (2 * _ENLARGED - 1) * MARGIN_PX) // (2 * _ENLARGED)
     strip = np.empty((cell + _LINE_PX if places else 0, width, 3), np.uint8)
     strip[:] = PAPER
     for column, box in enumerate(places):
-        for side, picture in enumerate((composed, image)):
+        for side, picture in enumerate(pictures):
             x = (2 * column + side) * (cell + MARGIN_PX)
             paste(
                 strip,
                 (x, _LINE_PX),
                 cv2.resize(_window(picture, box), (cell, cell), interpolation=cv2.INTER_CUBIC),
             )
-            title = ("compositor", "generator")[side]
+            title = names[side]
             if text_extent(title, TEXT_PX)[0] <= cell:
                 write_text(strip, (x, 0), title)
     return strip

@@ -12,6 +12,7 @@ from drivesem.attack.objective import GRADIENT_PASSES
 from drivesem.attack.space import Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
+from drivesem.run.protocol import follows_paper
 from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 
@@ -76,9 +77,8 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
 
 
 def _arm(name: str, config: Attack, reference: float | None = None) -> Arm:
-    """reference: the paper's figure; it stands beside the paper's method and detector only."""
-    theirs = config.method == "si-fgsm" and config.detector == "squeezedet"
-    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if theirs else None)
+    """reference: the paper's figure; it stands beside the paper's own protocol only."""
+    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if follows_paper(config) else None)
 
 
 def _combo(base: Attack, number: int) -> Arm:

@@ -1,4 +1,4 @@
-"""The paper's experiments on frames of one's own, its figures beside ours."""
+"""The paper's experiments, and others, on frames of one's own."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from drivesem.report.answer import Answer
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line
-from drivesem.truth.redraw.plans import open_plans
+from drivesem.truth.redraw.choose import SecondRenderers
 
 _PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
 _TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
@@ -65,7 +65,7 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     workers = workers_of(arms)
     claim(out, config, _WRITTEN, _FREE)
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
-        open_plans(workers[0].config, None)
+        SecondRenderers(workers[0].config.dataset, workers[0].config.root).check()
     ran = run_arms(arms, workers, out)
     found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out))
     write_largest(out / _LARGEST, largest(ran.runs, out))
@@ -73,7 +73,7 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
 
 
 def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
-    """What the generator's pictures say of each arm that is no control, where that is asked."""
+    """What second renderers' pictures say of each arm that is no control, where that is asked."""
     if not config.confirm:
         return {}
     shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
@@ -105,7 +105,7 @@ _STUDIES = {"transfer": _transfer, "retrain": _retrain}
 
 def _findings(config: Study, ran: Ran) -> Findings:
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    grades = [grades_of(one, draws, config.seed) for one in ran.runs]
+    grades = [grades_of(one, draws, config.seed) for one in ran.runs if not one.summary.frames_ungraded]
     found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
     if config.name == "labels":
         return replace(found, label_sets=[label_sets(one) for one in ran.runs])

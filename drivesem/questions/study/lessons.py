@@ -17,6 +17,7 @@ from drivesem.data.registry import Dataset, open_dataset
 from drivesem.questions.study.arms import Arm, attack_of
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.run.attack import Worker
+from drivesem.run.protocol import follows_paper
 from drivesem.scenes.sources import SceneSource
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
@@ -58,14 +59,14 @@ _QUICK = {"steps": 40, "window": "640x224", "warmup": 10}
 @dataclass(frozen=True, slots=True)
 class Lesson:
     """One retraining. folder: short name; pictures: what is shown among benign frames; reference: the paper's mAP
-    on counterexamples and on benign frames.
+    on counterexamples and on benign frames, of what the paper has, too.
     """
 
     name: str
     folder: str
     pictures: Stage
     config: Retrain
-    reference: tuple[float, float]
+    reference: tuple[float, float] | None
 
     @property
     def run(self) -> str:
@@ -129,15 +130,19 @@ def lessons_of(study: Study) -> list[Lesson]:
         ours, paper = (replace(one, steps=study.train_steps) for one in (ours, paper))
     lessons = [
         Lesson("retrained on benign re-rendered images", "re-rendered", "rerender", ours, _PAPER_BEFORE),
-        Lesson("retrained, ours", "ours", "counterexample", ours, _PAPER_AFTER),
+        Lesson("retrained, ours", "ours", "counterexample", ours, None),
     ]
     if not study.quick:
         lessons.append(Lesson("retrained, paper's protocol", "paper", "counterexample", paper, _PAPER_AFTER))
     return lessons
 
 
-def reference_of(name: str, lessons: Sequence[Lesson]) -> tuple[float, float]:
-    """The paper's mAP on counterexamples and on benign frames, of a detector by name."""
+def reference_of(name: str, lessons: Sequence[Lesson], study: Study) -> tuple[float, float] | None:
+    """The paper's mAP on counterexamples and on benign frames, of a detector by name; None where it has none, or
+    where the study's attack is another than the paper's.
+    """
+    if not follows_paper(learning_arm(study).config):
+        return None
     return next((lesson.reference for lesson in lessons if lesson.name == name), _PAPER_BEFORE)
 
 

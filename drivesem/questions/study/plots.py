@@ -50,7 +50,7 @@ def write_plot(path: Path, found: Findings) -> None:
             _grades(axes, sure)
         else:
             _falls(axes, found.rows)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, fontsize=9)
+        figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     buffer = io.BytesIO()
     # no date and no version in the file: equal figures give equal bytes
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})

@@ -21,8 +21,13 @@ from drivesem.report.answer import Answer
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.report.tables import Sheet, percent
 from drivesem.settings.commands import Study
+from drivesem.truth.certificate import Rule
 from drivesem.truth.grades import Grade, Kind
 
+OWN_PROTOCOL = (
+    "Ours, own protocol: not comparable with the paper's figures, which stand beside its own protocol only "
+    "(--config configs/paper.yaml)."
+)
 _ARM, _MEASURE = "arm", "figure"
 _WORDS = (_ARM, _MEASURE)
 _MARKS = (1, 2, 5, 10, 20, 64)
@@ -48,7 +53,7 @@ class Told:
 class Findings:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
     within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
-    the generator's pictures say, by arm. grades: how sure failures are, of every arm, controls included.
+    second renderers' pictures say, by arm. grades: how sure failures are, of every arm, controls included.
     """
 
     study: Study
@@ -102,7 +107,7 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     if found.label_sets:
         tables += [_label_sets(found.label_sets), _counterexamples(found.label_sets)]
     if found.grades and (whole or found.study.name == "grades"):
-        tables += [_grades(found.grades), _kinds(found.grades)]
+        tables += [_grades(found.grades) if whole else _grades_short(found.grades), _kinds(found.grades)]
     tables.append(_precision(found.rows))
     if any(row.controls for row in found.rows):
         tables.append(_controls(found.rows))
@@ -152,7 +157,7 @@ def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
         lines.append(tuple(cells))
     names = next(iter(confirmed.values())).shares
     return Sheet(
-        "Failures that survive the generator's renderer, %",
+        "Failures that survive a second renderer, %",
         (_ARM, "drawn", *(s.name for s in names)),
         tuple(lines),
     )
@@ -177,12 +182,28 @@ def _grades(grades: Sequence[ArmGrades]) -> Sheet:
     return Sheet("Failures by grade, each with those above it", columns, tuple(lines))
 
 
+def _grades_short(grades: Sequence[ArmGrades]) -> Sheet:
+    """The same for a terminal: counts in one column."""
+    lines = []
+    for one in grades:
+        survive = f"{bounded(one.survive)} of {one.asked}" if one.asked else "-"
+        counts = _by_grade([one.counts[grade] for grade in Grade])
+        lines.append((one.name, counts, str(one.objects), bounded(one.rates[Grade.CERTAIN]), survive))
+    columns = (_ARM, "failures", "objects", "certain, % of objects", "confirmed, % of certain")
+    return Sheet(f"Failures by grade: {' / '.join(Grade)}", columns, tuple(lines))
+
+
 def _kinds(grades: Sequence[ArmGrades]) -> Sheet:
     told = (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)
     lines = [
-        (one.name, *(" / ".join(str(one.kinds[kind][grade]) for grade in told) for kind in Kind)) for one in grades
+        (one.name, *(_by_grade([one.kinds[kind][grade] for grade in told]) for kind in Kind)) for one in grades
     ]
     return Sheet(f"Kinds of failure: {' / '.join(told)}", (_ARM, *map(str, Kind)), tuple(lines))
+
+
+def _by_grade(counts: Sequence[int]) -> str:
+    """`7 / 3 / 2`, or a dash where there is none."""
+    return " / ".join(map(str, counts)) if any(counts) else "-"
 
 
 def _further(rows: Sequence[StudyRow]) -> Sheet:
@@ -204,7 +225,8 @@ def _frames(rows: Sequence[StudyRow]) -> Sheet:
     for row in rows:
         flat = row.flat()
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
-        lines.append((row.name, *(str(flat[key]) for key in ("frames", *keys, "queries"))))
+        # An arm may have none of the controls that another has.
+        lines.append((row.name, *(str(flat.get(key, "-")) for key in ("frames", *keys, "queries"))))
     columns = (_ARM, "frames", *MODES, *controls, "queries")
     return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
 
@@ -255,11 +277,17 @@ def notes(found: Findings) -> list[str]:
     ]
     if any(row.run.arm.reference is not None for row in found.rows):
         told.append(
-            f"There: in the paper, with its own detector on Virtual KITTI; mAP {100 * PAPER_BENIGN:.1f} before."
+            "Ours, under the paper's protocol. There: in the paper, with its own detector on Virtual KITTI; mAP "
+            f"{100 * PAPER_BENIGN:.1f} before."
+        )
+    elif found.study.name in ("single", "multi"):
+        told.append(OWN_PROTOCOL)
+    if any(RANDOM in row.controls for row in found.rows):
+        told.append(
+            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead."
         )
     if any(row.controls for row in found.rows):
         told.append(
-            "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead. "
             "Placebo: one random edit as large as the attack's, through the same pipeline; its size beside the "
             "attack's, which projection onto what is feasible may lessen. The attack's effect is what it lowers "
             "AP50 by more than the placebo."
@@ -278,16 +306,21 @@ def notes(found: Findings) -> list[str]:
         )
     if found.confirmed:
         told.append(
-            "Survive: the same change, drawn by the generator and with exact labels, fails the detector too; in "
-            "brackets Wilson's 95 %. Generator only: of frames that did not fail before."
+            "Survive: the same change, drawn by a second renderer and with its labels, fails the detector too; in "
+            "brackets Wilson's 95 %. Second only: of frames that did not fail before."
         )
     if found.grades:
+        rule = Rule(found.study.draws)
         told.append(
-            "Certain: right in 15 of 16 draws of a camera's small changes before, wrong in 12 of 16 after. "
+            f"Certain: right in {rule.before} of {rule.draws} draws of a camera's small changes before, wrong in "
+            f"{rule.after} of {rule.draws} after. "
             "Confirmed: a second renderer's pictures fail too, in 3 of 4. Shared: so does another architecture. "
             "Kinds leave out what a person would not call a failure: found as far as it shows, on a real object, "
             "suspect before."
         )
+    unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
+    if unknown:
+        told.append(f"Grades unknown, of an older version: {', '.join(unknown)}.")
     share = feasible_fraction([result for run in found.ran.runs for result in run.results])
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
     if found.ran.without_vehicles:

@@ -55,7 +55,7 @@ class Judged:
     """
 
     name: str
-    reference: tuple[float, float]
+    reference: tuple[float, float] | None
     t_star: float
     benign_frames: int
     benign: ClassScores
@@ -67,7 +67,7 @@ class Judged:
 
     def flat(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
-        counterexamples, benign = self.reference
+        counterexamples, benign = self.reference or (None, None)
         theirs, fresh = self.known.flat(), self.fresh.flat()
         found: dict[str, Any] = {
             "name": self.name,
@@ -299,7 +299,7 @@ def rows_for(
         found.append(
             Judged(
                 name=name,
-                reference=plan.reference_of(name, lessons),
+                reference=plan.reference_of(name, lessons, study),
                 t_star=one.t_star,
                 benign_frames=one.frames,
                 benign=one.scores,

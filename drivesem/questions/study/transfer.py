@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from detectors.base import Predictor
-from detectors.squeezedet import SqueezeDet
 from detectors.yolov3.yolov3 import YoloV3
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import DRAWS, Interval, differences
 from drivesem.questions.study.arms import Arm
-from drivesem.questions.study.report import Told
+from drivesem.questions.study.report import OWN_PROTOCOL, Told
 from drivesem.questions.study.rows import MODES, feasible_fraction
 from drivesem.questions.study.running import ARMS, Ran, run_arms
 from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, rows_of
@@ -25,9 +23,10 @@ from drivesem.questions.transfer.report import sheets as matrix_sheets
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.attack import Worker
-from drivesem.run.finished import Run, load_runs
+from drivesem.run.finished import load_runs
+from drivesem.run.protocol import follows_paper
 from drivesem.settings.blocks import Asking
-from drivesem.settings.commands import DEFAULT_COMBO, Study
+from drivesem.settings.commands import DEFAULT_COMBO, Attack, Study
 
 _SIDES = ("source", "target")
 _LABELS = "labels"
@@ -114,13 +113,13 @@ def run(
     split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
     draws = DRAWS if study.bootstrap is None else study.bootstrap
     found: list[Before] = []
-    for arm, worker, one in zip(arms, workers, named, strict=True):
+    for arm, one in zip(arms, named, strict=True):
         if arm.control is not None:
             continue
         beside = next((o for a, o in zip(arms, named, strict=True) if a.of == arm.name), None)
         for place, target in enumerate(asked):
             placebo = None if beside is None else split[beside.folder][place]
-            reference = _reference(worker.detector, one, target)
+            reference = _reference(arm.config, target)
             row = split[one.folder][place]
             beyond = {}
             if placebo is not None:
@@ -145,13 +144,13 @@ def _settings(study: Study) -> Asking:
     )
 
 
-def _reference(source: Predictor, run: Run, target: Asked) -> tuple[float, float] | None:
-    """The paper's mAP for a SqueezeDet and itself, or a YOLOv3 of any size."""
-    if not isinstance(source, SqueezeDet):
+def _reference(attack: Attack, target: Asked) -> tuple[float, float] | None:
+    """The paper's mAP under its own protocol: of the SqueezeDet that was attacked, and of a whole YOLOv3."""
+    if not follows_paper(attack):
         return None
-    if target.order.detector == run.detector:
+    if target.order.detector == attack.detector:
         return PAPER_BENIGN, PAPER_COMBOS[DEFAULT_COMBO]
-    return PAPER_TRANSFER if isinstance(target.predictor, YoloV3) else None
+    return PAPER_TRANSFER if type(target.predictor) is YoloV3 else None
 
 
 def told(found: Matrix) -> Told:
@@ -173,18 +172,19 @@ def _plain(sheet: Sheet, sources: Sequence[str]) -> Sheet:
 
 
 def _precision(rows: Sequence[Before]) -> Sheet:
-    lines = []
+    lines, told = [], _has_references(rows)
     for one in rows:
         row, there = one.row, one.reference or (None, None)
         scores = (row.benign, row.rerendered, row.paper, row.moved)
-        lines.append((*_sides(row), *(percent(s.headline.ap50) for s in scores), *map(percent, there)))
-    columns = (*_SIDES, "benign", "re-rendered", *MODES, "benign there", "attacked there")
+        cells = (*_sides(row), *(percent(s.headline.ap50) for s in scores))
+        lines.append((*cells, *map(percent, there)) if told else cells)
+    columns = (*_SIDES, "benign", "re-rendered", *MODES, *(["benign there", "attacked there"] if told else []))
     return Sheet(f"{HEADLINE} AP50, %", columns, tuple(lines))
 
 
 def _falls(rows: Sequence[Before]) -> Sheet:
     controlled = any(one.placebo is not None for one in rows)
-    lines = []
+    lines, told = [], _has_references(rows)
     for one in rows:
         there, attacked = one.reference or (None, None)
         fallen = None if there is None or attacked is None else there - attacked
@@ -192,9 +192,15 @@ def _falls(rows: Sequence[Before]) -> Sheet:
         if controlled:
             cells.append("-" if one.placebo is None else bounded(_fall(one.placebo, "moved")))
             cells.append(bounded(one.beyond["moved"]) if one.beyond else "-")
-        lines.append((*cells, "-" if fallen is None else f"{100 * fallen:.1f}"))
-    columns = [*_SIDES, *MODES, *(["placebo, moved", "attack less placebo"] if controlled else []), "there"]
+        cells += ["-" if fallen is None else f"{100 * fallen:.1f}"] if told else []
+        lines.append(tuple(cells))
+    columns = [*_SIDES, *MODES, *(["placebo, moved", "attack less placebo"] if controlled else [])]
+    columns += ["there"] if told else []
     return Sheet(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
+
+
+def _has_references(rows: Sequence[Before]) -> bool:
+    return any(one.reference is not None for one in rows)
 
 
 def _sides(row: TransferRow) -> tuple[str, str]:
@@ -225,10 +231,15 @@ def notes(found: Matrix) -> list[str]:
         "Each source was attacked by combination 2; each target looked at the photographs, at the same rendered "
         "again without any change, and at the counterexamples.",
         f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
-        f"There: in the paper, whose SqueezeDet fell from {100 * PAPER_BENIGN:.1f} to "
-        f"{100 * PAPER_COMBOS[DEFAULT_COMBO]:.1f} on Virtual KITTI, and a YOLOv3, trained on KITTI, from {there} "
-        "before the same pictures.",
     ]
+    if _has_references(found.rows):
+        lines.append(
+            "Ours, under the paper's protocol. There: in the paper, whose SqueezeDet fell from "
+            f"{100 * PAPER_BENIGN:.1f} to {100 * PAPER_COMBOS[DEFAULT_COMBO]:.1f} on Virtual KITTI, and a YOLOv3, "
+            f"trained on KITTI, from {there} before the same pictures."
+        )
+    else:
+        lines.append(OWN_PROTOCOL)
     if any(one.placebo is not None for one in found.rows):
         lines.append(
             "Placebo: one random edit as large as the attack's, before the same target. What the attack takes "

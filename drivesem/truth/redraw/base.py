@@ -36,6 +36,10 @@ class SecondRenderer(Protocol):
         """A state of the scene. Raises SceneError where the change cannot be drawn."""
         ...
 
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """What of a change `redraw` leaves out, in words; nothing where it draws it whole."""
+        ...
+
 
 class NoSecondRendererError(SceneError):
     """Nothing on this machine can draw the scene a second time; the message says what to install."""

@@ -12,6 +12,7 @@ from drivesem.truth.redraw.base import SecondRenderer
 from drivesem.truth.redraw.generator import GeneratorRedraw
 from drivesem.truth.redraw.photograph import PhotographRedraw
 from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
+from drivesem.truth.redraw.screen import shared_screen
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR
 
@@ -23,6 +24,7 @@ class SecondRenderers:
     """
 
     def __init__(self, dataset: str, root: str | None) -> None:
+        self._dataset = dataset
         self._folder = _folder_plans(dataset, root)
         self._last: tuple[Tensor, SecondRenderer] | None = None
 
@@ -33,6 +35,11 @@ class SecondRenderers:
         if self._last is None or self._last[0] is not scene.photograph:
             self._last = (scene.photograph, self._made(identifier, scene))
         return self._last[1]
+
+    def check(self) -> None:
+        """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
+        if self._folder is None and self._dataset != DEMO:
+            shared_screen()
 
     def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder

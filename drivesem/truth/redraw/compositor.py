@@ -23,6 +23,11 @@ class CompositorDraw:
     def name(self) -> str:
         return "compositor"
 
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """Nothing is left out."""
+        del changed
+        return ()
+
     @torch.no_grad()
     def redraw(self, changed: SceneIR) -> Redrawn:
         """A state of the scene, as a file would hold it."""

@@ -50,6 +50,10 @@ class GeneratorRedraw:
         _check_same(identifier, scene.photograph, frame.image)
         self._before = self._last = _Drawn(self.carried(self._still).edit, frame, surround)
 
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """Changes of vehicles for which the plan has no counterpart."""
+        return self.carried(changed).missing
+
     def carried(self, changed: SceneIR) -> Carried:
         """The change as an edit of the plan, and what of it the plan has no counterpart for."""
         return carried(self._still, changed, self._planned)

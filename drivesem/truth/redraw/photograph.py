@@ -77,6 +77,11 @@ class PhotographRedraw:
         self._shares = before.shares
         self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), before)
 
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """Nothing is left out."""
+        del changed
+        return ()
+
     @torch.no_grad()
     def redraw(self, changed: SceneIR) -> Redrawn:
         """A state of the scene. Labels: the photograph's, moved as the boxes of the meshes move. Ignored are
@@ -228,7 +233,7 @@ def _levels(colour: Array) -> NDArray[np.uint8]:
 
 def _around(placed: Sequence[Array], lens: Lens) -> Window | None:
     """The part of the picture that shows vehicles; None where none does."""
-    boxes = np.array([lens.box(p) for p in placed])
+    boxes = np.array([lens.box(p) for p in placed]).reshape(-1, 4)
     boxes = boxes[~np.isnan(boxes).any(axis=1)]
     if not len(boxes):
         return None

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.settings.blocks import DEMO
-from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.synth.demo import demo_plan
 from drivesem.synth.frames import GENERATOR_VERSION, Plan
@@ -115,17 +113,3 @@ def _order(root: Path, manifest: Mapping[str, Any]) -> Order:
         cameras=manifest["cameras"],
         validation=manifest["validation"],
     )
-
-
-def open_plans(attack: Attack, root: str | None) -> Plans:
-    """The plans of a run's frames. attack: its settings; root: of its data set, where it is no longer where the
-    run found it. Raises UsageError where its frames were not generated, FormatError for a manifest that says too
-    little.
-    """
-    if attack.dataset == DEMO:
-        if root is not None:
-            raise UsageError("--root", "none for the embedded scenes", root)
-        return DemoPlans()
-    if attack.dataset != "kitti":
-        raise UsageError("--run", _GENERATED, f"one on data set {attack.dataset!r}")
-    return FolderPlans(Path(root or attack.root or ""))

@@ -1,6 +1,7 @@
 """`drivesem bench` as a user types it: one JSON object, files, and errors on one line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from drivesem.bench import memory, render, step
+from drivesem.bench.planted import yardstick
 from drivesem.bench.scenes import bench_scene
 from drivesem.cli import main
 from drivesem.commands import bench
@@ -149,3 +151,41 @@ def test_out_must_be_a_folder_or_a_new_file(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "taken").write_text("")
     assert main(["bench", "step", "--out", str(tmp_path / "taken")]) == 2
     assert "--out" in capsys.readouterr().err
+
+
+def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """What is done is kept, and the figures are of it."""
+    row = yardstick.Attempt("demo-000", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 1, 1, 1, 50, 4.0)
+    asked = []
+
+    def judged(self: yardstick.Yardstick, name: str) -> yardstick.Judged:
+        asked.append(name)
+        return yardstick.Judged(name, (replace(row, frame=name),), ("contrast rare",))
+
+    monkeypatch.setattr(yardstick.Yardstick, "_judge", judged)
+    words = ["bench", "planted", "--methods", "halton", "--limit", "2", "--workers", "1", "--json"]
+    for _ in range(2):
+        assert main([*words, "--out", str(tmp_path)]) == 0
+        result = json.loads(capsys.readouterr().out)
+    assert asked == ["demo-000", "demo-001"]
+    (summed,) = result["rows"]
+    assert (summed["found"], summed["faults"], summed["found_per_100"]) == (2, 2, 2.0)
+    assert result["kinds"][1]["planted"] == 0
+    assert main([*words, "--out", str(tmp_path), "--passes", "48"]) == 0
+    assert len(asked) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["planted", "--methods", "halton,luck"], "--methods: expected names among"),
+        (["planted", "--passes", "3"], "--passes: expected at least"),
+        (
+            ["step", "--dataset", "kitti", "--root", "."],
+            "--dataset: expected --dataset demo, but for",
+        ),
+    ],
+)
+def test_bad_input_of_planted(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *words]) == 2
+    assert message in capsys.readouterr().err

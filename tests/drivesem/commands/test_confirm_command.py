@@ -1,4 +1,4 @@
-"""`drivesem confirm` on a small run of `drivesem attack`: the generator draws what the compositor drew."""
+"""`drivesem confirm` on small runs of `drivesem attack`: a second renderer draws what the compositor drew."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ import pytest
 import yaml
 
 from drivesem.cli import main
-from drivesem.questions.confirm import frame as confirm_frame
 from drivesem.questions.confirm.results import load
 from drivesem.run.results import load_frame
+from drivesem.truth.redraw import screen
+from drivesem.truth.redraw.base import NoSecondRendererError
+from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 
 
@@ -63,7 +65,7 @@ def test_vehicles_stand_where_the_compositor_put_them(run: Path) -> None:
     frame = run / "frames" / "demo-000"
     result, found = (
         load_frame(frame / "result.json"),
-        load(out / "frames" / "demo-000" / "result.json"),
+        load(out / "frames" / "demo-000" / "confirmed.json"),
     )
     assert len(found.compositor) == len(result.failures)
     assert [s.iou_benign for s in found.stands] == pytest.approx([1.0] * result.objects, abs=1e-4)
@@ -92,8 +94,8 @@ def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
 ) -> None:
     before = json.loads((run / "confirm" / "confirm.json").read_text())
     draws: list[int] = []
-    draw = confirm_frame.render_frame
-    monkeypatch.setattr(confirm_frame, "render_frame", lambda plan: draws.append(1) or draw(plan))
+    draw = GeneratorRedraw.redraw
+    monkeypatch.setattr(GeneratorRedraw, "redraw", lambda self, scene: draws.append(1) or draw(self, scene))
     again = confirm(run)
     assert again == before | {"run": str(run)}
     assert draws == []
@@ -106,7 +108,7 @@ def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
 def test_another_picture_is_refused(
     run: Path, confirm: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    benign = run / "frames" / "demo-000" / "benign.png"
+    benign = run / "frames" / "demo-000" / "scene" / "photograph.png"
     image = files.read_image(benign)
     image[5, 5] ^= 64
     files.write_png(benign, image)
@@ -114,7 +116,8 @@ def test_another_picture_is_refused(
     assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(out)]) == 2
     told = " ".join(capsys.readouterr().err.split())
     assert (
-        f"{benign}: expected the picture that the generator makes of this frame, found one 64 levels off" in told
+        "photograph of demo-000: expected the picture that the generator makes of it, found one 64 levels off"
+        in told
     )
     words = ("--run", str(run), "--workers", "1", "--out", str(out), "--keep-going")
     assert main(["confirm", *words]) == 2
@@ -131,12 +134,50 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert refused() == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
     assert refused("--run", run, "--root", tmp_path).startswith("--root: expected none for the embedded scenes")
-    path = run / "config.yaml"
-    settings = yaml.safe_load(path.read_text())
-    photographs = tmp_path / "kitti"
-    path.write_text(yaml.safe_dump(settings | {"dataset": "kitti", "root": str(photographs)}))
-    assert refused("--run", run).endswith(f"found one on {photographs}, which has no manifest.json")
-    path.write_text(yaml.safe_dump(settings | {"dataset": "coco", "root": str(photographs)}))
-    assert refused("--run", run).endswith("found one on data set 'coco'")
     (run / "metrics.json").unlink()
     assert "a finished run" in refused("--run", run)
+
+
+@pytest.fixture
+def photographs(run: Path, tmp_path: Path) -> Path:
+    """The run as if its frames were photographs of a data set."""
+    shutil.rmtree(run / "confirm")
+    path = run / "config.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"dataset": "coco", "root": str(tmp_path)}))
+    for file in (run / "frames").glob("*/scene/scene.json"):
+        data = json.loads(file.read_text())
+        data["provenance"]["dataset"] = "coco"
+        file.write_text(json.dumps(data))
+    return run
+
+
+def test_photographs_are_drawn_by_pyrender(photographs: Path, confirm: Callable[..., dict[str, Any]]) -> None:
+    try:
+        screen.shared_screen()
+    except NoSecondRendererError as error:
+        pytest.skip(str(error))
+    data = confirm(photographs)
+    assert (data["frames"], data["not_carried"]) == (1, {})
+    assert data["box_iou"]["least"] > 0.99
+    frame, out = photographs / "frames" / "demo-000", photographs / "confirm" / "frames" / "demo-000"
+    found = load(out / "confirmed.json")
+    assert found.renderer == "pyrender"
+    assert len(found.compositor) == len(load_frame(frame / "result.json").failures)
+    drawn, benign, composed = (
+        files.read_image(path).astype(float)
+        for path in (out / "pyrender.png", frame / "benign.png", frame / "counterexample.png")
+    )
+    assert np.abs(drawn - composed).mean() < 0.5 * np.abs(benign - composed).mean()
+
+
+def test_without_opengl_nothing_is_written(
+    photographs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setattr(screen, "_LIBRARIES", {})
+    screen.shared_screen.cache_clear()
+    assert main(["confirm", "--run", str(photographs), "--workers", "1"]) == 2
+    screen.shared_screen.cache_clear()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "install Debian's libegl1 or libosmesa6" in line
+    assert not (photographs / "confirm").exists()

@@ -19,7 +19,9 @@ from drivesem.cli import main
 from drivesem.report.frames import cards_of
 from drivesem.report.plots import COLOURS
 from drivesem.run.page import load_shown
+from drivesem.run.protocol import PROTOCOL
 from drivesem.run.results import load_frame
+from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -114,12 +116,32 @@ def test_boxes_are_those_of_the_results(page: Path, parse: Callable[[Path], Any]
     assert "nothing → 0.70" in found.text
 
 
-def test_figures_stand_beside_the_papers(page: Path, parse: Callable[[Path], Any]) -> None:
+def test_the_papers_figures_stand_beside_its_protocol_only(
+    tmp_path: Path,
+    page: Path,
+    frame: Callable[..., Any],
+    make_run: Callable[..., Path],
+    parse: Callable[[Path], Any],
+) -> None:
+    text = parse(page).text
+    assert "65.9" not in text
+    assert "Ours, own protocol: not comparable" in text
+    theirs = make_run(tmp_path / "theirs", [frame("1", lost=True)], Attack(**PROTOCOL))  # pyright: ignore[reportArgumentType]
+    assert main(["report", str(theirs)]) == 0
+    text = parse(theirs / "report.html").text
+    assert "99.4 → 65.9" in text
+    assert "Ours, under the paper's protocol" in text
+    both = tmp_path / "own"
+    own = make_run(both, [frame("1")])
+    assert main(["report", str(own), str(theirs), "--out", str(tmp_path / "both.html")]) == 0
+    assert "paper's mAP after" in parse(tmp_path / "both.html").text
+
+
+def test_figures_are_told(page: Path, parse: Callable[[Path], Any]) -> None:
     found = parse(page)
     metrics = json.loads((page.parent / "metrics.json").read_text())
     text = " ".join(found.text.split())
     assert f"{100 * metrics['benign']['ap50']:.1f} → {100 * metrics['attacked']['moved']['ap50']:.1f}" in text
-    assert "99.4 → 65.9" in text
     assert "squeezedet loses 2 objects and makes up 2, in 3 of 4 frames" in text
     for what in ("+0.21 m", "−0.08 m", "+17.2°", "1 offsets, up to 0.04 m", "drivesem attack"):
         assert what in text

@@ -43,13 +43,13 @@ def test_horizon_and_plane_depth_of_a_level_camera():
     assert depth[188, 100] == pytest.approx(380 * 1.65 / 100, rel=1e-4)
 
 
-def test_depth_is_ground_below_a_wall_above_and_infinite_in_the_sky():
+def test_walls_stand_on_the_end_of_the_ground_and_the_sky_is_endlessly_far():
     ground = maps.plane_depth(LEVEL, CAMERA)
     road = np.zeros((200, 480), np.float32)
     road[120:] = 1
     sky = np.zeros_like(road)
     sky[:40] = 1
-    depth = maps.depth_map(ground, road, sky, 88.0)
+    depth = maps.walls(ground, road, np.zeros_like(road), sky, 88.0)
     assert depth[150] == pytest.approx(ground[150])
     assert depth[60, 200] == pytest.approx(ground[120, 200], rel=0.05)
     assert np.isinf(depth[:40]).all()
@@ -63,14 +63,15 @@ def test_where_a_car_stands_there_is_ground_and_no_wall_before_it():
     labels = replace(
         labels_at([[0.0, 1.65, 20.0], [0.0, 1.65, 0.2]]), size_lhw=torch.tensor([[4.0, 1.5, 1.8]] * 2)
     )
-    flat = maps.with_footprints(road, labels, [0, 1], LEVEL, CAMERA)
+    stood = maps.footprints(labels, [0, 1], LEVEL, CAMERA)
     nothing = np.zeros_like(road)
-    before, after = (maps.depth_map(ground, where, nothing, 88.0) for where in (road, flat))
+    before, after = (maps.walls(ground, road, where, nothing, 88.0) for where in (nothing, stood))
     car = slice(240 - 17, 240 + 17)
     assert before[100, car].max() < 11
     assert after[100, car].min() > 20
     assert after[100, :100] == pytest.approx(before[100, :100], rel=0.01)
-    assert set(np.unique(flat)) == {0.0, 1.0}
+    assert set(np.unique(stood)) == {0.0, 1.0}
+    assert not stood[:100].any()
 
 
 def test_sun_is_a_unit_vector_that_points_up():

@@ -1,33 +1,22 @@
-"""Failures in both pictures, by exact labels: what counts, what is ignored, what is the same failure."""
+"""Failures in both pictures, by each renderer's labels: what counts, what is ignored, what is the same failure."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import torch
 
-from detectors.types import CLASSES, Detections
+from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.judging import JudgedClasses
-from drivesem.questions.confirm.judge import findings, stands
+from drivesem.questions.confirm.judge import findings, rows_of, stands
 from drivesem.run.results import BoxRecord, Failure
-from drivesem.truth.redraw.exact import exact_labels
+from drivesem.truth.redraw.base import Redrawn
 
 T_STAR = 0.5
 BOX = (100.0, 100.0, 160.0, 140.0)
-
-
-def truth(track: int, box: tuple[float, ...] = BOX, kind: str = "Car", **changes: Any) -> Any:
-    facts = {"labelled": True, "occlusion": 0, "truncation": 0.0} | changes
-    actor = SimpleNamespace(track=track, label=kind)
-    return SimpleNamespace(actor=actor, box_xyxy=np.array(box, float), **facts)
-
-
-def frame(*truths: Any, ignore: tuple[tuple[float, ...], ...] = ()) -> Any:
-    return SimpleNamespace(
-        truths=truths, labels=SimpleNamespace(ignore_xyxy=torch.tensor(ignore, dtype=torch.float32).reshape(-1, 4))
-    )
+CAR = CLASSES.index("Car")
+NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
 def beside(step: float) -> tuple[float, float, float, float]:
@@ -35,74 +24,67 @@ def beside(step: float) -> tuple[float, float, float, float]:
     return x0 + step, y0, x1 + step, y1
 
 
-def detections(*boxes: tuple[float, ...], label: str = "Car", score: float = 0.9) -> Detections:
+def drawn(
+    *boxes: tuple[float, ...], ignored: tuple[int, ...] = (), region: tuple[float, ...] | None = None
+) -> Redrawn:
+    """A picture with cars in these boxes, and one region for cars."""
+    count = len(boxes)
+    rows = [*boxes, *([region] if region else [])]
+    ignore = [i in ignored for i in range(count)] + [True] * (len(rows) - count)
+    targets = Targets(
+        torch.tensor(rows, dtype=torch.float32).reshape(-1, 4), torch.full((len(rows),), CAR), torch.tensor(ignore)
+    )
+    return Redrawn(torch.zeros(3, 4, 4), targets, torch.zeros(count, 4))
+
+
+def detections(*boxes: tuple[float, ...]) -> Detections:
     count = len(boxes)
     return Detections(
         torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4),
-        torch.full((count,), CLASSES.index(label)),
-        torch.full((count,), score),
+        torch.full((count,), CAR),
+        torch.full((count,), 0.9),
     )
 
 
-def test_what_is_too_hard_before_or_after_is_ignored() -> None:
-    before = frame(
-        truth(0),
-        truth(1, occlusion=2),
-        truth(2),
-        truth(3),
-        truth(4),
-        truth(5, labelled=False),
-        truth(6, kind="Van"),
-    )
-    after = frame(
-        truth(0, beside(9)), truth(1), truth(2, truncation=0.4), truth(4, labelled=False), truth(6, kind="Van")
-    )
-    exact = exact_labels(before, after)
-    assert exact.tracks == (0, 1, 2, 3, 4, 6)
-    assert exact.changed.ignore.tolist() == [False, True, True, True, True, False]
-    assert exact.benign.boxes_xyxy[0].tolist() == list(BOX)
-    assert exact.changed.boxes_xyxy[0].tolist() == list(beside(9))
-    assert exact.changed.boxes_xyxy[3].tolist() == [0, 0, 0, 0]
-    assert exact.changed.labels.tolist() == [CLASSES.index("Car")] * 6
+def test_rows_are_objects_then_regions_of_both_pictures() -> None:
+    before = drawn(BOX, beside(300), beside(500), ignored=(0,), region=beside(700))
+    after = drawn(BOX, beside(310), beside(500), ignored=(2,), region=beside(800))
+    rows = rows_of(before, after, 3)
+    for targets in (rows.benign, rows.changed):
+        assert targets.ignore.tolist() == [True, False, True, True, True]
+        assert targets.boxes_xyxy[3:].tolist() == [list(beside(700)), list(beside(800))]
+    assert rows.benign.boxes_xyxy[1].tolist() == list(beside(300))
+    assert rows.changed.boxes_xyxy[1].tolist() == list(beside(310))
 
 
-def test_people_and_what_comes_into_view_are_regions_of_both() -> None:
-    person = truth(7, beside(200), "Pedestrian")
-    before = frame(truth(0), person, ignore=(beside(400),))
-    after = frame(truth(0), person, truth(8, beside(600)), ignore=(beside(400),))
-    exact = exact_labels(before, after)
-    for targets in (exact.benign, exact.changed):
-        assert targets.ignore.tolist() == [False] + [True] * (len(targets.ignore) - 1)
-    regions = exact.changed.boxes_xyxy[1:, 0].unique().tolist()
-    assert regions == [BOX[0] + step for step in (200, 400, 600)]
-    # each for every class
-    assert len(exact.changed.labels) == 1 + len(CLASSES) * 5
-
-
-def found(failures: list[Failure], after: Detections, *moved: Any) -> Any:
-    """Findings of two cars with tracks 4 and 9, both found before; `moved`: their truths after the change."""
-    before = frame(truth(4), truth(9, beside(300)))
-    exact = exact_labels(before, frame(*(moved or before.truths)))
-    result = SimpleNamespace(failures=failures)
+def found(failures: list[Failure], after: Detections, *moved: tuple[float, ...]) -> Any:
+    """Findings of two cars, both found before; `moved`: their boxes after the change."""
+    before = drawn(BOX, beside(300))
+    rows = rows_of(before, drawn(*moved) if moved else before, 2)
+    result: Any = SimpleNamespace(failures=failures)
     seen = [detections(BOX, beside(300)), after]
-    return findings(result, (9, 4, None), exact, seen, JudgedClasses(CLASSES, CLASSES), T_STAR)
+    return findings(result, rows, seen, JudgedClasses(CLASSES, CLASSES), T_STAR)
 
 
 def test_the_same_vehicle_is_lost_in_both() -> None:
-    ours, theirs = found([Failure("lost", "Car", beside(300), index=0)], detections(BOX))
-    assert [(f.kind, f.track, f.survives) for f in ours] == [("lost", 9, True)]
-    assert [(f.kind, f.track, f.survives, f.xyxy) for f in theirs] == [("lost", 9, True, beside(300))]
+    ours, theirs = found([Failure("lost", "Car", beside(300), index=1)], detections(BOX))
+    assert [(f.kind, f.index, f.survives) for f in ours] == [("lost", 1, True)]
+    assert [(f.kind, f.index, f.survives, f.xyxy) for f in theirs] == [("lost", 1, True, beside(300))]
 
 
 def test_another_vehicle_is_another_failure() -> None:
-    ours, theirs = found([Failure("lost", "Car", BOX, index=1)], detections(BOX))
-    assert [(f.track, f.survives) for f in ours] == [(4, False)]
-    assert [(f.track, f.survives) for f in theirs] == [(9, False)]
+    ours, theirs = found([Failure("lost", "Car", BOX, index=0)], detections(BOX))
+    assert [(f.index, f.survives) for f in ours] == [(0, False)]
+    assert [(f.index, f.survives) for f in theirs] == [(1, False)]
 
 
-def test_without_a_counterpart_nothing_survives() -> None:
-    ours, _ = found([Failure("lost", "Car", beside(300), index=2)], detections(BOX))
-    assert [(f.track, f.survives) for f in ours] == [(None, False)]
+def test_what_is_ignored_is_not_lost() -> None:
+    rows = rows_of(drawn(BOX), drawn(NOTHING, ignored=(0,)), 1)
+    result: Any = SimpleNamespace(failures=[Failure("lost", "Car", BOX, index=0)])
+    seen = [detections(BOX), detections()]
+    ours, theirs = findings(result, rows, seen, JudgedClasses(CLASSES, CLASSES), T_STAR)
+    assert [f.survives for f in ours] == [False]
+    assert theirs == ()
 
 
 def test_phantoms_of_a_class_and_place_are_the_same() -> None:
@@ -117,20 +99,20 @@ def test_phantoms_of_a_class_and_place_are_the_same() -> None:
 
 
 def test_found_where_it_went_is_no_failure() -> None:
-    ours, theirs = found([], detections(BOX, beside(330)), truth(4), truth(9, beside(330)))
+    ours, theirs = found([], detections(BOX, beside(330)), BOX, beside(330))
     assert ours == theirs == ()
 
 
 def test_where_vehicles_stand() -> None:
-    before = frame(truth(4), truth(9, beside(300)))
-    after = frame(truth(4), truth(9, beside(312), occlusion=3))
+    rows = rows_of(drawn(BOX, beside(300), BOX), drawn(BOX, beside(312), NOTHING, ignored=(1, 2)), 3)
     record = [
         BoxRecord(BOX, "Car", index=0),
         BoxRecord(beside(300), "Car", index=1),
         BoxRecord(BOX, "Car", index=2),
     ]
-    moved = [BoxRecord(beside(20), "Car", index=0), BoxRecord(beside(312), "Car", index=1)]
+    moved = [BoxRecord(beside(20), "Car", index=0), BoxRecord(beside(312), "Car", index=1), record[2]]
     result: Any = SimpleNamespace(targets_benign=record, targets_moved=moved)
-    one, two = stands(result, (4, 9, None), exact_labels(before, after), before, after)
-    assert (one.index, one.track, one.judged, one.iou_benign, one.iou) == (0, 4, True, 1.0, 0.5)
-    assert (two.index, two.track, two.judged, two.iou_benign, two.iou) == (1, 9, False, 1.0, 1.0)
+    one, two, three = stands(result, rows, 3)
+    assert (one.index, one.judged, one.iou_benign, one.iou) == (0, True, 1.0, 0.5)
+    assert (two.index, two.judged, two.iou_benign, two.iou) == (1, False, 1.0, 1.0)
+    assert (three.judged, three.iou) == (False, None)

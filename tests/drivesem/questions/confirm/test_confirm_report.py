@@ -19,8 +19,8 @@ from scene_ir.errors import FormatError
 BOX = (100.0, 100.0, 160.0, 140.0)
 
 
-def lost(survives: bool, track: int | None = 1) -> RendererFailure:
-    return RendererFailure("lost", "Car", BOX, track, None, survives)
+def lost(survives: bool, index: int | None = 1) -> RendererFailure:
+    return RendererFailure("lost", "Car", BOX, index, None, survives)
 
 
 def phantom(survives: bool) -> RendererFailure:
@@ -33,9 +33,10 @@ def confirmed(
     facts: dict[str, Any] = {
         "identifier": name,
         "source": "00",
+        "renderer": "generator",
         "compositor": ours,
-        "generator": theirs,
-        "stands": (Stand(0, 1, True, 1.0, 0.9), Stand(1, 2, False, 1.0, 0.1)),
+        "second": theirs,
+        "stands": (Stand(0, True, 1.0, 0.9), Stand(1, False, 1.0, 0.1)),
         "targets_benign": (BoxRecord(BOX, "Car", index=1),),
         "targets_changed": (BoxRecord(BOX, "Car", index=1),),
         "detections_benign": (BoxRecord(BOX, "Car", score=0.9),),
@@ -89,15 +90,15 @@ def test_shares_by_hand() -> None:
         ("frames, same failure", 1, 3),
         ("lost", 1, 2),
         ("phantoms", 0, 2),
-        ("frames, generator only", 1, 2),
+        ("frames, second only", 1, 2),
     ]
     assert (report.shares[0].low, report.shares[0].high) == wilson(2, 3)
     assert report.overlap == (pytest.approx(0.9), 0.9, 5)
     assert {name: s.headline.ap50 for name, s in report.scores.items()} == {
         "photograph": pytest.approx(1.0),
-        "photograph, exact labels": pytest.approx(1.0),
+        "second renderer, unchanged": pytest.approx(1.0),
         "compositor": pytest.approx(1.0),
-        "generator, exact labels": 0.0,
+        "second renderer": 0.0,
     }
     assert report.to_json()["survive"] == pytest.approx(2 / 3)
 
@@ -115,6 +116,7 @@ def test_files(tmp_path: Path) -> None:
     rows = list(csv.DictReader((tmp_path / "confirm.csv").read_text().splitlines()))
     assert [row["survives"] for row in rows] == ["True", "True", "False", "False", "False", "True"]
     assert (rows[0]["lost_both"], rows[0]["phantoms_compositor"], rows[0]["box_iou"]) == ("1", "1", "0.9")
+    assert {row["second"] for row in rows} == {"generator"}
     assert rows[5]["not_carried"] == "objects[3]: no such vehicle"
     text = (tmp_path / "confirm.md").read_text()
     assert "| frames | 3 | 2 | 66.67 |" in text
@@ -122,10 +124,10 @@ def test_files(tmp_path: Path) -> None:
 
 
 def test_a_frame_comes_back(tmp_path: Path) -> None:
-    path = tmp_path / "result.json"
+    path = tmp_path / "confirmed.json"
     path.write_text(dump(FRAMES[0]))
     assert load(path) == FRAMES[0]
-    path.write_text('{"schema": 1}')
+    path.write_text('{"schema": 2}')
     with pytest.raises(FormatError, match="as drivesem confirm writes it"):
         load(path)
     path.write_text('{"schema": 0}')

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, arms_of
+from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
+from drivesem.run.protocol import PROTOCOL
 from drivesem.settings.commands import Study
 
 OUT = Path("out")
@@ -38,7 +40,7 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
     arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7), OUT)}
     assert len(arms) == 3 * count
     for arm in [a for a in arms.values() if a.control is None]:
-        assert (arm.reference is None) == (arm.config.method != "si-fgsm")
+        assert arm.reference is None  # of another protocol than the paper's
         samples, edit = arms[f"{arm.name} {RANDOM}"], arms[f"{arm.name} {PLACEBO}"]
         assert samples.of == edit.of == arm.name
         assert (samples.config.method, samples.config.range, samples.config.queries) == (
@@ -53,11 +55,21 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
     assert len(arms_of(Study(name=name, controls=False), OUT)) == count
 
 
+def test_the_papers_figures_stand_beside_its_own_protocol_only() -> None:
+    theirs = {k: v for k, v in PROTOCOL.items() if k != "early_stop"} | {"controls": False}
+    multi = arms_of(Study(name="multi", **theirs), OUT)  # pyright: ignore[reportArgumentType]
+    assert [arm.reference for arm in multi] == [*PAPER_COMBOS.values(), None]  # the last is Auto-PGD's
+    single = arms_of(Study(name="single", **theirs), OUT)  # pyright: ignore[reportArgumentType]
+    assert [arm.reference for arm in single] == list(PAPER_SINGLE.values())
+    for other in ({"detector": "yolov3-slim"}, {"steps": 7}, {"keep": "best"}, {"budget": "parking"}):
+        arms = arms_of(Study(name="multi", **theirs | other), OUT)  # pyright: ignore[reportArgumentType]
+        assert {arm.reference for arm in arms} == {None}
+
+
 def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
     arms = arms_of(Study(name="multi", steps=7, controls=False), OUT)
     assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
-    assert (arms[-1].config.combo, arms[-1].reference) == (2, None)
-    assert arms_of(Study(name="multi", detector="yolov3-slim", controls=False), OUT)[1].reference is None
+    assert arms[-1].config.combo == 2
     alone = arms_of(Study(name="multi", method="apgd", controls=False), OUT)
     assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
 

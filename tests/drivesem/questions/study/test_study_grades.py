@@ -40,6 +40,7 @@ def runs(frame, arm_run, arm) -> list:
     return [
         arm_run(arm("combo 2"), frames),
         arm_run(arm("combo 2 placebo", control=(PLACEBO, "combo 2")), control),
+        arm_run(arm("combo 2, halton", method="halton"), frames[:1] + control[1:]),
     ]
 
 
@@ -88,11 +89,13 @@ def test_told_to_people(runs: list, tmp_path: Path) -> None:
         rows_of(runs, DRAWS, 0),
         grades=[grades_of(run, DRAWS, 0) for run in runs],
     )
-    by_grade, by_kind = sheets(found, whole=False)[:2]
+    by_grade, by_kind = sheets(found)[:2]
+    assert sheets(found, whole=False)[0].rows[0][:3] == ("combo 2", "4 / 3 / 2 / 1", "8")
     assert by_grade.rows[0][:8] == ("combo 2", "4", "8", "120", "4", "3", "2", "1")
     assert by_grade.rows[1][4:8] == ("4", "0", "0", "0")
     assert by_grade.rows[1][-1] == "-"
     assert dict(zip(by_kind.columns, by_kind.rows[0], strict=True))["missed"] == "3 / 2 / 1"
+    assert sheets(found)[-1].rows[1][-2:] == ("-", "40")  # which has no placebo
     assert any(note.startswith("Certain:") for note in notes(found))
     assert found.to_json()["grades"][0]["survive"] == pytest.approx(2 / 3)
     write_plot(tmp_path / "study.png", found)

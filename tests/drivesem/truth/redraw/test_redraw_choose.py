@@ -1,7 +1,8 @@
-"""Generated frames, embedded or in a folder, go to the generator; a run with --confirm has it, without it none."""
+"""Generated frames, embedded or in a folder, go to the generator, others to pyrender; runs ask if they are to."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from drivesem.synth.demo import demo_scene
 from drivesem.synth.write import Order, synthesise
 from drivesem.truth.redraw.choose import SecondRenderers
 from drivesem.truth.redraw.generator import GeneratorRedraw
+from drivesem.truth.redraw.photograph import PhotographRedraw
+from drivesem.truth.redraw.screen import Screen
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +35,15 @@ def test_frames_of_a_folder_that_the_generator_wrote(folder: Path) -> None:
     scene = open_source(Attack(dataset="kitti", root=str(folder))).scene("000000")
     second = SecondRenderers("kitti", str(folder))
     assert isinstance(second.of("000000", scene), GeneratorRedraw)
+
+
+def test_photographs_go_to_pyrender(screen: Screen, tmp_path: Path) -> None:
+    del screen
+    scene = demo_scene(0, 0)
+    photograph = replace(scene, provenance={**scene.provenance, "dataset": "kitti"})
+    second = SecondRenderers("kitti", str(tmp_path))
+    second.check()
+    assert isinstance(second.of("000000", photograph), PhotographRedraw)
 
 
 def test_attacks_on_one_scene_share_the_renderer() -> None:

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from drivesem.data.kitti import read_labels
-from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
 from drivesem.synth.frames import render_frame
 from drivesem.synth.write import Order, synthesise
-from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, open_plans
+from drivesem.truth.redraw.plans import DemoPlans, FolderPlans
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -85,14 +84,10 @@ def test_manifests_that_cannot_be_used(
 
 def test_photographs_are_no_generated_frames(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"which has no manifest\.json"):
-        open_plans(Attack(dataset="kitti", root=str(tmp_path)), None)
+        FolderPlans(tmp_path)
     (tmp_path / "manifest.json").write_text('{"name": "something else"}')
     with pytest.raises(UsageError, match="another program's"):
-        open_plans(Attack(dataset="kitti", root="moved"), str(tmp_path))
-    with pytest.raises(UsageError, match="one on data set 'coco'"):
-        open_plans(Attack(dataset="coco", root=str(tmp_path)), None)
-    with pytest.raises(UsageError, match="--root"):
-        open_plans(Attack(), str(tmp_path))
+        FolderPlans(tmp_path)
 
 
 def test_an_embedded_scene_names_its_street() -> None:

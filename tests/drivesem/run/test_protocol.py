@@ -1,0 +1,52 @@
+"""Which runs keep to the paper's protocol."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drivesem.attack.budgets import budget_of, written
+from drivesem.run.protocol import PROTOCOL, follows_paper
+from drivesem.settings.commands import Attack
+from drivesem.settings.parsing import parse
+
+PRESET = Path(__file__).parents[3] / "configs" / "paper.yaml"
+
+
+def test_the_preset_is_the_protocol() -> None:
+    preset = yaml.safe_load(PRESET.read_text())
+    assert {name: value for name, value in preset.items() if name not in ("for", "combo", "budget")} == PROTOCOL
+    config = parse(["attack", "--config", str(PRESET)])
+    assert isinstance(config, Attack)
+    assert follows_paper(config)
+    # as a finished run's config.yaml has it, and for other parameters and data
+    other = replace(
+        config, budget=written(budget_of("paper")), combo=None, params="mesh", limit=3, draws=20, seed=5
+    )
+    assert follows_paper(other)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"method": "apgd"},
+        {"detector": "yolov3-slim"},
+        {"steps": 40},
+        {"early_stop": True},
+        {"objective": "objectness"},
+        {"objective_labels": "moved"},
+        {"keep": "best"},
+        {"project": "feasible"},
+        {"budget": "parking"},
+        {"rate": 0.5},
+        {"scouts": 4},
+    ],
+)
+def test_any_other_setting_is_another_protocol(changed: dict[str, object]) -> None:
+    theirs = Attack(**PROTOCOL)  # pyright: ignore[reportArgumentType]
+    assert follows_paper(theirs)
+    assert not follows_paper(replace(theirs, **changed))  # pyright: ignore[reportArgumentType]
+    assert not follows_paper(Attack())

@@ -1,0 +1,379 @@
+"""Train the network that tells how far a photograph's surroundings are (`scene_ir.derender.depth`) on generated
+streets, whose depth is known exactly.
+
+    python tools/train_depth.py --run build/depth
+
+A run first makes its frames (they are kept in its folder), then trains, from the segmenter's weights on. It goes
+on where it was stopped, to the same bytes as one that was never stopped (one thread, one machine).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from averaged import AveragedRun
+from torch import Tensor
+from train_segmenter import (
+    CLASS_OF,
+    HORIZON_ERROR,
+    STORE_HW,
+    classes_of,
+    other_camera,
+    other_colours,
+    other_light,
+    planned,
+    shrunk,
+    taken,
+    window,
+)
+
+from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
+from scene_ir import files
+from scene_ir.derender import depth, maps, segment, unet
+from scene_ir.derender.depth import DepthNet
+from scene_ir.derender.segment import Class
+
+STREAM = 0xDE9
+"""Keeps this tool's random numbers apart from the generator's."""
+HIGHER_FROM, HIGHER = 350, (0.6, 1.7)
+"""Index of a stream's first frame that is taken from another height than KITTI's, and how many times as high those
+may be: sizes of things alone must not tell how far they are, feet on the ground tell it too."""
+LEAST_NEARNESS = 0.01
+"""Added before logarithms are taken: beyond 165 m nothing tells distances apart, and no fog shows them."""
+
+
+def street(seed: int, index: int, split: str) -> SynthFrame:
+    """Frame `index` of a stream, with a background: as the segmenter sees it, from other heights too."""
+    plan = planned(seed, index, split)
+    if index >= HIGHER_FROM:
+        rng = np.random.default_rng([STREAM, seed, index, split == "train"])
+        view = plan.setting.view
+        higher = replace(view, height_m=view.height_m * float(np.exp(rng.uniform(*np.log(HIGHER)))))
+        plan = replace(plan, setting=replace(plan.setting, view=higher))
+    frame = render_frame(plan, with_background=True)
+    assert frame is not None
+    return frame
+
+
+def nearness_of(depth_m: np.ndarray, height_m: float) -> np.ndarray:
+    """Nearness (h, w) float16 at the size of kept frames. depth_m (H, W): each pixel takes one of its."""
+    nearness = (height_m / depth_m).astype(np.float32)
+    return cv2.resize(nearness, STORE_HW[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16)
+
+
+def pictures_of(frame: SynthFrame) -> dict[str, np.ndarray]:
+    """What is kept of a frame with a background: twice, with its actors and without, image (2, h, w, 3) uint8,
+    classes (2, h, w) uint8 and nearness (2, h, w) float16; elevation and the ground's nearness (h, w) float16;
+    focal () px.
+    """
+    assert frame.background is not None
+    assert frame.background_depth_m is not None
+    ground, camera = frame.environment.ground, frame.camera
+    table = np.full(256, Class.OTHER, np.uint8)
+    for material, kind in CLASS_OF.items():
+        table[material] = kind
+    height_m = float(ground[3])
+    size = STORE_HW[::-1]
+    images = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (frame.image, frame.background))
+    return {
+        "images": np.stack(list(images)),
+        "classes": np.stack([shrunk(classes_of(frame)), shrunk(table[frame.ground_material])]),
+        "nearness": np.stack([nearness_of(d, height_m) for d in (frame.depth_m, frame.background_depth_m)]),
+        "elevation": unet.elevation(ground, camera, STORE_HW).astype(np.float16),
+        "ground": nearness_of(maps.plane_depth(ground, camera), height_m),
+        "focal": np.array(float(camera.intrinsics[0, 0]) * STORE_HW[0] / camera.height, np.float32),
+    }
+
+
+class Store:
+    """Frames of a stream, made as far as they are not there yet: see `pictures_of`. A picture is half a frame: 2i
+    the one with actors, 2i + 1 the one without."""
+
+    def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        stamp = folder / "frames.json"
+        told = {"seed": seed, "split": split}
+        found = files.read_json(stamp) if stamp.is_file() else told | {"frames": 0}
+        if {k: found[k] for k in told} != told:
+            raise ValueError(f"{stamp}: expected frames of {told}, found {found}")
+        for index in range(found["frames"], frames):
+            files.write_npz(folder / f"{index:05d}.npz", pictures_of(street(seed, index, split)))
+            files.write_json(stamp, told | {"frames": index + 1})
+        parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
+        self.images, self.classes, self.nearness = (
+            np.concatenate([p[name] for p in parts]) for name in ("images", "classes", "nearness")
+        )
+        self.elevation, self.ground, self.focal = (
+            np.stack([p[name] for p in parts]) for name in ("elevation", "ground", "focal")
+        )
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@dataclass(frozen=True)
+class Example:
+    """A part of a picture. image (h, w, 3) in [0, 1]; elevation, ground, nearness (h, w): as a camera of the
+    network's focal length would have them."""
+
+    image: np.ndarray
+    elevation: np.ndarray
+    ground: np.ndarray
+    nearness: np.ndarray
+
+
+_LEVEL = (Class.ROAD, Class.GROUND, Class.GRASS)
+
+
+def example(store: Store, index: int, rng: np.random.Generator) -> Example:
+    """A part of a picture, zoomed, mirrored or not, in other light and colours.
+
+    Zoomed, all is as near as it seems. What the network is told of the horizon is off, as an estimated plane is;
+    the ground is off with it.
+    """
+    part = window(rng)
+    image = taken(store.images[index], part).astype(np.float32) / 255
+    classes = taken(store.classes[index], part, cv2.INTER_NEAREST)
+    zoom = np.float32(store.focal[index // 2] * part[1, 1] / unet.INPUT_FOCAL_PX)
+    looks = taken(store.elevation[index // 2].astype(np.float32), part) * zoom
+    ground = taken(store.ground[index // 2].astype(np.float32), part) * zoom
+    near = taken(store.nearness[index].astype(np.float32), part, cv2.INTER_NEAREST) * zoom
+    other_colours(image, classes, looks, rng)
+    other_light(image, classes, rng)
+    image = other_camera(image, rng)
+    error = np.float32(rng.normal(0, HORIZON_ERROR))
+    told = np.where(ground > 0, np.maximum(ground - error, 0), 0)
+    near = np.maximum(np.where(np.isin(classes, _LEVEL), near + told - ground, near), told)
+    return Example(image, looks + error, told, near)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides on the result of a run. frames: of the training set; gradient: weight of the slopes' term."""
+
+    steps: int = 2600
+    batch: int = 8
+    frames: int = 500
+    rate: float = 2e-3
+    weight_decay: float = 0.02
+    average: float = 0.995
+    gradient: float = 0.5
+    seed: int = 0
+
+
+Batch = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def batch_of(store: Store, step: int, settings: Settings) -> Batch:
+    """Images (N, 3, h, w), elevations, the ground's nearness and the truth (N, 1, h, w) of a step: a function of
+    the seed and the step alone."""
+    examples = []
+    for place in range(settings.batch):
+        epoch, inside = divmod(step * settings.batch + place, len(store))
+        order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
+        examples.append(example(store, int(order[inside]), np.random.default_rng([settings.seed, step, place])))
+    maps_of = (np.stack([getattr(e, name) for e in examples]) for name in ("elevation", "ground", "nearness"))
+    looks, ground, near = (torch.from_numpy(m.astype(np.float32))[:, None] for m in maps_of)
+    images = torch.from_numpy(np.stack([e.image for e in examples])).permute(0, 3, 1, 2)
+    return images, looks, ground, near
+
+
+def loss_of(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> Tensor:
+    """Mean difference () of the logarithms of nearness, and of their slopes at three scales. numbers (N, 1, h/2,
+    w/2): the network's; ground, near (N, 1, h, w)."""
+    found = F.avg_pool2d(ground, 2) + depth.excess(numbers)
+    apart = (found + LEAST_NEARNESS).log() - (F.avg_pool2d(near, 2) + LEAST_NEARNESS).log()
+    loss = apart.abs().mean()
+    for _ in range(3):
+        slopes = apart.diff(dim=2).abs().mean() + apart.diff(dim=3).abs().mean()
+        loss = loss + gradient * slopes
+        apart = F.avg_pool2d(apart, 2)
+    return loss
+
+
+class Run(AveragedRun[DepthNet]):
+    """The network in training."""
+
+    settings: Settings
+
+    def __init__(self, settings: Settings) -> None:
+        torch.manual_seed(settings.seed)
+        network = DepthNet().train()
+        known = segment.load_network().state_dict()
+        network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
+        super().__init__(network, settings)
+        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def step(self, store: Store) -> float:
+        """One step of the optimiser; the loss."""
+        step, settings = self.step_number, self.settings
+        with self.timed():
+            images, looks, ground, near = batch_of(store, step, settings)
+            warm = min(1.0, (step + 1) / 50)
+            with torch.autocast("cpu", torch.bfloat16):
+                numbers = self.network(images, looks)
+            loss = loss_of(numbers.float(), ground, near, settings.gradient)
+            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
+        return float(loss.detach())
+
+
+FAR_M = 120.0
+"""Farther truths are not judged: fog hides what is there."""
+
+
+def judge(network: DepthNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[float, float]]:
+    """Relative error and share of pixels within a quarter of the truth, means over frames with a background, by
+    what tells the depth: walls by rule, the network, and both, as they are used."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for frame in frames:
+        assert frame.background is not None
+        assert frame.background_depth_m is not None
+        ground, camera = frame.environment.ground, frame.camera
+        image = np.asarray(frame.background / 255, np.float32)
+        seen = segment.segment(image, ground, camera)
+        nothing = np.zeros_like(seen.sky)
+        ties = depth.Ties(seen.sky, seen.ground, nothing, nothing)
+        outlook = depth.Outlook.of(image, ground, camera)
+        alone = depth.by_network(outlook, seen.ground, network)
+        horizon = maps.horizon_row(ground, camera)
+        guesses = {
+            "walls by rule": maps.walls(outlook.plane_m, seen.ground, nothing, seen.sky, horizon),
+            "network": outlook.depth_m(alone * (1 - seen.sky)),
+            "both": depth.surroundings(image, ground, camera, ties, network),
+        }
+        known = frame.background_depth_m < FAR_M
+        true = frame.background_depth_m[known]
+        for name, guess in guesses.items():
+            told = np.minimum(guess[known], 300.0)
+            near = np.maximum(told / true, true / told) < 1.25
+            found.setdefault(name, []).append((float((np.abs(told - true) / true).mean()), float(near.mean())))
+    means = {name: np.mean(rows, axis=0) for name, rows in found.items()}
+    return {name: (float(error), float(near)) for name, (error, near) in means.items()}
+
+
+CARD = """# Depth of photographs' surroundings, trained on generated streets
+
+- Architecture: `scene_ir.derender.depth.DepthNet`, {parameters:,} parameters: the segmenter's network
+  (`scene_ir.derender.unet`), on the picture at 0.4 of KITTI's size (focal length {focal:.0f} px) and the
+  elevation of each pixel's ray above the horizon. One number a pixel: by how much it is nearer than the ground
+  that its ray meets.
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Training starts from
+  the segmenter's weights; nothing else is pretrained.
+- Data: {frames:,} frames of the project's own generator, version {version}, in all its weathers, seasons and
+  camera angles, each with its vehicles and people and without; those from number {higher} on from {low} to {high}
+  times KITTI's height. No photographs. Other colours and light, other skies; other exposure and contrast, blur,
+  haze, noise, compression; zoomed, mirrored.
+- Training: {steps:,} steps of {batch} crops, {minutes:.0f} minutes of one CPU core, seed {seed}. Loss:
+  difference of the logarithms of nearness, and of their slopes at three scales.{note}
+
+## Figures
+
+Held out: {held_out} frames of the generator without vehicles (shapes and streets that no training frame has), up
+to {far:.0f} m. Relative error is the mean of |d - d*| / d*; within 1.25 is the share of pixels whose ratio to
+the truth is smaller. What a scene keeps is the mean of both, in logarithms.
+
+{table}
+
+Beside a laser, and in fog, on photographs: `python -m tools.bench depth`, docs/benchmarks.md.
+
+## Limits
+
+It has seen generated pictures only. On photographs it errs to the far side. Things that stand on no ground that
+is seen, fences that one sees through, trams and bridges it does not know. Not for use in a vehicle, and no
+measurement.
+
+## Train it again
+
+```
+python tools/train_depth.py --frames {frames} --steps {steps} --seed {seed}
+```
+With the same generator, on the same machine, another run gives the same bytes.
+"""
+
+
+def table_of(figures: dict[str, tuple[float, float]]) -> str:
+    """A Markdown table, a row each thing that tells depth."""
+    rows = [f"| {name} | {error:.3f} | {near:.3f} |" for name, (error, near) in figures.items()]
+    return "\n".join(["| depth by | relative error | within 1.25 |", "| --- | --- | --- |", *rows])
+
+
+TRAIN_SEED, HELD_SEED = 51, 52
+"""Of the generator's streams."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, default=Path("build/depth"), help="frames, checkpoint, log")
+    parser.add_argument("--out", type=Path, default=depth.WEIGHTS)
+    parser.add_argument("--frames", type=int, default=Settings.frames)
+    parser.add_argument("--held-out", type=int, default=40, help="generated frames to judge by")
+    parser.add_argument("--steps", type=int, default=Settings.steps)
+    parser.add_argument("--batch", type=int, default=Settings.batch)
+    parser.add_argument("--rate", type=float, default=Settings.rate)
+    parser.add_argument("--seed", type=int, default=Settings.seed)
+    parser.add_argument(
+        "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
+    )
+    parser.add_argument("--remark", default="", help="a remark on this run for the model card")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
+    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
+    print(f"{len(store)} pictures", flush=True)
+    run = Run(settings)
+    checkpoint = arguments.run / "checkpoint.safetensors"
+    if checkpoint.is_file():
+        run.load(checkpoint)
+        print(f"going on from step {run.step_number}", flush=True)
+    end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
+    with (arguments.run / "log.csv").open("a", newline="") as file:
+        log = csv.writer(file)
+        while run.step_number < end:
+            loss = run.step(store)
+            if run.step_number % 25 == 0:
+                log.writerow([run.step_number, f"{run.seconds:.1f}", f"{loss:.4f}"])
+                file.flush()
+            if run.step_number % 100 == 0 or run.step_number == end:
+                run.save(checkpoint)
+                print(f"step {run.step_number}, {run.seconds:.0f} s: {loss:.3f}", flush=True)
+    if run.step_number < settings.steps:
+        return
+    network = run.averaged()
+    figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
+    print(table_of(figures))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    run.ship(arguments.out, facts)
+    card = CARD.format(
+        parameters=sum(p.numel() for p in network.parameters()),
+        focal=unet.INPUT_FOCAL_PX,
+        file=arguments.out.name,
+        frames=settings.frames,
+        version=GENERATOR_VERSION,
+        higher=HIGHER_FROM,
+        low=HIGHER[0],
+        high=HIGHER[1],
+        steps=settings.steps,
+        batch=settings.batch,
+        minutes=run.seconds / 60,
+        seed=settings.seed,
+        note=f"\n  {arguments.remark}" if arguments.remark else "",
+        held_out=arguments.held_out,
+        far=FAR_M,
+        table=table_of(figures),
+    )
+    files.write_text(arguments.out.with_suffix(".md"), card)
+
+
+if __name__ == "__main__":
+    main()
