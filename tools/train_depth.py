@@ -238,15 +238,17 @@ def judge(network: DepthNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[fl
     for frame in frames:
         assert frame.background is not None
         assert frame.background_depth_m is not None
-        image, ground, camera = frame.background.astype(np.float32) / 255, frame.environment.ground, frame.camera
+        ground, camera = frame.environment.ground, frame.camera
+        image = np.asarray(frame.background / 255, np.float32)
         seen = segment.segment(image, ground, camera)
         nothing = np.zeros_like(seen.sky)
         ties = depth.Ties(seen.sky, seen.ground, nothing, nothing)
-        plane_m = maps.plane_depth(ground, camera)
-        alone = depth.by_network(image, ground, camera, network)
+        outlook = depth.Outlook.of(image, ground, camera)
+        alone = depth.by_network(outlook, seen.ground, network)
+        horizon = maps.horizon_row(ground, camera)
         guesses = {
-            "walls by rule": maps.walls(plane_m, seen.ground, nothing, seen.sky, maps.horizon_row(ground, camera)),
-            "network": depth.depth_of(alone * (1 - seen.sky), ground),
+            "walls by rule": maps.walls(outlook.plane_m, seen.ground, nothing, seen.sky, horizon),
+            "network": outlook.depth_m(alone * (1 - seen.sky)),
             "both": depth.surroundings(image, ground, camera, ties, network),
         }
         known = frame.background_depth_m < FAR_M

@@ -5,7 +5,8 @@ ground, about the tangent of the angle below the horizon. Nothing lies below the
 than the ground its ray meets. The network (`unet`) says by how much a pixel is nearer than that: not at all on the
 ground itself, little at the foot of a wall, more towards its top. That is smooth wherever the surroundings are.
 Walls by rule, upright on the end of the ground, tell well how far things are, and badly where they begin: they are
-smoothed along the picture's edges, and averaged with what the network says.
+smoothed along the picture's edges, and averaged with what the network says. Nearness is smoothed and not what is
+added to the ground's: it is the same all the way down a wall.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _SCALE = 1.15
 _FAR_OFF = 0.005
 """Nearness added before that by network and by rule are averaged: 330 m, beyond which neither knows anything."""
 _TO_EDGES, _RELAXED = (200.0, 8.0), (3000.0, 10.0)
-"""How much the network's picture and walls by rule are smoothed; see `_smoothed`."""
+"""How much nearness by the network and by rule is smoothed; see `Outlook.smoothed`."""
 _FOCAL_PX = 721.5
 """KITTI's."""
 _BLURRED = 0.008
@@ -83,33 +84,70 @@ class Ties:
     behind_m: Array
 
 
-def from_network(image: Array, ground: Tensor, camera: Camera, network: DepthNet | None = None) -> Array:
-    """By how much each pixel (h, w) of a photograph (H, W, 3) RGB in [0, 1], coarser than it, is nearer than the
-    ground."""
-    view = unet.view(image, ground, camera)
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """A picture (H, W, 3) RGB float32 in [0, 1] without vehicles, its camera, and the ground: plane (4,) n.x + d =
+    0, n up, and its depth plane_m (H, W), inf above the horizon."""
+
+    image: Array
+    ground: Tensor
+    camera: Camera
+    plane_m: Array
+
+    @staticmethod
+    def of(image: Array, ground: Tensor, camera: Camera) -> Outlook:
+        """The outlook of a picture over a plane."""
+        return Outlook(image, ground, camera, maps.plane_depth(ground, camera))
+
+    def nearness(self, depth_m: Array) -> Array:
+        """Of depth (H, W) m."""
+        return np.asarray(float(self.ground[3]) / depth_m, np.float32)
+
+    def depth_m(self, nearness: Array) -> Array:
+        """Of nearness (H, W); inf where that is hardly any."""
+        endless = nearness < _ENDLESS
+        return np.where(endless, np.inf, float(self.ground[3]) / np.where(endless, 1, nearness)).astype(np.float32)
+
+    def smoothed(self, values: Array, how: tuple[float, float]) -> Array:
+        """Values (H, W) smoothed where the picture has no edge (Min et al., Fast Global Image Smoothing, 2014).
+        how: how much at KITTI's focal length, and the difference of 8-bit colours that is an edge."""
+        guide = np.clip(np.rint(self.image * 255), 0, 255).astype(np.uint8)
+        more = (float(self.camera.intrinsics[0, 0]) / _FOCAL_PX) ** 2
+        smooth = cv2.ximgproc.fastGlobalSmootherFilter(
+            guide, np.asarray(values, np.float32), how[0] * more, how[1]
+        )
+        return np.asarray(smooth, np.float32)
+
+
+def from_network(outlook: Outlook, network: DepthNet | None = None) -> Array:
+    """By how much each pixel (h, w) of a picture, coarser than it, is nearer than the ground."""
+    camera = outlook.camera
+    view = unet.view(outlook.image, outlook.ground, camera)
     # In a picture of another focal length all is as near as it seems.
     zoom = float(camera.intrinsics[1, 1]) * view.image.shape[0] / (camera.height * unet.INPUT_FOCAL_PX)
     view = replace(view, elevation=view.elevation * np.float32(zoom))
     return np.asarray(excess((network or load_network()).look(view))[0, 0].numpy() / zoom, np.float32)
 
 
-def by_network(image: Array, ground: Tensor, camera: Camera, network: DepthNet | None = None) -> Array:
-    """Nearness (H, W) of a picture (H, W, 3) RGB in [0, 1] as the network has it, its borders laid along the
-    picture's edges."""
-    level = np.log(from_network(image, ground, camera, network) + _LEAST)
-    large = np.asarray(cv2.resize(level, image.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-    excess_of_it = np.exp(_smoothed(large, image, _TO_EDGES, camera))
-    return _level(ground, camera) + _SCALE * excess_of_it
+def by_network(outlook: Outlook, flat: Array, network: DepthNet | None = None) -> Array:
+    """Nearness (H, W) as the network has it. flat (H, W) in [0, 1]: where ground is seen; borders of what stands
+    there are laid along the picture's edges."""
+    size = outlook.image.shape[1::-1]
+    level = outlook.nearness(outlook.plane_m)
+    large = cv2.resize(np.log(from_network(outlook, network) + _LEAST), size, interpolation=cv2.INTER_LINEAR)
+    told = level + _SCALE * np.exp(np.asarray(large, np.float32))
+    standing = np.exp(outlook.smoothed(np.log(told + _FAR_OFF), _TO_EDGES)) - _FAR_OFF
+    return np.maximum(flat * told + (1 - flat) * standing, level)
 
 
-def by_rule(image: Array, ground: Tensor, camera: Camera, ties: Ties) -> Array:
-    """Nearness (H, W) of ground and of walls on its end, smoothed where the picture (H, W, 3) has no edge."""
-    plane_m = maps.plane_depth(ground, camera)
-    walls_m = maps.walls(plane_m, ties.flat, ties.stood, ties.sky, maps.horizon_row(ground, camera))
-    known = np.isfinite(walls_m).astype(np.float32)
-    nearer = ((1 / walls_m - 1 / plane_m) * known).astype(np.float32)
-    total, weight = (_smoothed(m, image, _RELAXED, camera) for m in (nearer, known))
-    return _level(ground, camera) + np.float32(ground[3]) * np.maximum(total / np.maximum(weight, _LEAST), 0)
+def by_rule(outlook: Outlook, ties: Ties) -> Array:
+    """Nearness (H, W) of ground and of walls on its end, smoothed where the picture has no edge."""
+    horizon = maps.horizon_row(outlook.ground, outlook.camera)
+    walls = outlook.nearness(maps.walls(outlook.plane_m, ties.flat, ties.stood, ties.sky, horizon))
+    known = (walls > 0).astype(np.float32)
+    total, weight = (outlook.smoothed(m, _RELAXED) for m in (walls, known))
+    standing = total / np.maximum(weight, _LEAST)
+    return np.maximum(ties.flat * walls + (1 - ties.flat) * standing, outlook.nearness(outlook.plane_m))
 
 
 def surroundings(
@@ -121,29 +159,11 @@ def surroundings(
     one. The network sees what stands where, the end of the ground tells how far that is: nearness by both is
     averaged, in logarithms. Nothing is farther than the ground that its ray meets.
     """
-    told, ruled = by_network(image, ground, camera, network), by_rule(image, ground, camera, ties)
+    outlook = Outlook.of(image, ground, camera)
+    told, ruled = by_network(outlook, ties.flat, network), by_rule(outlook, ties)
     both = np.sqrt((told + _FAR_OFF) * (ruled + _FAR_OFF)) - _FAR_OFF
-    level = _level(ground, camera)
+    level = outlook.nearness(outlook.plane_m)
     stood = cv2.GaussianBlur(ties.stood, (0, 0), max(_BLURRED * float(camera.intrinsics[0, 0]), 0.5))
     nearness = level + np.maximum(both - level, 0) * (1 - ties.sky) * (1 - stood)
-    behind = np.float32(ground[3]) / np.where(ties.behind_m > 0, ties.behind_m, np.float32(1e-3))
-    return depth_of(np.maximum(np.minimum(nearness, behind), level), ground)
-
-
-def depth_of(nearness: Array, ground: Tensor) -> Array:
-    """Depth (H, W) m of nearness (H, W); inf where that is hardly any."""
-    endless = nearness < _ENDLESS
-    return np.where(endless, np.inf, np.float32(ground[3]) / np.where(endless, 1, nearness)).astype(np.float32)
-
-
-def _level(ground: Tensor, camera: Camera) -> Array:
-    """The ground's nearness (H, W)."""
-    return np.asarray(float(ground[3]) / maps.plane_depth(ground, camera), np.float32)
-
-
-def _smoothed(values: Array, image: Array, how: tuple[float, float], camera: Camera) -> Array:
-    """Values (H, W) smoothed where the picture (H, W, 3) has no edge (Min et al., Fast Global Image Smoothing, TIP
-    2014). how: how much at KITTI's focal length, and the difference of 8-bit colours that is an edge."""
-    guide = np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
-    more = (float(camera.intrinsics[0, 0]) / _FOCAL_PX) ** 2
-    return np.asarray(cv2.ximgproc.fastGlobalSmootherFilter(guide, values, how[0] * more, how[1]), np.float32)
+    behind = outlook.nearness(np.where(ties.behind_m > 0, ties.behind_m, np.float32(1e-3)))
+    return outlook.depth_m(np.maximum(np.minimum(nearness, behind), level))

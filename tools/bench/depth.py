@@ -83,14 +83,14 @@ class Street:
 
     def guesses(self) -> dict[str, Array]:
         """Depths (H, W) m by name: what the depth that is used is made of, and what was used before."""
-        plane, camera, ties = self.plane, self.camera, self.ties
-        plane_m, horizon = maps.plane_depth(plane, camera), maps.horizon_row(plane, camera)
+        outlook, ties = depth.Outlook.of(self.picture, self.plane, self.camera), self.ties
+        horizon = maps.horizon_row(self.plane, self.camera)
         nearness = {
-            "walls, relaxed": depth.by_rule(self.picture, plane, camera, ties),
-            "network alone": depth.by_network(self.picture, plane, camera),
+            "walls, relaxed": depth.by_rule(outlook, ties),
+            "network alone": depth.by_network(outlook, ties.flat),
         }
-        guessed = maps.walls(plane_m, ties.flat, ties.stood, ties.sky, horizon)
-        without_sky = {name: depth.depth_of(near * (1 - ties.sky), plane) for name, near in nearness.items()}
+        guessed = maps.walls(outlook.plane_m, ties.flat, ties.stood, ties.sky, horizon)
+        without_sky = {name: outlook.depth_m(near * (1 - ties.sky)) for name, near in nearness.items()}
         return {"guessed walls": guessed, **without_sky}
 
 
