@@ -275,6 +275,20 @@ class Confirm(FinishedRun, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Holes(FrameCommand):
+    """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
+
+    runs: Runs = ()
+    """Folders of drivesem attack."""
+    samples: Annotated[int, at_least(24, "of which a rule can be made")] = 96
+    """States around each failure, within what the run could change; each is seen once, with nuisances."""
+    fresh: Count = 32
+    """Further ones inside of the rule that was found, which it is held against."""
+    reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
+    """How far from the counterexample, as a share of each bound's width, within the bounds."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Command):
     """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
 
@@ -763,6 +777,7 @@ _ALL: tuple[type[Command], ...] = (
         Study,
         Explain,
         Confirm,
+        Holes,
         Report,
         Plausibility,
         Realism,

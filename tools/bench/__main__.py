@@ -23,7 +23,7 @@ from drivesem.bench.tables import Section
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
-from tools.bench import depth, derender, evaluation, found, label_free, rivals, synth
+from tools.bench import depth, derender, evaluation, found, label_free, redraw, rivals, synth
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -50,6 +50,7 @@ def run(config: BenchTool) -> int:
         "depth": _depth,
         "found": _found,
         "label-free": _label_free,
+        "redraw": _redraw,
         "synth": _synth,
         "rivals": _rivals,
         "eval": _eval,
@@ -86,6 +87,17 @@ def _found(config: BenchTool, console: Console) -> Measured:
         found.rank_sheets(rows, sheets)
     fields = {"frames": len(frames), "rows": [asdict(row) for row in rows], "summary": found.summary(rows)}
     return _measured(found, fields)
+
+
+def _redraw(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    try:
+        frames = dict(watched(redraw.measure(config, _sheets(config)), found.count(config), console))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    rows = [frames[name] for name in sorted(frames)]
+    fields = {"frames": len(rows), "rows": [asdict(row) for row in rows], "summary": redraw.summary(rows)}
+    return _measured(redraw, fields)
 
 
 def _label_free(config: BenchTool, console: Console) -> Measured:

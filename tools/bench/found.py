@@ -103,20 +103,22 @@ def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str
 
 def count(config: BenchTool) -> int:
     """How many frames `measure` goes through."""
-    return len(_names(config))
+    return len(names_of(config))
 
 
 def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[CarRow]]:
     return _FoundJudge(config, sheets).frame
 
 
-def _source(config: BenchTool) -> SceneSource:
+def source_of(config: BenchTool) -> SceneSource:
+    """The scenes that are asked for: of a data set, or a folder of them."""
     asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
-def _names(config: BenchTool) -> list[str]:
-    return list(_source(config).identifiers())[: config.limit]
+def names_of(config: BenchTool) -> list[str]:
+    """Their identifiers, as many as are wanted."""
+    return list(source_of(config).identifiers())[: config.limit]
 
 
 class SceneFolder:
@@ -143,7 +145,7 @@ class _FoundJudge:
 
     def __init__(self, config: BenchTool, sheets: Path | None) -> None:
         self._config = config
-        self._source = _source(config)
+        self._source = source_of(config)
         self._sheets = sheets
         self._predictor = load_predictor(config.detector, config.device, config.tiles)
 
@@ -169,10 +171,11 @@ def judge(
     if not rows:
         return []
     eye = Eye(predictor)
-    moves = _Moves(scene, rows, rng)
+    moves = Moves(scene, rows, rng)
     photograph = eye.look(scene.photograph, scene.objects.box2d)
     emptied = eye.look(_emptied(scene), scene.objects.box2d)
-    crowd = eye.look(*moves.together())
+    together = moves.together()
+    crowd = eye.look(together.image, together.boxes_xyxy)
     found: list[CarRow] = []
     for row in rows:
         chosen = moves.alone.get(row)
@@ -228,8 +231,8 @@ def _emptied(scene: SceneIR) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class _Moved:
-    """A scene with one car moved, its picture (3, H, W), and the boxes (N, 4) px of all objects in it."""
+class Moved:
+    """A scene with a car moved, or several; its picture (3, H, W), and the boxes (N, 4) px of all its objects."""
 
     along_m: float
     turn: float
@@ -238,7 +241,7 @@ class _Moved:
     boxes_xyxy: Tensor
 
 
-class _Moves:
+class Moves:
     """A move of each car of a scene that can be moved, and the scene with as many of them as fit together.
 
     alone: by row, what could be moved; in_crowd: rows moved in `together`.
@@ -253,7 +256,7 @@ class _Moves:
         self.alone = {row: move for row in rows if (move := self._possible(row, signs[row])) is not None}
         self.in_crowd: list[int] = []
 
-    def _possible(self, row: int, order: NDArray[np.int64]) -> _Moved | None:
+    def _possible(self, row: int, order: NDArray[np.int64]) -> Moved | None:
         for k in order.tolist():
             along, turn = (1 - 2 * (k & 1)) * MOVE_M, (1 - (k & 2)) * TURN_RAD
             changed = self._changed({row: (along, turn)})
@@ -261,7 +264,7 @@ class _Moves:
                 continue
             image, labels = self._drawn(changed)
             if self._as_visible(labels, row):
-                return _Moved(along, turn, changed, image, labels.boxes_xyxy)
+                return Moved(along, turn, changed, image, labels.boxes_xyxy)
         return None
 
     def _changed(self, places: Mapping[int, tuple[float, float]]) -> SceneIR | None:
@@ -285,8 +288,8 @@ class _Moves:
             cut or bool(labels.became_ignored[row]) or int(labels.occlusion[row]) > int(objects.occlusion[row])
         )
 
-    def together(self) -> tuple[Tensor, Tensor]:
-        """The picture (3, H, W) of as many moves at once as do not collide, and all objects' boxes (N, 4) px."""
+    def together(self) -> Moved:
+        """As many moves at once as do not collide; without a way of their own."""
         places: dict[int, tuple[float, float]] = {}
         changed = self._scene
         for row, move in self.alone.items():
@@ -295,7 +298,7 @@ class _Moves:
                 places[row], changed = (move.along_m, move.turn), more
         image, labels = self._drawn(changed)
         self.in_crowd = [row for row in places if self._as_visible(labels, row)]
-        return image, labels.boxes_xyxy
+        return Moved(0.0, 0.0, changed, image, labels.boxes_xyxy)
 
 
 def summary(cars: Sequence[CarRow]) -> list[dict[str, Any]]:

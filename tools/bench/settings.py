@@ -18,13 +18,14 @@ from drivesem.settings.values import numbers
 class BenchTool(Tiles, DataSource, FrameCommand):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
-    what: tyro.conf.Positional[Literal["derender", "depth", "found", "label-free", "synth", "rivals", "eval"]] = (
-        "derender"
-    )
+    what: tyro.conf.Positional[
+        Literal["derender", "depth", "found", "label-free", "redraw", "synth", "rivals", "eval"]
+    ] = "derender"
     """derender: de-rendered generated frames beside the generator's truth; depth: how far surroundings are, beside
     the generator's truth, a laser, and in fog; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
-    those labels; synth: the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
+    those labels; redraw: the second renderer of photographs beside the photograph and ours; synth: the
+    scene generator; rivals: other renderers beside the project's verbs; eval: drivesem
     eval of many frames beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions or frames."""
@@ -41,16 +42,17 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that was trained
-    elsewhere."""
+    """Of found and redraw: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a detector that
+    was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Of found, label-free and depth: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or
-    yolo."""
+    """Of found, label-free, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2,
+    coco or yolo."""
     root: str | None = None
-    """Of found, label-free and depth: folder of the data set, such as KITTI's with training/image_2, label_2,
-    calib."""
+    """Of found, label-free, redraw and depth: the data set's folder, such as KITTI's with training/image_2,
+    label_2, calib."""
     scenes: str | None = None
-    """A folder of scenes that drivesem derender wrote. Of found: instead of a data set; of depth: besides one."""
+    """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
+    besides one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 

@@ -1,8 +1,8 @@
 """Textures of vehicles, baked once from a photograph: each triangle has a patch of its own in an atlas.
 
 A texel is a point of the mesh as it stood when the photograph was taken. Where the photograph shows it, it has the
-photograph's colour; else that of the same point on the other side, as far as that was seen; else the mean of the
-nearest triangles of its own part that were.
+photograph's colour; else that of the same point on the other side, as far as that was seen; else the median of
+what was seen of its part.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import KDTree
 
 from drivesem.truth.redraw.placing import Body, Lens, Pose, numbers
 from drivesem.truth.redraw.screen import SUPERSAMPLING, Alone, Array, Window
@@ -41,8 +40,8 @@ _BLUR_PX = 1.5
 """Colours that are drawn out over the outline would be stripes."""
 _BEYOND = (2.0, 0.03)
 """How far beyond those pixels their colours are drawn out: pixels, and a share of the vehicle's height on top."""
-_NEAREST = 12
-"""Triangles of a part that stand for one that was never seen."""
+_TOLD = 0.9
+"""How far a texel is seen, or is paint, that stands for those of its part that never were."""
 _UNSEEN = {
     Part.PAINT: (0.45, 0.45, 0.45), Part.GLASS: (0.16, 0.17, 0.18), Part.TYRE: (0.09, 0.09, 0.09),
     Part.LIGHT: (0.55, 0.5, 0.48), Part.OTHER: (0.16, 0.16, 0.16),
@@ -147,7 +146,7 @@ def bake(body: Body, source: Source, seen: Photographed, lens: Lens, alone: Alon
             if told is not None:
                 paint += weight * (told - paint)
             shown += weight
-    filled = _completed(body, layout, colour, shown)
+    filled = _completed(body, layout, colour, shown, paint)
     colour += (1 - shown)[:, None] * filled[layout.face]
     unit = np.einsum("tk,tk->t", layout.weights, body.unit[layout.face][..., 1])
 
@@ -159,27 +158,14 @@ def bake(body: Body, source: Source, seen: Photographed, lens: Lens, alone: Alon
     return Atlas(layout.uv, spread(colour), spread(paint), spread(np.clip(-unit, 0, 1)), numbers(source.paint))
 
 
-def _completed(body: Body, layout: _Layout, colour: Array, shown: Array) -> Array:
-    """Colours (F, 3) of triangles by the nearest that were seen of the same part, on either side."""
-    count = len(body.part)
-    weight = np.bincount(layout.face, shown, count)
-    sums = np.stack([np.bincount(layout.face, colour[:, c], count) for c in range(3)], axis=1)
-    known = weight > 0.5 * np.bincount(layout.face, minlength=count)
-    means = sums / np.maximum(weight, 1e-6)[:, None]
-    at = body.unit.mean(axis=1) * np.array([2.0, 1.0, 1.0], np.float32)
-    at[:, 2] = np.abs(at[:, 2])
-    filled = np.empty((count, 3), np.float32)
+def _completed(body: Body, layout: _Layout, colour: Array, shown: Array, paint: Array) -> Array:
+    """Colours (F, 3) of triangles that were never seen: their part's median. Lamps and plates that the mesh takes
+    for paint are no paint by the photograph."""
+    filled = np.empty((len(body.part), 3), np.float32)
     for part in Part:
-        mine = body.part == part
-        told = mine & known
-        if told.any():
-            amount = min(_NEAREST, int(told.sum()))
-            apart, nearest = KDTree(at[told]).query(at[mine], amount)
-            share = 1 / (np.asarray(apart).reshape(-1, amount) + 0.05)
-            chosen = means[told][np.asarray(nearest).reshape(-1, amount)]
-            filled[mine] = (share[..., None] * chosen).sum(axis=1) / share.sum(axis=1, keepdims=True)
-        else:
-            filled[mine] = _UNSEEN[part]
+        told = (body.part == part)[layout.face] & (shown > _TOLD)
+        told &= (paint > _TOLD) | (part != Part.PAINT)
+        filled[body.part == part] = np.median(colour[told], axis=0) if told.any() else _UNSEEN[part]
     return filled
 
 

@@ -233,7 +233,7 @@ def _levels(colour: Array) -> NDArray[np.uint8]:
 
 def _around(placed: Sequence[Array], lens: Lens) -> Window | None:
     """The part of the picture that shows vehicles; None where none does."""
-    boxes = np.array([lens.box(p) for p in placed])
+    boxes = np.array([lens.box(p) for p in placed]).reshape(-1, 4)
     boxes = boxes[~np.isnan(boxes).any(axis=1)]
     if not len(boxes):
         return None

@@ -61,8 +61,8 @@ def cars(boxes: Tensor, scores: Sequence[float]) -> Rows:
 
 def moved_boxes(scene: SceneIR) -> tuple[dict[int, Tensor], Tensor, list[int]]:
     """Boxes (N, 4) with each car moved alone, then with all that fit; rows of those."""
-    moves = found._Moves(scene, range(len(scene.objects)), np.random.default_rng(0))
-    _, boxes = moves.together()
+    moves = found.Moves(scene, range(len(scene.objects)), np.random.default_rng(0))
+    boxes = moves.together().boxes_xyxy
     return {row: move.boxes_xyxy for row, move in moves.alone.items()}, boxes, moves.in_crowd
 
 
@@ -78,7 +78,7 @@ def test_each_detection_is_one_cars_only() -> None:
 
 def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> None:
     scene = street()
-    moves = found._Moves(scene, range(4), np.random.default_rng(3))
+    moves = found.Moves(scene, range(4), np.random.default_rng(3))
     assert set(moves.alone) == {0, 1, 2, 3}
     for row, move in moves.alone.items():
         apart = (move.scene.objects.translation - scene.objects.translation).norm(dim=1)
@@ -94,7 +94,7 @@ def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> No
 def test_a_car_between_others_stays(street: Callable[..., SceneIR]) -> None:
     # bumper to bumper: no way along the heading
     scene = street(positions_xz=((0.0, 9.0), (0.0, 13.3), (0.0, 17.6)))
-    assert 1 not in found._Moves(scene, range(3), np.random.default_rng(0)).alone
+    assert 1 not in found.Moves(scene, range(3), np.random.default_rng(0)).alone
 
 
 def test_what_is_counted(street: Callable[..., SceneIR]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -163,6 +164,17 @@ def test_what_stands_in_front_stays_in_front(screen: Screen, scene: SceneIR) -> 
     beyond = replace(with_pole, front=(Front(Crop(pole, x, y), 90.0),))
     drawn = PhotographRedraw("demo-000", beyond).redraw(beyond).image[:, y + 2 : y + 18, x + 1 : x + 5]
     assert float((drawn - pole[:3, 2:18, 1:5]).abs().mean()) > 0.1
+
+
+def test_without_vehicles_the_background_has_its_weather(screen: Screen, street: Callable[..., SceneIR]) -> None:
+    del screen
+    empty = street(())
+    second = PhotographRedraw("empty", empty)
+    drawn = second.redraw(empty)
+    assert (len(drawn.targets), len(drawn.shown_xyxy)) == (0, 0)
+    assert float((drawn.image - empty.background).abs().max()) < 1 / 255
+    foggy = second.redraw(empty.with_environment(weather=torch.tensor([1.0, 0, 0, 0])))
+    assert float((foggy.image - drawn.image).abs().mean()) > 0.1
 
 
 def test_other_vehicles_than_the_photographs_are_refused(second: PhotographRedraw) -> None:
