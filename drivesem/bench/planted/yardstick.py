@@ -13,7 +13,7 @@ from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.bench.planted.plant import KINDS, FaultKind, Planting, plant
-from drivesem.bench.planted.survey import Survey
+from drivesem.bench.planted.survey import FrameSurvey
 from drivesem.evaluation import failures
 from drivesem.run.attack import Worker, grader_of
 from drivesem.run.frame import AttackedScene
@@ -138,7 +138,7 @@ class Yardstick:
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
         space = ParameterSpace(scene, parse_params(self.config.params))
         objective = Objective(Compositor(scene), space, self.detector)
-        survey = Survey.make(objective, objective.feasible_set(), name, self.config.seed)
+        survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
         attempts: list[Attempt] = []
         unplanted: list[str] = []
         for kind in self.kinds:
@@ -154,7 +154,7 @@ class Yardstick:
         return Judged(name, tuple(attempts), tuple(unplanted))
 
     def _attempt(
-        self, name: str, method: str, planting: Planting, survey: Survey, attacked: AttackedScene
+        self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
     ) -> Attempt:
         certain = [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
         seen = _seen_without(self.detector, attacked) if certain else ()
