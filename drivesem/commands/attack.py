@@ -49,7 +49,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         f"{sum(summary.phantoms.values())} phantoms by threshold, {summary.successes_moved} frames broken; "
         f"feasible {feasible}; {summary.queries} queries in {summary.seconds:.0f} s"
     )
-    console.print(told_grades(summary))
+    console.print(told_grades(summary), soft_wrap=True)
     for note, frames in summary.grade_notes.items():
         console.print(f"{frames} frames: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:

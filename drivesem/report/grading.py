@@ -30,7 +30,7 @@ CHANCE = "each of which chance may explain"
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class GradesAsked:
     """What a run asks of its failures. draws: of a certificate, before the change and after it; right, wrong: of
     these, how many it needs; second, peer: whether another renderer and another detector were to be asked.
     """
@@ -43,7 +43,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class GradeRule:
     """A grade in the legend."""
 
     grade: str
@@ -159,28 +159,28 @@ def _counts(failures: Sequence[Failure]) -> tuple[int, ...]:
     return tuple(sum(f.grade == grade for f in failures) for grade in reversed(Grade))
 
 
-def rules(asked: Asked) -> list[Rule]:
+def rules(asked: GradesAsked) -> list[GradeRule]:
     """The legend, highest grade first."""
     needed, of = SECOND
     no = " Not asked in this run."
     return [
-        Rule(
+        GradeRule(
             Grade.SHARED,
             f"Confirmed, and a detector of another architecture fails too ({needed} of {of} draws), one that is "
             f"right under a random change as large.{'' if asked.second and asked.peer else no}",
         ),
-        Rule(
+        GradeRule(
             Grade.CONFIRMED,
             f"Certain, and so it is when a second renderer draws the scene: right before, wrong after in {needed} "
             f"of {of} draws.{'' if asked.second else no}",
         ),
-        Rule(
+        GradeRule(
             Grade.CERTAIN,
             "The scene is photographed again and again, each time shifted, blurred, lit and placed a little "
             f"otherwise, as never during the search: right in {asked.right} of {asked.draws} draws or more before "
             f"the change, wrong in {asked.wrong} of {asked.draws} or more after it.",
         ),
-        Rule(
+        GradeRule(
             Grade.THRESHOLD,
             "Right in one picture, wrong in another. A shift of a few pixels may do the same: chance may "
             "explain it.",

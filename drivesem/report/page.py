@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.report.grading import Asked
+from drivesem.report.grading import GradesAsked
 from drivesem.run.results import FrameResult, RunSummary
 
 Point = tuple[float, float]
@@ -35,7 +35,7 @@ class ShownRun:
     method: str
     command: str
     weathers: tuple[str | None, ...]
-    asked: Asked
+    asked: GradesAsked
     paper: PaperFigure | None = None
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.report import grading
 from drivesem.run.results import BoxRecord, Failure
 
 Image = NDArray[np.uint8]
@@ -29,7 +30,7 @@ def overlay(
     threshold: float,
 ) -> Image:
     """`image` with true boxes (green; grey where ignored), detections above `threshold` (yellow, with class and
-    score), lost objects (red) and phantoms (purple).
+    score), lost objects (red) and phantoms (purple) with their kinds and grades.
     """
     canvas = image.copy()
     for box in targets:
@@ -39,7 +40,8 @@ def overlay(
             _draw(canvas, box.xyxy, DETECTED_COLOUR, 1, f"{box.label} {box.score:.2f}")
     for failure in failures:
         colour = LOST_COLOUR if failure.kind == "lost" else PHANTOM_COLOUR
-        _draw(canvas, failure.xyxy, colour, 2, f"{failure.kind} {failure.label}", below=True)
+        grade = f": {failure.grade}" if failure.grade else ""
+        _draw(canvas, failure.xyxy, colour, 2, f"{grading.what(failure)}{grade}", below=True)
     return canvas
 
 

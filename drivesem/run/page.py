@@ -15,7 +15,7 @@ from drivesem.data.label_table import WEATHERS
 from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.outcome import Outcome
-from drivesem.report.grading import Asked
+from drivesem.report.grading import GradesAsked
 from drivesem.report.html import render_report
 from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
@@ -242,9 +242,11 @@ def _shown(
     )
 
 
-def _asked(config: Attack) -> Asked:
+def _asked(config: Attack) -> GradesAsked:
     rule = Rule(config.draws)
-    return Asked(rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.peer != "off")
+    return GradesAsked(
+        rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.peer != "off"
+    )
 
 
 def _paper(params: tuple[str, ...]) -> PaperFigure | None:

@@ -275,6 +275,36 @@ class Confirm(FinishedRun, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Holes(FrameCommand):
+    """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
+
+    runs: Runs = ()
+    """Folders of drivesem attack."""
+    samples: Annotated[int, at_least(24, "of which a rule can be made")] = 96
+    """States around each failure, within what the run could change; each is seen once, with nuisances."""
+    fresh: Count = 32
+    """Further ones inside of the rule that was found, which it is held against."""
+    reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
+    """How far from the counterexample, as a share of each bound's width, within the bounds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate(Bootstrap, Tiles, FrameCommand):
+    """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
+
+    runs: Runs = ()
+    """Folders of drivesem attack."""
+    before: str = "squeezedet"
+    """The detector that stands: shipped, a file, or another project's."""
+    after: str = "squeezedet"
+    """The one that is to take its place."""
+    tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
+    """By how much the share of lost objects may grow, of a hole, of a kind of failure, and of all."""
+    samples: Count = 32
+    """States around each failure, the same for both detectors."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Command):
     """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
 
@@ -763,6 +793,8 @@ _ALL: tuple[type[Command], ...] = (
         Study,
         Explain,
         Confirm,
+        Holes,
+        Gate,
         Report,
         Plausibility,
         Realism,

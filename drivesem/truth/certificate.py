@@ -67,6 +67,18 @@ class Look:
     classes: int
 
 
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One draw of one state as a picture (3, H, W), before a detector sees it. targets: labels among CLASSES;
+    shown_xyxy: (N, 4) px, the boxes of what shows of the objects.
+    """
+
+    picture: Tensor
+    targets: Targets
+    shown_xyxy: Tensor
+    draw: Draw
+
+
 @dataclass(frozen=True)
 class Camera:
     """Looks at states of one scene through a renderer and a detector. stream: name of the draws, which follow from
@@ -79,19 +91,29 @@ class Camera:
     nuisances: Nuisances
     stream: str
 
-    @torch.no_grad()
     def look(self, state: SceneIR, number: int, ignore: Tensor) -> Look:
         """The number-th draw of a state. ignore: (N,) bool, the objects that are not judged in it."""
+        return self.see(self.expose(state, number, ignore))
+
+    @torch.no_grad()
+    def expose(self, state: SceneIR, number: int, ignore: Tensor) -> Exposure:
+        """The same, before the detector sees it."""
         draw = self.nuisances.draw(self.stream, number, state)
         redrawn = self.renderer.redraw(draw.scene(state))
         truth, known, count = redrawn.targets, redrawn.shown_xyxy, len(ignore)
-        judged = JudgedClasses.of(self.detector)
         skipped = torch.cat([truth.ignore[:count] | ignore.to(truth.ignore), truth.ignore[count:]])
-        targets = judged.targets(Targets(draw.boxes(truth.boxes_xyxy), truth.labels, skipped))
         shown = torch.where(boxes.area(known)[:, None] > 0, draw.boxes(known), torch.zeros_like(known))
-        detections = judged.detections(predict(self.detector, draw.picture(redrawn.image)[None])[0])
-        view = View(targets, with_regions(shown, targets), detections)
-        return Look(view, judge(view, self.t_star), self.t_star, draw, len(judged.names))
+        targets = Targets(draw.boxes(truth.boxes_xyxy), truth.labels, skipped)
+        return Exposure(draw.picture(redrawn.image), targets, shown, draw)
+
+    @torch.no_grad()
+    def see(self, exposure: Exposure) -> Look:
+        """What the detector makes of it."""
+        judged = JudgedClasses.of(self.detector)
+        targets = judged.targets(exposure.targets)
+        detections = judged.detections(predict(self.detector, exposure.picture[None])[0])
+        view = View(targets, with_regions(exposure.shown_xyxy, targets), detections)
+        return Look(view, judge(view, self.t_star), self.t_star, exposure.draw, len(judged.names))
 
 
 def with_regions(shown_xyxy: Tensor, targets: Targets) -> Tensor:

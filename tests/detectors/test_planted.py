@@ -142,11 +142,11 @@ def test_a_box_without_an_area_has_features() -> None:
 @given(low=st.floats(-5, 5), width=st.floats(0.01, 10), softness=st.floats(0.01, 0.12))
 def test_outside_nothing_is_lowered_and_inside_by_the_depth(low: float, width: float, softness: float) -> None:
     fault = PlantedFault((Band("aspect", low, low + width),), softness=softness)
-    reach = 12 * softness * width
+    reach = 10 * softness * width
     outside = torch.tensor([[low - reach, low + width + reach]], dtype=torch.float64)
     middle = torch.tensor([[low + width / 2]], dtype=torch.float64)
     assert float(fault.depth * fault.share(outside).max()) < 1e-4
-    assert float(fault.share(middle)) > 0.96
+    assert float(fault.share(middle)) > 0.78
     assert fault.contains(middle).all()
     assert not fault.contains(outside).any()
 
@@ -154,7 +154,7 @@ def test_outside_nothing_is_lowered_and_inside_by_the_depth(low: float, width: f
 def test_a_pair_asks_for_both() -> None:
     fault = PlantedFault.of("aspect=1:2,lightness=0.2:0.4")
     values = torch.tensor([[1.5, 1.5, 3.5], [0.3, 0.9, 0.3]])
-    assert fault.share(values).tolist() == pytest.approx([0.974, 0, 0], abs=2e-3)
+    assert fault.share(values).tolist() == pytest.approx([0.823, 0, 0], abs=2e-3)
     assert fault.contains(values).tolist() == [True, False, False]
 
 
@@ -273,7 +273,7 @@ def test_a_detector_without_gradients_can_have_a_fault_too() -> None:
     assert isinstance(detector, PlantedPredictor)
     (found,) = predict(detector, picture())
     assert found.labels.tolist() == [0, 1]
-    assert found.scores.tolist() == pytest.approx([0.6, 0.003], abs=1e-3)
+    assert found.scores.tolist() == pytest.approx([0.6, 0.0063], abs=1e-3)
     assert not check_detector(detector, HW).require().gradients
 
 

@@ -18,6 +18,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from drivesem.attack.methods.base import Attack, Problem, Proposals, Views, check_counts
+from drivesem.attack.methods.unit_box import UnitBox
 from scene_ir.errors import RangeError
 
 LEAST_PASSES = 24
@@ -64,60 +65,11 @@ class Climb(Attack):
             raise RangeError("problem", "one with views of its objects", "none")
         if not bool(problem.views.judged.any()):
             return Proposals((), (), 0)
-        search = _Search(
-            problem, problem.views, _Coordinates(problem, theta0), generator, self.passes - _OTHERWISE
-        )
+        search = _Search(problem, problem.views, UnitBox(problem, theta0), generator, self.passes - _OTHERWISE)
         place = search.look_around(max(int(_SCOUTS * self.passes), 1))
         place = search.descend(place, self.gradient and problem.views.differentiable)
         theta, active = search.theta(place)
         return Proposals((theta,), (None,), search.spent, active)
-
-
-class _Coordinates:
-    """Places u (K,) in the unit box as thetas (D,): the bounds of each coordinate, or, in groups with modes, how
-    much of each mode. owner: (K,) the object that each belongs to, -1 for the scene; wide: (K,) bool, where a
-    gradient at a point says little.
-    """
-
-    def __init__(self, problem: Problem, theta0: Tensor) -> None:
-        self._problem = problem
-        blocks: list[Tensor] = []
-        owners: list[Tensor] = []
-        wide: list[Tensor] = []
-        start: list[Tensor] = []
-        span = problem.upper - problem.lower
-        for group in problem.groups:
-            lower, width = problem.lower[group.where], span[group.where]
-            size, count = len(width), max(group.owners, 1)
-            if group.modes is None:
-                block = torch.diag(width)
-                at = (theta0[group.where] - lower) / width.clamp_min(1e-12)
-            else:
-                half = 0.5 * width.reshape(count, -1)
-                block = torch.block_diag(*(2 * group.modes.to(half) * row for row in half))
-                at = torch.full((len(block),), 0.5).to(block)
-            first = torch.zeros(len(block), len(theta0)).to(block)
-            first[:, group.where] = block
-            blocks.append(first)
-            start.append(at)
-            each = len(block) // count
-            owner = torch.arange(count).repeat_interleave(each) if group.owners else torch.full((len(block),), -1)
-            owners.append(owner)
-            wide.append(torch.full((len(block),), not group.smooth))
-            assert size == len(first[0, group.where])
-        self._matrix = torch.cat(blocks)
-        self.start = torch.cat(start)
-        self._offset = theta0 - self.start @ self._matrix
-        self.owner, self.wide = torch.cat(owners), torch.cat(wide)
-
-    def theta(self, place: Tensor) -> Tensor:
-        """theta (D,) at u (K,), within the bounds; feasible or not."""
-        theta = self._offset + place @ self._matrix
-        return torch.minimum(torch.maximum(theta, self._problem.lower), self._problem.upper)
-
-    def slope(self, gradient: Tensor) -> Tensor:
-        """Of a gradient (D,) to theta, that to u (K,)."""
-        return self._matrix @ gradient
 
 
 @dataclass
@@ -126,7 +78,7 @@ class _Search:
 
     problem: Problem
     views: Views
-    at: _Coordinates
+    at: UnitBox
     generator: torch.Generator
     limit: int
     _active: list[str] = field(default_factory=list)

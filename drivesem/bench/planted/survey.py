@@ -1,4 +1,4 @@
-"""What features a frame's cars have, and which ones theta can give them: where faults can be planted."""
+"""What a detector sees of a frame's cars, as photographed and where theta brings them: where to plant faults."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from detectors import boxes
+from detectors.base import lowered_probability
 from detectors.planted import BLIND_TO, FEATURES, OF_THE_PICTURE, PlantedFault, features, seen_cars
 from detectors.types import CLASSES
 from drivesem.attack.feasible.projection import FeasibleSet
@@ -18,6 +19,7 @@ from drivesem.attack.objective import Objective
 from drivesem.evaluation.failures import IOU
 from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.redraw.compositor import CompositorDraw
+from scene_ir.types import SceneIR
 
 HALTON = 128
 """Draws of a scrambled Halton sequence over all of the bounds: they say how rare a fault is."""
@@ -32,59 +34,67 @@ _BY_FACTOR = ("height_px", "aspect")
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """How a detector sees the cars of a frame before any change. judged (N,) bool: the cars; sure (N,) bool: of
-    these, the ones found in all looks, mostly by one box; factor, shift (F, N): of FEATURES, what makes those of
-    the detector's boxes of those of the labels' boxes; farthest, mostly (F, N): how far single looks are off what
-    that gives, at most, and in `MOSTLY` of them.
+class Sighting:
+    """What a detector without a fault says of the cars in one picture, as faults take it. values (F, K): of
+    FEATURES, of the K cars that it sees; car (R,) int64, scores (R,): of predictions, which of these each is
+    about; meets (N, R) bool: whether each finds one of the scene's objects, score and place; none that is ignored.
     """
 
-    judged: Tensor
-    sure: Tensor
-    factor: Tensor
-    shift: Tensor
-    farthest: Tensor
-    mostly: Tensor
+    values: Tensor
+    car: Tensor
+    scores: Tensor
+    meets: Tensor
+    t_star: float
 
     @classmethod
-    def of(cls, objective: Objective, name: str, seed: int) -> Seen:
-        """By `LOOKS` draws of the scene before a change. Raises RangeError where the detector has no gradient,
-        DetectorError where it does not tell its candidates.
+    @torch.no_grad()
+    def of(cls, objective: Objective, image: Tensor, labels_xyxy: Tensor, ignore: Tensor) -> Sighting:
+        """In an image (3, H, W) with labels (N, 4) px and ignore (N,) bool of the scene's objects."""
+        detector = objective.differentiable
+        label = detector.classes.index(BLIND_TO)
+        told = detector.candidates(detector(image[None]))
+        placed, scores = told.boxes_of(label), told.log_scores[:, label].exp()
+        cars = seen_cars(placed, scores)
+        own = scores[cars.rows]
+        meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
+        meets &= (own >= objective.t_star) & ~ignore.to(meets.device)[:, None]
+        values = features(image[None], cars.boxes_xyxy[None])[:, 0]
+        return cls(values, cars.car, own, meets, objective.t_star)
+
+    @property
+    def main(self) -> Tensor:
+        """Features (F, N) of each object, of the car that the best prediction that finds it is about; nan where
+        none does.
         """
-        paper, scene = objective.benign.paper, objective.space.scene
-        renderer = CompositorDraw(objective.compositor, objective.labeller)
-        base = FeaturesOf(objective).plain(objective.space.theta0)
-        judged = ~paper.ignore & (paper.category == CLASSES.index(BLIND_TO))
-        labelled, seen, single = [], [], []
-        for number in range(LOOKS):
-            draw = Nuisances().draw(f"planted:{name}:{seed}", number, scene)
-            redrawn = renderer.redraw(draw.scene(scene))
-            image = draw.picture(redrawn.image)
-            labels = draw.boxes(redrawn.targets.boxes_xyxy[: len(judged)]).to(image)
-            labelled.append(features(image[None], labels[None])[:, 0])
-            values, alone = _as_seen(objective, image, labels)
-            seen.append(values)
-            single.append(alone)
-        by_label, by_box = torch.stack(labelled), torch.stack(seen)  # (LOOKS, F, N)
-        found = torch.isfinite(by_box).all(1)
-        mostly_single = torch.stack(single).double().mean(0) >= MOSTLY
-        by_factor = torch.tensor([feature in _BY_FACTOR for feature in FEATURES])[:, None]
-        off = torch.where(by_factor, by_box / by_label, by_box - by_label).nanmedian(0).values
-        factor = torch.where(by_factor, off, 1.0).nan_to_num(1.0)
-        shift = torch.where(by_factor, 0.0, off).nan_to_num(0.0)
-        apart = (by_box - (factor * base + shift)).abs().nan_to_num(0.0)
-        sure = judged & found.all(0) & mostly_single
-        return cls(judged, sure, factor, shift, apart.amax(0), apart.quantile(MOSTLY, 0))
+        found = torch.full((len(self.values), len(self.meets)), torch.nan)
+        for i, own in enumerate(self.meets):
+            if bool(own.any()):
+                found[:, i] = self.values[:, self.car[self.scores.where(own, 0.0).argmax()]]
+        return found
+
+    @property
+    def single(self) -> Tensor:
+        """(N,) bool: objects that are found, all predictions of which are about one car."""
+        return torch.tensor([len(self.car[own].unique()) == 1 for own in self.meets])
+
+    def lost(self, fault: PlantedFault) -> Tensor:
+        """Objects (N,) bool that are found, and are not with the fault."""
+        rows = [FEATURES.index(name) for name in fault.names]
+        by = fault.depth * fault.share(self.values[rows])
+        still = lowered_probability(self.scores, by[self.car]) >= self.t_star
+        return self.meets.any(1) & ~(self.meets & still).any(1)
 
 
-class FeaturesOf:
-    """The features of a scene's cars at theta, by their labels and the rendered picture: no detector is asked."""
+class SeenFrame:
+    """A scene's cars at theta, by labels and pictures. judged (N,) bool: its cars that count."""
 
     def __init__(self, objective: Objective) -> None:
         self.objective = objective
+        paper = objective.benign.paper
+        self.judged = ~paper.ignore & (paper.category == CLASSES.index(BLIND_TO))
 
     @torch.no_grad()
-    def plain(self, theta: Tensor, names: Sequence[str] = FEATURES) -> Tensor:
+    def labelled(self, theta: Tensor, names: Sequence[str] = FEATURES) -> Tensor:
         """Features (F, N) at a feasible theta (D,), of labels that moved along; OF_THE_PICTURE need a render."""
         objective = self.objective
         scene = objective.space.apply(objective.space.scene, theta)
@@ -94,46 +104,94 @@ class FeaturesOf:
         labels = objective.labeller.moved(scene)
         return features(image[None], labels.boxes_xyxy.to(image)[None], names)[:, 0]
 
+    def sighting(self, theta: Tensor) -> Sighting:
+        """What the detector sees at a feasible theta (D,)."""
+        scene = self.objective.space.apply(self.objective.space.scene, theta)
+        return self._sighting(scene)
+
+    def looks(self, name: str, seed: int) -> Iterator[Sighting]:
+        """What it sees in `LOOKS` draws of the scene before any change."""
+        scene = self.objective.space.scene
+        for number in range(LOOKS):
+            yield self._sighting(scene, f"planted:{name}:{seed}", number)
+
+    def _sighting(self, scene: SceneIR, stream: str | None = None, number: int = 0) -> Sighting:
+        renderer = CompositorDraw(self.objective.compositor, self.objective.labeller)
+        if stream is None:
+            drawn = renderer.redraw(scene)
+            image, at = drawn.image, drawn.targets.boxes_xyxy
+        else:
+            draw = Nuisances().draw(stream, number, scene)
+            drawn = renderer.redraw(draw.scene(scene))
+            image, at = draw.picture(drawn.image), draw.boxes(drawn.targets.boxes_xyxy)
+        count = len(self.judged)
+        return Sighting.of(self.objective, image, at[:count], drawn.targets.ignore[:count] | ~self.judged)
+
 
 @dataclass(frozen=True)
-class Survey:
-    """What theta can do to a frame's cars, in features as the detector sees them. benign (F, N); halton (K, F, N)
-    and corners (C, F, N): at feasible thetas.
+class FrameSurvey:
+    """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners. benign
+    (F, N): features as photographed, by the detector's boxes; farthest, mostly (F, N): how far those of single
+    looks are off, at most and in `MOSTLY` of them; sure (N,) bool: cars found in all looks, mostly as one.
+    factor, shift (F, N): what makes features by the detector's boxes of those by labels, as photographed.
     """
 
-    of: FeaturesOf
-    seen: Seen
+    frame: SeenFrame
+    looks: tuple[Sighting, ...]
+    halton: tuple[Sighting, ...]
+    corners: tuple[Sighting, ...]
     benign: Tensor
-    halton: Tensor
-    corners: Tensor
+    farthest: Tensor
+    mostly: Tensor
+    sure: Tensor
+    factor: Tensor
+    shift: Tensor
 
     @classmethod
-    def make(cls, objective: Objective, feasible: FeasibleSet, name: str, seed: int) -> Survey:
-        """Of one frame; the same arguments give the same survey. name: the frame's."""
-        of, seen = FeaturesOf(objective), Seen.of(objective, name, seed)
-
-        def as_seen(thetas: Iterator[Tensor]) -> Tensor:
-            return torch.stack([seen.factor * of.plain(theta) + seen.shift for theta in thetas])
-
+    def make(cls, objective: Objective, feasible: FeasibleSet, name: str, seed: int) -> FrameSurvey:
+        """Of one frame; the same arguments give the same survey. name: the frame's. Raises RangeError where the
+        detector has no gradient, DetectorError where it does not tell its candidates.
+        """
+        frame = SeenFrame(objective)
+        looks = tuple(frame.looks(name, seed))
+        labelled = frame.labelled(objective.space.theta0)
+        benign = frame.sighting(objective.space.theta0).main
+        seen = torch.isfinite(benign)
+        by_factor = torch.tensor([feature in _BY_FACTOR for feature in FEATURES])[:, None]
+        factor = torch.where(by_factor & seen, benign / labelled, 1.0)
+        shift = torch.where(~by_factor & seen, benign - labelled, 0.0)
+        benign = benign.where(seen, labelled)
+        mains = torch.stack([look.main for look in looks])  # (LOOKS, F, N)
+        off = (mains - benign).abs().nan_to_num(0.0)
+        single = torch.stack([look.single for look in looks]).double().mean(0) >= MOSTLY
         return cls(
-            of,
-            seen,
-            as_seen(iter([objective.space.theta0]))[0],
-            as_seen(halton(feasible, HALTON, seed)),
-            as_seen(corners(feasible, CORNERS, seed)),
+            frame=frame,
+            looks=looks,
+            halton=tuple(map(frame.sighting, halton(feasible, HALTON, seed))),
+            corners=tuple(map(frame.sighting, corners(feasible, CORNERS, seed))),
+            benign=benign,
+            farthest=off.amax(0),
+            mostly=off.quantile(MOSTLY, 0),
+            sure=frame.judged & seen.all(0) & torch.isfinite(mains).all(0).all(0) & single,
+            factor=factor,
+            shift=shift,
         )
 
     def inside(self, fault: PlantedFault, theta: Tensor) -> Tensor:
-        """Whether each object (N,) is a car inside of the fault's region at a feasible theta (D,)."""
+        """Whether each object (N,) is a car inside of the fault's bands at a feasible theta (D,), by labels and
+        picture, and by how far the detector's boxes are off as photographed. No detector is asked.
+        """
         rows = [FEATURES.index(name) for name in fault.names]
-        values = self.seen.factor[rows] * self.of.plain(theta, fault.names) + self.seen.shift[rows]
-        return self.seen.judged & fault.contains(values)
+        values = self.factor[rows] * self.frame.labelled(theta, fault.names) + self.shift[rows]
+        return self.frame.judged & fault.contains(values)
+
+    def blind(self, fault: PlantedFault, theta: Tensor) -> Tensor:
+        """Whether each object (N,) is a car that the fault hides at a feasible theta (D,). Asks the detector."""
+        return self.frame.sighting(theta).lost(fault)
 
     def rarity(self, fault: PlantedFault) -> float:
-        """Share of Halton's draws in which a car is inside of the fault's region."""
-        values = self.halton[:, [FEATURES.index(name) for name in fault.names]]
-        hit = fault.contains(values.transpose(0, 1)) & self.seen.judged
-        return float(hit.any(1).double().mean())
+        """Share of Halton's draws in which the fault hides a car."""
+        return sum(bool(sighting.lost(fault).any()) for sighting in self.halton) / len(self.halton)
 
 
 def halton(feasible: FeasibleSet, count: int, seed: int) -> Iterator[Tensor]:
@@ -155,26 +213,3 @@ def corners(feasible: FeasibleSet, count: int, seed: int) -> Iterator[Tensor]:
             if still and not held.all():
                 theta[where] = 0
         yield feasible.project(theta).theta
-
-
-@torch.no_grad()
-def _as_seen(objective: Objective, image: Tensor, labels_xyxy: Tensor) -> tuple[Tensor, Tensor]:
-    """Features (F, N) of cars with labels (N, 4) px in a picture (3, H, W), by the box of the detector's best
-    prediction that meets each; nan where none does. And (N,) bool: whether all that meet it are about one car.
-    """
-    detector = objective.differentiable
-    label = detector.classes.index(BLIND_TO)
-    told = detector.candidates(detector(image[None]))
-    placed, scores = told.boxes_of(label), told.log_scores[:, label].exp()
-    cars = seen_cars(placed, scores)
-    values = features(image[None], cars.boxes_xyxy[None])[:, 0]
-    meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
-    meets &= scores[cars.rows] >= objective.t_star
-    seen = torch.full((len(FEATURES), len(labels_xyxy)), torch.nan)
-    single = torch.zeros(len(labels_xyxy), dtype=torch.bool)
-    for i, own in enumerate(meets):
-        if bool(own.any()):
-            best = scores[cars.rows].where(own, 0.0).argmax()
-            seen[:, i] = values[:, cars.car[best]]
-            single[i] = len(cars.car[own].unique()) == 1
-    return seen, single

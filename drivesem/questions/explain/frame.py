@@ -14,10 +14,8 @@ from torch import Tensor
 
 from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
-from drivesem.attack.aims import Aim
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.bounds import Limits
-from drivesem.attack.labels import Difficulty
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Parameter, ParameterSpace
@@ -37,13 +35,12 @@ from drivesem.questions.explain.results import (
 from drivesem.questions.explain.shapley import MOST_EXACT, Flags, Floats, shapley
 from drivesem.report import pictures
 from drivesem.run.frame import RESULT, detection_records, failure_records, target_records
-from drivesem.run.results import Coordinate, FrameResult, load_frame
+from drivesem.run.rebuilt import rebuilt
+from drivesem.run.results import Coordinate, load_frame
 from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene, to_uint8
-from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
+from scene_ir.io import to_uint8
 
 KINDS: tuple[Kind, ...] = ("parameter", "object")
 
@@ -115,7 +112,7 @@ def explain_frame(
     """
     start = time.perf_counter()
     result = load_frame(folder / RESULT)
-    objective, theta = rebuild(result, folder, attack, params, detector)
+    objective, theta = rebuilt(result, folder, attack, params, detector)
     space = objective.space
     limits, only_bounds = Limits(joint_weather=result.joint_weather), attack.project == "bounds"
     judge = Judge(objective.problem(objective.feasible_set(limits, only_bounds)))
@@ -150,26 +147,6 @@ def explain_frame(
     with files.whole_folder(out) as part:
         _write(part, explanation, objective, least, views)
     return explanation
-
-
-def rebuild(
-    result: FrameResult, folder: Path, attack: Attack, params: Sequence[Parameter], detector: Predictor
-) -> tuple[Objective, Tensor]:
-    """The objective of a frame of a run, and the theta (D,) that was found, from the scene that was saved.
-
-    The saved scene carries the one it was made from, so that neither the data set nor its de-rendering is needed.
-    A budget is not needed either: all that is asked for lies between theta0 and theta. Raises FormatError.
-    """
-    scene = load_scene(folder / "scene").as_photographed()
-    space = ParameterSpace(scene, params)
-    if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
-        raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
-    theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
-    compositor = Compositor(scene, RenderSettings(backend=attack.backend))
-    labels, term = attack.objective_labels, attack.objective
-    aim = Aim.of(attack.target_objects, attack.target_classes)
-    difficulty = Difficulty(min_contrast=result.min_contrast)
-    return Objective(compositor, space, detector, labels, term, difficulty, attack.t_star, aim), theta
 
 
 def weigh(

@@ -24,6 +24,7 @@ from drivesem.questions.explain import frame as explaining
 from drivesem.questions.explain.results import read_explanation
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
+from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import load_frame
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
@@ -184,7 +185,7 @@ def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     # judged anew from what was written
     frame = explained / "frames" / "demo-000"
     result, attack = load_frame(frame / "result.json"), run_folder.attack_of(explained)
-    objective, theta = explaining.rebuild(result, frame, attack, ("translate", "rotate"), Jumpy())
+    objective, theta = rebuilt(result, frame, attack, ("translate", "rotate"), Jumpy())
     names = [objective.space.name(i) for i in range(objective.space.dim)]
     small = torch.zeros_like(theta)
     for coordinate in least.theta:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from detectors.planted import FEATURES, Band, PlantedFault
+from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.bench.planted import survey as surveying
-from drivesem.bench.planted.survey import FeaturesOf, Survey, corners, halton
+from drivesem.bench.planted.survey import FrameSurvey, SeenFrame, corners, halton
+from drivesem.evaluation import failures
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 
@@ -29,21 +30,21 @@ def feasible(objective: Objective) -> FeasibleSet:
 
 
 def test_features_are_those_of_labels_and_picture(objective: Objective) -> None:
-    values = FeaturesOf(objective).plain(objective.space.theta0)
+    values = SeenFrame(objective).labelled(objective.space.theta0)
     label = objective.benign.paper.boxes_xyxy
     assert values.shape == (len(FEATURES), len(label))
     torch.testing.assert_close(values[0], label[:, 3] - label[:, 1])
-    (lightness,) = FeaturesOf(objective).plain(objective.space.theta0, ("lightness",))
+    (lightness,) = SeenFrame(objective).labelled(objective.space.theta0, ("lightness",))
     torch.testing.assert_close(lightness, values[FEATURES.index("lightness")])
 
 
 def test_turning_a_car_changes_its_aspect_and_painting_it_its_lightness(objective: Objective) -> None:
-    space, of = objective.space, FeaturesOf(objective)
+    space, of = objective.space, SeenFrame(objective)
     names = [space.name(i) for i in range(space.dim)]
-    before, theta = of.plain(space.theta0), space.theta0.clone()
+    before, theta = of.labelled(space.theta0), space.theta0.clone()
     theta[names.index("objects[0].paint.lightness")] = 0.8
     theta[names.index("objects[1].yaw")] = 0.3
-    change = (of.plain(theta) - before).abs()
+    change = (of.labelled(theta) - before).abs()
     aspect, lightness = FEATURES.index("aspect"), FEATURES.index("lightness")
     assert float(change[lightness, 0]) > 0.05
     assert float(change[aspect, 0]) == 0
@@ -63,21 +64,38 @@ def test_a_survey_knows_what_is_inside(
 ) -> None:
     for name, count in (("HALTON", 4), ("CORNERS", 2), ("LOOKS", 3)):
         monkeypatch.setattr(surveying, name, count)
-    made = Survey.make(objective, feasible, "frame", 0)
-    seen = made.seen
-    assert seen.sure.any()
-    assert not (seen.sure & ~seen.judged).any()
-    assert bool((seen.mostly <= seen.farthest).all())
-    assert (len(made.halton), len(made.corners)) == (4, 2)
+    made = FrameSurvey.make(objective, feasible, "frame", 0)
+    assert made.sure.any()
+    assert not (made.sure & ~made.frame.judged).any()
+    assert bool((made.mostly <= made.farthest).all())
+    assert (len(made.looks), len(made.halton), len(made.corners)) == (3, 4, 2)
     # The detector's boxes are off the labels' by little, and so are features by it.
-    assert float((seen.factor[0, seen.sure] - 1).abs().max()) < 0.3
-    car = int(seen.sure.nonzero()[0])
+    assert float((made.factor[0, made.sure] - 1).abs().max()) < 0.3
+    car, theta0 = int(made.sure.nonzero()[0]), objective.space.theta0
     aspect = float(made.benign[1, car])
-    around = PlantedFault((Band("aspect", aspect - 0.01, aspect + 0.01),))
-    assert bool(made.inside(around, objective.space.theta0)[car])
+    around = PlantedFault((Band("aspect", aspect - 0.1, aspect + 0.1),))
+    assert bool(made.inside(around, theta0)[car])
+    assert bool(made.blind(around, theta0)[car])
     beyond = PlantedFault((Band("aspect", 50.0, 60.0),))
-    assert not made.inside(beyond, objective.space.theta0).any()
+    assert not made.inside(beyond, theta0).any()
+    assert not made.blind(beyond, theta0).any()
     assert made.rarity(beyond) == 0
     everything = PlantedFault((Band("lightness", -9.0, 9.0),))
     assert made.rarity(everything) == 1
-    assert torch.equal(made.inside(everything, objective.space.theta0), seen.judged)
+    assert torch.equal(made.inside(everything, theta0), made.frame.judged)
+
+
+def test_what_a_survey_calls_hidden_a_planted_detector_does_not_find(objective: Objective) -> None:
+    frame, space = SeenFrame(objective), objective.space
+    sighting = frame.sighting(space.theta0)
+    aspects = sighting.main[1]
+    middle = float(aspects[torch.isfinite(aspects)].median())
+    fault = PlantedFault((Band("aspect", middle - 0.2, middle + 0.2),))
+    hidden = sighting.lost(fault)
+    assert hidden.any()
+    planted = Objective(objective.compositor, space, PlantedDetector(objective.differentiable, fault))
+    targets = planted.judged.targets(planted.benign.paper.targets)
+    found = failures.judge(targets, planted.benign.detections, planted.t_star).found[: len(hidden)]
+    assert not found[hidden].any()
+    kept = torch.isfinite(aspects) & ~hidden
+    assert found[kept].all()

@@ -1,0 +1,17 @@
+"""`drivesem holes`: how large the holes are that a run's certain failures lie in, as rules a person can read."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from drivesem.questions.holes.asking import holes_run
+from drivesem.run.ask import say
+from drivesem.settings.commands import Holes
+from drivesem.settings.devices import check_device
+
+
+def run(config: Holes) -> int:
+    """Look around, report; exit code 0. Raises UsageError or SceneError for bad input."""
+    check_device(config.device)
+    say(holes_run(config), config.json, end=None if config.json else Console())
+    return 0

@@ -1,0 +1,90 @@
+"""The holes of a detector that runs' certain failures lie in: samples around each, gathered over frames."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from drivesem.attack.space import parse_params
+from drivesem.questions.holes.frame import Effort, look_around
+from drivesem.questions.holes.merged import merged
+from drivesem.questions.holes.report import answer_of
+from drivesem.questions.holes.results import HOLES, Around, FrameHoles, load
+from drivesem.report.answer import Answer
+from drivesem.run.ask import Bar, KeptFrames
+from drivesem.run.finished import Run, load_runs
+from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of, folder_of
+from drivesem.run.tally import certain_losses
+from drivesem.settings.commands import Holes
+
+_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs")
+_FREE = (*PRESENTATION, "runs")
+
+
+def holes_run(config: Holes) -> Answer:
+    """Look around the certain failures of runs, or go on with it, and write what is said. Raises UsageError or
+    SceneError for bad input.
+    """
+    runs = load_runs(config.runs, config.limit, "RUN")
+    out = folder_of(config.out, runs[0].folder / "holes")
+    claim(out, config, _WRITTEN, _FREE)
+    _tell_effort(runs, config)
+    found: dict[str, list[Around]] = {}
+    failed: dict[str, str] = {}
+    results: list[FrameHoles] = []
+    for place, run in enumerate(runs):
+        below = out / "runs" / str(place)
+        build = partial(HolesWorker, config, run, below)
+        names = _chosen(run)
+        kept, left = KeptFrames(run, below, HOLES, load).ask(
+            names, build(), build, config, Bar(f"looking around failures of {run.name}", remaining=True)
+        )
+        mark = f"{run.name}/" if len(runs) > 1 else ""
+        found |= {mark + one.identifier: list(one.around) for one in kept}
+        failed |= {mark + name: reason for name, reason in left.items()}
+        results += kept
+    facts = {
+        "out": str(out),
+        "runs": [str(run.folder) for run in runs],
+        "detector": runs[0].detector,
+        "params": runs[0].params,
+        "frames": sum(len(run.frames) for run in runs),
+        "failures": sum(map(len, found.values())),
+        "passes": sum(one.passes for one in results),
+        "frames_failed": failed,
+    }
+    answer = answer_of(out, merged(found), facts, failed)
+    answer.write()
+    return answer
+
+
+class HolesWorker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Holes, run: Run, out: Path) -> None:
+        self.run, self.out = run, out
+        self.effort = Effort(config.samples, config.fresh, config.reach, config.seed)
+        self.attack, self.params = attack_of(run.folder), parse_params(run.params)
+        self.detector = detector_of(self.attack, config.device)
+
+    def __call__(self, name: str) -> None:
+        """One frame, from the run's folder to its own."""
+        folder = self.run.folder / FRAMES / name
+        look_around(folder, self.attack, self.params, self.detector, self.effort, self.out / FRAMES / name)
+
+
+def _chosen(run: Run) -> list[str]:
+    return [frame.result.identifier for frame in run.frames if certain_losses(frame.result)]
+
+
+def _tell_effort(runs: list[Run], config: Holes) -> None:
+    """How much there is to do, before it begins; by the pace of the runs, whose seconds hold more than passes."""
+    count = sum(len(certain_losses(frame.result)) for run in runs for frame in run.frames)
+    results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
+    seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
+    wanted = count * (config.samples + config.fresh)
+    minutes = wanted * seconds / passes / 60 if passes else None
+    pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
+    Console(stderr=True).print(f"{count} certain failures, about {wanted} passes{pace}", soft_wrap=True)

@@ -1,0 +1,135 @@
+"""One frame: samples around each of its certain failures, a rule of them, and fresh samples inside of the rule."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from detectors.base import Predictor
+from drivesem.attack.budgets import budget_of
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.space import Parameter
+from drivesem.questions.holes.results import HOLES, Around, FrameHoles, Samples, dump
+from drivesem.run.frame import RESULT
+from drivesem.run.rebuilt import rebuilt
+from drivesem.run.results import Failure, load_frame
+from drivesem.run.tally import certain_losses
+from drivesem.settings.commands import Attack
+from drivesem.truth.neighbourhood import NEAR, Neighbourhood, Sample
+from drivesem.truth.nuisances import Nuisances
+from drivesem.truth.rules import Floats, contains, fit
+from scene_ir import files
+
+_TRIES = 6
+"""States that may be looked at for each fresh sample inside of a rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """samples: around each failure; fresh: inside of its rule; reach: see `Neighbourhood`; seed: of all."""
+
+    samples: int
+    fresh: int
+    reach: float
+    seed: int
+
+
+def look_around(
+    folder: Path,
+    attack: Attack,
+    params: Sequence[Parameter],
+    detector: Predictor,
+    effort: Effort,
+    out: Path,
+) -> FrameHoles:
+    """Look around the failures in a run's folder of one frame, and write the folder `out`, whole or not at all.
+
+    attack, params: the run's. Raises FormatError where the scene is not there or is damaged.
+    """
+    start = time.perf_counter()
+    result = load_frame(folder / RESULT)
+    objective, theta = rebuilt(result, folder, attack, params, detector, budget_of(attack.budget))
+    limits = Limits(joint_weather=result.joint_weather)
+    feasible = objective.feasible_set(limits, attack.project == "bounds")
+    around, passes = [], 0
+    for failure in certain_losses(result):
+        assert failure.index is not None
+        name = f"{result.identifier}:{failure.index}:{effort.seed}"
+        near = Neighbourhood(
+            objective, feasible, theta, failure.index, Nuisances.of(attack.nuisances), name, effort.reach
+        )
+        one = _around(failure, near, effort)
+        passes += len(one.asked.fails) + len(one.fresh.fails)
+        around.append(one)
+    found = FrameHoles(
+        identifier=result.identifier,
+        source=files.digest(folder / RESULT),
+        around=tuple(around),
+        passes=passes,
+        seconds=round(time.perf_counter() - start, 3),
+    )
+    with files.whole_folder(out) as part:
+        files.write_text(part / HOLES, dump(found))
+    return found
+
+
+def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
+    half, last = effort.samples // 2, effort.samples + _TRIES * effort.fresh
+    asked, _ = _seen(near, range(half), half, {})
+    close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, NEAR)
+    where = _rule(asked, close)
+    fresh, tried = _seen(near, range(effort.samples, last), effort.fresh if asked.fails else 0, where)
+    assert failure.index is not None
+    return Around(
+        index=failure.index,
+        label=failure.label,
+        error=failure.error or "",
+        grade=failure.grade or "",
+        asked=asked,
+        near=close,
+        where=where,
+        fresh=fresh,
+        tried=tried,
+    )
+
+
+def _rule(asked: Samples, close: Samples) -> dict[str, tuple[float, float]]:
+    both = [samples for samples in (asked, close) if samples.fails]
+    if not both:
+        return {}
+    columns = {name: np.concatenate([samples.columns()[name] for samples in both]) for name in both[0].names}
+    return fit(columns, np.concatenate([samples.failing for samples in both])).where
+
+
+def _seen(
+    near: Neighbourhood,
+    numbers: Iterable[int],
+    enough: int,
+    where: Mapping[str, tuple[float, float]],
+    part: float = 1.0,
+) -> tuple[Samples, int]:
+    """Up to `enough` samples inside of a rule, in which the object counts, before the detector; and how many were
+    tried for them. part: of the neighbourhood's reach.
+    """
+    rows: list[dict[str, float]] = []
+    fails: list[bool] = []
+    tried = 0
+    for number in numbers:
+        if len(rows) == enough:
+            break
+        tried += 1
+        sample = near.sample(number, part)
+        if sample is None or not contains(where, _columns(sample), 1)[0]:
+            continue
+        rows.append(sample.features)
+        fails.append(near.fails(sample))
+    names = tuple(rows[0]) if rows else ()
+    return Samples(names, tuple(tuple(round(v, 6) for v in row.values()) for row in rows), tuple(fails)), tried
+
+
+def _columns(sample: Sample) -> dict[str, Floats]:
+    return {name: np.array([value]) for name, value in sample.features.items()}

@@ -1,0 +1,156 @@
+"""From samples around single failures to holes: rules of the same features in about the same intervals are one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivesem.evaluation.resampling import wilson
+from drivesem.questions.holes.results import Around
+from drivesem.synth.compare import QUANTITIES, reference
+from drivesem.truth.rules import Rule, counted, overlap
+
+ONE = 0.5
+"""Overlap from which two rules of the same features are one hole."""
+_OF_KITTI = {
+    "distance_m": ("depth_m", 1.0),
+    "height_px": ("box_height_px", 1.0),
+    "yaw_deg": ("yaw_rad", np.pi / 180),
+}
+"""Features of which KITTI's distribution is known: its name there, and how many of its units one of ours is."""
+
+Where = dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """where: the rule, by feature; empty where failures are told by nothing, and the whole neighbourhood is meant.
+    label: class of the objects; probability, low, high: of failing in fresh samples inside, with Wilson's 95 %
+    interval, of `count` samples; outside: share of failures outside of it; share: of the neighbourhoods' samples,
+    those that lie inside and fail: how large it is; kitti: share of KITTI's vehicles inside, by feature; failures,
+    frames: that led to it.
+    """
+
+    where: Where
+    label: str
+    probability: float | None
+    low: float | None
+    high: float | None
+    count: int
+    outside: float | None
+    share: float
+    kitti: dict[str, float]
+    failures: tuple[str, ...]
+    frames: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object."""
+        return {
+            "parameters": list(self.where),
+            "where": {name: list(bounds) for name, bounds in self.where.items()},
+            "class": self.label,
+            "probability": self.probability,
+            "interval": [self.low, self.high],
+            "samples": self.count,
+            "outside": self.outside,
+            "share": self.share,
+            "kitti": self.kitti,
+            "failures": list(self.failures),
+            "frames": list(self.frames),
+        }
+
+    @property
+    def words(self) -> str:
+        """The rule for people."""
+        return (
+            ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in self.where.items()) or "anywhere"
+        )
+
+
+def merged(found: Mapping[str, Sequence[Around]]) -> list[Hole]:
+    """Holes of all frames, by name, largest first; what is told by the same features as a larger one comes after
+    those that are not.
+    """
+    groups: list[list[tuple[str, Around]]] = []
+    for frame, arounds in found.items():
+        for around in arounds:
+            like = next((group for group in groups if _alike(group[0][1], around)), None)
+            if like is None:
+                groups.append([(frame, around)])
+            else:
+                like.append((frame, around))
+    holes = sorted((_hole(group) for group in groups), key=lambda hole: -hole.share)
+    seen: set[tuple[str, ...]] = set()
+    first: list[Hole] = []
+    copies: list[Hole] = []
+    for hole in holes:
+        key = (hole.label, *sorted(hole.where))
+        (copies if key in seen else first).append(hole)
+        seen.add(key)
+    return first + copies
+
+
+def _alike(one: Around, other: Around) -> bool:
+    same = one.label == other.label and set(one.where) == set(other.where)
+    return same and overlap(one.where, other.where) >= ONE
+
+
+def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
+    members = [around for _, around in group]
+    # Of bounds that differ a little from failure to failure, the ones in the middle.
+    where: Where = {
+        name: (
+            float(np.median([around.where[name][0] for around in members])),
+            float(np.median([around.where[name][1] for around in members])),
+        )
+        for name in members[0].where
+    }
+    asked = [
+        counted(where, around.asked.columns(), around.asked.failing) for around in members if around.asked.fails
+    ]
+    fresh = [
+        counted(where, around.fresh.columns(), around.fresh.failing) for around in members if around.fresh.fails
+    ]
+    fails, count = sum(rule.fails for rule in fresh), sum(rule.count for rule in fresh)
+    low, high = wilson(fails, count) if count else (None, None)
+    return Hole(
+        where=where,
+        label=members[0].label,
+        probability=fails / count if count else None,
+        low=low,
+        high=high,
+        count=count,
+        outside=_share(asked),
+        share=sum(r.fails for r in asked) / max(sum(r.count + r.count_outside for r in asked), 1),
+        kitti=of_kitti(where),
+        failures=tuple(f"{frame}: objects[{around.index}]" for frame, around in group),
+        frames=tuple(dict.fromkeys(frame for frame, _ in group)),
+    )
+
+
+def _share(rules: Sequence[Rule]) -> float | None:
+    count = sum(rule.count_outside for rule in rules)
+    return sum(rule.fails_outside for rule in rules) / count if count else None
+
+
+def of_kitti(where: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Share of KITTI's labelled vehicles inside of each interval, of features whose distribution is known."""
+    found: dict[str, float] = {}
+    for name, (low, high) in where.items():
+        if name not in _OF_KITTI:
+            continue
+        theirs, unit = _OF_KITTI[name]
+        found[name] = round(_below(theirs, high * unit) - _below(theirs, low * unit), 4)
+    return found
+
+
+def _below(name: str, value: float) -> float:
+    """Share of KITTI's vehicles below a value; an angle adds one for each turn."""
+    quantity = QUANTITIES[name]
+    edges = np.asarray(quantity.edges, float)
+    below = np.concatenate([[0.0], np.cumsum(reference().shares[name])])
+    turns, rest = divmod(value - edges[0], 2 * np.pi) if quantity.angle else (0.0, value - edges[0])
+    return float(turns + np.interp(edges[0] + rest, edges, below / below[-1]))

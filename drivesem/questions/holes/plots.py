@@ -1,0 +1,44 @@
+"""Holes as a picture: how often what lies inside of each rule is lost, and what lies outside of it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from drivesem.questions.holes.merged import Hole
+from drivesem.report.plots import COLOURS, STYLE
+from scene_ir import files
+
+_MOST = 12
+"""Holes shown; the table has all."""
+_DPI = 150
+
+
+def write_holes(path: Path, holes: Sequence[Hole]) -> None:
+    """Bars of the largest, with intervals; marks for elsewhere."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    shown = holes[:_MOST]
+    with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=(8.0, 1.6 + 0.5 * len(shown)), layout="constrained")
+        axes = figure.add_subplot()
+        for place, hole in enumerate(shown):
+            inside = "fresh samples inside of the rule, 95 % interval" if place == 0 else None
+            if hole.probability is not None:
+                axes.barh([place], [100 * hole.probability], color=COLOURS[1], height=0.6, label=inside)
+                axes.plot(
+                    [100 * (hole.low or 0), 100 * (hole.high or 0)], [place] * 2, color="black", linewidth=1.2
+                )
+            if hole.outside is not None:
+                mark = "elsewhere in the neighbourhood" if place == 0 else None
+                axes.plot([100 * hole.outside], [place], "D", color=COLOURS[0], markersize=6, label=mark, zorder=3)
+        axes.set_yticks(range(len(shown)), [f"{hole.words}\n{len(hole.failures)} failures" for hole in shown])
+        axes.invert_yaxis()
+        axes.set(xlim=(0, 102), xlabel="lost, %")
+        axes.set_title("Holes, largest first", loc="left", fontsize=11)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.7 / (1 + len(shown))), ncols=2, fontsize=9)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    files.write_bytes(path, buffer.getvalue())

@@ -1,0 +1,74 @@
+"""Holes for people and programs: a table, JSON, CSV, Markdown and a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drivesem.questions.holes.merged import Hole
+from drivesem.questions.holes.plots import write_holes
+from drivesem.report.answer import Answer
+from drivesem.report.tables import Sheet
+
+_NONE = "No certain failure of an object in these runs: nothing to look around."
+_NOTES = (
+    "Lost: share of fresh samples inside of the rule in which the object is not found, with Wilson's 95 % "
+    "interval. Elsewhere: the same of samples outside of it. Size: share of all samples of the neighbourhood, of "
+    "what the run could change, that lie inside and are lost. The neighbourhood is that of one object with all "
+    "others as found.",
+    "Features: height_px, aspect (width by height), across (0 left, 1 right) of the label's box; lightness and "
+    "contrast of the picture in it; distance_m; yaw_deg; codes of paint, weather and foliage. A rule names what "
+    "tells failures best from the rest; what goes along with it may be the reason.",
+)
+
+
+def answer_of(out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
+    """What is said of all frames. facts: what stands before the holes in the JSON."""
+    lines = tuple(
+        (
+            hole.words,
+            hole.label,
+            "-"
+            if hole.probability is None
+            else f"{100 * hole.probability:.0f} [{_percent(hole.low)}, {_percent(hole.high)}]",
+            "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
+            f"{100 * hole.share:.1f}",
+            str(len(hole.failures)),
+            str(len(hole.frames)),
+        )
+        for hole in holes
+    )
+    columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures", "frames")
+    title = f"Holes of {facts['detector']}, within {facts['params']}"
+    return Answer(
+        out=out,
+        name="holes",
+        heading="Holes",
+        data={**facts, "holes": [hole.to_json() for hole in holes]},
+        tables={"holes": [_flat(hole) for hole in holes]} if holes else {},
+        sheets=[Sheet(title, columns, lines)],
+        notes=_NOTES if holes else (_NONE,),
+        words=("where", "class"),
+        picture=partial(write_holes, holes=holes) if holes else None,
+        failed=failed,
+    )
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f}"
+
+
+def _flat(hole: Hole) -> dict[str, Any]:
+    return {
+        "where": hole.words,
+        "class": hole.label,
+        "probability": hole.probability,
+        "low": hole.low,
+        "high": hole.high,
+        "samples": hole.count,
+        "outside": hole.outside,
+        "share": hole.share,
+        "failures": "; ".join(hole.failures),
+    }

@@ -1,0 +1,83 @@
+"""What is kept of one frame, as plain dataclasses: samples around its certain failures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivesem.run.records import from_json
+from drivesem.truth.rules import Flags, Floats
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+SCHEMA = 1
+HOLES = "holes.json"
+"""The file that marks a frame as done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """names: of features; values: a row a sample; fails: whether the object was not found in it."""
+
+    names: tuple[str, ...]
+    values: tuple[tuple[float, ...], ...]
+    fails: tuple[bool, ...]
+
+    def columns(self) -> dict[str, Floats]:
+        """Features (n,) by name."""
+        table = np.array(self.values, np.float64).reshape(len(self.values), len(self.names))
+        return {name: table[:, i] for i, name in enumerate(self.names)}
+
+    @property
+    def failing(self) -> Flags:
+        """(n,)."""
+        return np.array(self.fails, np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """Around one certain failure. index: of the object; error, grade: of the failure; asked: samples of the whole
+    neighbourhood; near: of the part of it around the failure, as a hole may be small; where: the rule of both;
+    fresh: further ones of the whole, inside of the rule, which it is held against; tried: states that were looked
+    at for these.
+    """
+
+    index: int
+    label: str
+    error: str
+    grade: str
+    asked: Samples
+    near: Samples
+    where: dict[str, tuple[float, float]]
+    fresh: Samples
+    tried: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrameHoles:
+    """One frame. source: digest of the run's result. `seconds` alone may differ between two calls."""
+
+    identifier: str
+    source: str
+    around: tuple[Around, ...]
+    passes: int
+    seconds: float
+
+
+def dump(result: FrameHoles) -> str:
+    """JSON text."""
+    return json.dumps({"schema": SCHEMA, **asdict(result)}, allow_nan=False) + "\n"
+
+
+def load(path: Path) -> FrameHoles:
+    """Read what `dump` gave. Raises FormatError naming the file."""
+    data = files.read_json(path)
+    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
+        raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
+    try:
+        return from_json(FrameHoles, data)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise FormatError(str(path), "the fields of a frame's holes", error) from error

@@ -1,0 +1,253 @@
+"""`drivesem holes` and `gate` on a run whose detector is blind to cars of a lightness: rules, worse detectors."""
+
+from __future__ import annotations
+
+import csv
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+from torch import Tensor
+
+from detectors.planted import features
+from detectors.types import Detections
+from drivesem.attack.labels import Labeller
+from drivesem.cli import main
+from drivesem.questions.gate import asking as gate_asking
+from drivesem.questions.holes.results import load
+from drivesem.run import attack as run_attack
+from drivesem.run import folder as run_folder
+from drivesem.run.finished import load_run
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.sources import solve_sources
+from scene_ir.types import SceneIR
+
+ATTACK = [
+    "attack",
+    "--detector",
+    "any",
+    "--method",
+    "halton",
+    "--queries",
+    "48",
+    "--params",
+    "color",
+    "--limit",
+    "1",
+]
+STILL = ["--nuisances", "off", "--no-confirm", "--peer", "off", "--workers", "1", "--json"]
+HOLES = ["--workers", "1", "--json", "--samples", "64", "--fresh", "10"]
+WIDE = 0.06
+"""Of the band of lightness in which cars are not seen, below the lightness of either car as photographed."""
+
+
+class Blind:
+    """Sees each car where it was photographed, but for those whose paint is as dark as its band says."""
+
+    name, t_star = "blind", 0.5
+    classes: tuple[str, ...] = ("Car",)
+
+    def __init__(self, boxes_xyxy: Tensor, band: tuple[float, float]) -> None:
+        self.boxes, self.band = boxes_xyxy, band
+
+    def forward(self, images: Tensor) -> Tensor:
+        return features(images, self.boxes.expand(len(images), -1, -1), ("lightness",))[0]
+
+    def decode(self, raw: Tensor) -> list[Detections]:
+        found = []
+        for lightness in raw:
+            seen = self.boxes[(lightness < self.band[0]) | (lightness > self.band[1])]
+            found.append(
+                Detections(seen, torch.zeros(len(seen), dtype=torch.int64), torch.full((len(seen),), 0.9))
+            )
+        return found
+
+
+class Other(Blind):
+    """The same of other classes."""
+
+    classes = ("Car", "Bus")
+
+
+@pytest.fixture(scope="module")
+def scene(street: Callable[..., SceneIR]) -> SceneIR:
+    """Two cars on a small grey street, photographed and taken apart."""
+    bare = street(positions_xz=((-2.5, 9.0), (2.5, 12.0)))
+    shot = Compositor(bare).render(bare)
+    return solve_sources(replace(bare, photograph=(shot.image * 255).round() / 255), shot.opacity)
+
+
+@pytest.fixture(scope="module")
+def blind(scene: SceneIR) -> Blind:
+    labels = Labeller(scene, Compositor(scene).render(scene)).paper()
+    cars = labels.targets.boxes_xyxy[: len(scene.objects)]
+    usual = float(features(scene.photograph[None], cars[None], ("lightness",)).min())
+    return Blind(cars, (usual - 0.02 - WIDE, usual - 0.02))
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory, scene: SceneIR, blind: Blind) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "dark"
+    with pytest.MonkeyPatch.context() as patch:
+        _patch(patch, scene, blind)
+        assert main([*ATTACK, *STILL, "--out", str(out)]) == 0
+    return out
+
+
+def _patch(patch: pytest.MonkeyPatch, scene: SceneIR, detector: Any) -> None:
+    patch.setattr("drivesem.synth.demo.demo_scene", lambda *_: scene)
+    for module in (run_attack, run_folder):
+        patch.setattr(module, "load_predictor", lambda *_: detector)
+
+
+@pytest.fixture(autouse=True)
+def patched(monkeypatch: pytest.MonkeyPatch, scene: SceneIR, blind: Blind) -> None:
+    _patch(monkeypatch, scene, blind)
+
+
+def holes(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(["holes", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture(scope="module")
+def looked(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: SceneIR, blind: Blind) -> Path:
+    """What is written of that run."""
+    out = tmp_path_factory.mktemp("looked") / "holes"
+    with pytest.MonkeyPatch.context() as patch:
+        _patch(patch, scene, blind)
+        assert main(["holes", str(attacked), *HOLES, "--out", str(out)]) == 0
+    return out
+
+
+def test_the_feature_and_the_band_are_named(attacked: Path, looked: Path, blind: Blind) -> None:
+    (frame,) = load_run(attacked).frames
+    certain = [f for f in frame.result.failures if f.grade != "threshold"]
+    assert certain
+    found = json.loads((looked / "holes.json").read_text())
+    assert found["failures"] == len(certain)
+    first = found["holes"][0]
+    assert first["parameters"] == ["lightness"]
+    low, high = first["where"]["lightness"]
+    assert (low, high) == pytest.approx(blind.band, abs=0.3 * WIDE)
+    assert first["probability"] >= 0.8
+    assert first["interval"][0] <= first["probability"] <= first["interval"][1]
+    assert first["outside"] < 0.05
+    assert 0 < first["share"] < 0.7
+    assert first["frames"] == ["demo-000"]
+    rows = list(csv.DictReader((looked / "holes.csv").read_text().splitlines()))
+    assert rows[0]["where"].startswith("lightness")
+    assert cv2.imread(str(looked / "holes.png")).std() > 10
+    assert "lightness" in (looked / "holes.md").read_text()
+
+
+def test_a_second_call_goes_on_and_says_the_same(
+    attacked: Path, looked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, kept = (
+        (looked / "holes.json").read_text(),
+        looked / "runs" / "0" / "frames" / "demo-000" / "holes.json",
+    )
+    written = kept.stat().st_mtime_ns
+    holes([str(attacked), *HOLES, "--out", str(looked)], capsys)
+    assert (looked / "holes.json").read_text() == before
+    assert kept.stat().st_mtime_ns == written
+
+
+def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kept = []
+    for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
+        words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--seed", seed]
+        holes([*words, "--out", str(tmp_path / name)], capsys)
+        kept.append(load(tmp_path / name / "runs" / "0" / "frames" / "demo-000" / "holes.json").around)
+    one, again, other = kept
+    assert one == again != other
+
+
+def test_a_run_without_certain_failures(
+    tmp_path: Path, scene: SceneIR, blind: Blind, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        _patch(patch, scene, Blind(blind.boxes, (2.0, 3.0)))
+        assert main([*ATTACK, *STILL, "--out", str(tmp_path / "fine")]) == 0
+    found = holes([str(tmp_path / "fine"), *HOLES], capsys)
+    assert found["holes"] == []
+    assert "No certain failure" in (tmp_path / "fine" / "holes" / "holes.md").read_text()
+
+
+@pytest.fixture
+def gate(
+    attacked: Path,
+    blind: Blind,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[[str], tuple[int, dict[str, Any]]]:
+    """The blind detector before, another after: exit code, and what is said."""
+    low, high = blind.band
+    known = {
+        "any": blind,
+        "better": Blind(blind.boxes, (2.0, 3.0)),
+        "worse": Blind(blind.boxes, (low - 0.3, high)),
+        "other": Other(blind.boxes, blind.band),
+    }
+    monkeypatch.setattr(gate_asking, "load_predictor", lambda name, *_: known[name])
+
+    def call(after: str) -> tuple[int, dict[str, Any]]:
+        capsys.readouterr()
+        words = ["--before", "any", "--after", after, "--samples", "20", "--workers", "1", "--json"]
+        code = main(["gate", str(attacked), *words, "--out", str(tmp_path / after)])
+        return code, json.loads(capsys.readouterr().out or "{}")
+
+    return call
+
+
+def test_a_detector_passes_its_own_gate(gate: Callable[[str], tuple[int, dict[str, Any]]]) -> None:
+    code, told = gate("any")
+    assert (code, told["passed"]) == (0, True)
+    assert {row["difference"] for row in told["rows"]} == {0}
+    assert told["rows"][0]["before"] > 0
+
+
+def test_a_worse_one_does_not_and_a_better_one_does(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
+) -> None:
+    code, told = gate("worse")
+    assert (code, told["passed"]) == (1, False)
+    row = told["rows"][0]
+    assert (row["level"], row["grew"]) == ("hole", True)
+    assert row["interval"][0] > 0.05
+    suite = ET.parse(tmp_path / "worse" / "gate.xml").getroot()
+    assert int(suite.attrib["failures"]) == sum(row["grew"] for row in told["rows"]) > 0
+    code, told = gate("better")
+    assert (code, told["passed"]) == (0, True)
+    assert told["rows"][-1]["difference"] < -0.05
+
+
+def test_other_classes_are_no_comparison(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["gate", "nowhere", "--after", "any"]) == 2
+    capsys.readouterr()
+    code, _ = gate("other")
+    assert code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "RUN: expected folders of drivesem attack"),
+        (["nowhere"], "RUN: expected a folder of drivesem attack, found nowhere"),
+        (["nowhere", "--samples", "9"], "--samples: expected at least 24, of which a rule can be made, found 9"),
+        (["nowhere", "--reach", "0"], "--reach: expected a share above 0, up to 1, found 0"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert refused("holes", *words).startswith(f"drivesem: {message}")

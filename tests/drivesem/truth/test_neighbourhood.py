@@ -1,0 +1,78 @@
+"""States around a counterexample: what moves and what does not, how far, and what is told of each."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from detectors.registry import load_detector
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import ParameterSpace
+from drivesem.synth.demo import demo_scene
+from drivesem.truth.neighbourhood import Neighbourhood
+from drivesem.truth.nuisances import Nuisances
+from scene_ir.render.compositor import Compositor
+
+CAR = 3
+
+
+@pytest.fixture(scope="module")
+def objective() -> Objective:
+    scene = demo_scene(0, 0)
+    space = ParameterSpace(scene, ("color", "weather", "translate"))
+    return Objective(Compositor(scene), space, load_detector("squeezedet"))
+
+
+@pytest.fixture(scope="module")
+def theta(objective: Objective) -> torch.Tensor:
+    space = objective.space
+    return objective.feasible_set().project(0.1 * space.upper).theta
+
+
+def around(objective: Objective, theta: torch.Tensor, reach: float = 1.0, name: str = "a") -> Neighbourhood:
+    return Neighbourhood(objective, objective.feasible_set(), theta, CAR, Nuisances.of("off"), name, reach)
+
+
+def own(objective: Objective) -> torch.Tensor:
+    names = [objective.space.name(i) for i in range(objective.space.dim)]
+    return torch.tensor([n.startswith(f"objects[{CAR}]") or not n.startswith("objects") for n in names])
+
+
+def test_only_the_object_and_what_is_shared_move(objective: Objective, theta: torch.Tensor) -> None:
+    near = around(objective, theta)
+    mine = own(objective)
+    for number in range(4):
+        state = near.theta(number)
+        # A neighbour may have to make a little room.
+        torch.testing.assert_close(state[~mine], theta[~mine], atol=0.01, rtol=0)
+        assert bool((state[mine] != theta[mine]).any())
+        assert bool((state >= objective.space.lower - 1e-6).all() & (state <= objective.space.upper + 1e-6).all())
+
+
+def test_the_reach_is_kept_to(objective: Objective, theta: torch.Tensor) -> None:
+    span = objective.space.upper - objective.space.lower
+    far, near = ([around(objective, theta, reach).theta(n) for n in range(4)] for reach in (1.0, 0.1))
+    assert all(bool(((state - theta).abs() <= 0.1 * span + 0.01).all()) for state in near)
+    assert any(bool(((state - theta).abs() > 0.1 * span).any()) for state in far)
+    close = [around(objective, theta).theta(n, part=0.1) for n in range(4)]
+    assert all(bool(((state - theta).abs() <= 0.1 * span + 0.01).all()) for state in close)
+
+
+def test_states_follow_from_the_name(objective: Objective, theta: torch.Tensor) -> None:
+    one, again, other = (around(objective, theta, name=name) for name in "aab")
+    assert torch.equal(one.theta(2), again.theta(2))
+    assert not torch.equal(one.theta(2), other.theta(2))
+
+
+def test_features_are_those_of_the_state(objective: Objective, theta: torch.Tensor) -> None:
+    near = around(objective, theta)
+    sample = near.sample(1)
+    assert sample is not None
+    scene = objective.space.apply(objective.space.scene, near.theta(1))
+    x0, y0, x1, y1 = sample.exposure.targets.boxes_xyxy[CAR].tolist()
+    assert sample.features["height_px"] == pytest.approx(y1 - y0, rel=1e-4)
+    assert sample.features["aspect"] == pytest.approx((x1 - x0) / (y1 - y0), rel=1e-4)
+    assert sample.features["distance_m"] == pytest.approx(float(scene.objects.translation[CAR, 2]))
+    assert sample.features["weather.fog"] == pytest.approx(float(scene.environment.weather[0]))
+    assert sample.features["paint.lightness"] == pytest.approx(float(scene.objects.texture_code[CAR, 0]))
+    assert isinstance(near.fails(sample), bool)

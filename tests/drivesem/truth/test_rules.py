@@ -1,0 +1,88 @@
+"""Rules found again in samples that follow one: the feature, the interval, and none where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivesem.truth.rules import Flags, Floats, contains, counted, fit, overlap
+
+NAMES = ("height_px", "aspect", "across", "lightness", "distance_m", "yaw_deg")
+
+
+def samples(count: int, seed: int) -> dict[str, Floats]:
+    values = np.random.default_rng(seed).random((len(NAMES), count))
+    return dict(zip(NAMES, values, strict=True))
+
+
+def failing(inside: Flags, seed: int, often: float = 0.9, else_: float = 0.05) -> Flags:
+    return np.random.default_rng(seed + 1000).random(len(inside)) < np.where(inside, often, else_)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("band", [(0.2, 0.5), (0.0, 0.3), (0.65, 1.0)])
+def test_one_feature(seed: int, band: tuple[float, float]) -> None:
+    features = samples(96, seed)
+    rule = fit(features, failing(contains({"aspect": band}, features, 96), seed))
+    assert next(iter(rule.where)) == "aspect"
+    low, high = rule.where["aspect"]
+    assert (low, high) == pytest.approx(band, abs=0.12)
+    assert rule.fails / rule.count > 0.7
+    assert rule.fails_outside / rule.count_outside < 0.2
+
+
+def test_two_features() -> None:
+    """In most of 8 draws: a pair that covers 16 % of the samples leaves few failures to tell from."""
+    truth, named = {"height_px": (0.3, 0.7), "lightness": (0.0, 0.4)}, 0
+    for seed in range(8):
+        features = samples(128, seed)
+        rule = fit(features, failing(contains(truth, features, 128), seed, else_=0.02))
+        named += set(rule.where) == set(truth)
+    assert named >= 6
+
+
+def test_nothing_is_told_of_chance() -> None:
+    """At most one rule in twenty where failures follow nothing."""
+    told = 0
+    for seed in range(60):
+        features = samples(96, seed)
+        told += bool(fit(features, failing(np.ones(96, np.bool_), seed, often=0.4)).where)
+    assert told <= 3
+
+
+def test_everything_fails_or_nothing() -> None:
+    features = samples(50, 0)
+    for fails in (np.ones(50, np.bool_), np.zeros(50, np.bool_)):
+        rule = fit(features, fails)
+        assert rule.where == {}
+        assert (rule.fails, rule.count) == (int(fails.sum()), 50)
+
+
+def test_a_feature_that_stands_still_tells_nothing() -> None:
+    features = samples(60, 3) | {"across": np.full(60, 0.4)}
+    fails = features["height_px"] < 0.5
+    assert set(fit(features, fails, only=("across",)).where) == set()
+    assert set(fit(features, fails).where) == {"height_px"}
+
+
+@given(st.integers(0, 500), st.floats(0.05, 0.95), st.floats(0.05, 0.95))
+@settings(max_examples=40, deadline=None)
+def test_counts_add_up(seed: int, often: float, else_: float) -> None:
+    features = samples(64, seed)
+    fails = failing(features["aspect"] < 0.5, seed, often, else_)
+    rule = fit(features, fails)
+    assert rule.count + rule.count_outside == 64
+    assert rule.fails + rule.fails_outside == int(fails.sum())
+    assert rule == counted(rule.where, features, fails)
+    if rule.where:
+        assert rule.fails * rule.count_outside > rule.fails_outside * rule.count
+
+
+def test_overlap_is_by_the_worst_feature() -> None:
+    one = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
+    assert overlap(one, one) == 1
+    assert overlap(one, {"a": (0.5, 1.5), "b": (0.0, 1.0)}) == pytest.approx(0.5 / 1.5)
+    assert overlap(one, {"a": (2.0, 3.0), "b": (0.0, 1.0)}) == 0
+    assert overlap({}, {}) == 1
