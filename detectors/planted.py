@@ -51,7 +51,7 @@ _LEAST_VARIANCE = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _Boxed:
     """What features are made of. boxes_xyxy (B, A, 4) px, inside the image; light (B, 2, H + 1, W + 1): sums of
     luma and of its square over all pixels above and to the left, None where nobody asks.
     """
@@ -90,28 +90,28 @@ def _centred(parts_xyxy: Tensor) -> tuple[Tensor, Tensor]:
     return (top_left + bottom_right) / 2, ((bottom_right - top_left) / 2).clamp_min(0.5)
 
 
-def _height(look: _Look) -> Tensor:
-    return look.boxes_xyxy[..., 3] - look.boxes_xyxy[..., 1]
+def _height(boxed: _Boxed) -> Tensor:
+    return boxed.boxes_xyxy[..., 3] - boxed.boxes_xyxy[..., 1]
 
 
-def _aspect(look: _Look) -> Tensor:
-    return (look.boxes_xyxy[..., 2] - look.boxes_xyxy[..., 0]) / _height(look).clamp_min(1)
+def _aspect(boxed: _Boxed) -> Tensor:
+    return (boxed.boxes_xyxy[..., 2] - boxed.boxes_xyxy[..., 0]) / _height(boxed).clamp_min(1)
 
 
-def _across(look: _Look) -> Tensor:
-    return (look.boxes_xyxy[..., 0] + look.boxes_xyxy[..., 2]) / (2 * look.image_hw[1])
+def _across(boxed: _Boxed) -> Tensor:
+    return (boxed.boxes_xyxy[..., 0] + boxed.boxes_xyxy[..., 2]) / (2 * boxed.image_hw[1])
 
 
-def _lightness(look: _Look) -> Tensor:
-    return look.means(_PAINT)[0]
+def _lightness(boxed: _Boxed) -> Tensor:
+    return boxed.means(_PAINT)[0]
 
 
-def _contrast(look: _Look) -> Tensor:
-    mean, square = look.means((0.0, 0.0, 1.0, 1.0))
+def _contrast(boxed: _Boxed) -> Tensor:
+    mean, square = boxed.means((0.0, 0.0, 1.0, 1.0))
     return ((square - mean.square()).clamp_min(0) + _LEAST_VARIANCE).sqrt()
 
 
-_MEASURES: dict[str, Callable[[_Look], Tensor]] = {
+_MEASURES: dict[str, Callable[[_Boxed], Tensor]] = {
     "height_px": _height,
     "aspect": _aspect,
     "across": _across,
@@ -133,8 +133,8 @@ def features(images: Tensor, boxes_xyxy: Tensor, names: Sequence[str] = FEATURES
     """
     height, width = int(images.shape[2]), int(images.shape[3])
     light = _light(images) if set(names) & set(OF_THE_PICTURE) else None
-    look = _Look(boxes.clip(boxes_xyxy, height, width), (height, width), light)
-    return torch.stack([_MEASURES[name](look).to(boxes_xyxy) for name in names])
+    boxed = _Boxed(boxes.clip(boxes_xyxy, height, width), (height, width), light)
+    return torch.stack([_MEASURES[name](boxed).to(boxes_xyxy) for name in names])
 
 
 def _light(images: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from drivesem.evaluation import coco
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import Failure, FrameResult
 from drivesem.truth.grades import Grade, Kind
+from drivesem.truth.kinds import OF_OBJECTS
 
 
 def boxes_of(
@@ -26,6 +27,12 @@ def at_least(grade: Grade) -> Callable[[Failure], bool]:
     """Whether a failure has that grade or a higher one; every failure has that of the threshold."""
     higher = list(Grade)[list(Grade).index(grade) :]
     return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
+
+
+def certain_losses(result: FrameResult) -> list[Failure]:
+    """Certain failures of objects; a phantom has no object whose states could be looked through."""
+    certain = at_least(Grade.CERTAIN)
+    return [f for f in result.failures if f.index is not None and f.error in OF_OBJECTS and certain(f)]
 
 
 def graded(results: Sequence[FrameResult]) -> dict[str, Any]:

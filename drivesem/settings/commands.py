@@ -289,6 +289,22 @@ class Holes(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Gate(Bootstrap, Tiles, FrameCommand):
+    """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
+
+    runs: Runs = ()
+    """Folders of drivesem attack."""
+    before: str = "squeezedet"
+    """The detector that stands: shipped, a file, or another project's."""
+    after: str = "squeezedet"
+    """The one that is to take its place."""
+    tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
+    """By how much the share of lost objects may grow, of a hole, of a kind of failure, and of all."""
+    samples: Count = 32
+    """States around each failure, the same for both detectors."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Command):
     """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
 
@@ -778,6 +794,7 @@ _ALL: tuple[type[Command], ...] = (
         Explain,
         Confirm,
         Holes,
+        Gate,
         Report,
         Plausibility,
         Realism,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.stats import qmc
 from torch import Tensor
 
+from detectors.base import Predictor
 from detectors.planted import features as features_of
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.unit_box import UnitBox
@@ -23,6 +24,8 @@ from scene_ir.types import SceneIR
 
 SEEN: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast")
 """Features of the object's label and of the picture in it, see `detectors.planted.FEATURES`."""
+NEAR = 0.3
+"""Part of the reach in which states lie that are near the counterexample."""
 PLACED = ("distance_m", "yaw_deg")
 """distance_m: depth of the object's origin; yaw_deg: its heading about the vertical axis, as KITTI counts it."""
 
@@ -85,6 +88,10 @@ class Neighbourhood:
             away = part * away
         away = torch.minimum(torch.maximum(away, -part * self._span), part * self._span)
         return self._feasible.project(self._theta + away).theta
+
+    def camera_of(self, detector: Predictor, t_star: float) -> Camera:
+        """Another detector in the place of the objective's, which sees the same pictures."""
+        return replace(self._camera, detector=detector, t_star=t_star)
 
     def fails(self, sample: Sample, camera: Camera | None = None) -> bool:
         """Whether the object is not found, by the objective's detector, or another camera's. Costs a pass."""

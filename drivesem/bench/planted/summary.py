@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.bench.planted.yardstick import Judged
+from drivesem.bench.planted.yardstick import JudgedFrame
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import DRAWS, intervals, rate
 
@@ -36,14 +36,14 @@ COLUMNS: Columns = {
 KINDS_TITLE = "planted faults, by kind"
 
 
-def rows_of(judged: Sequence[Judged], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
+def rows_of(judged: Sequence[JudgedFrame], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
     """A row for each rarity and method; None where nothing was planted."""
     attempts = [attempt for frame in judged for attempt in frame.attempts]
     rarities = dict.fromkeys(attempt.rarity for attempt in attempts)
     return [_row(judged, method, rarity, seed) for rarity in rarities for method in methods]
 
 
-def kind_rows(judged: Sequence[Judged], methods: Sequence[str]) -> list[dict[str, Any]]:
+def kind_rows(judged: Sequence[JudgedFrame], methods: Sequence[str]) -> list[dict[str, Any]]:
     """A row for each kind: in how many frames it could be planted, how often chance hits it, and how many of the
     planted ones each method found.
     """
@@ -79,7 +79,7 @@ def kind_columns(methods: Sequence[str]) -> Columns:
     }
 
 
-def _row(judged: Sequence[Judged], method: str, rarity: str, seed: int) -> dict[str, Any]:
+def _row(judged: Sequence[JudgedFrame], method: str, rarity: str, seed: int) -> dict[str, Any]:
     by_frame = [[a for a in frame.attempts if (a.method, a.rarity) == (method, rarity)] for frame in judged]
     own = [attempt for frame in by_frame for attempt in frame]
 

@@ -53,7 +53,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class JudgedFrame:
     """A frame. attempts: on all faults that could be planted; unplanted: kinds of the others."""
 
     frame: str
@@ -64,7 +64,7 @@ class Judged:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, data: Mapping[str, Any]) -> Judged:
+    def of_json(cls, data: Mapping[str, Any]) -> JudgedFrame:
         return cls(data["frame"], tuple(Attempt(**row) for row in data["attempts"]), tuple(data["unplanted"]))
 
 
@@ -117,7 +117,7 @@ class Yardstick:
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
         return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, kept)
 
-    def judge(self, name: str) -> Judged:
+    def judge(self, name: str) -> JudgedFrame:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
         asked = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
         asked |= {key: getattr(self.config, key) for key in ("methods", "passes", "params", "detector", "quick")}
@@ -126,13 +126,13 @@ class Yardstick:
         if path is not None and self.config.resume and path.is_file():
             known = files.read_json(path)
             if known["asked"] == asked:
-                return Judged.of_json(known["judged"])
+                return JudgedFrame.of_json(known["judged"])
         judged = self._judge(name)
         if path is not None:
             files.write_json(path, {"asked": asked, "judged": judged.to_json()})
         return judged
 
-    def _judge(self, name: str) -> Judged:
+    def _judge(self, name: str) -> JudgedFrame:
         scene = next(iter(self.workers.values())).source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
@@ -151,7 +151,7 @@ class Yardstick:
                 grader = grader_of(worker.config, detector)
                 attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
                 attempts.append(self._attempt(name, method, planting, survey, attacked))
-        return Judged(name, tuple(attempts), tuple(unplanted))
+        return JudgedFrame(name, tuple(attempts), tuple(unplanted))
 
     def _attempt(
         self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
@@ -176,7 +176,7 @@ class Yardstick:
         )
 
 
-def judge_of(config: Bench) -> Callable[[str], Judged]:
+def judge_of(config: Bench) -> Callable[[str], JudgedFrame]:
     """`Yardstick.judge` of another process."""
     return Yardstick.of(config).judge
 

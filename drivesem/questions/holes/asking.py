@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from drivesem.attack.space import parse_params
-from drivesem.questions.holes.frame import Effort, holes_of, look_around
+from drivesem.questions.holes.frame import Effort, look_around
 from drivesem.questions.holes.merged import merged
 from drivesem.questions.holes.report import answer_of
 from drivesem.questions.holes.results import HOLES, Around, FrameHoles, load
@@ -16,6 +16,7 @@ from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of, folder_of
+from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Holes
 
 _WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs")
@@ -75,12 +76,12 @@ class HolesWorker:
 
 
 def _chosen(run: Run) -> list[str]:
-    return [frame.result.identifier for frame in run.frames if holes_of(frame.result)]
+    return [frame.result.identifier for frame in run.frames if certain_losses(frame.result)]
 
 
 def _tell_effort(runs: list[Run], config: Holes) -> None:
     """How much there is to do, before it begins; by the pace of the runs, whose seconds hold more than passes."""
-    count = sum(len(holes_of(frame.result)) for run in runs for frame in run.frames)
+    count = sum(len(certain_losses(frame.result)) for run in runs for frame in run.frames)
     results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
     seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
     wanted = count * (config.samples + config.fresh)

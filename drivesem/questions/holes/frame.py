@@ -16,18 +16,14 @@ from drivesem.attack.space import Parameter
 from drivesem.questions.holes.results import HOLES, Around, FrameHoles, Samples, dump
 from drivesem.run.frame import RESULT
 from drivesem.run.rebuilt import rebuilt
-from drivesem.run.results import Failure, FrameResult, load_frame
-from drivesem.run.tally import at_least
+from drivesem.run.results import Failure, load_frame
+from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Attack
-from drivesem.truth.grades import Grade
-from drivesem.truth.kinds import OF_OBJECTS
-from drivesem.truth.neighbourhood import Neighbourhood, Sample
+from drivesem.truth.neighbourhood import NEAR, Neighbourhood, Sample
 from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.rules import Floats, contains, fit
 from scene_ir import files
 
-_NEAR = 0.3
-"""Part of the reach in which the second half of the samples lies."""
 _TRIES = 6
 """States that may be looked at for each fresh sample inside of a rule."""
 
@@ -40,12 +36,6 @@ class Effort:
     fresh: int
     reach: float
     seed: int
-
-
-def holes_of(result: FrameResult) -> list[Failure]:
-    """Certain failures of objects; a phantom has no object whose states could be looked through."""
-    certain = at_least(Grade.CERTAIN)
-    return [f for f in result.failures if f.index is not None and f.error in OF_OBJECTS and certain(f)]
 
 
 def look_around(
@@ -66,7 +56,7 @@ def look_around(
     limits = Limits(joint_weather=result.joint_weather)
     feasible = objective.feasible_set(limits, attack.project == "bounds")
     around, passes = [], 0
-    for failure in holes_of(result):
+    for failure in certain_losses(result):
         assert failure.index is not None
         name = f"{result.identifier}:{failure.index}:{effort.seed}"
         near = Neighbourhood(
@@ -90,7 +80,7 @@ def look_around(
 def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
     half, last = effort.samples // 2, effort.samples + _TRIES * effort.fresh
     asked, _ = _seen(near, range(half), half, {})
-    close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, _NEAR)
+    close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, NEAR)
     where = _rule(asked, close)
     fresh, tried = _seen(near, range(effort.samples, last), effort.fresh if asked.fails else 0, where)
     assert failure.index is not None

@@ -149,7 +149,9 @@ class PhotographRedraw:
         shade = np.zeros_like(self._background)
         for vehicle, pose in zip(self._vehicles, poses, strict=True):
             vehicle.shadow.cast(pose, shade)
-        image = self._background * np.exp(-weathering.shade_left(numbers(environment.weather)) * shade)
+        # Leaves stand behind vehicles, or in `front`, which keeps the photograph's.
+        behind = weathering.with_leaves(self._background, numbers(environment.foliage), self._leaves, self._air)
+        image = behind * np.exp(-weathering.shade_left(numbers(environment.weather)) * shade)
         depth_m, owner = self._depth_m.copy(), np.zeros(image.shape[:2], np.int64)
         window = _around(placed, lens)
         if window is not None:
@@ -158,8 +160,7 @@ class PhotographRedraw:
             drawn = self._screen.draw([p.reshape(-1, 3) for p in placed], skins, lens.intrinsics, window)
             owner[window.where] = _owners(drawn, len(placed))
             _compose(image[window.where], depth_m[window.where], owner[window.where], drawn, self._fronts(window))
-        image = weathering.with_leaves(image, numbers(environment.foliage), self._leaves, self._air)
-        image = weathering.weathered(image, depth_m, environment, self._air)
+        image = weathering.weathered(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
         image = np.rint(np.clip(image, 0, 1) * 255).astype(np.float32) / np.float32(255)
         shares = np.array([self._share(p, owner == i + 1) for i, p in enumerate(placed)], np.float32)
         return _State(placed, image, owner, shares)

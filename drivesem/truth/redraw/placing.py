@@ -101,6 +101,7 @@ class Body:
 
 
 def numbers(tensor: Tensor) -> Array:
+    """A tensor's values, wherever it is."""
     return tensor.detach().cpu().numpy().astype(np.float32)
 
 

@@ -1,7 +1,8 @@
 """Paint, leaves and weather of the second renderer: its own formulas for what the codes mean.
 
-Light is computed with linear values (display values to the power of 2.2), where the first renderer works on
-display values. A code of 0 changes nothing. The codes' meaning is in scene_ir/conventions.md; strengths are those
+How much light there is changes linear values (display values to the power of 2.2), where the first renderer works
+on display values; veils of fog, rain and drops lie over display values, as Foggy Cityscapes' do (Sakaridis et al.
+2018). A code of 0 changes nothing. The codes' meaning is in scene_ir/conventions.md; strengths are those
 of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst, time 1 the end of civil twilight, overcast 1 a
 closed cover.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from drivesem.truth.redraw.placing import numbers
 from drivesem.truth.redraw.screen import Array
 from scene_ir.types import Environment
 
@@ -35,8 +37,8 @@ _GLOW = np.array([0.35, 0.0, -0.35], np.float32)
 _SOFTENING = np.array([0.5, 0.4, 0.5, 0.6], np.float32)
 """What is lost of cast shadows at code 1 of fog, rain, time, overcast."""
 
-_AUTUMN_TURN, _SPRING_TURN = -65.0, 45.0
-"""Degrees by which hue code 1 and -1 turn the leaves' hue."""
+_AUTUMN, _SPRING, _MOST_TURN = 28.0, 150.0, 65.0
+"""Hues, in degrees, towards which hue code 1 and -1 turn the leaves, and how far at most."""
 _LEAF_GAMMA = 1.1
 """How lightness code 1 changes the exponent of leaves' values, as a logarithm."""
 
@@ -88,8 +90,8 @@ def with_leaves(image: Array, code: Array, leaves: Array, air: Array) -> Array:
     hue, lightness, density = (float(c) for c in code)
     here = image[rows, columns]
     hsv = cv2.cvtColor(here[None], cv2.COLOR_RGB2HSV)[0]
-    turn = _AUTUMN_TURN * hue if hue > 0 else _SPRING_TURN * -hue
-    hsv[:, 0] = np.mod(hsv[:, 0] + turn, 360)
+    way = np.mod((_AUTUMN if hue > 0 else _SPRING) - hsv[:, 0] + 180, 360) - 180
+    hsv[:, 0] = np.mod(hsv[:, 0] + abs(hue) * np.clip(way, -_MOST_TURN, _MOST_TURN), 360)
     hsv[:, 1] = np.clip(hsv[:, 1] * (1 + 0.3 * hue), 0, 1)
     hsv[:, 2] = np.clip(hsv[:, 2], 0, 1) ** np.exp(-_LEAF_GAMMA * lightness)
     rgb = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
@@ -101,12 +103,13 @@ def with_leaves(image: Array, code: Array, leaves: Array, air: Array) -> Array:
     return out
 
 
-def weathered(image: Array, depth_m: Array, environment: Environment, air: Array) -> Array:
-    """The picture (H, W, 3) under the environment's weather. depth_m: (H, W), inf in the sky."""
+def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environment, air: Array) -> Array:
+    """The picture (H, W, 3) under the environment's weather. depth_m: (H, W), inf in the sky; open_to: (H, W), 0
+    where a vehicle hides the sky and the road."""
     fog, rain, time, overcast = environment.weather.tolist()
     if not (fog or rain or time or overcast):
         return image
-    sky = environment.sky.cpu().numpy().astype(np.float32)[..., None]
+    sky, road = (open_to[..., None] * numbers(m)[..., None] for m in (environment.sky, environment.road))
     light, air = image**_GAMMA, air**_GAMMA
     if overcast:
         grey = (light @ _LUMA)[..., None]
@@ -123,16 +126,16 @@ def weathered(image: Array, depth_m: Array, environment: Environment, air: Array
     if rain:
         grey = (light @ _LUMA)[..., None]
         wet = 0.5 * (0.65 * light + 0.35 * grey)
-        road = environment.road.cpu().numpy().astype(np.float32)[..., None]
         mirror = _smeared(light) * 0.5 + 0.35 * air
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
-        veil = 1 - np.exp(-_RAIN_PER_M * rain * depth)
-        light += veil * (0.7 * air - light)
-        light += 0.2 * rain * _drops(*light.shape[:2])[..., None] * (air - light)
+    shown, air = np.clip(light, 0, 1) ** (1 / _GAMMA), air ** (1 / _GAMMA)
+    if rain:
+        shown += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.85 * air - shown)
+        shown += 0.25 * rain * _drops(*shown.shape[:2])[..., None] * (air - shown)
     if fog:
-        light += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - light)
-    return np.clip(light, 0, 1) ** (1 / _GAMMA)
+        shown += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - shown)
+    return shown.astype(np.float32)
 
 
 def _smeared(light: Array) -> Array:

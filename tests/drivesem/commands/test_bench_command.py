@@ -158,9 +158,9 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     row = yardstick.Attempt("demo-000", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 1, 1, 1, 50, 4.0)
     asked = []
 
-    def judged(self: yardstick.Yardstick, name: str) -> yardstick.Judged:
+    def judged(self: yardstick.Yardstick, name: str) -> yardstick.JudgedFrame:
         asked.append(name)
-        return yardstick.Judged(name, (replace(row, frame=name),), ("contrast rare",))
+        return yardstick.JudgedFrame(name, (replace(row, frame=name),), ("contrast rare",))
 
     monkeypatch.setattr(yardstick.Yardstick, "_judge", judged)
     words = ["bench", "planted", "--methods", "halton", "--limit", "2", "--workers", "1", "--json"]

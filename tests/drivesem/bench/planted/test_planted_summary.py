@@ -7,18 +7,20 @@ from dataclasses import replace
 import pytest
 
 from drivesem.bench.planted.summary import kind_columns, kind_rows, rows_of
-from drivesem.bench.planted.yardstick import METHODS, Attempt, Judged
+from drivesem.bench.planted.yardstick import METHODS, Attempt, JudgedFrame
 from drivesem.bench.tables import Section, terminal
 
 FIRST = Attempt("a", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 3, 2, 1, 50, 4.0)
 
 
-def frames() -> list[Judged]:
+def frames() -> list[JudgedFrame]:
     other = replace(FIRST, method="climb", certain=1, found=1, inside=1, passes=100)
     rare = replace(FIRST, kind="contrast rare", rarity="rare", fault="contrast=0.1:0.2", found=0, inside=0)
     return [
-        Judged("a", (FIRST, other), ("contrast rare",)),
-        Judged("b", (replace(FIRST, frame="b", found=0, inside=0), replace(other, frame="b", found=3), rare), ()),
+        JudgedFrame("a", (FIRST, other), ("contrast rare",)),
+        JudgedFrame(
+            "b", (replace(FIRST, frame="b", found=0, inside=0), replace(other, frame="b", found=3), rare), ()
+        ),
     ]
 
 
@@ -46,7 +48,7 @@ def test_kinds_tell_in_how_many_frames_they_could_be_planted() -> None:
 
 def test_what_was_judged_comes_back_from_json() -> None:
     for judged in frames():
-        assert Judged.of_json(judged.to_json()) == judged
+        assert JudgedFrame.of_json(judged.to_json()) == judged
 
 
 def test_methods_are_those_of_the_command() -> None:

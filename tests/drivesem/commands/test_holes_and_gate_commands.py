@@ -1,9 +1,10 @@
-"""`drivesem holes` on a run whose detector is blind to cars of a lightness: the rule, what is kept, bad input."""
+"""`drivesem holes` and `gate` on a run whose detector is blind to cars of a lightness: rules, worse detectors."""
 
 from __future__ import annotations
 
 import csv
 import json
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from detectors.planted import features
 from detectors.types import Detections
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
+from drivesem.questions.gate import asking as gate_asking
 from drivesem.questions.holes.results import load
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
@@ -48,7 +50,8 @@ WIDE = 0.06
 class Blind:
     """Sees each car where it was photographed, but for those whose paint is as dark as its band says."""
 
-    name, classes, t_star = "blind", ("Car",), 0.5
+    name, t_star = "blind", 0.5
+    classes: tuple[str, ...] = ("Car",)
 
     def __init__(self, boxes_xyxy: Tensor, band: tuple[float, float]) -> None:
         self.boxes, self.band = boxes_xyxy, band
@@ -64,6 +67,12 @@ class Blind:
                 Detections(seen, torch.zeros(len(seen), dtype=torch.int64), torch.full((len(seen),), 0.9))
             )
         return found
+
+
+class Other(Blind):
+    """The same of other classes."""
+
+    classes = ("Car", "Bus")
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +180,64 @@ def test_a_run_without_certain_failures(
     found = holes([str(tmp_path / "fine"), *HOLES], capsys)
     assert found["holes"] == []
     assert "No certain failure" in (tmp_path / "fine" / "holes" / "holes.md").read_text()
+
+
+@pytest.fixture
+def gate(
+    attacked: Path,
+    blind: Blind,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[[str], tuple[int, dict[str, Any]]]:
+    """The blind detector before, another after: exit code, and what is said."""
+    low, high = blind.band
+    known = {
+        "any": blind,
+        "better": Blind(blind.boxes, (2.0, 3.0)),
+        "worse": Blind(blind.boxes, (low - 0.3, high)),
+        "other": Other(blind.boxes, blind.band),
+    }
+    monkeypatch.setattr(gate_asking, "load_predictor", lambda name, *_: known[name])
+
+    def call(after: str) -> tuple[int, dict[str, Any]]:
+        capsys.readouterr()
+        words = ["--before", "any", "--after", after, "--samples", "20", "--workers", "1", "--json"]
+        code = main(["gate", str(attacked), *words, "--out", str(tmp_path / after)])
+        return code, json.loads(capsys.readouterr().out or "{}")
+
+    return call
+
+
+def test_a_detector_passes_its_own_gate(gate: Callable[[str], tuple[int, dict[str, Any]]]) -> None:
+    code, told = gate("any")
+    assert (code, told["passed"]) == (0, True)
+    assert {row["difference"] for row in told["rows"]} == {0}
+    assert told["rows"][0]["before"] > 0
+
+
+def test_a_worse_one_does_not_and_a_better_one_does(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
+) -> None:
+    code, told = gate("worse")
+    assert (code, told["passed"]) == (1, False)
+    row = told["rows"][0]
+    assert (row["level"], row["grew"]) == ("hole", True)
+    assert row["interval"][0] > 0.05
+    suite = ET.parse(tmp_path / "worse" / "gate.xml").getroot()
+    assert int(suite.attrib["failures"]) == sum(row["grew"] for row in told["rows"]) > 0
+    code, told = gate("better")
+    assert (code, told["passed"]) == (0, True)
+    assert told["rows"][-1]["difference"] < -0.05
+
+
+def test_other_classes_are_no_comparison(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["gate", "nowhere", "--after", "any"]) == 2
+    capsys.readouterr()
+    code, _ = gate("other")
+    assert code == 2
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,20 @@
+"""`drivesem gate`: does a new detector fail more often than an old one around failures that are known?"""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from drivesem.questions.gate.asking import gate_run
+from drivesem.run.ask import say
+from drivesem.settings.commands import Gate
+from drivesem.settings.devices import check_device
+
+
+def run(config: Gate) -> int:
+    """Compare, report; exit code 0 where the gate is passed, 1 where it is not. Raises UsageError or SceneError
+    for bad input.
+    """
+    check_device(config.device)
+    passed, answer = gate_run(config)
+    say(answer, config.json, end=None if config.json else Console())
+    return 0 if passed else 1

@@ -1,0 +1,99 @@
+"""Two detectors in the neighbourhoods of runs' certain failures: does the new one fail more often?"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from detectors.base import DetectorError, Predictor
+from detectors.registry import load_predictor
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.space import parse_params
+from drivesem.evaluation.resampling import DRAWS
+from drivesem.questions.gate.frame import compare_frame
+from drivesem.questions.gate.report import answer_of
+from drivesem.questions.gate.results import GATE, Pair, load
+from drivesem.questions.gate.rows import rows_of
+from drivesem.report.answer import Answer
+from drivesem.run.ask import Bar, KeptFrames
+from drivesem.run.finished import Run, load_runs
+from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, folder_of
+from drivesem.run.tally import certain_losses
+from drivesem.settings.commands import Gate
+from drivesem.settings.errors import UsageError
+
+_WRITTEN = ("gate.json", "gate.md", "gate.csv", "gate.xml", "runs")
+_FREE = (*PRESENTATION, "runs", "tolerance", "bootstrap")
+
+
+def gate_run(config: Gate) -> tuple[bool, Answer]:
+    """Whether the gate is passed, and what is said. Raises UsageError or SceneError for bad input."""
+    runs = load_runs(config.runs, config.limit, "RUN")
+    detectors_of(config)
+    out = folder_of(config.out, runs[0].folder / "gate")
+    claim(out, config, _WRITTEN, _FREE)
+    found: dict[str, list[Pair]] = {}
+    failed: dict[str, str] = {}
+    for place, run in enumerate(runs):
+        below = out / "runs" / str(place)
+        build = partial(GateWorker, config, run, below)
+        names = [frame.result.identifier for frame in run.frames if certain_losses(frame.result)]
+        kept, left = KeptFrames(run, below, GATE, load).ask(
+            names, build(), build, config, Bar(f"comparing in {run.name}", remaining=True)
+        )
+        mark = f"{run.name}/" if len(runs) > 1 else ""
+        found |= {mark + one.identifier: list(one.pairs) for one in kept}
+        failed |= {mark + name: reason for name, reason in left.items()}
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    rows = rows_of(found, config.tolerance, draws, config.seed)
+    passed = not any(row.grew for row in rows)
+    answer = answer_of(out, passed, rows, _facts(config, runs), failed)
+    answer.write()
+    return passed, answer
+
+
+def detectors_of(config: Gate) -> tuple[Predictor, Predictor]:
+    """The two. Raises UsageError where one cannot be had, or they do not know the same classes."""
+    found: list[Predictor] = []
+    for setting, name in (("--before", config.before), ("--after", config.after)):
+        try:
+            found.append(load_predictor(name, config.device, config.tiles))
+            JudgedClasses.of(found[-1])
+        except DetectorError as error:
+            raise UsageError(setting, "a detector", error) from error
+    before, after = found
+    if set(before.classes) != set(after.classes):
+        raise UsageError(
+            "--after", f"the classes of --before, {', '.join(before.classes)}", ", ".join(after.classes)
+        )
+    return before, after
+
+
+class GateWorker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Gate, run: Run, out: Path) -> None:
+        self.config, self.run, self.out = config, run, out
+        self.attack, self.params = attack_of(run.folder), parse_params(run.params)
+        self.detectors = detectors_of(config)
+
+    def __call__(self, name: str) -> None:
+        """One frame, from the run's folder to its own."""
+        compare_frame(
+            self.run.folder / FRAMES / name,
+            self.attack,
+            self.params,
+            self.detectors,
+            self.config.samples,
+            self.config.seed,
+            self.out / FRAMES / name,
+        )
+
+
+def _facts(config: Gate, runs: list[Run]) -> dict[str, object]:
+    return {
+        "runs": [str(run.folder) for run in runs],
+        "before": config.before,
+        "after": config.after,
+        "tolerance": config.tolerance,
+    }

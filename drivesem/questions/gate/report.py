@@ -1,0 +1,86 @@
+"""The gate for people and programs: tables, JSON, CSV, Markdown, and JUnit's XML, which CI servers show."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from drivesem.questions.gate.rows import ALL, HOLE, GateRow
+from drivesem.report.answer import Answer
+from drivesem.report.tables import Sheet
+from scene_ir import files
+
+_SHOWN = 12
+"""Holes in the table on a terminal; the files have all."""
+_NOTE = (
+    "Lost: share of samples around a certain failure in which a detector does not find the object; both see the "
+    "same pictures. In brackets: 95 % by paired bootstrap, over samples of a hole, and over holes for kinds and "
+    "for all. A row grew where the difference is above the tolerance and its interval above 0."
+)
+_NONE = "No certain failure of an object in these runs: nothing to compare, so the gate is passed."
+
+
+def answer_of(
+    out: Path, passed: bool, rows: Sequence[GateRow], facts: Mapping[str, Any], failed: Mapping[str, str]
+) -> Answer:
+    """What is said, and gate.xml. facts: what stands first in the JSON."""
+    files.write_text(out / "gate.xml", junit(rows))
+    holes, others = ([r for r in rows if (r.level == HOLE) == own] for own in (True, False))
+    verdict = "passed" if passed else "not passed"
+    title = f"Gate {verdict}: {facts['after']} after {facts['before']}"
+    return Answer(
+        out=out,
+        name="gate",
+        heading=title,
+        data={"passed": passed, **facts, "out": str(out), "rows": [row.to_json() for row in rows]},
+        tables={"gate": [_flat(row) for row in rows]} if rows else {},
+        sheets=[_sheet(title, [*others, *holes])],
+        printed=[_sheet(title, [*others, *holes[:_SHOWN]])],
+        notes=(_NOTE,) if rows else (_NONE,),
+        failed=failed,
+    )
+
+
+def junit(rows: Sequence[GateRow]) -> str:
+    """A test case a row, in the XML that JUnit made common; a row that grew is a failure."""
+    grew = sum(row.grew for row in rows)
+    suite = ET.Element("testsuite", name="drivesem gate", tests=str(len(rows)), failures=str(grew), errors="0")
+    for row in rows:
+        case = ET.SubElement(suite, "testcase", classname=f"drivesem.gate.{row.level}", name=row.hole)
+        if row.grew:
+            told = f"lost {100 * row.before:.1f} % before, {100 * row.after:.1f} % after"
+            ET.SubElement(
+                case, "failure", message=told, type="grew"
+            ).text = f"{told}; difference {_difference(row)}"
+    ET.indent(suite)
+    return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _sheet(title: str, rows: Sequence[GateRow]) -> Sheet:
+    lines = tuple(
+        (
+            "all holes" if row.level == ALL else row.hole,
+            f"{100 * row.before:.0f}",
+            f"{100 * row.after:.0f}",
+            _difference(row),
+            str(row.samples),
+            "grew" if row.grew else "",
+        )
+        for row in rows
+    )
+    return Sheet(title, ("hole", "lost before, %", "after, %", "difference, points", "samples", ""), lines)
+
+
+def _difference(row: GateRow) -> str:
+    value = f"{100 * row.difference:+.1f}"
+    return (
+        value if row.low is None or row.high is None else f"{value} [{100 * row.low:+.1f}, {100 * row.high:+.1f}]"
+    )
+
+
+def _flat(row: GateRow) -> dict[str, Any]:
+    data = row.to_json()
+    low, high = data.pop("interval")
+    return {**data, "low": low, "high": high}
