@@ -12,7 +12,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import lowered_probability
-from detectors.planted import BLIND_TO, FEATURES, OF_THE_PICTURE, PlantedFault, features, seen_cars
+from detectors.planted import BLIND_TO, FEATURES, OF_THE_PICTURE, Band, PlantedFault, features, seen_cars
 from detectors.types import CLASSES
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
@@ -38,12 +38,14 @@ class Sighting:
     """What a detector without a fault says of the cars in one picture, as faults take it. values (F, K): of
     FEATURES, of the K cars that it sees; car (R,) int64, scores (R,): of predictions, which of these each is
     about; meets (N, R) bool: whether each finds one of the scene's objects, score and place; none that is ignored.
+    labelled (F, N): of FEATURES, of the objects by their labels.
     """
 
     values: Tensor
     car: Tensor
     scores: Tensor
     meets: Tensor
+    labelled: Tensor
     t_star: float
 
     @classmethod
@@ -59,7 +61,8 @@ class Sighting:
         meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
         meets &= (own >= objective.t_star) & ~ignore.to(meets.device)[:, None]
         values = features(image[None], cars.boxes_xyxy[None])[:, 0]
-        return cls(values, cars.car, own, meets, objective.t_star)
+        labelled = features(image[None], labels_xyxy.to(image)[None])[:, 0]
+        return cls(values, cars.car, own, meets, labelled, objective.t_star)
 
     @property
     def main(self) -> Tensor:
@@ -154,8 +157,8 @@ class FrameSurvey:
         """
         frame = SeenFrame(objective)
         looks = tuple(frame.looks(name, seed))
-        labelled = frame.labelled(objective.space.theta0)
-        benign = frame.sighting(objective.space.theta0).main
+        photographed = frame.sighting(objective.space.theta0)
+        labelled, benign = photographed.labelled, photographed.main
         seen = torch.isfinite(benign)
         by_factor = torch.tensor([feature in _BY_FACTOR for feature in FEATURES])[:, None]
         factor = torch.where(by_factor & seen, benign / labelled, 1.0)
@@ -188,6 +191,20 @@ class FrameSurvey:
     def blind(self, fault: PlantedFault, theta: Tensor) -> Tensor:
         """Whether each object (N,) is a car that the fault hides at a feasible theta (D,). Asks the detector."""
         return self.frame.sighting(theta).lost(fault)
+
+    def bands_by_label(self, fault: PlantedFault) -> tuple[Band, ...]:
+        """Where a fault hides cars in features of their labels: from the 5th to the 95th percentile over Halton's
+        draws and corners. A detector's boxes grow and shrink with what it sees, and a fault goes by them. Empty
+        where it hides none.
+        """
+        rows = [FEATURES.index(name) for name in fault.names]
+        hidden = [state.labelled[rows][:, state.lost(fault)] for state in (*self.halton, *self.corners)]
+        values = torch.cat(hidden, 1)
+        if values.shape[1] < 2:
+            return ()
+        low, high = values.quantile(torch.tensor([0.05, 0.95]).to(values), 1).tolist()
+        named = zip(fault.names, low, high, strict=True)
+        return tuple(Band(name, start, end) for name, start, end in named if start < end)
 
     def rarity(self, fault: PlantedFault) -> float:
         """Share of Halton's draws in which the fault hides a car."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detectors.planted import FEATURES, PlantedFault
+from detectors.planted import FEATURES, Band, PlantedFault
+from drivesem.bench.planted import plant as planting
 from drivesem.bench.planted.plant import HITS, KINDS, FaultKind, plant
 from drivesem.bench.planted.survey import FrameSurvey, SeenFrame, Sighting
 
@@ -14,11 +18,18 @@ SLACK = 0.02
 """How far features differ between draws of the camera."""
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _few_trials() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planting, "_TRIALS", 1200)
+        yield
+
+
 def seen(values: torch.Tensor) -> Sighting:
     """Each car by one prediction; values (F, N)."""
     count = values.shape[1]
     scores = torch.full((count,), 0.9)
-    return Sighting(values, torch.arange(count), scores, torch.eye(count, dtype=torch.bool), 0.5)
+    return Sighting(values, torch.arange(count), scores, torch.eye(count, dtype=torch.bool), values - 0.1, 0.5)
 
 
 def survey(seed: int = 0, cars: int = 3, sure: bool = True, reach: float = 0.3) -> FrameSurvey:
@@ -50,7 +61,7 @@ def test_a_sighting_tells_what_a_fault_hides() -> None:
     values = torch.zeros(len(FEATURES), 2)
     values[FEATURES.index("aspect")] = torch.tensor([1.5, 3.0])
     meets = torch.tensor([[True, True], [False, False]])
-    sighting = Sighting(values, torch.tensor([0, 1]), torch.tensor([0.9, 0.8]), meets, 0.5)
+    sighting = Sighting(values, torch.tensor([0, 1]), torch.tensor([0.9, 0.8]), meets, values, 0.5)
     assert sighting.single.tolist() == [False, False]
     assert sighting.main[FEATURES.index("aspect"), 0] == 1.5
     assert sighting.main[:, 1].isnan().all()
@@ -65,7 +76,7 @@ def test_the_yardstick_has_easy_and_rare_faults_of_every_feature() -> None:
         assert sum(kind.rarity == rarity for kind in KINDS) >= 6
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 10_000), kind=st.sampled_from(KINDS))
 def test_what_is_planted_keeps_its_promises(seed: int, kind: FaultKind) -> None:
     frame = survey(seed)
@@ -81,11 +92,23 @@ def test_what_is_planted_keeps_its_promises(seed: int, kind: FaultKind) -> None:
     assert any(state.lost(made.fault).any() for state in (*frame.halton, *frame.corners))
 
 
+def test_bands_by_label_are_those_of_the_labels_of_hidden_cars() -> None:
+    frame = survey(cars=1)  # labels are 0.1 less than what the detector sees
+    aspect = float(frame.benign[FEATURES.index("aspect"), 0])
+    fault = PlantedFault((Band("aspect", aspect, aspect + 0.2),))
+    (band,) = frame.bands_by_label(fault)
+    assert band.feature == "aspect"
+    assert aspect - 0.15 < band.low < band.high < aspect + 0.15
+    assert frame.bands_by_label(PlantedFault.of("aspect=50:60")) == ()
+
+
 def test_equal_arguments_give_equal_faults() -> None:
     frame, kind = survey(), KINDS[0]
-    assert plant(frame, kind, 3) == plant(frame, kind, 3)
-    assert plant(frame, kind, 3) != plant(frame, kind, 4)
-    assert PlantedFault.of(plant(frame, kind, 3).fault.text) == plant(frame, kind, 3).fault  # type: ignore[union-attr]
+    made = plant(frame, kind, 3)
+    assert made is not None
+    assert made == plant(frame, kind, 3)
+    assert made != plant(frame, kind, 4)
+    assert PlantedFault.of(made.fault.text) == made.fault
 
 
 def test_nothing_is_planted_where_no_car_is_sure_or_can_be_moved() -> None:
