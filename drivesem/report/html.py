@@ -72,7 +72,6 @@ def render_report(page: Page, at: Path) -> str:
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,
-        gradient=first.summary.queries > 0,
         headline=_comparison(runs) if several else _verdict(first),
         how_sure="" if several else _how_sure(first),
         lead=_lead(runs),

@@ -19,9 +19,9 @@ from drivesem.bench.planted.survey import FrameSurvey
 Rarity = Literal["easy", "rare"]
 HITS: dict[Rarity, tuple[float, float]] = {"easy": (0.1, 0.4), "rare": (0.0, 0.02)}
 """Shares of Halton's draws that hit a fault: of easy ones from a tenth on, of rare ones at most one in fifty."""
-_TRIALS = 1500
+_TRIALS = 4000
 """Bands that are drawn for a fault."""
-_LOOKED_AT = 60
+_LOOKED_AT = 200
 """Of these, so many of the most promising are looked at closely."""
 _DIGITS = 4
 

@@ -18,6 +18,7 @@ from drivesem.questions.study import asking as study_asking
 from drivesem.questions.study.arms import Arm, arms_of
 from drivesem.settings.commands import Study
 from drivesem.synth.write import Order, synthesise
+from drivesem.truth.redraw.base import NoSecondRendererError
 
 WORDS = ["study", "multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
 ASKED = (
@@ -93,12 +94,18 @@ def test_the_generator_draws_again_on_request(
     assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
 
 
-def test_photographs_cannot_be_drawn_again(tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_without_a_second_renderer_nothing_is_attacked(
+    tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing() -> None:
+        raise NoSecondRendererError("pyrender", "EGL or OSMesa", "neither")
+
+    monkeypatch.setattr("drivesem.truth.redraw.choose.shared_screen", nothing)
     for _ in synthesise(Order(tmp_path / "data", 1, seed=3, split="heldout")):
         pass
     (tmp_path / "data" / "manifest.json").unlink()  # now nobody knows that they were generated
     words = ["study", "multi", "--confirm", "--dataset", "kitti", "--root", str(tmp_path / "data")]
-    assert "manifest.json" in refused(*words, "--out", str(tmp_path / "out"))
+    assert "expected EGL or OSMesa, found neither" in refused(*words, "--out", str(tmp_path / "out"))
     assert not (tmp_path / "out" / "arms").exists()
 
 
