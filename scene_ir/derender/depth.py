@@ -48,6 +48,8 @@ _FOCAL_PX = 721.5
 """KITTI's."""
 _BLURRED = 0.008
 """Of the focal length: over how much the ground under vehicles passes into what stands beside them."""
+_AROUND = 0.03
+"""Of the width: how far around a vehicle what stands behind it goes on."""
 
 
 class DepthNet(UNet):
@@ -166,4 +168,14 @@ def surroundings(
     stood = cv2.GaussianBlur(ties.stood, (0, 0), max(_BLURRED * float(camera.intrinsics[0, 0]), 0.5))
     nearness = level + np.maximum(both - level, 0) * (1 - ties.sky) * (1 - stood)
     behind = outlook.nearness(np.where(ties.behind_m > 0, ties.behind_m, np.float32(1e-3)))
-    return outlook.depth_m(np.maximum(np.minimum(nearness, behind), level))
+    return outlook.depth_m(np.maximum(_no_nearer(nearness, behind), level))
+
+
+def _no_nearer(nearness: Array, most: Array) -> Array:
+    """Nearness (H, W), at most `most`; what is lowered lowers what is seen around it, or its border would show."""
+    share = np.minimum(most / np.maximum(nearness, _LEAST), 1).astype(np.float32)
+    if share.min() < 1:
+        side = round(_AROUND * nearness.shape[1])
+        least = cv2.erode(share, np.ones((2 * side + 1, 2 * side + 1), np.uint8))
+        nearness = nearness * cv2.GaussianBlur(least, (0, 0), max(side / 3, 0.5))
+    return np.minimum(nearness, most)

@@ -142,11 +142,11 @@ SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6)
 """Rates at which fog, rain, time and overcast weaken cast shadows."""
 OVERCAST = 0.85
 """How far overcast 1 goes towards the picture under a closed cover."""
-OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.45, 0.72
+OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.55, 0.88
 """What is left of colour and contrast."""
-OVERCAST_FROM, OVERCAST_TO = 0.42, 0.40
+OVERCAST_FROM, OVERCAST_TO = 0.42, 0.42
 """The display value about which contrast shrinks, and where that value comes to lie."""
-COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.55, 0.30, 0.15
+COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.55, 0.36, 0.15
 """The cover: share of the grey airlight, light of its own, and how much of the sky's own structure is left."""
 OVERCAST_AIR = 0.9
 """Brightness of the airlight under it, of the grey one's."""
@@ -159,7 +159,7 @@ DUSK_ENDS, DIMMING, DIMMING_ENDS = 3.5, 0.25, 2.0
 """Rates in the code's square at which that warmth and an early dimming end again, and how strong the latter is."""
 DAMP = 0.9
 """How far rain 1 goes towards the wet picture."""
-DAMP_LIGHT, DAMP_COLOUR = 0.72, 0.65
+DAMP_LIGHT, DAMP_COLOUR = 0.94, 0.65
 """What is left of light and colour in that."""
 SHEEN_NEAR, SHEEN_FAR, SHEEN_M = 0.15, 0.45, (4.0, 45.0)
 """How much of a wet road is sheen near the camera, what is added far away, and the distances between

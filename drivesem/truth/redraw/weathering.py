@@ -9,6 +9,8 @@ closed cover.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -146,6 +148,7 @@ def _smeared(light: Array) -> Array:
     return shifted.astype(np.float32)
 
 
+@lru_cache(maxsize=8)
 def _drops(height: int, width: int) -> Array:
     """Streaks of rain (H, W) in [0, 1]; the same for each size."""
     chance = np.random.default_rng(41)
@@ -161,6 +164,7 @@ def _drops(height: int, width: int) -> Array:
     return cv2.GaussianBlur(streaks, (0, 0), 0.6).astype(np.float32)
 
 
+@lru_cache(maxsize=8)
 def _speckles(height: int, width: int) -> Array:
     """Where thin leaves let the air through (H, W) in [0, 1]; the same for each size."""
     noise = cv2.GaussianBlur(np.random.default_rng(43).normal(size=(height, width)), (0, 0), 1.5)

@@ -127,7 +127,8 @@ def test_no_wall_stands_before_a_car_where_the_ground_was_not_recognised(street)
 
     depth = derender(street.frame, DerenderSettings(fit=False, segmenter=segmenter)).depth
     left, top, right, _ = (int(v) for v in street.frame.labels.boxes_xyxy[0])
-    assert float(depth[top + 5, left:right].min()) > 10.5
+    assert float(depth[top + 5][torch.from_numpy(street.mask[top + 5])].min()) > 10.5
+    assert float(depth[top + 5, left:right].diff().abs().max()) < 0.6
 
 
 def test_no_labels_is_an_error(street):
