@@ -28,7 +28,8 @@ from scene_ir.render.compositor import Compositor
 METHODS = tuple(name for name in get_args(get_type_hints(Attack)["method"]) if name != "placebo")
 """Attacks that can be judged: a placebo needs a run to be like."""
 SURE = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
-QUICK_KINDS = (KINDS[1], KINDS[-3])
+QUICK_KINDS = (KINDS[2], KINDS[-2])
+"""One easy, one rare: those that could be planted wherever that was tried."""
 
 
 @dataclass(frozen=True, slots=True)
