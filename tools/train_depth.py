@@ -9,8 +9,6 @@ on where it was stopped, to the same bytes as one that was never stopped (one th
 
 from __future__ import annotations
 
-import argparse
-import csv
 import json
 import math
 from collections.abc import Sequence
@@ -28,12 +26,14 @@ from train_segmenter import (
     HORIZON_ERROR,
     STORE_HW,
     classes_of,
+    options,
     other_camera,
     other_colours,
     other_light,
     planned,
     shrunk,
     taken,
+    train,
     window,
 )
 
@@ -312,42 +312,14 @@ TRAIN_SEED, HELD_SEED = 51, 52
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, default=Path("build/depth"), help="frames, checkpoint, log")
-    parser.add_argument("--out", type=Path, default=depth.WEIGHTS)
-    parser.add_argument("--frames", type=int, default=Settings.frames)
-    parser.add_argument("--held-out", type=int, default=40, help="generated frames to judge by")
-    parser.add_argument("--steps", type=int, default=Settings.steps)
-    parser.add_argument("--batch", type=int, default=Settings.batch)
-    parser.add_argument("--rate", type=float, default=Settings.rate)
-    parser.add_argument("--seed", type=int, default=Settings.seed)
-    parser.add_argument(
-        "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
-    )
-    parser.add_argument("--remark", default="", help="a remark on this run for the model card")
-    arguments = parser.parse_args()
+    arguments = options(__doc__, Path("build/depth"), depth.WEIGHTS, 40, Settings)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
     store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
     print(f"{len(store)} pictures", flush=True)
     run = Run(settings)
-    checkpoint = arguments.run / "checkpoint.safetensors"
-    if checkpoint.is_file():
-        run.load(checkpoint)
-        print(f"going on from step {run.step_number}", flush=True)
-    end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
-    with (arguments.run / "log.csv").open("a", newline="") as file:
-        log = csv.writer(file)
-        while run.step_number < end:
-            loss = run.step(store)
-            if run.step_number % 25 == 0:
-                log.writerow([run.step_number, f"{run.seconds:.1f}", f"{loss:.4f}"])
-                file.flush()
-            if run.step_number % 100 == 0 or run.step_number == end:
-                run.save(checkpoint)
-                print(f"step {run.step_number}, {run.seconds:.0f} s: {loss:.3f}", flush=True)
-    if run.step_number < settings.steps:
+    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
     figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])

@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -423,33 +424,34 @@ TRAIN_SEED, HELD_SEED = 41, 42
 """Of the generator's streams."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, default=Path("build/segment"), help="frames, checkpoint, log")
-    parser.add_argument("--out", type=Path, default=segment.WEIGHTS)
-    parser.add_argument("--frames", type=int, default=Settings.frames)
-    parser.add_argument("--held-out", type=int, default=60, help="generated frames to judge by")
-    parser.add_argument("--steps", type=int, default=Settings.steps)
-    parser.add_argument("--batch", type=int, default=Settings.batch)
-    parser.add_argument("--rate", type=float, default=Settings.rate)
-    parser.add_argument("--seed", type=int, default=Settings.seed)
+def options(about: str | None, run: Path, weights: Path, held_out: int, usual: Any) -> argparse.Namespace:
+    """The command line. about: what the tool does; run, weights, held_out: its defaults; usual: of the settings."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, default=run, help="frames, checkpoint, log")
+    parser.add_argument("--out", type=Path, default=weights)
+    parser.add_argument("--frames", type=int, default=usual.frames)
+    parser.add_argument("--held-out", type=int, default=held_out, help="generated frames to judge by")
+    parser.add_argument("--steps", type=int, default=usual.steps)
+    parser.add_argument("--batch", type=int, default=usual.batch)
+    parser.add_argument("--rate", type=float, default=usual.rate)
+    parser.add_argument("--seed", type=int, default=usual.seed)
     parser.add_argument(
         "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
     )
     parser.add_argument("--remark", default="", help="a remark on this run for the model card")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
-    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
-    print(f"{len(store)} frames", flush=True)
-    run = Run(settings)
-    checkpoint = arguments.run / "checkpoint.safetensors"
+    return parser.parse_args()
+
+
+def train(run: Any, store: Any, steps: int, folder: Path, pause_after: int | None) -> bool:
+    """Take a run's steps, from its checkpoint in `folder` on, and say whether all are done. pause_after: steps of
+    this call, None for all.
+    """
+    checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.is_file():
         run.load(checkpoint)
         print(f"going on from step {run.step_number}", flush=True)
-    end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
-    with (arguments.run / "log.csv").open("a", newline="") as file:
+    end = min(steps, run.step_number + (pause_after or steps))
+    with (folder / "log.csv").open("a", newline="") as file:
         log = csv.writer(file)
         while run.step_number < end:
             loss = run.step(store)
@@ -459,7 +461,18 @@ def main() -> None:
             if run.step_number % 100 == 0 or run.step_number == end:
                 run.save(checkpoint)
                 print(f"step {run.step_number}, {run.seconds:.0f} s: {loss:.3f}", flush=True)
-    if run.step_number < settings.steps:
+    return run.step_number >= steps
+
+
+def main() -> None:
+    arguments = options(__doc__, Path("build/segment"), segment.WEIGHTS, 60, Settings)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
+    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
+    print(f"{len(store)} frames", flush=True)
+    run = Run(settings)
+    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
     figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
