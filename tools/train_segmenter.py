@@ -425,7 +425,7 @@ TRAIN_SEED, HELD_SEED = 41, 42
 
 
 def options(about: str | None, run: Path, weights: Path, held_out: int, usual: Any) -> argparse.Namespace:
-    """The command line. about: what the tool does; run, weights, held_out: its defaults; usual: of the settings."""
+    """The command line. about: what the tool does; run, weights, held_out, usual: its defaults."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, default=run, help="frames, checkpoint, log")
     parser.add_argument("--out", type=Path, default=weights)
