@@ -1,6 +1,6 @@
 """The README's picture: one frame of a run before and after, with true and detected boxes.
 
-python tools/example_picture.py runs/demo-translate-rotate-mesh-seed0 demo-000 docs/example.jpg
+python tools/example_picture.py runs/demo-color-weather-translate-rotate-climb-seed0 demo-003 docs/example.jpg
 """
 
 from __future__ import annotations
