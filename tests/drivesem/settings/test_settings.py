@@ -52,7 +52,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     "plausibility": ("--run", "run"),
     "verify": ("--run", "run"),
     "transfer": ("--run", "run", "--detectors", "squeezedet"),
-    **dict.fromkeys(("report", "realism", "worth", "survey"), ("run",)),
+    **dict.fromkeys(("holes", "gate", "report", "realism", "worth", "survey"), ("run",)),
     "survey-results": ("answers.csv", "--survey", "survey"),
     **dict.fromkeys(("render", "edit"), ("scene",)),
     "eval": ("--gt", "labels", "--pred", "results"),
