@@ -122,8 +122,8 @@ def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(objective.Objective, "feasible_set", lambda self, **_: FeasibleSet(self.space, free))
     monkeypatch.setattr(run_frame, "check_scene", partial(check_scene, joint_weather=False))
     out = tmp_path / "earlier"
-    words = ("--method", "random", "--queries", "2", "--seed", "2", "--budget", "translate=0.05m", "--out", str(out))
-    assert main(["attack", *WORDS, *words]) == 0
+    words = ("--method", "random", "--queries", "2", "--seed", "2", "--budget", "translate=0.05m")
+    assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
     for field in ("min_contrast", "joint_weather"):
         change(out / FRAME / "result.json", lambda data, field=field: data.pop(field))
     monkeypatch.undo()
