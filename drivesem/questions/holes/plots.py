@@ -15,6 +15,10 @@ _MOST = 12
 _DPI = 150
 
 
+def _count(hole: Hole) -> str:
+    return "1 failure" if len(hole.failures) == 1 else f"{len(hole.failures)} failures"
+
+
 def write_holes(path: Path, holes: Sequence[Hole]) -> None:
     """Bars of the largest, with intervals; marks for elsewhere."""
     import matplotlib as mpl
@@ -22,7 +26,7 @@ def write_holes(path: Path, holes: Sequence[Hole]) -> None:
 
     shown = holes[:_MOST]
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
-        figure = Figure(figsize=(8.0, 1.6 + 0.5 * len(shown)), layout="constrained")
+        figure = Figure(figsize=(8.0, 1.9 + 0.5 * len(shown)), layout="constrained")
         axes = figure.add_subplot()
         for place, hole in enumerate(shown):
             inside = "fresh samples inside of the rule, 95 % interval" if place == 0 else None
@@ -34,11 +38,11 @@ def write_holes(path: Path, holes: Sequence[Hole]) -> None:
             if hole.outside is not None:
                 mark = "elsewhere in the neighbourhood" if place == 0 else None
                 axes.plot([100 * hole.outside], [place], "D", color=COLOURS[0], markersize=6, label=mark, zorder=3)
-        axes.set_yticks(range(len(shown)), [f"{hole.words}\n{len(hole.failures)} failures" for hole in shown])
+        axes.set_yticks(range(len(shown)), [f"{hole.words}\n{_count(hole)}" for hole in shown])
         axes.invert_yaxis()
         axes.set(xlim=(0, 102), xlabel="lost, %")
         axes.set_title("Holes, largest first", loc="left", fontsize=11)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.7 / (1 + len(shown))), ncols=2, fontsize=9)
+        figure.legend(loc="outside lower center", fontsize=9)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     files.write_bytes(path, buffer.getvalue())
