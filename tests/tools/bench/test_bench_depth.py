@@ -131,4 +131,4 @@ def test_the_command(capsys: pytest.CaptureFixture[str], tmp_path) -> None:
     assert main(["depth", "--frames", "1", "--json", "--out", str(tmp_path / "depth")]) == 0
     result = json.loads(capsys.readouterr().out)
     assert {line["depth"] for line in result["summary"]} >= {"guessed walls", bench.USED, "exact"}
-    assert (tmp_path / "depth" / "generated_000.png").is_file()
+    assert (tmp_path / "depth" / "depth" / "generated_000.png").is_file()
