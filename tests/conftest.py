@@ -4,6 +4,7 @@ that takes seconds to make, made once.
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -46,6 +47,18 @@ QUICK = [
 
 settings.register_profile("drivesem", deadline=None, derandomize=True, database=None)
 settings.load_profile("drivesem")
+
+
+@pytest.fixture(scope="session")
+def screen() -> Any:
+    """OpenGL without a window. Skipped by name where neither EGL nor OSMesa is: pip has none."""
+    from drivesem.truth.redraw.base import NoSecondRendererError
+    from drivesem.truth.redraw.screen import shared_screen
+
+    try:
+        return shared_screen()
+    except NoSecondRendererError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

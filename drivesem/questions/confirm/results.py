@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from drivesem.questions.confirm.judge import RendererFailure, Stand
-from drivesem.run.records import from_json
+from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import BoxRecord
-from scene_ir import files
-from scene_ir.errors import FormatError
 
 SCHEMA = 2
 
@@ -39,15 +35,9 @@ class Confirmed:
 
 def dump(result: Confirmed) -> str:
     """JSON text of one frame's result."""
-    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
+    return dump_record(result, SCHEMA)
 
 
 def load(path: Path) -> Confirmed:
     """Read what `dump` wrote. Raises FormatError naming the file."""
-    data = files.read_json(path)
-    try:
-        if data.pop("schema") != SCHEMA:
-            raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        return from_json(Confirmed, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "a frame as drivesem confirm writes it", error) from error
+    return load_record(path, Confirmed, SCHEMA, "a frame as drivesem confirm writes it")

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.run.records import from_json
-from scene_ir import files
-from scene_ir.errors import FormatError
+from drivesem.run.records import dump_record, load_record
 
 SCHEMA = 1
 GATE = "gate.json"
@@ -40,15 +37,9 @@ class FrameGate:
 
 def dump(result: FrameGate) -> str:
     """JSON text."""
-    return json.dumps({"schema": SCHEMA, **asdict(result)}, allow_nan=False) + "\n"
+    return dump_record(result, SCHEMA)
 
 
 def load(path: Path) -> FrameGate:
     """Read what `dump` gave. Raises FormatError naming the file."""
-    data = files.read_json(path)
-    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
-        raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-    try:
-        return from_json(FrameGate, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "the fields of a frame's gate", error) from error
+    return load_record(path, FrameGate, SCHEMA, "the fields of a frame's gate")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drivesem.run.records import from_json
+from drivesem.run.records import dump_record, load_record
 from drivesem.truth.rules import Flags, Floats
-from scene_ir import files
-from scene_ir.errors import FormatError
 
 SCHEMA = 1
 HOLES = "holes.json"
@@ -69,15 +66,9 @@ class FrameHoles:
 
 def dump(result: FrameHoles) -> str:
     """JSON text."""
-    return json.dumps({"schema": SCHEMA, **asdict(result)}, allow_nan=False) + "\n"
+    return dump_record(result, SCHEMA)
 
 
 def load(path: Path) -> FrameHoles:
     """Read what `dump` gave. Raises FormatError naming the file."""
-    data = files.read_json(path)
-    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
-        raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-    try:
-        return from_json(FrameHoles, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "the fields of a frame's holes", error) from error
+    return load_record(path, FrameHoles, SCHEMA, "the fields of a frame's holes")

@@ -17,7 +17,6 @@ from drivesem.cli import main
 from drivesem.questions.confirm.results import load
 from drivesem.run.results import load_frame
 from drivesem.truth.redraw import screen
-from drivesem.truth.redraw.base import NoSecondRendererError
 from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 
@@ -151,11 +150,8 @@ def photographs(run: Path, tmp_path: Path) -> Path:
     return run
 
 
+@pytest.mark.usefixtures("screen")
 def test_photographs_are_drawn_by_pyrender(photographs: Path, confirm: Callable[..., dict[str, Any]]) -> None:
-    try:
-        screen.shared_screen()
-    except NoSecondRendererError as error:
-        pytest.skip(str(error))
     data = confirm(photographs)
     assert (data["frames"], data["not_carried"]) == (1, {})
     assert data["box_iou"]["least"] > 0.99

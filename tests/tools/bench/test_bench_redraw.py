@@ -14,20 +14,12 @@ from torch import Tensor
 
 from detectors.types import Detections
 from drivesem.synth.demo import demo_scene
-from drivesem.truth.redraw.base import NoSecondRendererError
-from drivesem.truth.redraw.screen import shared_screen
 from scene_ir import files
 from scene_ir.types import SceneIR
 from tools.bench import redraw
 from tools.bench.__main__ import main
 
-
-@pytest.fixture(autouse=True)
-def _screen() -> None:
-    try:
-        shared_screen()
-    except NoSecondRendererError as error:
-        pytest.skip(str(error))
+pytestmark = pytest.mark.usefixtures("screen")
 
 
 class Twice:
