@@ -1,9 +1,9 @@
 """Paint, leaves and weather of the second renderer: its own formulas for what the codes mean.
 
-Light and the veils of fog and rain are linear values (display values to the power of 2.2), where the first renderer
-works on display values and their squares. A code of 0 changes nothing. The codes' meaning is in scene_ir/conventions.md; strengths are those
-of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst, time 1 the end of civil twilight, overcast 1 a
-closed cover.
+Light and the veils of fog and rain are linear values (display values to the power of 2.2), where the first
+renderer works on display values and their squares. A code of 0 changes nothing. The codes' meaning is in
+scene_ir/conventions.md; strengths are those of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst,
+time 1 the end of civil twilight, overcast 1 a closed cover.
 """
 
 from __future__ import annotations
