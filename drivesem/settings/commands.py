@@ -551,6 +551,23 @@ class Gradcheck(Scenes, FrameCommand):
     """Least cosine between gradient and differences."""
     max_error: Annotated[float, Within(0, ends="(]", expected="a positive number")] = 0.05
     """Largest relative error of the gradient."""
+    reach: Flag = False
+    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
+    parameter and distance; some minutes a frame."""
+    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
+    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
+
+    def check(self) -> None:
+        super().check()
+        for name in ("directions", "min_cosine", "max_error"):
+            value = getattr(self, name)
+            refuse(
+                self.reach and value != getattr(Gradcheck, name),
+                f"--{name.replace('_', '-')}",
+                "no --reach beside it",
+                value,
+            )
+        refuse(not self.reach and self.draws != Gradcheck.draws, "--draws", "--reach beside it", self.draws)
 
 
 @dataclass(frozen=True, kw_only=True)
