@@ -150,6 +150,11 @@ class Reference:
             if region.contains(changed) and region.area <= _LOOSE * changed.area:
                 self._plans.insert(0, self._plans.pop(i))
                 return plan
+        # What a frame's steps change is soon known: a plan for all of it serves the next ones too.
+        for region, _ in self._plans:
+            joined = region.joined(changed)
+            if joined.area <= _LOOSE * changed.area:
+                changed = joined
         top, left = self.trunk.at
         within = Rect(top, top + changed.hw[0], left, left + changed.hw[1])
         moved = changed.placed((top, left), self.shapes.hw[self.incremental.graph.layers[0]])
