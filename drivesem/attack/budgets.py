@@ -29,7 +29,7 @@ PRESETS: Mapping[str, Budget] = {
     # What a parked car's place may well differ by, and no driver would notice.
     PARKING: Budget(translate_m=0.5, rotate=math.radians(5)),
     # Where pictures of moved cars still hold: docs/attacks.md has the measurement.
-    STREET: Budget(translate=1.5, translate_m=6.0, across_m=1.0, partly=0.25),
+    STREET: Budget(translate=1.5, translate_m=4.0, across_m=1.0, of_distance=0.3, partly=0.25),
 }
 _UNITS: Mapping[Parameter, Mapping[str, float]] = {
     Parameter.TRANSLATE: LENGTH_UNITS,
@@ -70,7 +70,7 @@ def written(budget: Budget) -> str:
     for name, preset in PRESETS.items():
         if budget == preset:
             return name
-    # Only this preset has bounds of its own across and for cars that are partly shown; none can be given any.
+    # The bounds that no other preset has, and that no budget can be given, tell it apart.
     preset = STREET if budget.across_m == PRESETS[STREET].across_m else PAPER
     widest = PRESETS[preset]
     changed = [p.value for p in Parameter if getattr(budget, p.value) != getattr(widest, p.value)]

@@ -80,8 +80,9 @@ JUDGED_PX = 25.0
 @dataclass(frozen=True, slots=True)
 class Reach:
     """How far a change may go at most: by default as far as the paper's budget. translate: own lengths, along and
-    across; translate_m: the same in m; across_m: m, across; partly: own lengths, of a car that is hidden in part
-    or cut by the picture's border; rotate: rad; mesh: unit boxes, of a lattice offset; codes: their largest values.
+    across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
+    partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
+    boxes, of a lattice offset; codes: their largest values.
     """
 
     translate: float = 0.25
@@ -92,6 +93,7 @@ class Reach:
     weather: float = 1.0
     foliage: float = 1.0
     across_m: float = math.inf
+    of_distance: float = math.inf
     partly: float = math.inf
 
 
@@ -346,12 +348,12 @@ def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
     found = []
     metres = old.axes @ (new.position - old.position)
     along, across = metres[0] / old.size[0], metres[2] / old.size[0]
+    most_m = min(reach.translate_m, reach.of_distance * math.hypot(*old.position))
+    across_m = min(most_m, reach.across_m)
     most = reach.translate if old.whole else min(reach.translate, reach.partly)
     if max(abs(along), abs(across)) > most + REACH_TOLERANCE:
         found.append(f"moved by {along:.3f}, {across:.3f} own lengths")
-    elif max(abs(metres[0]), abs(metres[2])) > reach.translate_m + REACH_TOLERANCE or (
-        abs(metres[2]) > reach.across_m + REACH_TOLERANCE
-    ):
+    elif abs(metres[0]) > most_m + REACH_TOLERANCE or abs(metres[2]) > across_m + REACH_TOLERANCE:
         found.append(f"moved by {metres[0]:.3f}, {metres[2]:.3f} m")
     turned = math.remainder(new.yaw - old.yaw, 2 * math.pi)
     if abs(turned) > reach.rotate + REACH_TOLERANCE:

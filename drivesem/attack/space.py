@@ -81,9 +81,10 @@ _HARDLY_CUT = 0.1
 class Budget:
     """How far each parameter may go from the photograph, at most. Codes end at these values whatever they start
     from; the others are distances from the photographed scene, and of several bounds the nearest binds. translate:
-    own lengths; translate_m: metres, the same for long and short cars; across_m: metres, across alone; partly: own
-    lengths, of cars that the photograph does not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the
-    bound on strain in `drivesem.attack.feasible` is the one that binds).
+    own lengths; translate_m: metres, the same for long and short cars; across_m: metres, across alone;
+    of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
+    not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
+    `drivesem.attack.feasible` is the one that binds).
     """
 
     color: float = 1.0
@@ -94,10 +95,11 @@ class Budget:
     mesh: float = 0.25
     translate_m: float = math.inf
     across_m: float = math.inf
+    of_distance: float = math.inf
     partly: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_positive("budget", self, unbounded=("translate_m", "across_m", "partly"))
+        _check_positive("budget", self, unbounded=("translate_m", "across_m", "of_distance", "partly"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,11 +344,13 @@ class ParameterSpace:
         elif parameter is Parameter.FOLIAGE:
             start, low = self.scene.environment.foliage, -limit
         elif parameter is Parameter.TRANSLATE:
-            length_m = self.scene.objects.size_lhw[:, :1].detach()
-            both_m = self.budget.translate_m, min(self.budget.translate_m, self.budget.across_m)
-            reach = (length_m.new_tensor(both_m) / length_m).clamp(max=limit)
+            budget, objects = self.budget, self.scene.objects
+            length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()
+            most_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])
+            most_m = torch.minimum(most_m, budget.of_distance * place.norm(dim=1, keepdim=True))
+            reach = (most_m / length_m).clamp(max=limit)
             partly = ~shown_whole(self.scene)
-            reach[partly] = reach[partly].clamp(max=self.budget.partly)
+            reach[partly] = reach[partly].clamp(max=budget.partly)
             return -reach.reshape(-1), reach.reshape(-1)
         else:
             return -limit, limit

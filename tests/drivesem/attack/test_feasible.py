@@ -316,8 +316,11 @@ def test_the_second_check_follows_the_budget(street):
         (line,) = check_scene(scene, _moved(scene, across=1.2), reach=reach)
         assert "moved by" in line
     assert check_scene(scene, _moved(scene, across=0.99), reach=STREET) == []
-    too_far = PRESETS["street"].translate_m + 0.1
-    assert "moved by" in check_scene(scene, _moved(scene, too_far), reach=STREET)[0]
+    assert "moved by 4.100" in check_scene(scene, _moved(scene, 4.1), reach=STREET)[0]
+    # Of its distance from the camera, a car goes no more than a share.
+    near = street(positions_xz=((0.0, 10.0), (3.0, 30.0)), yaw=-math.pi / 2)
+    assert check_scene(near, _moved(near, 3.0), reach=STREET) == []
+    assert "moved by 3.100" in check_scene(near, _moved(near, 3.1), reach=STREET)[0]
 
 
 @pytest.mark.parametrize("partly", [{"occlusion": torch.tensor([1, 0])}, {"truncation": torch.tensor([0.2, 0])}])
@@ -338,14 +341,14 @@ def test_no_budget_lets_a_car_into_another_or_off_the_road(street, reach):
 
 
 def test_the_projection_keeps_a_street_s_cars_apart(street):
-    scene = street(positions_xz=((0.0, 10.0), (0.0, 18.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 14.0), (0.0, 21.0)), yaw=-math.pi / 2)
     # The far one is higher, so that it stays in sight.
     scene = scene.with_objects(size_lhw=torch.tensor([[4.2, 1.5, 1.75], [4.2, 2.6, 1.75]]))
     space = ParameterSpace(scene, COMBOS[1], PRESETS["street"])
     far = FeasibleSet(space).project(space.upper * torch.tensor([1.0, 0, 0, 0, 0, 0]))
     moved = space.apply(scene, far.theta)
     metres = (moved.objects.translation - scene.objects.translation).norm(dim=1)
-    assert 3.5 < float(metres[0]) < 3.8
+    assert 2.6 < float(metres[0]) < 2.8
     assert check_scene(scene, moved, reach=STREET) == []
     assert "objects[0]: collision" in far.active
 

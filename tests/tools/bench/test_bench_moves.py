@@ -97,13 +97,16 @@ def test_a_line_counts_what_both_see() -> None:
     def row(psnr_db: float, found: float | None, ours: float | None, change: str = "1 m farther") -> MovedRow:
         return MovedRow("train", 0, change, "sedan", 20.0, (1.0, 0.0), 0.0, psnr_db, 15.0, 22.0, found, ours, 1)
 
-    rows = [row(20, 0.9, 0.7), row(30, 0.8, None), row(25, None, None), row(25, 0.5, 0.6, "5 degrees")]
-    first, second = moves.summary(rows)
-    assert (first["split"], first["change"], first["count"]) == ("train", "1 m farther", 3)
-    assert (first["psnr_db"], first["tail_db"]) == (25.0, 21.0)
-    assert (first["found"], first["kept"], first["agree"]) == (2, 1, 0.667)
-    assert first["score_apart"] == pytest.approx(0.2)
-    assert second["change"] == "5 degrees"
+    near = row(25, 0.5, 0.6, "1 m nearer")
+    rows = [row(20, 0.9, 0.7), row(30, 0.8, None), row(25, None, None), near, row(25, 0.5, 0.6, "5 degrees")]
+    nearer, farther, turned, share = moves.summary(rows)
+    assert (farther["split"], farther["change"], farther["count"]) == ("train", "1 m farther", 3)
+    assert (farther["psnr_db"], farther["tail_db"]) == (25.0, 21.0)
+    assert (farther["found"], farther["kept"], farther["agree"]) == (2, 1, 0.667)
+    assert farther["score_apart"] == farther["score_tail"] == pytest.approx(0.2)
+    assert [line["change"] for line in (nearer, turned)] == ["1 m nearer", "5 degrees"]
+    # One metre of twenty.
+    assert (share["change"], share["count"]) == ("0 to 0.1 of its distance nearer", 1)
 
 
 def test_what_leaves_the_picture_is_left_out(case: Case) -> None:
