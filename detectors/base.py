@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self, runtime_checkable
@@ -134,6 +134,37 @@ class Candidates:
         return self.boxes_xyxy[:, label if self.boxes_xyxy.shape[1] > 1 else 0]
 
 
+@dataclass(frozen=True, slots=True)
+class Trunk:
+    """A detector taken apart, for images of one size: what is around the image, the network, how its outputs are
+    read. On it `detectors.incremental` builds.
+
+    network: takes a padded image (1, 3, H, W), RGB in [0, 1] less `mean`, and gives one tensor or several; in eval
+    mode, and torch.fx can trace it. fill: the padding's RGB; padding: its rows above and below, columns left and
+    right; interpret: of the network's outputs and of the image's height and width what `Detector.forward` gives.
+    """
+
+    network: nn.Module
+    mean: tuple[float, float, float]
+    fill: tuple[float, float, float]
+    padding: tuple[int, int, int, int]
+    interpret: Callable[[Sequence[Tensor], tuple[int, int]], RawPredictions]
+
+    @property
+    def at(self) -> tuple[int, int]:
+        """Row and column of the padded image at which the image begins."""
+        return self.padding[0], self.padding[2]
+
+    def padded(self, image: Tensor) -> Tensor:
+        """What the network takes for an image (1, 3, h, w)."""
+        top, bottom, left, right = self.padding
+        height, width = int(image.shape[2]), int(image.shape[3])
+        mean, around = (image.new_tensor(level).view(1, 3, 1, 1) for level in (self.mean, self.fill))
+        whole = (around - mean).repeat(1, 1, top + height + bottom, left + width + right)
+        whole[:, :, top : top + height, left : left + width] = image - mean
+        return whole.contiguous(memory_format=torch.channels_last)
+
+
 class Predictor(Protocol):
     """A detector that need have no gradient: what `Detector` is, less loss and t*; detectors of other projects.
 
@@ -198,6 +229,10 @@ class Detector(nn.Module, ABC):
         Raises DetectorError where a detector does not tell.
         """
         raise DetectorError(f"detector {self.name}: expected one that tells its candidates")
+
+    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
+        """The detector taken apart for images (height, width), as its weights are; None where it cannot be."""
+        return None
 
     @contextmanager
     def holding(self, raw: Any) -> Iterator[None]:

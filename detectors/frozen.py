@@ -3,8 +3,7 @@
 An attack runs the detector thousands of times and never changes it. So here no gradient of a weight is prepared;
 what two expansions of a Fire give is never joined, because the next layer takes each of them by its own part of
 the weights; rectifiers work in place, and after pooling; and the full-resolution stem runs in bands of rows that
-stay in the processor's cache, backwards too. In single precision on a CPU, weights lie as oneDNN wants them, where
-each pass would order them anew, and sums and rectifiers are part of the convolution.
+stay in the processor's cache, backwards too.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from detectors.convolving import convolve, convolve_onto, empty, last, mask, ordered, phases
+
 BAND_ROWS = 24
 """Pooled rows a band of the stem: at 1242 px its 64 convolved channels take 8 MB, which a server's cache holds."""
 
 _BACK_POOL = torch.ops.aten.max_pool2d_with_indices_backward
-_BACK_RELU = torch.ops.aten.threshold_backward.grad_input
-_ONEDNN = torch.ops.mkldnn
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +38,16 @@ class Convolution:
     bias: Tensor
 
     def __call__(self, parts: Sequence[Tensor], rectify: bool = False) -> Tensor:
-        reach, last = self.weights[0].shape[-1] // 2, len(parts) - 1
-        result = _convolve(parts[0], self.weights[0], self.bias, padding=reach, rectify=rectify and last == 0)
+        reach, final, slope = self.weights[0].shape[-1] // 2, len(parts) - 1, 0.0 if rectify else None
+        result = convolve(parts[0], self.weights[0], self.bias, padding=reach, slope=None if final else slope)
         for i, (part, weight) in enumerate(zip(parts[1:], self.weights[1:], strict=True), start=1):
-            result = _convolve_onto(result, part, weight, padding=reach, rectify=rectify and i == last)
+            result = convolve_onto(result, part, weight, padding=reach, slope=slope if i == final else None)
         return result
 
     def backward(self, gradient: Tensor) -> list[Tensor]:
         """The gradient to each part."""
         reach = self.weights[0].shape[-1] // 2
-        return [_convolve(gradient, weight, padding=reach) for weight in self.back]
+        return [convolve(gradient, weight, padding=reach) for weight in self.back]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +62,7 @@ class Stage:
         """The gradient to what both expansions take, of one to each of their outputs."""
         first, second = self.expansions
         total = second.backward(gradients[1])[0]
-        return _convolve_onto(total, gradients[0], first.back[0], padding=first.back[0].shape[-1] // 2)
+        return convolve_onto(total, gradients[0], first.back[0], padding=first.back[0].shape[-1] // 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +121,8 @@ def convolution(layer: nn.Conv2d, parts: Sequence[int], dtype: torch.dtype) -> C
     weight = layer.weight.detach().to(dtype)
     weights = weight.split(list(parts), 1)
     return Convolution(
-        weights=tuple(_ordered(part) for part in weights),
-        back=tuple(_ordered(part.flip(2, 3).transpose(0, 1)) for part in weights),
+        weights=tuple(ordered(part) for part in weights),
+        back=tuple(ordered(part.flip(2, 3).transpose(0, 1)) for part in weights),
         bias=layer.bias.detach().to(dtype),
     )
 
@@ -139,15 +138,13 @@ def stem(layer: nn.Conv2d, bgr_mean: Sequence[float], following: Convolution, dt
     """The stem of a convolution of odd size and stride 2 that wants BGR in 0..255 less its mean."""
     assert layer.bias is not None
     weight = layer.weight.detach().flip(1) * 255
-    # Image row 2i + a gets its gradient through the kernel's row a + 2m from the convolved row i - m.
-    taps = F.pad(weight, (0, 1, 0, 1)).unflatten(2, (-1, 2)).unflatten(4, (-1, 2))  # (C, c, m, a, n, b)
-    back = taps.permute(3, 5, 1, 0, 2, 4).flatten(0, 2).flip(2, 3)
+    back = phases(weight, 2)
     mean = weight.new_tensor(list(reversed(bgr_mean))) / 255
     return Stem(
         mean=mean.view(3, 1, 1),
-        weight=_ordered(weight.to(dtype), stride=2, padding=0),
+        weight=ordered(weight.to(dtype), stride=2, padding=0),
         bias=layer.bias.detach().to(dtype),
-        back=_ordered(back.to(dtype), padding=back.shape[-1] - 1),
+        back=ordered(back.to(dtype), padding=back.shape[-1] - 1),
         following=following,
     )
 
@@ -184,7 +181,7 @@ class _Frozen(torch.autograd.Function):
     ) -> tuple[Tensor, None, None]:
         net: FrozenNet = ctx.net
         shape, dtype = ctx.like
-        x = _last(gradients[0])
+        x = last(gradients[0])
         scale = None
         if x.dtype == torch.float16:
             # Its smallest number is 6e-8, and gradients of one confidence are smaller: carry them relative to 1.
@@ -194,11 +191,11 @@ class _Frozen(torch.autograd.Function):
             for stage, passed in zip(reversed(net.stages), reversed(ctx.passed), strict=True):
                 parts = stage.following.backward(x)
                 for i, part in enumerate(parts):
-                    _mask(part, passed.parts[i])
+                    mask(part, passed.parts[i])
                     if stage.pools:
                         parts[i] = _unpool(part, passed.indices[i], passed.shape)
                 x = stage.backward(parts)
-                _mask(x, passed.squeezed)
+                mask(x, passed.squeezed)
             image = _back_through_stem(net, x, ctx.bands, shape, dtype)
         return (image if scale is None else image * scale), None, None
 
@@ -210,21 +207,21 @@ def _through_stem(net: FrozenNet, images: Tensor, keep: bool) -> tuple[Tensor, l
     # More rows and columns than a multiple of the stride: see SqueezeDet.forward. Zero is the mean colour.
     kernel = layers.weight.shape[-1]
     before, beyond = rows_before(kernel), kernel - 2
-    x = _empty((batch, 3, padded_h + beyond, padded_w + beyond), dtype, images.device)
+    x = empty((batch, 3, padded_h + beyond, padded_w + beyond), dtype, images.device)
     x[:, :, :before] = 0
     x[:, :, before + height :] = 0
     x[:, :, before : before + height, :before] = 0
     x[:, :, before : before + height, before + width :] = 0
     torch.sub(images, layers.mean, out=x[:, :, before : before + height, before : before + width])
     convolved_rows = padded_h // 2
-    squeezed = _empty(
+    squeezed = empty(
         (batch, len(layers.following.bias), padded_h // 4, padded_w // 4), dtype=dtype, device=images.device
     )
     bands: list[_Band] = []
     for several, top, bottom in _bands(batch, squeezed.shape[2], images.device):
         rows = min(2 * bottom + 1, convolved_rows) - 2 * top
         seen = x[several, :, 4 * top : 4 * top + 2 * rows + beyond]
-        convolved = _convolve(seen, layers.weight, layers.bias, stride=2)
+        convolved = convolve(seen, layers.weight, layers.bias, stride=2)
         pooled, indices = _pool(convolved)
         squeezed[several, :, top:bottom] = layers.following([pooled[:, :, : bottom - top].relu_()], rectify=True)
         if keep:
@@ -243,9 +240,9 @@ def _back_through_stem(
     for band in bands:
         bottom = band.top + band.pooled.shape[2]
         (pooled,) = layers.following.backward(gradient[band.images, :, band.top : bottom])
-        _mask(pooled, band.pooled)
+        mask(pooled, band.pooled)
         convolved = _unpool(pooled, band.indices, band.convolved_shape[2:])
-        quads = _convolve(convolved, layers.back, padding=reach).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
+        quads = convolve(convolved, layers.back, padding=reach).permute(0, 2, 3, 1)  # (b, h, w, 2 * 2 * 3)
         into = image[band.images, 4 * band.top : 4 * band.top + 2 * quads.shape[1]]
         into = into.unflatten(1, (-1, 2)).unflatten(3, (-1, 2))  # (b, h, 2, w, 2, 3)
         into += quads.unflatten(3, (2, 2, 3)).transpose(2, 3)
@@ -262,67 +259,12 @@ def _bands(batch: int, rows: int, device: torch.device) -> Iterator[tuple[slice,
             yield slice(image, image + 1), top, min(top + BAND_ROWS, rows)
 
 
-def _ordered(weight: Tensor, stride: int = 1, padding: int | None = None) -> Tensor:
-    """Weights as `_convolve` takes them: in oneDNN's own order where it computes, else channels-last. padding: by
-    default what keeps the size.
-    """
-    weight = _last(weight)
-    if weight.device.type != "cpu" or weight.dtype != torch.float32 or not torch.backends.mkldnn.is_available():
-        return weight
-    reach = weight.shape[-1] // 2 if padding is None else padding
-    ordered: Tensor = _ONEDNN._reorder_convolution_weight(weight, [reach] * 2, [stride] * 2, [1, 1], 1)
-    return ordered
-
-
-def _convolve(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    stride: int = 1,
-    padding: int = 0,
-    rectify: bool = False,
-) -> Tensor:
-    if weight.is_mkldnn:
-        after = "relu" if rectify else "none"
-        result: Tensor = _ONEDNN._convolution_pointwise(
-            x, weight, bias, [padding] * 2, [stride] * 2, [1, 1], 1, after, [], ""
-        )
-        return result
-    result = F.conv2d(x, weight, bias, stride, padding)
-    return result.relu_() if rectify else result
-
-
-def _convolve_onto(total: Tensor, x: Tensor, weight: Tensor, padding: int, rectify: bool = False) -> Tensor:
-    """`total`, in place, plus a convolution."""
-    if weight.is_mkldnn:
-        after = "relu" if rectify else None
-        result: Tensor = _ONEDNN._convolution_pointwise_(
-            total, x, weight, None, [padding] * 2, [1, 1], [1, 1], 1, "add", 1.0, after, [], None
-        )
-        return result
-    total += F.conv2d(x, weight, padding=padding)
-    return total.relu_() if rectify else total
-
-
 def _pool(x: Tensor) -> tuple[Tensor, Tensor]:
     pooled, indices = F.max_pool2d_with_indices(x, [3, 3], stride=[2, 2], ceil_mode=True)
     return pooled, indices
 
 
 def _unpool(gradient: Tensor, indices: Tensor, image_hw: torch.Size) -> Tensor:
-    before = _empty((*gradient.shape[:2], *image_hw), gradient.dtype, gradient.device)
+    before = empty((*gradient.shape[:2], *image_hw), gradient.dtype, gradient.device)
     result: Tensor = _BACK_POOL(gradient, before, [3, 3], [2, 2], [0, 0], [1, 1], True, indices)
     return result
-
-
-def _mask(gradient: Tensor, rectified: Tensor) -> None:
-    """Set to 0, in place, where the rectifier did."""
-    _BACK_RELU(gradient, rectified, 0, grad_input=gradient)
-
-
-def _empty(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.empty(tuple(shape), dtype=dtype, device=device, memory_format=torch.channels_last)
-
-
-def _last(x: Tensor) -> Tensor:
-    return x.contiguous(memory_format=torch.channels_last)

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes, frozen, grid, quality
-from detectors.base import Candidates, Detector, RawPredictions
+from detectors.base import Candidates, Detector, RawPredictions, Trunk
 from detectors.types import CLASSES, Detections, Targets
 
 ANCHOR_SIZES_WH = (
@@ -240,12 +240,32 @@ class SqueezeDet(Detector):
         before = frozen.rows_before(self.layout.kernel)
         x = F.pad(x, (before, -width % grid.STRIDE + before + 1, before, -height % grid.STRIDE + before + 1))
         x = x.contiguous(memory_format=torch.channels_last)
-        x = F.relu(_pool(self.conv1(x)), inplace=True)  # the order does not matter, a quarter of the pixels does
+        return self._interpret(self.after(self.conv1(x)), (height, width))
+
+    def after(self, convolved: Tensor) -> Tensor:
+        """ConvDet's output of what conv1 gives."""
+        x = F.relu(_pool(convolved), inplace=True)  # the order does not matter, a quarter of the pixels does
         for name, fire in self.fires.items():
             x = fire(x)
             if name in self.layout.pooled:
                 x = _pool(x)
-        return self._interpret(self.convdet(self.dropout(x)), (height, width))
+        return self.convdet(self.dropout(x))
+
+    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
+        """With the order and range of pixels in conv1's weights; None with another precision for gradients."""
+        if self.gradient_precision is not None:
+            return None
+        before = frozen.rows_before(self.layout.kernel)
+        top, left = before, before
+        bottom, right = (-side % grid.STRIDE + self.layout.kernel - 2 - before for side in image_hw)
+        blue, green, red = (level / 255 for level in BGR_MEAN)
+        return Trunk(
+            _OfPixels(self),
+            (red, green, blue),
+            (red, green, blue),
+            (top, bottom, left, right),
+            lambda outputs, hw: self._interpret(outputs[0], hw),
+        )
 
     def _frozen(self, images: Tensor) -> frozen.FrozenNet:
         """The layers as attacks run them, made anew where the weights have changed since."""
@@ -414,6 +434,18 @@ class SqueezeDet(Detector):
             confidence_logits=confidence.reshape(batch, -1),
             image_hw=image_hw,
         )
+
+
+class _OfPixels(nn.Module):
+    """The layers of a SqueezeDet, for padded RGB in [0, 1] less the mean."""
+
+    def __init__(self, detector: SqueezeDet) -> None:
+        super().__init__()
+        self.detector = detector
+        self.weight = detector.conv1.weight.detach().flip(1) * 255
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.detector.after(F.conv2d(x, self.weight, self.detector.conv1.bias, 2))
 
 
 class SqueezeDetPlus(SqueezeDet):

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from detectors import boxes
-from detectors.base import Candidates, Detector, RawPredictions
+from detectors.base import Candidates, Detector, RawPredictions, Trunk
 from detectors.types import CLASSES, Detections, Targets
 from detectors.yolov3 import layouts
 from detectors.yolov3.cfg import Cfg
@@ -152,6 +152,13 @@ class YoloV3(Detector):
         with torch.autocast(images.device.type, enabled=False):
             outputs = self._folded(dtype)(_padded(x, stride))
         return self._interpret(outputs, (height, width), scaled)
+
+    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
+        """The whole network; None with another precision for gradients."""
+        if self.gradient_precision is not None:
+            return None
+        bottom, right = (-side % self.cfg.stride for side in image_hw)
+        return Trunk(self.network, (0.0, 0.0, 0.0), (GREY, GREY, GREY), (0, bottom, 0, right), self._interpret)
 
     def _folded(self, dtype: torch.dtype) -> Folded:
         """The network as attacks run it, made anew where the weights have changed since."""

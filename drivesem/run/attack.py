@@ -23,6 +23,7 @@ from drivesem.attack.methods.base import LOOKED_AT
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.cma_es import CMAES
+from drivesem.attack.methods.corners import Corners
 from drivesem.attack.methods.fgsm import FGSM
 from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.methods.restarts import Restarted
@@ -189,6 +190,7 @@ class Worker:
             grader=self.grader,
             keep_last=config.keep == "last",
             only_bounds=config.project == "bounds",
+            whole=config.whole,
         )
         try:
             return attack_scene(identifier, scene, self.detector, settings)
@@ -226,6 +228,8 @@ def _from_theta0(config: Attack) -> AttackMethod:
             return SCW(queries, steps, config.norm, config.rate, early_stop)
         case "climb":
             return Climb(config.passes or Climb().passes)
+        case "corners":
+            return Corners(config.passes or Corners().passes)
         case "placebo":
             return Placebo()
         case "subsets":

@@ -42,7 +42,18 @@ class AttackOptions(TypedDict, total=False):
     combo: int
     params: str
     method: Literal[
-        "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "climb"
+        "si-fgsm",
+        "apgd",
+        "fgsm",
+        "sgd",
+        "scw",
+        "subsets",
+        "random",
+        "halton",
+        "sobol",
+        "cma-es",
+        "corners",
+        "climb",
     ]
     steps: int
     queries: int

@@ -52,7 +52,7 @@ class FrameSettings:
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
     how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`.
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`.
     """
 
     attack: AttackMethod
@@ -67,6 +67,7 @@ class FrameSettings:
     grader: Grader | None = None
     keep_last: bool = False
     only_bounds: bool = False
+    whole: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +105,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         settings.term,
         t_star=settings.t_star,
         aim=settings.aim,
+        whole=settings.whole,
     )
     feasible = objective.feasible_set(only_bounds=settings.only_bounds)
     nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
@@ -114,6 +116,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     benign = objective.detect(scene.photograph)
     passes = objective.passes + 1
     failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
+    objective.forget()
     return AttackedScene(
         identifier=identifier,
         objective=objective,

@@ -44,4 +44,6 @@ def rebuilt(
     labels, term = attack.objective_labels, attack.objective
     aim = Aim.of(attack.target_objects, attack.target_classes)
     difficulty = Difficulty(min_contrast=result.min_contrast)
-    return Objective(compositor, space, detector, labels, term, difficulty, attack.t_star, aim), theta
+    return Objective(
+        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole
+    ), theta

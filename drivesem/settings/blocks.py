@@ -230,7 +230,16 @@ class FinishedRun(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attacking(Threshold, Precision, Scenes):
+class Regions(Options):
+    """How detectors look at changed pictures."""
+
+    whole: Flag = False
+    """Compute the detector's whole pass for each picture; by default only what changed, with the same result,
+    where its layers are known (docs/detectors.md)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attacking(Regions, Threshold, Precision, Scenes):
     """An attack, as far as a study gives it to all of its arms."""
 
     detector: str = "squeezedet"

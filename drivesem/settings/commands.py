@@ -78,16 +78,18 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         "halton",
         "sobol",
         "cma-es",
+        "corners",
         "climb",
         "placebo",
     ] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
     (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
-    each object's margin is on average over draws of --nuisances, and finds failures that hold."""
+    each object's margin is on average over draws of --nuisances, and finds failures that hold; corners is its
+    baseline, which tries corners of the bounds."""
     passes: Annotated[Count, at_least(LEAST_PASSES, "which the search needs")] | None = None
     """Passes of the detector that a frame may take, a gradient counted as 3: methods take as many steps or queries
-    as fit, whatever --steps says. By default only climb counts them, 90."""
+    as fit, whatever --steps says. By default only climb and corners count them, 90."""
     queries: Annotated[Count, Of(COUNTED)] | None = None
     """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
     step_form: Annotated[Literal["raw", "l2"], Of(("sgd",))] = "l2"
@@ -131,9 +133,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         both = self.passes is not None and self.queries is not None
         refuse(both, "--queries", "no --passes beside it", f"--passes {self.passes}")
         subsets = self.method == "subsets"
-        refuse(
-            self.early_stop and subsets, "--early-stop", "a method that may end at the first success", self.method
-        )
+        whole = self.early_stop and self.method in ("subsets", "corners", "climb")
+        refuse(whole, "--early-stop", "a method that may end at the first success", self.method)
         unlike = self.method == "placebo" and self.like is None
         refuse(unlike, "--like", "a run of drivesem attack, for --method placebo", "nothing")
         refuse(subsets and self.queries == 1, "--queries", "at least 2 with subsets", self.queries)
@@ -523,7 +524,7 @@ class Bench(Scenes, FrameCommand):
     """Name of a shipped detector, or a .safetensors file of one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
-    methods: str = "climb,si-fgsm,halton,cma-es"
+    methods: str = "climb,corners,si-fgsm,halton,cma-es"
     """Planted: attacks to judge, with commas (drivesem attack --method)."""
     passes: Annotated[int, at_least(LEAST_PASSES)] = 90
     """Planted: passes of the detector that each attack may take for a fault, a gradient counted as 3."""
@@ -550,6 +551,23 @@ class Gradcheck(Scenes, FrameCommand):
     """Least cosine between gradient and differences."""
     max_error: Annotated[float, Within(0, ends="(]", expected="a positive number")] = 0.05
     """Largest relative error of the gradient."""
+    reach: Flag = False
+    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
+    parameter and distance; some minutes a frame."""
+    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
+    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
+
+    def check(self) -> None:
+        super().check()
+        for name in ("directions", "min_cosine", "max_error"):
+            value = getattr(self, name)
+            refuse(
+                self.reach and value != getattr(Gradcheck, name),
+                f"--{name.replace('_', '-')}",
+                "no --reach beside it",
+                value,
+            )
+        refuse(not self.reach and self.draws != Gradcheck.draws, "--draws", "--reach beside it", self.draws)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,6 +115,7 @@ def apply_weather(
     target = flat + sky * (cover - flat)
     image = image + model.OVERCAST * overcast * (target - image)
     air = air + model.OVERCAST * overcast * (model.OVERCAST_AIR * grey_air - air)
+    air = air + model.HAZE_GREY * (fog + rain - fog * rain) * ((air * luma).sum() - air)
 
     gain = time_gain(time)
     image = image + gain[:, None, None] * image
@@ -129,12 +130,22 @@ def apply_weather(
     sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air[:, None, None]
     image = image + rain * (road * grazing) * (sheen - image)
     veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
-    image = image + veil * (model.RAIN_AIR * air[:, None, None] - image)
+    image = veiled(image, veil, model.RAIN_AIR * air[:, None, None])
     streaks = _streaks(*sky.shape).to(image)
     image = image + model.STREAKS * rain * streaks * (air[:, None, None] - image)
 
     # Fog (Koschmieder 1924).
-    return image - torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth) * (air[:, None, None] - image)
+    return veiled(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), air[:, None, None])
+
+
+def veiled(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
+    """A picture (3, H, W) behind a veil, of which a share (H, W) in [0, 1] is air (3, 1, 1); 0 leaves every bit.
+
+    Light adds up, display values do not: they are squared first, which is a display's exponent of 2.2 nearly, and
+    the root is bent near black, so that it has a slope there.
+    """
+    light = image * image + model.VEIL_BEND**2
+    return image + (torch.sqrt(light + veil * (air * air - image * image)) - torch.sqrt(light))
 
 
 def _mirror(image: Tensor) -> Tensor:

@@ -159,21 +159,25 @@ DUSK_ENDS, DIMMING, DIMMING_ENDS = 3.5, 0.25, 2.0
 """Rates in the code's square at which that warmth and an early dimming end again, and how strong the latter is."""
 DAMP = 0.9
 """How far rain 1 goes towards the wet picture."""
-DAMP_LIGHT, DAMP_COLOUR = 0.94, 0.65
+DAMP_LIGHT, DAMP_COLOUR = 1.0, 0.75
 """What is left of light and colour in that."""
-SHEEN_NEAR, SHEEN_FAR, SHEEN_M = 0.15, 0.45, (4.0, 45.0)
+SHEEN_NEAR, SHEEN_FAR, SHEEN_M = 0.10, 0.30, (4.0, 45.0)
 """How much of a wet road is sheen near the camera, what is added far away, and the distances between
 which it is."""
 SHEEN_MIRROR, SHEEN_AIR = 0.55, 0.40
 """What the sheen is made of: what stands above, and airlight."""
 RAIN_EXTINCTION_PER_M = 0.006
 """Haze of strong rain at rain code 1."""
-RAIN_AIR = 0.85
+RAIN_AIR = 0.8
 """Brightness of that haze, of the airlight."""
 STREAKS = 0.22
 """Opacity of the streaks of rain 1."""
 FOG_EXTINCTION_PER_M = 0.03
 """Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""
+HAZE_GREY = 0.8
+"""How far fog 1 or rain 1 takes the colour out of the airlight: drops scatter all colours alike."""
+VEIL_BEND = 0.05
+"""The display value about which the root that light is shown by bends, so that its slope stays finite at black."""
 HAZE_CAP_M = 300.0
 """Haze is a layer on the ground: the sky is seen through this much of it."""
 

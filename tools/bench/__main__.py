@@ -23,7 +23,7 @@ from drivesem.bench.tables import Section
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
-from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth
+from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth, weather
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -52,6 +52,7 @@ def run(config: BenchTool) -> int:
         "label-free": _label_free,
         "moves": _moves,
         "redraw": _redraw,
+        "weather": _weather,
         "synth": _synth,
         "rivals": _rivals,
         "eval": _eval,
@@ -99,6 +100,17 @@ def _redraw(config: BenchTool, console: Console) -> Measured:
     rows = [frames[name] for name in sorted(frames)]
     fields = {"frames": len(rows), "rows": [asdict(row) for row in rows], "summary": redraw.summary(rows)}
     return _measured(redraw, fields)
+
+
+def _weather(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = _frames(config, weather)
+    try:
+        measured = weather.measure(config, frames, _sheets(config))
+        rows = [row for found in watched(measured, frames, console) for row in found]
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    return _measured(weather, {"rows": [asdict(row) for row in rows], "summary": weather.summary(rows)})
 
 
 def _label_free(config: BenchTool, console: Console) -> Measured:

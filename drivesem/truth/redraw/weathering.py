@@ -1,10 +1,9 @@
 """Paint, leaves and weather of the second renderer: its own formulas for what the codes mean.
 
-How much light there is changes linear values (display values to the power of 2.2), where the first renderer works
-on display values; veils of fog, rain and drops lie over display values, as Foggy Cityscapes' do (Sakaridis et al.
-2018). A code of 0 changes nothing. The codes' meaning is in scene_ir/conventions.md; strengths are those
-of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst, time 1 the end of civil twilight, overcast 1 a
-closed cover.
+Light and the veils of fog and rain are linear values (display values to the power of 2.2), where the first
+renderer works on display values and their squares. A code of 0 changes nothing. The codes' meaning is in
+scene_ir/conventions.md; strengths are those of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst,
+time 1 the end of civil twilight, overcast 1 a closed cover.
 """
 
 from __future__ import annotations
@@ -127,17 +126,20 @@ def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environ
     depth = np.minimum(depth_m, _LAYER_M)[..., None]
     if rain:
         grey = (light @ _LUMA)[..., None]
-        wet = 0.5 * (0.65 * light + 0.35 * grey)
+        wet = 0.85 * (0.65 * light + 0.35 * grey)
         mirror = _smeared(light) * 0.5 + 0.35 * air
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
-    shown, air = np.clip(light, 0, 1) ** (1 / _GAMMA), air ** (1 / _GAMMA)
+    light = np.clip(light, 0, 1)
+    # Drops scatter all colours alike.
+    mist = np.exp(-1.6 * (fog + rain))
+    air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
-        shown += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.85 * air - shown)
-        shown += 0.25 * rain * _drops(*shown.shape[:2])[..., None] * (air - shown)
+        light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)
+        light += 0.25 * rain * _drops(*light.shape[:2])[..., None] * (air - light)
     if fog:
-        shown += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - shown)
-    return shown.astype(np.float32)
+        light += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - light)
+    return (light ** (1 / _GAMMA)).astype(np.float32)
 
 
 def _smeared(light: Array) -> Array:

@@ -38,6 +38,7 @@ start_warp()
 wp.set_module_options(OPTIONS)
 
 FOG, RAIN, NEAREST = model.FOG_EXTINCTION_PER_M, model.RAIN_EXTINCTION_PER_M, 1.0 / model.HAZE_CAP_M
+VEIL_BEND = model.VEIL_BEND**2
 FLAT, FLAT_GREY = (
     model.OVERCAST_CONTRAST * share for share in (model.OVERCAST_COLOUR, 1.0 - model.OVERCAST_COLOUR)
 )
@@ -55,13 +56,13 @@ WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
 """Columns that a thread of the CPU smears at a time; `mirror` and `unmirror` have room for this many."""
-OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, SETTINGS = (
+OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_HAZE, SETTINGS = (
     *(0, 1, 2, 3, 4),
-    *(7, 10, 13, 16, 19),
+    *(7, 10, 13, 16, 19, 22),
 )
 """Numbers that are the same for all pixels: where they begin, and their count. Overcast as a share; rain; fog;
 what overcast makes of a black sky; gain of the time of day (3) and its slope (3); airlight (3), its slopes along
-overcast (3) and time (3)."""
+overcast (3), time (3), and what either of fog and rain, fully on alone, does to it (3)."""
 
 
 @wp.func
@@ -97,6 +98,12 @@ def settings_kernel(
     grey = grey_air_of(air)
     away = wp.float64(model.OVERCAST_AIR) * grey - wp.float64(air[c])
     plain = wp.float64(air[c]) + overcast * away
+    darker = (wp.float64(model.OVERCAST_AIR) - one) * grey
+    fog = wp.float64(code[0])
+    rain = wp.float64(code[1])
+    greyed = wp.float64(model.HAZE_GREY) * (fog + rain - fog * rain)
+    paler = grey + overcast * darker - plain
+    misty = plain + greyed * paler
     if c == 0:
         settings[OVERCAST] = wp.float32(overcast)
         settings[WET] = code[1]
@@ -104,9 +111,11 @@ def settings_kernel(
         settings[COVER] = wp.float32(wp.float64(COVER_AIR) * grey + wp.float64(model.COVER_LIGHT))
     settings[GAIN + c] = wp.float32(gain)
     settings[GAIN_SLOPE + c] = wp.float32(slope)
-    settings[AIR + c] = wp.float32(plain + gain * plain)
-    settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * away * (one + gain))
-    settings[AIR_BY_TIME + c] = wp.float32(slope * plain)
+    settings[AIR + c] = wp.float32(misty + gain * misty)
+    along = away + greyed * (darker - away)
+    settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
+    settings[AIR_BY_TIME + c] = wp.float32(slope * misty)
+    settings[AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
 
 
 @wp.func
@@ -163,13 +172,37 @@ def grazing_at(depth: wp.float32):
 
 
 @wp.func
+def root_of(x: wp.vec3f):
+    return wp.vec3f(wp.sqrt(x[0]), wp.sqrt(x[1]), wp.sqrt(x[2]))
+
+
+@wp.func
+def veiled(x: wp.vec3f, veil: wp.float32, air: wp.vec3f):
+    """See `environment.veiled`."""
+    square = wp.cw_mul(x, x)
+    light = square + same(VEIL_BEND)
+    return x + (root_of(light + veil * (wp.cw_mul(air, air) - square)) - root_of(light))
+
+
+@wp.func
+def veiled_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3f):
+    """-> gradients to x, to the veil and to the air."""
+    square = wp.cw_mul(x, x)
+    light = square + same(VEIL_BEND)
+    more = wp.cw_mul(air, air) - square
+    by_root = wp.cw_div(g, root_of(light + veil * more))
+    to_x = g + wp.cw_mul(x, (1.0 - veil) * by_root - wp.cw_div(g, root_of(light)))
+    return to_x, 0.5 * wp.dot(by_root, more), veil * wp.cw_mul(by_root, air)
+
+
+@wp.func
 def hazed(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after haze, streaks and fog."""
     rain = load(settings, WET)
     air = load3(settings, AIR, 1)
-    far = x + (1.0 - exp_(-RAIN * rain * depth)) * (model.RAIN_AIR * air - x)
+    far = veiled(x, 1.0 - exp_(-RAIN * rain * depth), model.RAIN_AIR * air)
     streaked = far + (model.STREAKS * rain * streak) * (air - far)
-    return streaked + (1.0 - exp_(-FOG * load(settings, MIST) * depth)) * (air - streaked)
+    return veiled(streaked, 1.0 - exp_(-FOG * load(settings, MIST) * depth), air)
 
 
 @wp.func
@@ -270,27 +303,28 @@ def after_adjoint(
     sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air - x
     wetted = x + wet * sheen
     clear = exp_(-RAIN * rain * depth)
-    to_haze = model.RAIN_AIR * air - wetted
-    far = wetted + (1.0 - clear) * to_haze
+    haze = model.RAIN_AIR * air
+    far = veiled(wetted, 1.0 - clear, haze)
     streaked = far + (model.STREAKS * rain * streak) * (air - far)
     visible = exp_(-FOG * fog * depth)
 
-    g_fogged = FOG * visible * wp.dot(g, air - streaked)
-    g_far = visible * g
+    g_far, g_fog, g_fog_air = veiled_adjoint(streaked, 1.0 - visible, air, g)
+    g_fogged = FOG * visible * g_fog
     g_streak = wp.dot(g_far, air - far)
     g_haze = (1.0 - model.STREAKS * rain * streak) * g_far
-    g_hazed = RAIN * clear * wp.dot(g_haze, to_haze)
-    g_wet = clear * g_haze
+    g_wet, g_veil, g_haze_air = veiled_adjoint(wetted, 1.0 - clear, haze, g_haze)
+    g_hazed = RAIN * clear * g_veil
     g_sheen = wp.dot(g_wet, sheen)
     g_air = (
-        (1.0 - visible) * g
+        g_fog_air
         + (model.STREAKS * rain * streak) * g_far
-        + (model.RAIN_AIR * (1.0 - clear)) * g_haze
+        + model.RAIN_AIR * g_haze_air
         + (model.SHEEN_AIR * wet) * g_wet
     )
+    g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
     code = wp.vec4f(
-        g_fogged * depth,
-        g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen,
+        g_fogged * depth + (1.0 - rain) * g_grey,
+        g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen + (1.0 - fog) * g_grey,
         wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
     )

@@ -289,6 +289,7 @@ def test_what_cannot_grade_is_refused(
         (["--method", "random", "--queries", "0"], "--queries: expected at least 1, found 0"),
         (["--method", "random", "--precision", "bfloat16"], "--precision: expected float32 with random"),
         (["--method", "fgsm", "--early-stop"], "--early-stop: expected a method of several steps"),
+        (["--method", "corners", "--early-stop"], "--early-stop: expected a method that may end at the first"),
         (["--t-star", "1.5"], "--t-star: expected a score in (0, 1], found 1.5"),
     ],
 )
@@ -302,7 +303,12 @@ def test_what_does_not_go_together_is_named(
 def test_methods_are_those_that_need_no_gradient() -> None:
     names = get_args(get_type_hints(Attack)["method"])
     free = [name for name in names if not run_attack.attack_method(Attack(method=name)).needs_gradient]
-    assert set(free) == {*GRADIENT_FREE, "placebo", "climb"}  # which takes gradients where there are any
+    assert set(free) == {
+        *GRADIENT_FREE,
+        "placebo",
+        "corners",
+        "climb",
+    }  # the last takes gradients where there are any
 
 
 @pytest.mark.parametrize("objective", ["failure", "hide", "phantom", "localisation", "total"])

@@ -406,3 +406,21 @@ def test_halo_moves_with_the_outline(street: Street) -> None:
     )
     assert gaps == 2
     assert float(turned.values.sum()) == pytest.approx(float(still), rel=0.15)
+
+
+def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: SceneIR) -> None:
+    """Neither the picture nor, for any of them, a gradient of it; weather may change every pixel."""
+    scene = scene_to(photographed, torch.float32)
+    compositor = Compositor(scene)
+    moved = scene.objects.translation.clone().requires_grad_(True)
+    rendered = compositor.render(scene.with_objects(translation=moved + moved.new_tensor([0.3, 0.0, 0.2])))
+    assert rendered.drawn is not None
+    outside = torch.ones_like(scene.depth, dtype=torch.bool)
+    for x0, y0, x1, y1 in rendered.drawn.tolist():
+        outside[y0:y1, x0:x1] = False
+    assert 0 < int(outside.sum()) < outside.numel()
+    assert torch.equal(rendered.image.detach()[:, outside], scene.background[:, outside])
+    (gradient,) = torch.autograd.grad(rendered.image[:, outside].sum(), moved)
+    assert not bool(gradient.any())
+    foggy = scene.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
+    assert compositor.render(foggy).drawn is None

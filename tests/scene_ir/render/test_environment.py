@@ -69,12 +69,30 @@ def _code(index: int, value: float) -> Tensor:
     return torch.eye(4, dtype=torch.float64)[index] * value
 
 
-def test_fog_follows_koschmieder() -> None:
+def test_fog_follows_koschmieder_in_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model, "VEIL_BEND", 1e-6)
     image, after = _weather(_code(FOG, 0.5))
     _, inverse, _, air = _inputs()
     depth = 1.0 / inverse.clamp(min=1.0 / model.HAZE_CAP_M)
     clear = torch.exp(-0.015 * depth)
-    torch.testing.assert_close(after, image * clear + air[:, None, None] * (1 - clear))
+    grey = float(air @ torch.tensor(model.LUMA, dtype=air.dtype))
+    air = (air + 0.5 * model.HAZE_GREY * (grey - air))[:, None, None]
+    torch.testing.assert_close(after**2, image**2 * clear + air**2 * (1 - clear))
+
+
+def test_a_veil_bends_near_black_only() -> None:
+    """A thin veil brightens black by no more than its slope says, and hardly differs elsewhere."""
+    grey = torch.linspace(0, 1, 6, dtype=torch.float64).expand(3, 1, 6)
+    air = torch.full((3, 1, 1), 0.8, dtype=torch.float64)
+    veil = torch.full((1, 6), 0.3, dtype=torch.float64)
+    out = env.veiled(grey, veil, air)
+    light = torch.sqrt(0.7 * grey**2 + 0.3 * 0.8**2)
+    assert float((out - light).abs()[..., 1:].max()) < 0.02
+    assert 0.0 < float(light[0, 0, 0] - out[0, 0, 0]) < model.VEIL_BEND
+    assert torch.equal(env.veiled(grey, torch.zeros_like(veil), air), grey)
+    thin = 1e-7
+    slope = float((env.veiled(grey, thin * torch.ones_like(veil), air) - grey)[0, 0, 0]) / thin
+    assert slope == pytest.approx(0.8**2 / (2 * model.VEIL_BEND), rel=1e-3)
 
 
 def test_twilight_is_dark_and_blue_sunset_is_warm() -> None:

@@ -97,6 +97,7 @@ def test_methods_that_follow_the_gradient(
         ["--method", "subsets"],
         ["--method", "halton"],
         ["--method", "cma-es"],
+        ["--method", "corners"],
         ["--method", "climb"],
     ],
     ids=" ".join,

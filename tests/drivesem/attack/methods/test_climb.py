@@ -8,70 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import Projected
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.methods.climb import LEAST_PASSES, Climb
+from drivesem.attack.methods.base import Group
+from drivesem.attack.methods.climb import Climb
+from drivesem.attack.methods.margin_search import LEAST_PASSES
 from scene_ir.errors import RangeError
+from tests.drivesem.attack.methods.street import CARS, DIM, Street
 
-CARS, PASSES = 4, 90
-PLACE, PAINT, WEATHER = slice(0, 2 * CARS), slice(2 * CARS, 3 * CARS), slice(3 * CARS, 3 * CARS + 2)
-DIM = 3 * CARS + 2
-BLIND_AT = torch.tensor([[-0.8, 0.6], [0.7, 0.7], [-0.6, -0.9], [0.9, -0.5]])
-"""Where each car is to stand, of bounds from -1 to 1, to be lost."""
-
-
-@dataclass
-class Street:
-    """Cars that are lost near a place of their own, the more so dark and in fog. ripple: how much a car's margin
-    goes up and down with the place, many times within the bounds, as the phase of edges in pixels does; its
-    gradient is then of no use.
-    """
-
-    ripple: float = 0.0
-    judged: Tensor = field(default_factory=lambda: torch.ones(CARS, dtype=torch.bool))
-    differentiable: bool = True
-    passes: int = 0
-
-    def _margins(self, theta: Tensor, number: int) -> Tensor:
-        place, paint, weather = theta[PLACE].reshape(CARS, 2), theta[PAINT], theta[WEATHER]
-        away = ((place - BLIND_AT) ** 2).sum(dim=1)
-        wave = self.ripple * torch.sin(40 * place + number).sum(dim=1)
-        return 3 * away - 1.0 + 0.5 * paint - 0.3 * weather[0] + wave + 0.05 * (number % 3)
-
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        self.passes += 1
-        return self._margins(theta, number)
-
-    def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        self.passes += 3
-        leaf = theta.clone().requires_grad_(True)
-        margins = self._margins(leaf, number)
-        (gradient,) = torch.autograd.grad((weights * margins).sum(), leaf)
-        return margins.detach(), gradient
-
-    def problem(self, smooth_place: bool = False) -> Problem:
-        upper = torch.ones(DIM)
-        lower = -upper
-        lower[WEATHER] = 0.0
-
-        def score(theta: Tensor) -> Score:
-            lost = int((self._margins(theta, 0) < 0).sum())
-            return Score(0.0, lost, 0, lost > 0, False)
-
-        return Problem(
-            loss_and_grad=lambda theta: (0.0, torch.zeros_like(theta)),
-            project=lambda theta: Projected(theta.clamp(lower, upper), ()),
-            score=score,
-            step=torch.full((DIM,), 0.1),
-            lower=lower,
-            upper=upper,
-            groups=(
-                Group("place", PLACE, CARS, None, smooth_place),
-                Group("paint", PAINT, CARS),
-                Group("weather", WEATHER),
-            ),
-            views=self,
-        )
+PASSES = 90
 
 
 @dataclass
@@ -92,7 +35,7 @@ class Recorded(Street):
 def found(street: Street, climb: Climb | None = None, seed: int = 0) -> tuple[Tensor, int]:
     """Margins (CARS,) where the search ended, without ripples; passes it took."""
     result = (climb or Climb(PASSES))(street.problem(), torch.zeros(DIM), seed)
-    return replace(street, ripple=0.0)._margins(result.theta, 0), result.queries
+    return replace(street, ripple=0.0).known_margins(result.theta, 0), result.queries
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -113,7 +56,7 @@ def test_differences_find_what_gradients_of_ripples_do_not() -> None:
     street, trusting = Street(ripple=0.5), []
     for seed in range(8):
         result = Climb(PASSES)(street.problem(smooth_place=True), torch.zeros(DIM), seed)
-        trusting.append(replace(street, ripple=0.0)._margins(result.theta, 0))
+        trusting.append(replace(street, ripple=0.0).known_margins(result.theta, 0))
     wide = [found(street, seed=seed)[0] for seed in range(8)]
     assert torch.cat(wide).mean() < torch.cat(trusting).mean()
 
@@ -125,8 +68,8 @@ def test_it_ends_lower_than_anything_it_saw_while_looking_around(gradient: bool)
     for seed in range(5):
         street = Recorded()
         result = Climb(PASSES, gradient)(street.problem(), torch.zeros(DIM), seed)
-        around = min(float(street._margins(theta, 0).mean()) for theta in street.seen[: PASSES // 3])
-        gained.append(around - float(street._margins(result.theta, 0).mean()))
+        around = min(float(street.known_margins(theta, 0).mean()) for theta in street.seen[: PASSES // 3])
+        gained.append(around - float(street.known_margins(result.theta, 0).mean()))
     assert sum(gained) / len(gained) > 0.3, gained
 
 
@@ -150,14 +93,14 @@ def test_objects_that_do_not_count_are_no_aim() -> None:
     """Infinite margins, as of objects that are hidden on the way, change nothing for others."""
 
     class Hidden(Street):
-        def _margins(self, theta: Tensor, number: int) -> Tensor:
-            margins = super()._margins(theta, number)
+        def known_margins(self, theta: Tensor, number: int) -> Tensor:
+            margins = super().known_margins(theta, number)
             return torch.where(torch.arange(CARS) == 1, torch.inf, margins)
 
     street = Hidden(judged=torch.tensor([True, False, True, True]))
     result = Climb(PASSES)(street.problem(), torch.zeros(DIM), 0)
     assert bool(torch.isfinite(result.theta).all())
-    assert (street._margins(result.theta, 0)[[0, 2, 3]] < 0).all()
+    assert (street.known_margins(result.theta, 0)[[0, 2, 3]] < 0).all()
 
 
 def test_nothing_to_lose() -> None:

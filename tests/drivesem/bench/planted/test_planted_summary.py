@@ -52,5 +52,5 @@ def test_what_was_judged_comes_back_from_json() -> None:
 
 
 def test_methods_are_those_of_the_command() -> None:
-    assert {"si-fgsm", "halton", "cma-es", "climb"} <= set(METHODS)
+    assert {"si-fgsm", "halton", "cma-es", "corners", "climb"} <= set(METHODS)
     assert "placebo" not in METHODS

@@ -1,0 +1,186 @@
+"""The compositor's weather beside the generator's: brightness, contrast and a detector's scores, code by code.
+
+A failure that only the compositor's weather causes does not survive the second renderer. This says where the two
+part: for each effect, at half and at full strength, in the boxes of the labelled vehicles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from detectors.base import Predictor, predict
+from detectors.registry import load_predictor
+from drivesem.attack.goals import of_detections
+from drivesem.attack.judging import t_star_of
+from drivesem.bench.tables import Columns
+from drivesem.data.classes import VEHICLES
+from drivesem.report.drawing import write_picture
+from drivesem.settings.edits import FrameEdit
+from drivesem.synth import frames as generated
+from drivesem.synth.edits import apply_edit
+from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth
+from drivesem.truth.margin import of_objects
+from scene_ir.derender.derender import derender
+from scene_ir.io import to_uint8
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.model import LUMA
+from scene_ir.types import Frame, SceneIR
+from tools.bench.pictures import Strip, psnr, sheet
+from tools.bench.settings import BenchTool
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+TITLE = "Weather, ours beside the generator's"
+COLUMNS: Columns = {
+    "pool": ("pool", "pool"), "weather": ("weather", "weather"), "frames": ("frames", "frames"),
+    "cars": ("vehicles", "cars"), "psnr_db": ("PSNR in the boxes, dB", "PSNR"),
+    "mean": ("brightness in the boxes, ours", "mean"), "mean_true": ("the generator's", "true"),
+    "contrast": ("contrast in the boxes, ours", "contrast"), "contrast_true": ("the generator's ", "true"),
+    "margin": ("margin, ours, logits", "margin"), "margin_true": ("the generator's  ", "true"),
+}  # fmt: skip
+METHOD = (
+    "Clear generated frames of both pools, taken apart with their labels alone; a code of weather is drawn by the "
+    "compositor on the photograph and by the generator in its world. In the boxes of labelled "
+    "vehicles, at least 25 px high and half in view, grown by 15 % of their size each way: mean luma and its "
+    "standard deviation (contrast), display values of [0, 1], and PSNR of one picture to the other. Margin: the "
+    "logit of the best detection of the vehicle less that of the detector's t*, from -8; means over vehicles."
+)
+QUICK_FRAMES, FULL_FRAMES = 4, 24
+CODES: dict[str, tuple[float, float, float, float]] = {
+    "none": (0, 0, 0, 0),
+    **{
+        f"{name} {code:g}": tuple(code if i == at else 0.0 for i in range(4))  # pyright: ignore[reportAssignmentType]
+        for at, name in enumerate(("fog", "rain", "time", "overcast"))
+        for code in (0.5, 1.0)
+    },
+    "fog and rain 0.5": (0.5, 0.5, 0, 0),
+}
+_SEED = 59
+"""Of the frames: of no training and no other test."""
+_LEAST_PX, _LEAST_SEEN, _GROWN = 25.0, 0.5, 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class WeatherRow:
+    """One weather of one frame; figures are means over its vehicles."""
+
+    pool: str
+    frame: str
+    weather: str
+    cars: int
+    psnr_db: float
+    mean: float
+    mean_true: float
+    contrast: float
+    contrast_true: float
+    margin: float
+    margin_true: float
+
+
+def measure(config: BenchTool, frames: int, sheets: Path | None) -> Iterator[list[WeatherRow]]:
+    """Rows of a frame at a time, pools in turn; frames without a vehicle to look at have none."""
+    detector = load_predictor(config.detector)
+    for number in range(frames):
+        pool = SPLITS[number % len(SPLITS)]
+        plan = generated.plan_frame(_SEED, number // len(SPLITS), pool, SynthSettings(bent=True, sunny=True))
+        yield rows_of(pool, number, plan, detector, sheets)
+
+
+def rows_of(
+    pool: str, number: int, plan: Plan, detector: Predictor, sheets: Path | None = None
+) -> list[WeatherRow]:
+    """The figures of one frame. sheets: folder for its pictures."""
+    street = generated.street_of(plan)
+    made = _rendered(plan, street)
+    scene = derender(Frame(f"{number:03d}", _tensor(made.image), made.camera, made.labels))
+    shown = [truth for truth in made.truths if _shown(truth)]
+    if not shown:
+        return []
+    compositor = Compositor(scene)
+    rows, strips = [], []
+    for name, code in CODES.items():
+        ours = to_uint8(compositor.render(_in_weather(scene, code)).image)
+        truth = _rendered(apply_edit(plan, FrameEdit(weather=code)), street).image
+        rows.append(_row((pool, f"{number:03d}", name), ours, truth, shown, detector))
+        region = np.ones(ours.shape[:2], bool)
+        strips.append(Strip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
+    if sheets is not None:
+        write_picture(sheets / f"{number:03d}_{pool}.png", sheet(strips, 3200))
+    return rows
+
+
+def summary(rows: Sequence[WeatherRow]) -> list[dict[str, Any]]:
+    """Means over vehicles, by pool and weather."""
+    out: list[dict[str, Any]] = []
+    figures = ("psnr_db", "mean", "mean_true", "contrast", "contrast_true", "margin", "margin_true")
+    for pool in SPLITS:
+        for name in CODES:
+            chosen = [row for row in rows if (row.pool, row.weather) == (pool, name)]
+            if not chosen:
+                continue
+            cars = [row.cars for row in chosen]
+            table = np.array([[getattr(row, figure) for figure in figures] for row in chosen])
+            means = np.average(table, axis=0, weights=cars).round(3).tolist()
+            row = {"pool": pool, "weather": name, "frames": len(chosen), "cars": sum(cars)}
+            out.append({**row, **dict(zip(figures, means, strict=True))})
+    return out
+
+
+def _row(
+    name: tuple[str, str, str], ours: Picture, truth: Picture, shown: Sequence[Truth], detector: Predictor
+) -> WeatherRow:
+    figures = []
+    margins = [_margins(picture, shown, detector) for picture in (ours, truth)]
+    for i, car in enumerate(shown):
+        region = _region(car, ours.shape[:2])
+        lights = [(picture[region] @ np.array(LUMA)) / 255 for picture in (ours, truth)]
+        spread = [value for light in lights for value in (light.mean(), light.std())]
+        figures.append([psnr(ours, truth, region), spread[0], spread[2], spread[1], spread[3]])
+        figures[-1] += [float(margin[i]) for margin in margins]
+    means = np.mean(figures, axis=0).round(4).tolist()
+    return WeatherRow(*name, len(shown), *means)
+
+
+def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
+    boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
+    labels = torch.tensor([int(VEHICLES[car.actor.label]) for car in shown])
+    found = of_detections(predict(detector, _tensor(picture)[None])[0], len(detector.classes))
+    return of_objects(found, boxes, labels, boxes, t_star_of(detector))
+
+
+def _region(car: Truth, size: tuple[int, int]) -> Mask:
+    x0, y0, x1, y1 = car.box_xyxy
+    wide, high = _GROWN * (x1 - x0), _GROWN * (y1 - y0)
+    region = np.zeros(size, bool)
+    rows = slice(max(round(y0 - high), 0), round(y1 + high) + 1)
+    region[rows, max(round(x0 - wide), 0) : round(x1 + wide) + 1] = True
+    return region
+
+
+def _shown(truth: Truth) -> bool:
+    tall = truth.box_xyxy[3] - truth.box_xyxy[1] >= _LEAST_PX
+    return truth.labelled and truth.actor.label in VEHICLES and bool(tall) and truth.visible >= _LEAST_SEEN
+
+
+def _in_weather(scene: SceneIR, code: tuple[float, ...]) -> SceneIR:
+    weather = torch.tensor(code).to(scene.environment.weather)
+    return replace(scene, environment=replace(scene.environment, weather=weather))
+
+
+def _rendered(plan: Plan, street: generated.Street) -> SynthFrame:
+    frame = generated.render_frame(plan, surround=street)
+    assert frame is not None
+    return frame
+
+
+def _tensor(image: Picture) -> Tensor:
+    return torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))
