@@ -15,6 +15,7 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
+from drivesem.attack.budgets import reach_of
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses
@@ -159,7 +160,9 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
         active_constraints=search.active_constraints,
-        violations=tuple(check_scene(perturbed.as_photographed(), perturbed)),
+        violations=tuple(
+            check_scene(perturbed.as_photographed(), perturbed, reach=reach_of(objective.space.budget))
+        ),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(attacked.benign, names),
