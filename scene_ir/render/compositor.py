@@ -84,7 +84,10 @@ class Compositor(Prepared):
                 objects.size_lhw, objects.yaw, objects.translation, self.centre, self.footprints
             )
             if drawn is not None:
-                drawn = torch.cat([layers.layout.rects[: len(objects)], layers.shadow_layout.rects]).cpu()
+                with torch.no_grad():
+                    shown = blend.shown_rects(layers.layout, layers.opacity != 0)[: len(objects)]
+                    shaded = blend.shown_rects(layers.shadow_layout, (layers.shadow != 1).any(1))
+                drawn = torch.cat([shown, shaded])
             plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)

@@ -16,16 +16,18 @@ import yaml
 
 from detectors.types import CLASSES, Detections
 from drivesem.attack import objective
+from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
-from drivesem.attack.space import ParameterSpace
+from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.questions.verify.differences import CHECKS
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run import frame as run_frame
+from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.io import load_scene
@@ -139,6 +141,10 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     assert max(abs(c.value) for c in theta) > 0.25
     assert max(c.upper for c in theta) > 0.5
     assert verify(out, code=0)["differences"] == []
+    # What is asked of it next looks as far as it went.
+    result, attack = load_frame(out / FRAME / "result.json"), run_folder.attack_of(out)
+    again, _ = rebuilt(result, out / FRAME, attack, parse_params("translate,weather"), Drifting())
+    assert again.space.budget == PRESETS["street"]
     # The same scenes do not pass for a run in the paper's.
     change_text = (out / "config.yaml").read_text().replace("budget: street", "budget: paper")
     (out / "config.yaml").write_text(change_text)

@@ -424,3 +424,10 @@ def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: Scen
     assert not bool(gradient.any())
     foggy = scene.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
     assert compositor.render(foggy).drawn is None
+
+
+def test_what_shows_of_each_draw_has_a_rectangle_around_it() -> None:
+    layout = Layout.of(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
+    shown = torch.zeros(layout.size, dtype=torch.bool)
+    shown[:36].view(6, 6)[2:4, 0:3] = True
+    assert blend.shown_rects(layout, shown).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
