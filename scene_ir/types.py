@@ -400,13 +400,16 @@ class Frame:
 class Render:
     """A rendered scene. image (3, H, W) RGB in [0, 1]; depth (H, W) m, inf in the sky; object_id (H, W) int64,
     0 is background, i + 1 object i (the front-most object whose opacity is at least one half);
-    opacity: one Crop (1, h, w) an object, before others occlude it, in [0, 1].
+    opacity: one Crop (1, h, w) an object, before others occlude it, in [0, 1]. drawn: (K, 4) int64 px, half-open
+    (x0, y0, x1, y1): where vehicles and their shadows show; elsewhere no vehicle changes anything. None where
+    weather or foliage may change every pixel, or nobody knows.
     """
 
     image: Tensor
     depth: Tensor
     object_id: Tensor
     opacity: tuple[Crop, ...]
+    drawn: Tensor | None = None
 
 
 def scene_to(value: T, dtype: torch.dtype, device: torch.device | str | None = None) -> T:

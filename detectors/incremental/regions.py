@@ -161,20 +161,22 @@ class Region:
         covered = bottoms > tops
         tops = np.where(covered, tops // group * group, height)
         bottoms = np.where(covered, np.minimum(-(-bottoms // group) * group, height), 0)
-        extra = _EXTRA * height * width
-        count = len(tops)
-        best, begin = np.zeros(count + 1), np.zeros(count + 1, np.int64)
-        widths = np.arange(1, count + 1) * group
-        for end in range(1, count + 1):
+        # Only where a column differs from the one before it may a rectangle begin.
+        edges = np.flatnonzero(np.diff(tops, prepend=-1) | np.diff(bottoms, prepend=-1))
+        tops, bottoms, covered = tops[edges], bottoms[edges], covered[edges]
+        starts = edges * group
+        ends = np.append(starts[1:], width)
+        best, begin = np.zeros(len(edges) + 1), np.zeros(len(edges) + 1, np.int64)
+        for end in range(1, len(edges) + 1):
             if not covered[end - 1]:
                 best[end], begin[end] = best[end - 1], end
                 continue
             high = np.maximum.accumulate(bottoms[end - 1 :: -1]) - np.minimum.accumulate(tops[end - 1 :: -1])
-            costs = best[end - 1 :: -1] + widths[:end] * high + extra
+            costs = best[end - 1 :: -1] + (ends[end - 1] - starts[end - 1 :: -1]) * high
             shortest = int(costs.argmin())
-            best[end], begin[end] = costs[shortest], end - 1 - shortest
+            best[end], begin[end] = costs[shortest] + _EXTRA * height * width, end - 1 - shortest
         found: list[Rect] = []
-        end = count
+        end = len(edges)
         while end > 0:
             first = int(begin[end])
             if first == end:
@@ -182,7 +184,7 @@ class Region:
                 continue
             part = slice(first, end)
             found.append(
-                Rect(int(tops[part].min()), int(bottoms[part].max()), first * group, min(end * group, width))
+                Rect(int(tops[part].min()), int(bottoms[part].max()), int(starts[first]), int(ends[end - 1]))
             )
             end = first
         return tuple(reversed(found))

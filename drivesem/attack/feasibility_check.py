@@ -53,6 +53,8 @@ RAYS = (48, 64)
 """Rays through a car's image box at most, down and across; no more than one a pixel."""
 COLUMNS = 64
 """Plumb lines each way over the ground that two cars may share."""
+HARDLY_CUT = 0.1
+"""Truncation up to which a car counts as shown whole."""
 MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 WEATHER_TOLERANCE = 0.01
@@ -77,8 +79,10 @@ JUDGED_PX = 25.0
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How far a change may go at most: by default as far as any budget. translate: own lengths, along and across;
-    translate_m: the same in m; rotate: rad; mesh: unit boxes, of a lattice offset; codes: their largest values.
+    """How far a change may go at most: by default as far as the paper's budget. translate: own lengths, along and
+    across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
+    partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
+    boxes, of a lattice offset; codes: their largest values.
     """
 
     translate: float = 0.25
@@ -88,16 +92,19 @@ class Reach:
     color: float = 1.0
     weather: float = 1.0
     foliage: float = 1.0
+    across_m: float = math.inf
+    of_distance: float = math.inf
+    partly: float = math.inf
 
 
-WIDEST = Reach()
+PAPERS = Reach()
 
 
 def check_reach(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
     """What goes further than `reach`, one line each, such as `objects[3]: turned by 0.100 rad`. Both scenes have
     the same objects.
     """
-    found = _codes(perturbed, reach)
+    found = _codes(base, perturbed, reach)
     for i in range(len(base.objects)):
         lines = _distance(_Pose(base, i), _Pose(perturbed, i), reach)
         found += [f"objects[{i}]: {line}" for line in lines]
@@ -110,18 +117,23 @@ def judge_at_hand() -> JudgeName:
 
 
 def check_scene(
-    base: SceneIR, perturbed: SceneIR, by: JudgeName | None = None, joint_weather: bool = True
+    base: SceneIR,
+    perturbed: SceneIR,
+    by: JudgeName | None = None,
+    joint_weather: bool = True,
+    reach: Reach = PAPERS,
 ) -> list[str]:
     """What is violated, one line each, such as `objects[3]: collision with objects[1], 0.52 m2 (0.00 before)`.
 
     by: whose judgement counts, by default that of `judge_at_hand`, which also stands in where Open3D is asked for
     and missing. joint_weather: whether weather is looked at beyond its bounds: what comes together, and whom it
-    hides. Nothing counts that was as bad in `base`. Empty where the change is feasible.
+    hides. reach: how far the change may go, by the budget that it was made in. Nothing counts that was as bad in
+    `base`. Empty where the change is feasible.
     """
     judge = _Outlines() if by == "outlines" else _judge()
     if len(base.objects) != len(perturbed.objects):
         return [f"objects: {len(base.objects)} before, {len(perturbed.objects)} after"]
-    found = _unchanged(base, perturbed) + check_reach(base, perturbed, WIDEST)
+    found = _unchanged(base, perturbed) + check_reach(base, perturbed, reach)
     before = [_Car(base, i) for i in range(len(base.objects))]
     after = [_Car(perturbed, i) for i in range(len(base.objects))]
     road = base.environment.road.numpy().astype(np.float64)
@@ -158,6 +170,7 @@ class _Pose:
         self.yaw = float(objects.yaw[i])
         self.size = objects.size_lhw[i].detach().double().numpy()
         self.lattice = objects.ffd[i].detach().double().numpy().reshape(4, 4, 4, 3)
+        self.whole = int(objects.occlusion[i]) == 0 and float(objects.truncation[i]) <= HARDLY_CUT
         forward = np.array([math.cos(self.yaw), 0.0, -math.sin(self.yaw)])
         sideways = np.array([math.sin(self.yaw), 0.0, math.cos(self.yaw)])
         self.axes = np.stack([forward, np.array([0.0, 1.0, 0.0]), sideways])
@@ -250,17 +263,19 @@ def _unchanged(base: SceneIR, perturbed: SceneIR) -> list[str]:
     return [f"{name}: changed" for name, (a, b) in pairs.items() if a.shape != b.shape or not bool((a == b).all())]
 
 
-def _codes(scene: SceneIR, reach: Reach) -> list[str]:
+def _codes(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
+    (old, before), (new, after) = ((scene.objects, scene.environment) for scene in (base, perturbed))
     ranges = {
-        "objects.texture_code": (scene.objects.texture_code, -reach.color, reach.color),
-        "environment.weather": (scene.environment.weather, 0.0, reach.weather),
-        "environment.foliage": (scene.environment.foliage, -reach.foliage, reach.foliage),
+        "objects.texture_code": (old.texture_code, new.texture_code, -reach.color, reach.color),
+        "environment.weather": (before.weather, after.weather, 0.0, reach.weather),
+        "environment.foliage": (before.foliage, after.foliage, -reach.foliage, reach.foliage),
     }
-    return [
-        f"{name}: outside [{low:g}, {high:g}]"
-        for name, (code, low, high) in ranges.items()
-        if code.numel() and not (low - 1e-6 <= float(code.min()) and float(code.max()) <= high + 1e-6)
-    ]
+    found = []
+    for name, (start, code, low, high) in ranges.items():
+        # What lay outside from the start, as under an edit, may stay there.
+        if bool(((code < start.clamp(max=low) - 1e-6) | (code > start.clamp(min=high) + 1e-6)).any()):
+            found.append(f"{name}: outside [{low:g}, {high:g}]")
+    return found
 
 
 def _weather(base: SceneIR, perturbed: SceneIR) -> list[str]:
@@ -333,9 +348,12 @@ def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
     found = []
     metres = old.axes @ (new.position - old.position)
     along, across = metres[0] / old.size[0], metres[2] / old.size[0]
-    if max(abs(along), abs(across)) > reach.translate + REACH_TOLERANCE:
+    most_m = min(reach.translate_m, reach.of_distance * math.hypot(*old.position))
+    across_m = min(most_m, reach.across_m)
+    most = reach.translate if old.whole else min(reach.translate, reach.partly)
+    if max(abs(along), abs(across)) > most + REACH_TOLERANCE:
         found.append(f"moved by {along:.3f}, {across:.3f} own lengths")
-    elif max(abs(metres[0]), abs(metres[2])) > reach.translate_m + REACH_TOLERANCE:
+    elif abs(metres[0]) > most_m + REACH_TOLERANCE or abs(metres[2]) > across_m + REACH_TOLERANCE:
         found.append(f"moved by {metres[0]:.3f}, {metres[2]:.3f} m")
     turned = math.remainder(new.yaw - old.yaw, 2 * math.pi)
     if abs(turned) > reach.rotate + REACH_TOLERANCE:

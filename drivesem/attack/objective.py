@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from detectors.base import Detector, Predictor, RawPredictions, predict
+from detectors.incremental.reference import Reference
+from detectors.incremental.regions import Rect
 from detectors.types import Detections, Targets
 from drivesem.attack import detection_loss, goals
 from drivesem.attack.aims import EVERYTHING, Aim
@@ -55,7 +57,8 @@ class Objective:
     away from the label. They are constant in the gradient. term: one of `goals.GOALS`, or a key of
     `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. difficulty: what is judged. t_star:
     score from which a detection counts; by default the detector's own. aim: what counts as a failure, and is
-    raised; by default everything.
+    raised; by default everything. whole: the detector always sees whole pictures; else only what vehicles change
+    of the benign one is computed again, where the detector's layers are known (`detectors.incremental`).
     Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
     RangeError where it has no such term.
 
@@ -72,6 +75,7 @@ class Objective:
         difficulty: Difficulty | None = None,
         t_star: float | None = None,
         aim: Aim = EVERYTHING,
+        whole: bool = False,
     ) -> None:
         self.compositor = compositor
         self.space = space
@@ -85,7 +89,10 @@ class Objective:
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0))
         self._labeller = Labeller(space.scene, base_render, self.difficulty)
+        self._whole = True  # the reference comes first
+        self._reference: Reference | None = None
         self._benign = self._judged(space.scene, base_render)
+        self._whole = whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
         self._scores: dict[bytes, Score] = {}
@@ -208,6 +215,31 @@ class Objective:
         smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE)
         return Group(parameter.value, where, owners, modes, smooth)
 
+    def raw(self, render: Render) -> RawPredictions:
+        """What the detector says of a render of the scene, with a gradient wherever vehicles are drawn. RangeError
+        where it has none.
+        """
+        image = render.image[None]
+        reference = None if render.drawn is None else self._kept()
+        if reference is None or render.drawn is None:
+            return self.differentiable(image)
+        return reference(image, [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.drawn.tolist()])
+
+    def sees_regions(self, render: Render) -> bool:
+        """Whether the detector is to see only what changes."""
+        return render.drawn is not None and self._kept() is not None
+
+    def forget(self) -> None:
+        """Let go of the benign picture's layers, which are made anew when they are asked for."""
+        self._reference = None
+
+    def _kept(self) -> Reference | None:
+        """The benign picture's layers, or nothing where pictures are seen whole."""
+        if self._reference is None and not self._whole:
+            self._reference = Reference.of(self.differentiable, self._benign.render.image[None])
+            self._whole = self._reference is None
+        return self._reference
+
     @property
     def differentiable(self) -> Detector:
         """The detector. Raises RangeError where it has no gradient."""
@@ -242,7 +274,7 @@ class Objective:
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
-            raw = self.detector(render.image[None])
+            raw = self.raw(render)
             loss = float(self._loss(self.detector, raw, labels))
             found = self.judged.detections(self.detector.decode(raw)[0])
         else:
@@ -321,9 +353,12 @@ def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[T
     scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
     renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
     of_size: dict[torch.Size, list[int]] = {}
-    for i, render in enumerate(renders):
-        of_size.setdefault(render.image.shape, []).append(i)
     losses: dict[int, Tensor] = {}
+    for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
+        if objective.sees_regions(render):
+            losses[i] = objective.loss_at(thetas[i], objective.raw(render), scenes[i], render)
+        else:
+            of_size.setdefault(render.image.shape, []).append(i)
     for members in of_size.values():
         images = [renders[i].image for i in members]
         raw = objectives[members[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))

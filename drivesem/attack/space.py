@@ -73,12 +73,18 @@ COMBOS: dict[int, tuple[Parameter, ...]] = {
 """The paper's combinations for detection."""
 
 
+_HARDLY_CUT = 0.1
+"""Truncation up to which moved cars were held against the truth (`python -m tools.bench moves`)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """How far each parameter may go from the photograph, at most. Codes end at these values whatever they start
-    from; the others are distances from the photographed scene. translate: own lengths; translate_m: metres, the
-    same for long and short cars, and the nearer of both binds; rotate: rad; mesh: unit boxes (the bound on strain
-    in `drivesem.attack.feasible` is the one that binds).
+    from; the others are distances from the photographed scene, and of several bounds the nearest binds. translate:
+    own lengths; translate_m: metres, the same for long and short cars; across_m: metres, across alone;
+    of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
+    not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
+    `drivesem.attack.feasible` is the one that binds).
     """
 
     color: float = 1.0
@@ -88,9 +94,12 @@ class Budget:
     rotate: float = 0.35
     mesh: float = 0.25
     translate_m: float = math.inf
+    across_m: float = math.inf
+    of_distance: float = math.inf
+    partly: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_positive("budget", self, unbounded=("translate_m",))
+        _check_positive("budget", self, unbounded=("translate_m", "across_m", "of_distance", "partly"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,13 +344,25 @@ class ParameterSpace:
         elif parameter is Parameter.FOLIAGE:
             start, low = self.scene.environment.foliage, -limit
         elif parameter is Parameter.TRANSLATE:
-            length_m = self.scene.objects.size_lhw[:, :1].detach()
-            reach = (self.budget.translate_m / length_m).clamp(max=limit).expand(-1, 2).reshape(-1)
-            return -reach, reach
+            budget, objects = self.budget, self.scene.objects
+            length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()
+            most_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])
+            most_m = torch.minimum(most_m, budget.of_distance * place.norm(dim=1, keepdim=True))
+            reach = (most_m / length_m).clamp(max=limit)
+            partly = ~shown_whole(self.scene)
+            reach[partly] = reach[partly].clamp(max=budget.partly)
+            return -reach.reshape(-1), reach.reshape(-1)
         else:
             return -limit, limit
         start = start.detach()
         return (low - start).clamp(max=0), (limit - start).clamp(min=0)
+
+
+def shown_whole(scene: SceneIR) -> Tensor:
+    """(N,) bool: the cars that nothing hides, and that the picture's border hardly cuts. Of others a long way
+    shows what no photograph did.
+    """
+    return (scene.objects.occlusion == 0) & (scene.objects.truncation <= _HARDLY_CUT)
 
 
 def ground_axes(yaw: Tensor, length_m: Tensor, ground: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import scene_to
+from scene_ir.types import SceneIR, scene_to
 
 TITLE, BESIDE_TITLE = (
     "One attack step beside the detector alone",
@@ -37,7 +37,8 @@ COLUMNS: Columns = {
 }  # fmt: skip
 METHOD = (
     "A step is Objective.loss_and_grad at a feasible theta other than 0 (scene at theta, render, labels, "
-    "detector forward, loss, backward through all of it) and FeasibleSet.project of the theta that a sign "
+    "detector forward, loss, backward through all of it; the detector where vehicles are drawn, with --whole "
+    "everywhere) and FeasibleSet.project of the theta that a sign "
     "step leads to; the steps follow each other as an attack's do, and start anew at another random theta now "
     "and then. detector_ms is the same detector's forward and backward to the input image, with the same loss "
     "and fixed targets, in the faster of the two memory layouts of that image. Both are measured in turn in "
@@ -102,16 +103,18 @@ def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[StepCase]
 
 
 def measure(
-    case_list: Sequence[StepCase], detector: Detector, seconds: float, seed: int, device: str
+    case_list: Sequence[StepCase], detector: Detector, seconds: float, seed: int, device: str, whole: bool = False
 ) -> Iterator[StepRow]:
-    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow."""
+    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow. whole: as of
+    `Objective`.
+    """
     budget = Budget(seconds, len(case_list))
     clock = Clock(device)
     layout: torch.memory_format | None = None
     for case in case_list:
         start = time.perf_counter()
         bench = bench_scene(case.cars, case.triangles, seed)
-        step = _Step(case, bench, detector, seed, device)
+        step = Stepping(bench.scene, case.params, detector, seed, device, case.lod, whole)
         layout = layout or step.faster_layout(clock)
         alone = step.detector_alone(layout)
         for _ in range(_WARM_UP):
@@ -122,7 +125,7 @@ def measure(
 
 
 def _row(
-    case: StepCase, bench: BenchScene, step: _Step, alone: Callable[[], None], clock: Clock, seconds: float
+    case: StepCase, bench: BenchScene, step: Stepping, alone: Callable[[], None], clock: Clock, seconds: float
 ) -> StepRow:
     pairs: list[tuple[float, float]] = []
     parts: list[tuple[float, ...]] = []
@@ -159,14 +162,23 @@ def _row(
     )
 
 
-class _Step:
-    """An attack on one scene, step by step."""
+class Stepping:
+    """An attack on one scene, step by step. lod: level of detail on; whole: as of `Objective`."""
 
-    def __init__(self, case: StepCase, bench: BenchScene, detector: Detector, seed: int, device: str) -> None:
-        scene = scene_to(bench.scene, torch.float32, device)
-        self.space = ParameterSpace(scene, case.params)
-        self.compositor = Compositor(scene, RenderSettings(lod=case.lod))
-        self.objective = Objective(self.compositor, self.space, detector, term=_TERM)
+    def __init__(
+        self,
+        scene: SceneIR,
+        params: tuple[Parameter, ...],
+        detector: Detector,
+        seed: int,
+        device: str,
+        lod: bool = True,
+        whole: bool = False,
+    ) -> None:
+        scene = scene_to(scene, torch.float32, device)
+        self.space = ParameterSpace(scene, params)
+        self.compositor = Compositor(scene, RenderSettings(lod=lod))
+        self.objective = Objective(self.compositor, self.space, detector, term=_TERM, whole=whole)
         self.feasible = FeasibleSet(self.space)
         self.detector = detector
         with torch.no_grad():
@@ -209,6 +221,15 @@ class _Step:
         signs = torch.randn(self.space.dim, generator=self._generator).sign().to(self.theta)
         fourth = clock.ms(lambda: self.feasible.project(self.theta + self.space.step * signs))
         return first, second, third, fourth
+
+    def drawn_share(self) -> float:
+        """Of the picture, that vehicles and shadows are drawn into at the present theta."""
+        with torch.no_grad():
+            render = self.compositor.render(self.space.apply(self.space.scene, self.theta))
+        drawn = torch.zeros(render.image.shape[1:], dtype=torch.bool)
+        for x0, y0, x1, y1 in [] if render.drawn is None else render.drawn.tolist():
+            drawn[y0:y1, x0:x1] = True
+        return float(drawn.float().mean())
 
     def faster_layout(self, clock: Clock) -> torch.memory_format:
         """The layout of its input in which the detector is faster."""

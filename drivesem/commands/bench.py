@@ -6,13 +6,14 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from detectors.base import DetectorError
+from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
-from drivesem.bench import detector, memory, render, step
+from drivesem.bench import boxes, detector, memory, render, step
 from drivesem.bench.planted import summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
@@ -22,6 +23,7 @@ from drivesem.run.attack import select_frames
 from drivesem.settings.commands import Bench
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
+from scene_ir.errors import FormatError
 
 _SECONDS_A_PASS = 0.5
 """Of an attack on a frame as large as KITTI's, with its certificates and its share of the frame's survey."""
@@ -51,13 +53,30 @@ def _step(config: Bench, console: Console) -> Measured:
         detector = load_detector(config.detector, config.device)
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
+    if config.boxes is not None:
+        return _boxes(config, Path(config.boxes), detector, console)
     sizes, beside = step.cases(*_sizes(config))
-    measured = step.measure(sizes + beside, detector, _seconds("step", config), config.seed, config.device)
+    seconds = _seconds("step", config)
+    measured = step.measure(sizes + beside, detector, seconds, config.seed, config.device, config.whole)
     rows = _dicts(watched(measured, len(sizes) + len(beside), console))
     rows, beside_rows = rows[: len(sizes)], rows[len(sizes) :]
     return Measured(
         {"rows": rows, "beside": beside_rows, "method": step.METHOD},
         [Section(step.TITLE, step.COLUMNS, rows), Section(step.BESIDE_TITLE, step.COLUMNS, beside_rows)],
+    )
+
+
+def _boxes(config: Bench, path: Path, detector: Detector, console: Console) -> Measured:
+    try:
+        frames = boxes.frames_of(path, -(-config.frames // 4) if config.quick else config.frames)
+    except FormatError as error:
+        raise UsageError("--boxes", error.expected, f"{error.field}: {error.actual}") from error
+    measured = boxes.measure(frames, detector, config.seed, config.device, config.whole)
+    costs = list(watched(measured, len(frames), console))
+    row = asdict(boxes.BoxesRow.of(costs))
+    return Measured(
+        {"what": "step boxes", "boxes": row, "frames": _dicts(costs), "method": boxes.METHOD},
+        [Section(boxes.TITLE, boxes.COLUMNS, [row])],
     )
 
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from detectors.base import DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
-from drivesem.attack.space import Parameter
+from drivesem.attack.space import Parameter, StepSizes
 from drivesem.bench.gradcheck import (
     FUNCTIONALS,
     LOSS,
@@ -32,8 +32,11 @@ from drivesem.bench.gradcheck import (
     rows_of,
     worst,
 )
+from drivesem.bench.reach.agreement import rows_of as rows_of_reach
+from drivesem.bench.reach.frames import ReachWorker, measure_of
+from drivesem.bench.reach.report import answer_of as reach_answer
 from drivesem.report.answer import print_json
-from drivesem.run.ask import Bar, ask
+from drivesem.run.ask import Bar, ask, say_end
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import SceneSource, open_source
 from drivesem.settings.commands import Gradcheck
@@ -53,6 +56,8 @@ def run(config: Gradcheck) -> int:
 
     Raises UsageError or SceneError for bad input.
     """
+    if config.reach:
+        return _reach(config)
     start = time.perf_counter()
     worker = GradcheckWorker(config)
     names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or _DEFAULT_SCENES))
@@ -89,6 +94,38 @@ def run(config: Gradcheck) -> int:
         for name, reason in failed.items():
             console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     return 0 if passed else 1
+
+
+def _reach(config: Gradcheck) -> int:
+    """How far gradients of margins hold; exit code 0."""
+    check_device(config.device)
+    worker = ReachWorker.of(config)
+    names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or _DEFAULT_SCENES))
+    bar = Bar("comparing gradients and slopes", remaining=True)
+    asked = ask(names, worker.measure, partial(measure_of, config), config, bar)
+    rows = rows_of_reach([asked.results[name] for name in names if name in asked.results], config.seed)
+    if not rows:
+        raise UsageError("gradcheck --reach", "at least one vehicle that the detector finds", "none")
+    facts = {
+        "settings": {
+            "dataset": config.dataset,
+            "detector": config.detector,
+            "seed": config.seed,
+            "draws": config.draws,
+            "frames": len(asked.results),
+            "steps": asdict(StepSizes()),
+        },
+    }
+    answer = reach_answer(Path(config.out or "."), rows, facts, unreadable | asked.failed)
+    if config.out:
+        answer.write()
+    if config.json:
+        print_json(answer.data)
+    else:
+        answer.print(Console(width=None if sys.stdout.isatty() else _FILE_WIDTH))
+    if config.out:
+        say_end(answer.out, Console(stderr=True), answer.failed)
+    return 0
 
 
 @dataclass(frozen=True, slots=True)

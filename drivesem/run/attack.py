@@ -190,6 +190,7 @@ class Worker:
             grader=self.grader,
             keep_last=config.keep == "last",
             only_bounds=config.project == "bounds",
+            whole=config.whole,
         )
         try:
             return attack_scene(identifier, scene, self.detector, settings)

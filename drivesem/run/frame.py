@@ -15,6 +15,7 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
+from drivesem.attack.budgets import reach_of
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses
@@ -51,7 +52,7 @@ class FrameSettings:
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
     how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`.
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`.
     """
 
     attack: AttackMethod
@@ -66,6 +67,7 @@ class FrameSettings:
     grader: Grader | None = None
     keep_last: bool = False
     only_bounds: bool = False
+    whole: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         settings.term,
         t_star=settings.t_star,
         aim=settings.aim,
+        whole=settings.whole,
     )
     feasible = objective.feasible_set(only_bounds=settings.only_bounds)
     nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
@@ -113,6 +116,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     benign = objective.detect(scene.photograph)
     passes = objective.passes + 1
     failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
+    objective.forget()
     return AttackedScene(
         identifier=identifier,
         objective=objective,
@@ -156,7 +160,9 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
         active_constraints=search.active_constraints,
-        violations=tuple(check_scene(perturbed.as_photographed(), perturbed)),
+        violations=tuple(
+            check_scene(perturbed.as_photographed(), perturbed, reach=reach_of(objective.space.budget))
+        ),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(attacked.benign, names),

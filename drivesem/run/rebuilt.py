@@ -10,9 +10,10 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from drivesem.attack.aims import Aim
+from drivesem.attack.budgets import budget_of
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.objective import Objective
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult
 from drivesem.settings.commands import Attack
@@ -28,15 +29,14 @@ def rebuilt(
     attack: Attack,
     params: Sequence[Parameter],
     detector: Predictor,
-    budget: Budget | None = None,
 ) -> tuple[Objective, Tensor]:
     """The objective of a frame of a run, and the theta (D,) that was found, from the scene that was saved.
 
     The saved scene carries the one it was made from, so that neither the data set nor its de-rendering is needed.
-    budget: the run's, for those who look beyond theta. Raises FormatError.
+    Raises FormatError.
     """
     scene = load_scene(folder / "scene").as_photographed()
-    space = ParameterSpace(scene, params, budget)
+    space = ParameterSpace(scene, params, budget_of(attack.budget))
     if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
@@ -44,4 +44,6 @@ def rebuilt(
     labels, term = attack.objective_labels, attack.objective
     aim = Aim.of(attack.target_objects, attack.target_classes)
     difficulty = Difficulty(min_contrast=result.min_contrast)
-    return Objective(compositor, space, detector, labels, term, difficulty, attack.t_star, aim), theta
+    return Objective(
+        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole
+    ), theta

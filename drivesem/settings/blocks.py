@@ -230,7 +230,16 @@ class FinishedRun(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attacking(Threshold, Precision, Scenes):
+class Regions(Options):
+    """How detectors look at changed pictures."""
+
+    whole: Flag = False
+    """Compute the detector's whole pass for each picture; by default only what changed, with the same result,
+    where its layers are known (docs/detectors.md)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attacking(Regions, Threshold, Precision, Scenes):
     """An attack, as far as a study gives it to all of its arms."""
 
     detector: str = "squeezedet"
@@ -239,7 +248,8 @@ class Attacking(Threshold, Precision, Scenes):
     steps: Count = 10
     """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
     budget: str = "paper"
-    """How far parameters may go: paper; parking (0.5 m, 5 degrees); a YAML file; or translate=0.5m,rotate=5deg."""
+    """How far parameters may go: paper; parking (0.5 m, 5 degrees); street (4 m along, 1 m across, 20 degrees); a
+    YAML file; or translate=0.5m,rotate=5deg, also after a preset: street,translate=2m."""
     objective_labels: LabelMode = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (

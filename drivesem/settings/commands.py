@@ -29,6 +29,7 @@ from drivesem.settings.blocks import (
     Grading,
     LabelMode,
     NotNegative,
+    Regions,
     Repeated,
     Run,
     Scenes,
@@ -505,7 +506,7 @@ class Synth(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench(Scenes, FrameCommand):
+class Bench(Regions, Scenes, FrameCommand):
     """Measure: one attack step, the renderer, memory, detectors, and what attacks find of known faults."""
 
     what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "planted"]] = "step"
@@ -518,6 +519,10 @@ class Bench(Scenes, FrameCommand):
     """How many cars, 1 to 16, with commas."""
     triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
     """Triangles a car, with commas."""
+    boxes: str | None = None
+    """Step: a tar archive of KITTI's label_2 and calib; measure with vehicles where its labels have them."""
+    frames: Count = 40
+    """Step: how many frames of --boxes; with --quick a quarter of them."""
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
@@ -535,6 +540,7 @@ class Bench(Scenes, FrameCommand):
 
     def check(self) -> None:
         super().check()
+        refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
         only = "--dataset demo, but for bench planted"
         refuse(self.what != "planted" and self.dataset != DEMO, "--dataset", only, self.dataset)
 
@@ -551,6 +557,23 @@ class Gradcheck(Scenes, FrameCommand):
     """Least cosine between gradient and differences."""
     max_error: Annotated[float, Within(0, ends="(]", expected="a positive number")] = 0.05
     """Largest relative error of the gradient."""
+    reach: Flag = False
+    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
+    parameter and distance; some minutes a frame."""
+    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
+    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
+
+    def check(self) -> None:
+        super().check()
+        for name in ("directions", "min_cosine", "max_error"):
+            value = getattr(self, name)
+            refuse(
+                self.reach and value != getattr(Gradcheck, name),
+                f"--{name.replace('_', '-')}",
+                "no --reach beside it",
+                value,
+            )
+        refuse(not self.reach and self.draws != Gradcheck.draws, "--draws", "--reach beside it", self.draws)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -118,6 +118,22 @@ def composite(
     return image, nearest, number
 
 
+def shown_rects(layout: Layout, shown: Tensor) -> Tensor:
+    """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where `shown` (T,) is true, and of one
+    more around them, which the smallest change may show. Empty where nothing is.
+    """
+    rects = torch.zeros(len(layout.rects), 4, dtype=torch.int64)
+    packed = shown.cpu().numpy()
+    for i, ((part, size), whole) in enumerate(zip(layout.spans(), layout.rects.tolist(), strict=True)):
+        pixels = packed[part].reshape(size)
+        columns, rows = (np.flatnonzero(pixels.any(axis)) for axis in (0, 1))
+        if len(columns):
+            x0, y0 = whole[0] + int(columns[0]) - 1, whole[1] + int(rows[0]) - 1
+            x1, y1 = whole[0] + int(columns[-1]) + 2, whole[1] + int(rows[-1]) + 2
+            rects[i] = torch.tensor([max(x0, whole[0]), max(y0, whole[1]), min(x1, whole[2]), min(y1, whole[3])])
+    return rects
+
+
 def _stack(layout: Layout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
     return torch.tensor(order, dtype=torch.int32, device=layout.rects.device), layout.rects, layout.offsets
 

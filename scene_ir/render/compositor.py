@@ -70,6 +70,7 @@ class Compositor(Prepared):
             canvas = torch.cat([apply_foliage(canvas[:3], changed, self.air, backend), canvas[3:]])
         if self.standing is not None:
             layers = self.standing.before(layers, canvas[:3] - self.canvas[:3] if foliage else None)
+        drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
         if layers is None:
             with torch.no_grad():
                 depth = self.scene.depth.clone()
@@ -82,6 +83,11 @@ class Compositor(Prepared):
             order = blend.paint_order(
                 objects.size_lhw, objects.yaw, objects.translation, self.centre, self.footprints
             )
+            if drawn is not None:
+                with torch.no_grad():
+                    shown = blend.shown_rects(layers.layout, layers.opacity != 0)[: len(objects)]
+                    shaded = blend.shown_rects(layers.shadow_layout, (layers.shadow != 1).any(1))
+                drawn = torch.cat([shown, shaded])
             plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
@@ -98,7 +104,7 @@ class Compositor(Prepared):
             image = apply_weather(canvas[:3], canvas[3], changed, self.air, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
-        return Render(image, depth, number, opacity)
+        return Render(image, depth, number, opacity, drawn)
 
 
 def _layers(

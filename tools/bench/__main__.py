@@ -23,7 +23,7 @@ from drivesem.bench.tables import Section
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
-from tools.bench import depth, derender, evaluation, found, label_free, redraw, rivals, synth, weather
+from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth, weather
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -50,6 +50,7 @@ def run(config: BenchTool) -> int:
         "depth": _depth,
         "found": _found,
         "label-free": _label_free,
+        "moves": _moves,
         "redraw": _redraw,
         "weather": _weather,
         "synth": _synth,
@@ -119,6 +120,17 @@ def _label_free(config: BenchTool, console: Console) -> Measured:
     rows = [asdict(row) for frame in ordered for row in frame.rows]
     fields = {"frames": len(frames), "rows": rows, "summary": label_free.summary(ordered)}
     return _measured(label_free, fields)
+
+
+def _moves(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = _frames(config, moves)
+    try:
+        measured = watched(moves.measure(config, frames, _sheets(config)), frames, console)
+        rows = [row for found in measured for row in found]
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    return _measured(moves, {"rows": [asdict(row) for row in rows], "summary": moves.summary(rows)})
 
 
 def _synth(config: BenchTool, console: Console) -> Measured:

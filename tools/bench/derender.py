@@ -34,7 +34,7 @@ from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
 from drivesem.synth.layout import Actor, Road, clearance, footprint
 from drivesem.synth.view import blocks
-from scene_ir import files
+from scene_ir import ffd, files
 from scene_ir.derender import silhouette
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import RangeError
@@ -42,7 +42,7 @@ from scene_ir.geometry import project_boxes, yaw_matrix
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
-from scene_ir.types import Crop, Frame, Labels, SceneIR
+from scene_ir.types import LATTICE, Crop, Frame, Labels, SceneIR
 from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
 
 Mask = NDArray[np.bool_]
@@ -110,11 +110,19 @@ ABLATIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One vehicle's edit. shift_m: (along, across); turn: rad."""
+    """One vehicle's edit. shift_m: (along, across); turn: rad; stretch: of its sizes, as a share."""
 
     track: int
     shift_m: tuple[float, float]
     turn: float
+    stretch: float = 0.0
+
+    @property
+    def mesh(self) -> Tensor:
+        """The lattice code (96,) of the stretch: linear in where a lattice point is, from the ground's middle."""
+        length, height, width = (torch.linspace(0, 1, n, dtype=torch.float64) for n in LATTICE)
+        points = torch.stack(torch.meshgrid(length - 0.5, height - 1, width - 0.5, indexing="ij"), dim=-1)
+        return ffd.to_symmetric(self.stretch * points.reshape(-1, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,11 +278,13 @@ def _withheld(case: Case, frame: Frame) -> tuple[Shape, ...]:
     return tuple(silhouettes(case, Compositor(scene), tracks_of(scene, case.before), None))
 
 
-def make_case(seed: int, index: int) -> Case:
-    """Street `index` of stream `seed`, with a vehicle that can be moved. Raises RangeError where none is found."""
+def make_case(seed: int, index: int, split: str = "heldout") -> Case:
+    """Street `index` of stream `seed`, with a vehicle that can be moved. split: "train" or "heldout", the
+    generator's pools. Raises RangeError where none is found.
+    """
     settings = SynthSettings(sunny=index % 2 == 0)
     for attempt in range(_ATTEMPTS):
-        plan = plan_frame(seed, index, "heldout", settings, attempt)
+        plan = plan_frame(seed, index, split, settings, attempt)
         found = _photographed(plan, (_STREAM, seed, index, attempt)) if _promising(plan) else None
         if found is None:
             continue
@@ -311,7 +321,8 @@ def _seen(truths: Sequence[Truth]) -> bool:
 
 def edit_of(move: Move) -> FrameEdit:
     """The move as the generator takes it."""
-    return FrameEdit({move.track: ObjectEdit(translate_m=move.shift_m, rotate=move.turn)})
+    mesh = tuple(move.mesh.tolist()) if move.stretch else ()
+    return FrameEdit({move.track: ObjectEdit(translate_m=move.shift_m, rotate=move.turn, mesh=mesh)})
 
 
 def _promising(plan: Plan) -> bool:
@@ -348,12 +359,13 @@ def choose_move(plan: Plan, truths: Sequence[Truth], rng: np.random.Generator) -
             for turn in (1, -1)
         ]
         for j in rng.permutation(len(options)):
-            if _free(plan, actor, options[int(j)]):
+            if free(plan, actor, options[int(j)]):
                 return [options[int(j)]]
     return []
 
 
-def _free(plan: Plan, actor: Actor, move: Move) -> bool:
+def free(plan: Plan, actor: Actor, move: Move) -> bool:
+    """Whether a vehicle, moved so, meets no other and stands on nothing raised more than before."""
     edited = apply_edit(plan, edit_of(move)).actors
     place = next(a for a in edited if a.track == actor.track)
     old, new = (footprint(a.position_xz, a.yaw, a.size_lhw) for a in (actor, place))
@@ -493,15 +505,17 @@ def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequenc
 
 
 def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
-    """The scene with its vehicle moved by the same vector and angle as the true one."""
+    """The scene with its vehicle moved by the same vector and angle as the true one, and stretched alike."""
     if case.move.track not in tracks:
         return scene
     i = list(tracks).index(case.move.track)
-    old, new = (_truth(frame, case.move.track) for frame in (case.before, case.moved))
+    old, new = (truth_of(frame, case.move.track) for frame in (case.before, case.moved))
     translation, yaw = scene.objects.translation.clone(), scene.objects.yaw.clone()
     translation[i] += torch.from_numpy(new.translation - old.translation).to(translation)
     yaw[i] += case.move.turn
-    return scene.with_objects(translation=translation, yaw=yaw)
+    offsets = scene.objects.ffd.clone()
+    offsets[i] += ffd.from_symmetric(case.move.mesh).to(offsets)
+    return scene.with_objects(translation=translation, yaw=yaw, ffd=offsets)
 
 
 def _removable(frame: SynthFrame) -> list[int]:
@@ -519,7 +533,8 @@ def without(case: Case, tracks: Sequence[int]) -> SynthFrame:
     return frame
 
 
-def _truth(frame: SynthFrame, track: int) -> Truth:
+def truth_of(frame: SynthFrame, track: int) -> Truth:
+    """The truth of a vehicle that the frame has."""
     return next(t for t in frame.truths if t.actor.track == track)
 
 
@@ -674,7 +689,7 @@ def never_seen(case: Case) -> Mask:
     """Pixels (H, W) of the moved vehicle whose surface the photograph did not show: turned away, hidden or out of
     the image."""
     before, after = case.before, case.moved
-    old, new = _truth(before, case.move.track), _truth(after, case.move.track)
+    old, new = truth_of(before, case.move.track), truth_of(after, case.move.track)
     value = case.move.track + 1
     rows, columns = np.nonzero(after.instance == value)
     unseen = np.zeros(after.instance.shape, bool)
@@ -737,7 +752,7 @@ def perfect_scene(before: SynthFrame, empty: SynthFrame, tracks: Sequence[int]) 
     """The generator's own scene of these vehicles, in this order. empty: the street without them."""
     frame = replace(
         before,
-        truths=tuple(_truth(before, track) for track in tracks),
+        truths=tuple(truth_of(before, track) for track in tracks),
         background=empty.image,
         background_depth_m=empty.depth_m,
         ground_material=empty.ground_material,

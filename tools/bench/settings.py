@@ -19,14 +19,17 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
     what: tyro.conf.Positional[
-        Literal["derender", "depth", "found", "label-free", "redraw", "weather", "synth", "rivals", "eval"]
+        Literal[
+            "derender", "depth", "found", "label-free", "moves", "redraw", "weather", "synth", "rivals", "eval"
+        ]
     ] = "derender"
     """derender: de-rendered generated frames beside the generator's truth; depth: how far surroundings are, beside
     the generator's truth, a laser, and in fog; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
-    those labels; redraw: the second renderer of photographs beside the photograph and ours; weather: the
-    compositor's weather beside the generator's; synth: the scene generator; rivals: other renderers beside the
-    project's verbs; eval: drivesem eval of many frames beside pycocotools."""
+    those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
+    of photographs beside the photograph and ours; weather: the compositor's weather beside the generator's; synth:
+    the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many frames
+    beside pycocotools."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -35,15 +38,15 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     """Of rivals: triangles a car, with commas."""
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
-    100, with --quick 12; that depth does, by default 40, with --quick 6; that weather does, by default 24, with
-    --quick 4; that label-free looks at, by default 60,
+    100, with --quick 12; that moves does, by default 80, with --quick 6; that depth does, by default 40, with
+    --quick 6; that weather does, by default 24, with --quick 4; that label-free looks at, by default 60,
     with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found, redraw and weather: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a
+    """Of found, moves, redraw and weather: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a
     detector that was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """Of found, label-free, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2,

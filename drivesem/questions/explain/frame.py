@@ -14,6 +14,7 @@ from torch import Tensor
 
 from detectors.base import Detector, Predictor
 from detectors.types import CLASSES
+from drivesem.attack.budgets import reach_of
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.methods.base import Problem, Score
@@ -230,7 +231,9 @@ def _least(
         norm_whole=judge.size(shortened.shortened),
         norm=judge.size(small),
         outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
-        violations=tuple(check_scene(space.scene, rendered.scene, joint_weather=joint_weather)),
+        violations=tuple(
+            check_scene(space.scene, rendered.scene, joint_weather=joint_weather, reach=reach_of(space.budget))
+        ),
         sizes=tuple(players.sizes(space, small)),
         failures=failure_records(
             objective.judged, rendered.moved.targets, rendered.detections, objective.failures(rendered, "moved")

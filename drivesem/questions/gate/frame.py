@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from detectors.base import Predictor
-from drivesem.attack.budgets import budget_of
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.judging import t_star_of
 from drivesem.attack.space import Parameter
@@ -38,7 +37,7 @@ def compare_frame(
     start = time.perf_counter()
     result = load_frame(folder / RESULT)
     before, after = detectors
-    objective, theta = rebuilt(result, folder, attack, params, before, budget_of(attack.budget))
+    objective, theta = rebuilt(result, folder, attack, params, before)
     feasible = objective.feasible_set(Limits(joint_weather=result.joint_weather), attack.project == "bounds")
     nuisances = Nuisances.of(attack.nuisances)
     pairs = []

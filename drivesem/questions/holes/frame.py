@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from detectors.base import Predictor
-from drivesem.attack.budgets import budget_of
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.space import Parameter
 from drivesem.questions.holes.results import HOLES, Around, FrameHoles, Samples, dump
@@ -53,7 +52,7 @@ def look_around(
     """
     start = time.perf_counter()
     result = load_frame(folder / RESULT)
-    objective, theta = rebuilt(result, folder, attack, params, detector, budget_of(attack.budget))
+    objective, theta = rebuilt(result, folder, attack, params, detector)
     limits = Limits(joint_weather=result.joint_weather)
     feasible = objective.feasible_set(limits, attack.project == "bounds")
     around, passes = [], 0

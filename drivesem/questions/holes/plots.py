@@ -28,16 +28,19 @@ def write_holes(path: Path, holes: Sequence[Hole]) -> None:
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=(8.0, 1.9 + 0.5 * len(shown)), layout="constrained")
         axes = figure.add_subplot()
+        inside, elsewhere = "fresh samples inside of the rule, 95 % interval", "elsewhere in the neighbourhood"
         for place, hole in enumerate(shown):
-            inside = "fresh samples inside of the rule, 95 % interval" if place == 0 else None
             if hole.probability is not None:
                 axes.barh([place], [100 * hole.probability], color=COLOURS[1], height=0.6, label=inside)
+                inside = None  # the legend names each sign once
                 axes.plot(
                     [100 * (hole.low or 0), 100 * (hole.high or 0)], [place] * 2, color="black", linewidth=1.2
                 )
             if hole.outside is not None:
-                mark = "elsewhere in the neighbourhood" if place == 0 else None
-                axes.plot([100 * hole.outside], [place], "D", color=COLOURS[0], markersize=6, label=mark, zorder=3)
+                axes.plot(
+                    [100 * hole.outside], [place], "D", color=COLOURS[0], markersize=6, label=elsewhere, zorder=3
+                )
+                elsewhere = None
         axes.set_yticks(range(len(shown)), [f"{hole.words}\n{_count(hole)}" for hole in shown])
         axes.invert_yaxis()
         axes.set(xlim=(0, 102), xlabel="lost, %")

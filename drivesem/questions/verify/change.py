@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasibility_check import Reach, check_reach, check_scene
+from drivesem.attack.budgets import reach_of
+from drivesem.attack.feasibility_check import check_reach, check_scene
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.questions.verify.differences import CheckLog
 from drivesem.run.results import FrameResult
@@ -88,6 +88,7 @@ def check_feasibility(
     log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
 ) -> None:
     """What the second check finds in the saved scene, and whether the poses in it lie within the run's budget."""
-    found = check_scene(base, perturbed, result.checked_by, result.joint_weather)
+    reach = reach_of(budget)
+    found = check_scene(base, perturbed, result.checked_by, result.joint_weather, reach)
     log.same("feasibility", "violations", list(result.violations), found)
-    log.same("feasibility", "budget", [], check_reach(base, perturbed, Reach(**asdict(budget))))
+    log.same("feasibility", "budget", [], check_reach(base, perturbed, reach))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import budget_of, written
+from drivesem.attack.budgets import PRESETS, budget_of, written
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.settings.errors import UsageError
@@ -58,25 +59,39 @@ def test_a_bad_file_is_one_line(tmp_path: Path, text: str, message: str):
 
 
 def test_what_is_no_budget_is_named(tmp_path: Path):
-    with pytest.raises(UsageError, match="--budget: expected paper, parking, a YAML file, or NAME=VALUE"):
+    with pytest.raises(UsageError, match="--budget: expected paper, parking, street, a YAML file, or NAME=VALUE"):
         budget_of("generous")
     with pytest.raises(FormatError, match=r"nowhere\.yaml: expected a readable file"):
         budget_of(str(tmp_path / "nowhere.yaml"))
+    with pytest.raises(UsageError, match=r"--budget: expected paper, parking, street, .*found 'street,'"):
+        budget_of("street,")
     with pytest.raises(FormatError, match="--budget: rotate: expected each parameter once"):
         budget_of("rotate=5deg,rotate=6deg")
+
+
+def test_a_preset_can_be_narrowed_and_not_widened():
+    assert budget_of("street,translate=2m,rotate=5deg") == replace(
+        PRESETS["street"], translate_m=2.0, rotate=math.radians(5)
+    )
+    assert budget_of("street,translate=0.1") == replace(PRESETS["street"], translate=0.1)
+    assert budget_of("parking,rotate=2deg") == replace(PRESETS["parking"], rotate=math.radians(2))
+    for text in ("street,translate=50m", "street,translate=50", "parking,translate=0.6m", "street,rotate=0.36"):
+        with pytest.raises(FormatError, match=r"--budget: .*: expected a positive number of at most"):
+            budget_of(text)
 
 
 _LIMITS = st.floats(1e-6, 0.25)
 
 
 @given(
+    preset=st.sampled_from(["paper", "street"]),
     narrowed=st.dictionaries(st.sampled_from([p.value for p in Parameter]), _LIMITS),
-    metres=st.none() | st.floats(1e-3, 10),
+    metres=st.none() | st.floats(1e-3, 1),
 )
-def test_what_is_written_reads_back(narrowed, metres):
+def test_what_is_written_reads_back(preset, narrowed, metres):
+    budget = replace(PRESETS[preset], **narrowed)
     if metres is not None:
-        narrowed = {**narrowed, "translate": 0.25, "translate_m": metres}
-    budget = Budget(**narrowed)
+        budget = replace(budget, translate=PRESETS[preset].translate, translate_m=metres)
     assert budget_of(written(budget)) == budget
 
 
@@ -94,6 +109,36 @@ def test_metres_are_the_same_for_long_and_short_cars(street):
     assert bool((far <= space.upper).all())
     moved = space.apply(scene, space.upper).objects.translation - scene.objects.translation
     assert float(moved.norm(dim=1).max()) <= 0.5 * math.sqrt(2) + 1e-5
+
+
+def test_a_street_is_longer_along_than_across(street):
+    scene = street()
+    length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
+    scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
+    budget = budget_of("street")
+    space = ParameterSpace(scene, tuple(Parameter), budget)
+    where = space.slice_of(Parameter.TRANSLATE)
+    along_m, across_m = (space.upper[where].reshape(4, 2) * length_m[:, None]).T.tolist()
+    away_m = budget.of_distance * scene.objects.translation.norm(dim=1)
+    assert 2.5 < away_m[0] < 3 < away_m[1] < 4 < away_m[2]
+    assert along_m == pytest.approx([float(away_m[0]), float(away_m[1]), budget.translate * 1.6, 4.0])
+    assert across_m == pytest.approx([1.0] * 4)
+    # All else goes as far as the paper's.
+    papers = ParameterSpace(scene, tuple(Parameter))
+    wider = papers.upper != space.upper
+    assert not bool(wider[: where.start].any() or wider[where.stop :].any())
+
+
+def test_a_car_that_is_partly_shown_goes_no_farther_than_the_papers(street):
+    scene = street().with_objects(
+        occlusion=torch.tensor([0, 1, 0, 0]), truncation=torch.tensor([0.0, 0.0, 0.3, 0.1])
+    )
+    space = ParameterSpace(scene, ("translate",), budget_of("street"))
+    along = space.upper.reshape(4, 2)[:, 0].tolist()
+    assert along[1] == along[2] == 0.25
+    assert 0.5 < along[0] < along[3]
+    # In the paper's budget it makes no difference.
+    assert ParameterSpace(scene, ("translate",)).upper.tolist() == [0.25] * 8
 
 
 def test_the_papers_budget_is_the_same_for_all(street):

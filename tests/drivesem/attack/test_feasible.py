@@ -10,10 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import drivesem.attack.feasibility_check
+from drivesem.attack.budgets import PRESETS, reach_of
 from drivesem.attack.feasibility_check import (
+    PAPERS,
+    Reach,
     _Car,
     _collisions,
     _Outlines,
+    check_reach,
     check_scene,
     judge_at_hand,
     overlap_area,
@@ -22,7 +26,7 @@ from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.cars import Cars
 from drivesem.attack.feasible.collisions import gap_between, shared_ground
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import COMBOS, ParameterSpace
+from drivesem.attack.space import COMBOS, ParameterSpace, ground_axes
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 
@@ -287,6 +291,88 @@ def test_the_second_check_finds_collisions_roads_and_hiding(street):
     pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
     hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
     assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
+
+
+STREET = reach_of(PRESETS["street"])
+
+
+def _moved(scene, along=0.0, across=0.0):
+    """The first car moved by metres."""
+    shift = ground_axes(scene.objects.yaw, torch.ones(len(scene.objects)), scene.environment.ground)[0]
+    by = torch.zeros_like(scene.objects.translation)
+    by[0] = along * shift[0] + across * shift[1]
+    return scene.with_objects(translation=scene.objects.translation + by)
+
+
+def test_the_second_check_follows_the_budget(street):
+    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=-math.pi / 2)
+    for along in (3.0, -3.0):
+        far = _moved(scene, along)
+        (line,) = check_scene(scene, far)
+        assert line.startswith("objects[0]: moved by")
+        assert "own lengths" in line
+        assert check_scene(scene, far, reach=STREET) == []
+    for reach in (PAPERS, STREET):
+        (line,) = check_scene(scene, _moved(scene, across=1.2), reach=reach)
+        assert "moved by" in line
+    assert check_scene(scene, _moved(scene, across=0.99), reach=STREET) == []
+    assert "moved by 4.100" in check_scene(scene, _moved(scene, 4.1), reach=STREET)[0]
+    # Of its distance from the camera, a car goes no more than a share.
+    near = street(positions_xz=((0.0, 10.0), (3.0, 30.0)), yaw=-math.pi / 2)
+    assert check_scene(near, _moved(near, 3.0), reach=STREET) == []
+    assert "moved by 3.100" in check_scene(near, _moved(near, 3.1), reach=STREET)[0]
+
+
+@pytest.mark.parametrize("partly", [{"occlusion": torch.tensor([1, 0])}, {"truncation": torch.tensor([0.2, 0])}])
+def test_the_second_check_holds_cars_that_are_partly_shown_to_the_papers_bounds(street, partly):
+    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=-math.pi / 2).with_objects(**partly)
+    (line,) = check_scene(scene, _moved(scene, 2.0), reach=STREET)
+    assert line.startswith("objects[0]: moved by")
+    assert check_scene(scene, _moved(scene, 1.0), reach=STREET) == []
+
+
+@pytest.mark.parametrize("reach", [PAPERS, STREET])
+def test_no_budget_lets_a_car_into_another_or_off_the_road(street, reach):
+    row = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=-math.pi / 2)
+    assert any("collision with objects[0]" in line for line in check_scene(row, _moved(row, 3.0), reach=reach))
+    narrow = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
+    left = check_scene(narrow, _moved(narrow, across=0.9), reach=reach)
+    assert any("left the road" in line for line in left)
+
+
+def test_the_projection_keeps_a_street_s_cars_apart(street):
+    scene = street(positions_xz=((0.0, 14.0), (0.0, 21.0)), yaw=-math.pi / 2)
+    # The far one is higher, so that it stays in sight.
+    scene = scene.with_objects(size_lhw=torch.tensor([[4.2, 1.5, 1.75], [4.2, 2.6, 1.75]]))
+    space = ParameterSpace(scene, COMBOS[1], PRESETS["street"])
+    far = FeasibleSet(space).project(space.upper * torch.tensor([1.0, 0, 0, 0, 0, 0]))
+    moved = space.apply(scene, far.theta)
+    metres = (moved.objects.translation - scene.objects.translation).norm(dim=1)
+    assert 2.6 < float(metres[0]) < 2.8
+    assert check_scene(scene, moved, reach=STREET) == []
+    assert "objects[0]: collision" in far.active
+
+
+def test_a_car_may_grow_by_a_tenth_through_its_lattice(street):
+    scene = street(positions_xz=((0.0, 14.0),))
+    points = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, 4),) * 3, indexing="ij"), dim=-1).reshape(64, 3)
+    for tenth in (0.1, -0.1):
+        code = ffd.to_symmetric(tenth * (points - torch.tensor([0.5, 1.0, 0.5])))
+        space = ParameterSpace(scene, ("mesh",))
+        kept = FeasibleSet(space).project(code)
+        assert kept.active == ()
+        grown = space.apply(scene, kept.theta)
+        old, new = (np.ptp(_Car(s, 0).deformed, axis=0) for s in (scene, grown))
+        assert new.tolist() == pytest.approx((old * (1 + tenth)).tolist(), rel=1e-3)
+        assert check_scene(scene, grown) == []
+
+
+def test_codes_beyond_the_budget_from_the_start_may_stay(street):
+    foggy = street().with_environment(weather=torch.tensor([0.4, 0.0, 0.0, 0.0]))
+    reach = Reach(weather=0.2)
+    assert check_reach(foggy, foggy, reach) == []
+    thicker = foggy.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
+    assert check_reach(foggy, thicker, reach) == ["environment.weather: outside [0, 0.2]"]
 
 
 def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):

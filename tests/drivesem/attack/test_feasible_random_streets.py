@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS
-from drivesem.attack.feasibility_check import Reach, check_reach, check_scene
+from drivesem.attack.budgets import PRESETS, reach_of
+from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 
@@ -30,9 +28,11 @@ def test_projection_is_idempotent_inside_and_feasible(street, seed, count, names
     places = torch.rand(count, 2, generator=generator) * torch.tensor([16.0, 30.0]) + torch.tensor([-8.0, 6.0])
     scene = street(positions_xz=places.tolist(), road_edge_x_m=edge)
     scene = scene.with_objects(yaw=(torch.rand(count, generator=generator) - 0.5) * 6)
+    scene = scene.with_objects(occlusion=torch.randint(0, 2, (count,), generator=generator))
     space = ParameterSpace(scene, tuple(names), PRESETS[budget])
     feasible = FeasibleSet(space)
-    theta = torch.randn(space.dim, generator=generator) * 10 * scale * space.step
+    far = torch.maximum(10 * space.step, space.upper / 2)
+    theta = torch.randn(space.dim, generator=generator) * scale * far
     once = feasible.project(theta)
     assert bool(((once.theta >= space.lower) & (once.theta <= space.upper)).all())
     assert feasible.violations(once.theta) == ()
@@ -40,8 +40,7 @@ def test_projection_is_idempotent_inside_and_feasible(street, seed, count, names
     assert torch.equal(twice.theta, once.theta)
     assert twice.active == ()
     changed = space.apply(scene, once.theta)
-    assert check_scene(scene, changed) == []
-    assert check_reach(scene, changed, Reach(**asdict(PRESETS[budget]))) == []
+    assert check_scene(scene, changed, reach=reach_of(PRESETS[budget])) == []
 
 
 @pytest.mark.parametrize(

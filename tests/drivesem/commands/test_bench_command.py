@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from drivesem.attack.space import combo
 from drivesem.bench import memory, render, step
 from drivesem.bench.planted import yardstick
 from drivesem.bench.scenes import bench_scene
@@ -56,8 +57,7 @@ def test_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
 def test_a_step_goes_on_from_a_theta_that_is_not_the_photograph() -> None:
     from detectors.registry import load_detector
 
-    case = step.StepCase(1, 600)
-    attack = step._Step(case, bench_scene(1, 600), load_detector("squeezedet"), 0, "cpu")
+    attack = step.Stepping(bench_scene(1, 600).scene, combo(2), load_detector("squeezedet"), 0, "cpu")
     before = attack.theta
     attack()
     assert bool(before.any())
@@ -189,3 +189,10 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
 def test_bad_input_of_planted(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_boxes_without_an_archive_and_elsewhere(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["bench", "step", "--boxes", str(tmp_path / "none.tar.xz")]) == 2
+    assert "--boxes: expected a tar archive of KITTI's label_2 and calib" in capsys.readouterr().err
+    assert main(["bench", "render", "--boxes", str(tmp_path / "none.tar.xz")]) == 2
+    assert "--boxes: expected bench step, found bench render" in capsys.readouterr().err

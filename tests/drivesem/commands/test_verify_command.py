@@ -12,19 +12,22 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from detectors.types import CLASSES, Detections
 from drivesem.attack import objective
+from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
-from drivesem.attack.space import ParameterSpace
+from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.questions.verify.differences import CHECKS
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run import frame as run_frame
+from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.io import load_scene
@@ -112,6 +115,41 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
     # Another number of threads may round a pixel otherwise.
     assert data["rendered_again"]["counterexample.png"]["largest_share"] < 1e-4
     assert json.loads((run / "verify.json").read_text()) == data
+
+
+def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
+    drifting: None, tmp_path: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (
+        "--method",
+        "random",
+        "--queries",
+        "2",
+        "--params",
+        "translate,weather",
+        "--budget",
+        "street",
+        "--seed",
+        "3",
+    )
+    out = tmp_path / "street"
+    assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["feasible_fraction"] == 1.0
+    assert yaml.safe_load((out / "config.yaml").read_text())["budget"] == "street"
+    theta = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.endswith("along")]
+    assert max(abs(c.value) for c in theta) > 0.25
+    assert max(c.upper for c in theta) > 0.5
+    assert verify(out, code=0)["differences"] == []
+    # What is asked of it next looks as far as it went.
+    result, attack = load_frame(out / FRAME / "result.json"), run_folder.attack_of(out)
+    again, _ = rebuilt(result, out / FRAME, attack, parse_params("translate,weather"), Drifting())
+    assert again.space.budget == PRESETS["street"]
+    # The same scenes do not pass for a run in the paper's.
+    change_text = (out / "config.yaml").read_text().replace("budget: street", "budget: paper")
+    (out / "config.yaml").write_text(change_text)
+    found = told(verify(out))
+    assert "own lengths" in found["violations"]["found"]
 
 
 @pytest.fixture
@@ -288,8 +326,8 @@ def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
     data = verify(run)
     found = told(data)
     assert "scene: objects[0].translation" in found
-    assert found["budget"]["found"].startswith("objects[0]: moved by")
-    assert "violations" not in found
+    for name in ("budget", "violations"):
+        assert found[name]["found"].startswith("objects[0]: moved by")
     assert {"pictures", "feasibility", "theta", "labels"} <= checks(data)
 
 

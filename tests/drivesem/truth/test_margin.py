@@ -99,3 +99,21 @@ def test_a_badly_placed_box_is_pulled_towards_its_object() -> None:
     assert boxes.grad is not None
     assert boxes.grad[0, 0] < 0
     assert boxes.grad[0, 2] < 0
+
+
+def test_gradients_are_never_so_small_that_they_slow_a_detector_down() -> None:
+    """Boxes that meet the object less and less: the last weights of the soft maximum are subnormal numbers, and
+    change nothing.
+    """
+    boxes = BOX.float() + torch.linspace(0, 200, 400)[:, None]
+    scores = torch.full((400, 2), 0.9, requires_grad=True)
+    soft = margin.of_objects(candidates(boxes, scores), BOX.float(), LABEL, NOTHING.float(), T_STAR, sharpness=4.0)
+    soft.sum().backward()
+    assert scores.grad is not None
+    sizes = scores.grad.abs()
+    assert bool((sizes > 0).any())
+    assert not bool(((sizes > 0) & (sizes < 1e-24)).any())
+    exact = margin.of_objects(
+        candidates(boxes.double(), scores.detach().double()), BOX, LABEL, NOTHING, T_STAR, sharpness=4.0
+    )
+    torch.testing.assert_close(soft.detach().double(), exact, rtol=1e-6, atol=0)

@@ -406,3 +406,28 @@ def test_halo_moves_with_the_outline(street: Street) -> None:
     )
     assert gaps == 2
     assert float(turned.values.sum()) == pytest.approx(float(still), rel=0.15)
+
+
+def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: SceneIR) -> None:
+    """Neither the picture nor, for any of them, a gradient of it; weather may change every pixel."""
+    scene = scene_to(photographed, torch.float32)
+    compositor = Compositor(scene)
+    moved = scene.objects.translation.clone().requires_grad_(True)
+    rendered = compositor.render(scene.with_objects(translation=moved + moved.new_tensor([0.3, 0.0, 0.2])))
+    assert rendered.drawn is not None
+    outside = torch.ones_like(scene.depth, dtype=torch.bool)
+    for x0, y0, x1, y1 in rendered.drawn.tolist():
+        outside[y0:y1, x0:x1] = False
+    assert 0 < int(outside.sum()) < outside.numel()
+    assert torch.equal(rendered.image.detach()[:, outside], scene.background[:, outside])
+    (gradient,) = torch.autograd.grad(rendered.image[:, outside].sum(), moved)
+    assert not bool(gradient.any())
+    foggy = scene.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
+    assert compositor.render(foggy).drawn is None
+
+
+def test_what_shows_of_each_draw_has_a_rectangle_around_it() -> None:
+    layout = Layout.of(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
+    shown = torch.zeros(layout.size, dtype=torch.bool)
+    shown[:36].view(6, 6)[2:4, 0:3] = True
+    assert blend.shown_rects(layout, shown).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]

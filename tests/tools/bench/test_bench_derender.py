@@ -142,14 +142,14 @@ def test_de_rendering_is_given_neither_mask_nor_depth(case: Case) -> None:
 def test_what_is_in_the_way_forbids_a_move(case: Case) -> None:
     plan = case.plan
     actor = next(a for a in plan.actors if a.track == case.move.track)
-    assert bench._free(plan, actor, case.move)
+    assert bench.free(plan, actor, case.move)
     x, z = actor.position_xz
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
     along, across = case.move.shift_m
     ahead = 2 * along * (actor.size_lhw[0] + 0.6), 2 * across * (actor.size_lhw[2] + 0.6)
     place = (x + ahead[0] * cos + ahead[1] * sin, z - ahead[0] * sin + ahead[1] * cos)
     blocked = replace(plan, actors=(*plan.actors, replace(actor, position_xz=place, track=99)))
-    assert not bench._free(blocked, actor, case.move)
+    assert not bench.free(blocked, actor, case.move)
 
 
 def test_a_kerb_is_raised(case: Case) -> None:

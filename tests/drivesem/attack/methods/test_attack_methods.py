@@ -171,9 +171,11 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
         (["--passes", "10"], "--passes: expected at least 24, which the search needs, found 10"),
         (["--method", "subsets", "--queries", "1"], "--queries: expected at least 2 with subsets, found 1"),
         (["--method", "subsets", "--early-stop"], "--early-stop: expected a method that may end at the first"),
-        (["--budget", "parkng"], "--budget: expected paper, parking, a YAML file, or NAME=VALUE with commas"),
+        (["--budget", "parkng"], "--budget: expected paper, parking, street, a YAML file, or NAME=VALUE"),
         (["--budget", "nowhere.yaml"], "nowhere.yaml: expected a readable file"),
         (["--budget", "spin=1"], "--budget: spin: expected one of color, weather"),
+        (["--budget", "street,wide"], "--budget: expected paper, parking, street, a YAML file, or NAME=VALUE"),
+        (["--budget", "street,rotate=21deg"], "--budget: rotate: expected a positive number of at most 0.35"),
     ],
 )
 def test_options_that_do_not_fit_are_named(words: list[str], message: str, refused: Callable[..., str]) -> None:

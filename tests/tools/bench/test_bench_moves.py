@@ -1,0 +1,130 @@
+"""Cars moved far beside the generator's truth: a perfect scene gets good marks, and what cannot be is left out."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from detectors.types import Detections
+from drivesem.synth.edits import apply_edit
+from drivesem.synth.frames import render_frame
+from scene_ir.types import SceneIR
+from tools.bench import derender, moves
+from tools.bench.__main__ import main
+from tools.bench.derender import Case, Move
+from tools.bench.moves import MovedRow
+from tools.bench.sights import Eye
+
+
+class Dazzled:
+    """Sees one car where it is told, and nothing in every second picture."""
+
+    name = "dazzled"
+    classes = ("Car",)
+
+    def __init__(self, box: Tensor) -> None:
+        self.box, self.looks = box, 0
+
+    def forward(self, images: Tensor) -> Tensor:
+        self.looks += 1
+        return images
+
+    def decode(self, raw: Tensor) -> list[Detections]:
+        boxes = self.box[None][: self.looks % 2]
+        return [Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), torch.full((len(boxes),), 0.9))]
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return derender.make_case(0, 0, "train")
+
+
+@pytest.fixture(scope="module")
+def perfect(case: Case) -> SceneIR:
+    tracks = _tracks(case)
+    return derender.perfect_scene(case.before, derender.without(case, tracks), tracks)
+
+
+def _tracks(case: Case) -> list[int]:
+    return [t.actor.track for t in case.before.truths if t.labelled and t.actor.label in derender.VEHICLES]
+
+
+def test_a_stretched_vehicle_is_stretched_in_truth_and_in_the_scene(case: Case, perfect: SceneIR) -> None:
+    move = Move(case.move.track, (0.0, 0.0), 0.0, 0.1)
+    moved = render_frame(apply_edit(case.plan, derender.edit_of(move)))
+    assert moved is not None
+    old, new = (derender.truth_of(frame, move.track).box_xyxy for frame in (case.before, moved))
+    assert ((new[2:] - new[:2]) / (old[2:] - old[:2])).tolist() == pytest.approx([1.1, 1.1], abs=0.05)
+    ours = derender.moved_scene(replace(case, move=move, moved=moved), perfect, _tracks(case))
+    corner = ours.objects.ffd[_tracks(case).index(move.track)].reshape(4, 4, 4, 3)[0, 0, 0]
+    assert corner.tolist() == pytest.approx([-0.05, -0.1, -0.05])
+
+
+def test_nearer_is_towards_the_camera(case: Case) -> None:
+    old = derender.truth_of(case.before, case.move.track)
+    tried = dict(moves.changes(old, np.random.default_rng(0)))
+    for metres in (0.5, 8.0):
+        places = []
+        for way in ("nearer", "farther"):
+            (move,) = tried[f"{metres:g} m {way}"]
+            actor = apply_edit(case.plan, derender.edit_of(move)).actors[old.index]
+            places.append(actor.position_xz[1])
+        assert places[0] < case.plan.actors[old.index].position_xz[1] < places[1]
+    for name, most in (("paper", 0.25 * old.actor.size_lhw[0]), ("street", 1.0)):
+        assert max(abs(move.shift_m[1]) for move in tried[f"anywhere in {name}"]) <= most
+
+
+def test_a_perfect_scene_holds_and_the_detector_is_heard(case: Case, perfect: SceneIR) -> None:
+    box = torch.from_numpy(derender.truth_of(case.before, case.move.track).box_xyxy).float()
+    rng = np.random.default_rng(0)
+    rows, strips = moves.judge(case, perfect, _tracks(case), Eye(Dazzled(box)), rng)
+    assert len(rows) == len(strips) > 10
+    by_name = {row.change: row for row in rows}
+    assert by_name["0.5 m farther"].psnr_db > by_name["0.5 m farther"].unchanged_db + 3
+    assert by_name["0.5 m farther"].found == pytest.approx(0.9)
+    assert by_name["0.5 m farther"].ours is None
+    assert moves.judge(case, perfect, [-1] * len(_tracks(case)), Eye(Dazzled(box)), rng) == ([], [])
+
+
+def test_a_line_counts_what_both_see() -> None:
+    def row(psnr_db: float, found: float | None, ours: float | None, change: str = "1 m farther") -> MovedRow:
+        return MovedRow("train", 0, change, "sedan", 20.0, (1.0, 0.0), 0.0, psnr_db, 15.0, 22.0, found, ours, 1)
+
+    near = row(25, 0.5, 0.6, "1 m nearer")
+    rows = [row(20, 0.9, 0.7), row(30, 0.8, None), row(25, None, None), near, row(25, 0.5, 0.6, "5 degrees")]
+    nearer, farther, turned, share = moves.summary(rows)
+    assert (farther["split"], farther["change"], farther["count"]) == ("train", "1 m farther", 3)
+    assert (farther["psnr_db"], farther["tail_db"]) == (25.0, 21.0)
+    assert (farther["found"], farther["kept"], farther["agree"]) == (2, 1, 0.667)
+    assert farther["score_apart"] == farther["score_tail"] == pytest.approx(0.2)
+    assert [line["change"] for line in (nearer, turned)] == ["1 m nearer", "5 degrees"]
+    # One metre of twenty.
+    assert (share["change"], share["count"]) == ("0 to 0.1 of its distance nearer", 1)
+
+
+def test_what_leaves_the_picture_is_left_out(case: Case) -> None:
+    assert moves.changed_case(case, Move(case.move.track, (-60.0, 0.0), 0.0)) is None
+    assert moves.changed_case(case, Move(case.move.track, (60.0, 0.0), 0.0)) is None
+    other = next(t for t in case.before.truths if t.actor.track != case.move.track)
+    own = derender.truth_of(case.before, case.move.track)
+    apart = np.array(other.actor.position_xz) - np.array(own.actor.position_xz)
+    cos, sin = math.cos(own.actor.yaw), math.sin(own.actor.yaw)
+    onto = (float(apart @ [cos, -sin]), float(apart @ [sin, cos]))
+    assert moves.changed_case(case, Move(case.move.track, onto, 0.0)) is None
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["moves", "--frames", "2", "--workers", "1", "--json", "--out", str(tmp_path)]
+    assert main([*words, "--markdown", str(tmp_path / "all.md")]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {row["split"] for row in result["rows"]} == {"train", "heldout"}
+    assert "<!-- bench moves: begin -->" in (tmp_path / "all.md").read_text()
+    assert len(list((tmp_path / "moves").glob("*.png"))) == 2
