@@ -79,13 +79,14 @@ def write_reach(path: Path, rows: Sequence[ReachRow]) -> None:
             panel.set_title(name, fontsize=9, loc="left")
             panel.set_xscale("log", base=4)
             panel.set_xticks(STEPS, [str(step) for step in STEPS])
+            panel.minorticks_off()
             panel.set_ylim(-1.02, 1.02)
         for panel in panels[len(names) :]:
             panel.set_visible(False)
         figure.supxlabel("steps to either side", fontsize=9)
         figure.supylabel("cosine to the slope", fontsize=9)
         first = figure.axes[0]
-        figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+        figure.legend(*first.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=9)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     files.write_bytes(path, buffer.getvalue())
