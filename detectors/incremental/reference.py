@@ -27,8 +27,9 @@ AGREES = 1e-3
 _BLOCK = 8  # bytes of an int64
 """Pixels to which regions are rounded, so that the next step's often fit into this one's plan."""
 _PLANS = 16
-_LOOSE = 1.25
-"""A plan for a region so many times as large is taken rather than a new one made."""
+_ROOM = 16
+"""Pixels by which a plan's region may be larger than what is asked for: a new plan, oneDNN's first look at its
+sizes included, takes as long as a tenth of a pass, and an attack's steps move cars only a little."""
 
 
 class Incremental:
@@ -146,15 +147,15 @@ class Reference:
     def _plan(self, image: Tensor, rects: Sequence[Rect]) -> Plan:
         """For those rectangles and what differs, in whole blocks."""
         changed = self._region(image, rects)
+        around = changed.grown(_ROOM)
         for i, (region, plan) in enumerate(self._plans):
-            if region.contains(changed) and region.area <= _LOOSE * changed.area:
+            if region.contains(changed) and around.contains(region):
                 self._plans.insert(0, self._plans.pop(i))
                 return plan
-        # What a frame's steps change is soon known: a plan for all of it serves the next ones too.
+        # A plan for all of a frame's steps so far serves the next ones too.
         for region, _ in self._plans:
-            joined = region.joined(changed)
-            if joined.area <= _LOOSE * changed.area:
-                changed = joined
+            if around.contains(region):
+                changed = changed.joined(region)
         top, left = self.trunk.at
         within = Rect(top, top + changed.hw[0], left, left + changed.hw[1])
         moved = changed.placed((top, left), self.shapes.hw[self.incremental.graph.layers[0]])

@@ -127,6 +127,10 @@ class Region:
         empty = other.bottom <= other.top
         return bool((empty | ((self.top <= other.top) & (self.bottom >= other.bottom))).all())
 
+    def grown(self, by: int) -> Region:
+        """The same, and what is at most `by` rows and columns away."""
+        return self.reached(Span((2 * by + 1, 2 * by + 1), (1, 1), (by, by)), self.hw)
+
     def reached(self, span: Span, hw: tuple[int, int]) -> Region:
         """The output places of a layer (h, w) that see any of these."""
         height, width = hw

@@ -422,3 +422,18 @@ def test_detectors_that_may_change_or_are_not_known_have_no_reference() -> None:
     coarse = load_detector("squeezedet")
     coarse.gradient_precision = torch.bfloat16
     assert Reference.of(coarse, image) is None
+
+
+def test_a_plan_serves_the_next_small_moves() -> None:
+    reference = Reference.of(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
+    assert reference is not None
+
+    def plan(left: int) -> object:
+        return reference._plan(reference.image, [Rect(200, 260, left, left + 80)])
+
+    first = plan(400)
+    assert plan(399) is not first  # another block of pixels
+    joined = plan(407)
+    assert plan(400) is not first  # it lies in the latest, which is hardly larger
+    assert plan(402) is joined
+    assert plan(600) is not joined

@@ -112,6 +112,11 @@ def test_placing_and_enlarging_move_every_place() -> None:
     assert np.array_equal(mask(region.enlarged(3)), mask(Region.of([Rect(6, 15, 9, 21)], (30, 36))))
 
 
+def test_growing_adds_rows_and_columns_inside_of_the_tensor() -> None:
+    grown = Region.of([Rect(2, 5, 3, 7)], (10, 12)).grown(3)
+    assert np.array_equal(mask(grown), mask(Region.of([Rect(0, 8, 0, 10)], (10, 12))))
+
+
 @pytest.mark.parametrize(
     ("inner", "expected"), [(Rect(2, 5, 3, 7), True), (Rect(1, 5, 3, 7), False), (Rect(2, 5, 3, 8), False)]
 )
