@@ -17,15 +17,19 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.unit_box import UnitBox
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import SPECS, Parameter
-from drivesem.truth.certificate import Camera, Exposure
+from drivesem.truth.certificate import Camera, Exposure, margin_of
+from drivesem.truth.kinds import Fault, Kind
 from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.redraw.compositor import CompositorDraw
+from drivesem.truth.rules import Floats
 from scene_ir.types import SceneIR
 
 SEEN: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast")
 """Features of the object's label and of the picture in it, see `detectors.planted.FEATURES`."""
 NEAR = 0.3
 """Part of the reach in which states lie that are near the counterexample."""
+_LEAST = 1e-6
+"""Margin, in logits, of what is just found."""
 PLACED = ("distance_m", "yaw_deg")
 """distance_m: depth of the object's origin; yaw_deg: its heading about the vertical axis, as KITTI counts it."""
 
@@ -66,24 +70,36 @@ class Neighbourhood:
         self._sequence = qmc.Halton(
             len(self._own), scramble=True, rng=np.random.default_rng(zlib.crc32(name.encode()))
         )
-        self._places: list[Tensor] = []
+        self._places: list[Floats] = []
 
     def sample(self, number: int, part: float = 1.0) -> Sample | None:
         """The number-th state, seen once; None where the object does not count there. part: of the reach."""
-        scene = self._objective.space.apply(self._objective.space.scene, self.theta(number, part))
+        return self.sample_at(self.place(number), number, part)
+
+    def sample_at(self, place: Floats, draw: int, part: float = 1.0) -> Sample | None:
+        """The state at a place (d,) of the unit cube, in a draw by its number; see `sample`."""
+        scene = self._objective.space.apply(self._objective.space.scene, self.theta_at(place, part))
         ignore = torch.zeros(len(scene.objects), dtype=torch.bool)
-        exposure = self._camera.expose(scene, number, ignore)
+        exposure = self._camera.expose(scene, draw, ignore)
         if bool(exposure.targets.ignore[self.index]):
             return None
         return Sample(exposure, self._features(scene, exposure))
 
+    def place(self, number: int) -> Floats:
+        """Of the number-th state, (d,) in the unit cube: Halton's."""
+        while len(self._places) <= number:
+            self._places.append(self._sequence.random(1)[0])
+        return self._places[number]
+
     def theta(self, number: int, part: float = 1.0) -> Tensor:
         """Of the number-th state (D,), feasible. part: of the reach, in which states lie closer together."""
-        while len(self._places) <= number:
-            self._places.append(torch.from_numpy(self._sequence.random(1)[0]))
-        place = self._box.start.clone()
-        place[self._own] = self._places[number].to(place)
-        away = torch.where(self._mine, self._box.theta(place) - self._theta, 0)
+        return self.theta_at(self.place(number), part)
+
+    def theta_at(self, place: Floats, part: float = 1.0) -> Tensor:
+        """At a place (d,) of the unit cube, see `theta`."""
+        at = self._box.start.clone()
+        at[self._own] = torch.from_numpy(place).to(at)
+        away = torch.where(self._mine, self._box.theta(at) - self._theta, 0)
         if part < 1:
             away = part * away
         away = torch.minimum(torch.maximum(away, -part * self._span), part * self._span)
@@ -97,6 +113,14 @@ class Neighbourhood:
         """Whether the object is not found, by the objective's detector, or another camera's. Costs a pass."""
         camera = camera or self._camera
         return not bool(camera.see(sample.exposure).judged.found[self.index])
+
+    def margin(self, sample: Sample) -> float:
+        """How far the object is from being lost, in logits beyond t*: below 0 where it is. Costs a pass."""
+        look = self._camera.see(sample.exposure)
+        beyond = margin_of(Fault(Kind.MISSED, self.index, -1), torch.zeros(4), look)
+        assert beyond is not None
+        # A detection that meets two objects is one's alone: then what is best placed is not what is found.
+        return max(beyond, _LEAST) if bool(look.judged.found[self.index]) else min(beyond, -_LEAST)
 
     def _features(self, scene: SceneIR, exposure: Exposure) -> dict[str, float]:
         i, objects, environment = self.index, scene.objects, scene.environment

@@ -87,4 +87,5 @@ def _tell_effort(runs: list[Run], config: Holes) -> None:
     wanted = count * (config.samples + config.fresh)
     minutes = wanted * seconds / passes / 60 if passes else None
     pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
-    Console(stderr=True).print(f"{count} certain failures, about {wanted} passes{pace}", soft_wrap=True)
+    told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare"
+    Console(stderr=True).print(told, soft_wrap=True)

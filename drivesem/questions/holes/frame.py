@@ -20,6 +20,7 @@ from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Attack
 from drivesem.truth.neighbourhood import NEAR, Neighbourhood, Sample
 from drivesem.truth.nuisances import Nuisances
+from drivesem.truth.rare import State, share_lost
 from drivesem.truth.rules import Floats, contains, fit
 from scene_ir import files
 
@@ -62,7 +63,7 @@ def look_around(
             objective, feasible, theta, failure.index, Nuisances.of(attack.nuisances), name, effort.reach
         )
         one = _around(failure, near, effort)
-        passes += len(one.asked.fails) + len(one.fresh.fails)
+        passes += sum(len(seen.margins) for seen in (one.asked, one.near, one.fresh)) + one.lost.asked
         around.append(one)
     found = FrameHoles(
         identifier=result.identifier,
@@ -78,10 +79,16 @@ def look_around(
 
 def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
     half, last = effort.samples // 2, effort.samples + _TRIES * effort.fresh
-    asked, _ = _seen(near, range(half), half, {})
+    asked, states = _seen(near, range(half), half, {})
     close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, NEAR)
     where = _rule(asked, close)
-    fresh, tried = _seen(near, range(effort.samples, last), effort.fresh if asked.fails else 0, where)
+    fresh, _ = _seen(near, range(effort.samples, last), effort.fresh if asked.margins else 0, where)
+
+    def margin(place: Floats, draw: int) -> float | None:
+        sample = near.sample_at(place, draw)
+        return None if sample is None else near.margin(sample)
+
+    lost = share_lost(states, margin, np.random.default_rng([effort.seed, near.index]))
     assert failure.index is not None
     return Around(
         index=failure.index,
@@ -92,12 +99,12 @@ def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
         near=close,
         where=where,
         fresh=fresh,
-        tried=tried,
+        lost=lost,
     )
 
 
 def _rule(asked: Samples, close: Samples) -> dict[str, tuple[float, float]]:
-    both = [samples for samples in (asked, close) if samples.fails]
+    both = [samples for samples in (asked, close) if samples.margins]
     if not both:
         return {}
     columns = {name: np.concatenate([samples.columns()[name] for samples in both]) for name in both[0].names}
@@ -110,24 +117,23 @@ def _seen(
     enough: int,
     where: Mapping[str, tuple[float, float]],
     part: float = 1.0,
-) -> tuple[Samples, int]:
-    """Up to `enough` samples inside of a rule, in which the object counts, before the detector; and how many were
-    tried for them. part: of the neighbourhood's reach.
+) -> tuple[Samples, list[State]]:
+    """Up to `enough` samples inside of a rule, in which the object counts, before the detector; and where they
+    lie. part: of the neighbourhood's reach.
     """
     rows: list[dict[str, float]] = []
-    fails: list[bool] = []
-    tried = 0
+    states: list[State] = []
     for number in numbers:
         if len(rows) == enough:
             break
-        tried += 1
         sample = near.sample(number, part)
         if sample is None or not contains(where, _columns(sample), 1)[0]:
             continue
         rows.append(sample.features)
-        fails.append(near.fails(sample))
+        states.append(State(near.place(number), number, near.margin(sample)))
     names = tuple(rows[0]) if rows else ()
-    return Samples(names, tuple(tuple(round(v, 6) for v in row.values()) for row in rows), tuple(fails)), tried
+    values = tuple(tuple(round(v, 6) for v in row.values()) for row in rows)
+    return Samples(names, values, tuple(round(state.margin, 6) for state in states)), states
 
 
 def _columns(sample: Sample) -> dict[str, Floats]:

@@ -11,6 +11,7 @@ import numpy as np
 from drivesem.evaluation.resampling import wilson
 from drivesem.questions.holes.results import Around
 from drivesem.synth.compare import QUANTITIES, reference
+from drivesem.truth.rare import Share
 from drivesem.truth.rules import Rule, counted, overlap
 
 ONE = 0.5
@@ -29,9 +30,9 @@ Where = dict[str, tuple[float, float]]
 class Hole:
     """where: the rule, by feature; empty where failures are told by nothing, and the whole neighbourhood is meant.
     label: class of the objects; probability, low, high: of failing in fresh samples inside, with Wilson's 95 %
-    interval, of `count` samples; outside: share of failures outside of it; share: of the neighbourhoods' samples,
-    those that lie inside and fail: how large it is; kitti: share of KITTI's vehicles inside, by feature; failures,
-    frames: that led to it.
+    interval, of `count` samples; outside: share of failures outside of it; lost: how large it is, the
+    share of the neighbourhoods in which the object is lost; kitti: share of KITTI's vehicles inside, by feature;
+    failures, frames: that led to it.
     """
 
     where: Where
@@ -41,7 +42,7 @@ class Hole:
     high: float | None
     count: int
     outside: float | None
-    share: float
+    lost: Share
     kitti: dict[str, float]
     failures: tuple[str, ...]
     frames: tuple[str, ...]
@@ -56,7 +57,11 @@ class Hole:
             "interval": [self.low, self.high],
             "samples": self.count,
             "outside": self.outside,
-            "share": self.share,
+            "size": {
+                "probability": self.lost.probability,
+                "interval": [self.lost.low, self.lost.high],
+                "by": self.lost.by,
+            },
             "kitti": self.kitti,
             "failures": list(self.failures),
             "frames": list(self.frames),
@@ -82,7 +87,7 @@ def merged(found: Mapping[str, Sequence[Around]]) -> list[Hole]:
                 groups.append([(frame, around)])
             else:
                 like.append((frame, around))
-    holes = sorted((_hole(group) for group in groups), key=lambda hole: -hole.share)
+    holes = sorted((_hole(group) for group in groups), key=lambda hole: -hole.lost.probability)
     seen: set[tuple[str, ...]] = set()
     first: list[Hole] = []
     copies: list[Hole] = []
@@ -109,10 +114,10 @@ def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
         for name in members[0].where
     }
     asked = [
-        counted(where, around.asked.columns(), around.asked.failing) for around in members if around.asked.fails
+        counted(where, around.asked.columns(), around.asked.failing) for around in members if around.asked.margins
     ]
     fresh = [
-        counted(where, around.fresh.columns(), around.fresh.failing) for around in members if around.fresh.fails
+        counted(where, around.fresh.columns(), around.fresh.failing) for around in members if around.fresh.margins
     ]
     fails, count = sum(rule.fails for rule in fresh), sum(rule.count for rule in fresh)
     low, high = wilson(fails, count) if count else (None, None)
@@ -124,11 +129,19 @@ def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
         high=high,
         count=count,
         outside=_share(asked),
-        share=sum(r.fails for r in asked) / max(sum(r.count + r.count_outside for r in asked), 1),
+        lost=_mean([around.lost for around in members]),
         kitti=of_kitti(where),
         failures=tuple(f"{frame}: objects[{around.index}]" for frame, around in group),
         frames=tuple(dict.fromkeys(frame for frame, _ in group)),
     )
+
+
+def _mean(shares: Sequence[Share]) -> Share:
+    """Of several neighbourhoods. The ends are means as well, which is wider than need be."""
+    ends = [(share.probability, share.low, share.high) for share in shares]
+    by = " and ".join(sorted({share.by for share in shares}))
+    probability, low, high = np.mean(ends, axis=0).tolist()
+    return Share(probability, low, high, by, sum(share.asked for share in shares))
 
 
 def _share(rules: Sequence[Rule]) -> float | None:

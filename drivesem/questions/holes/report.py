@@ -15,9 +15,9 @@ from drivesem.report.tables import Sheet
 _NONE = "No certain failure of an object in these runs: nothing to look around."
 _NOTES = (
     "Lost: share of fresh samples inside of the rule in which the object is not found, with Wilson's 95 % "
-    "interval. Elsewhere: the same of samples outside of it. Size: share of all samples of the neighbourhood, of "
-    "what the run could change, that lie inside and are lost. The neighbourhood is that of one object with all "
-    "others as found.",
+    "interval. Elsewhere: the same of samples outside of it. Size: share of the whole neighbourhood, of what "
+    "the run could change, in which the object is lost, inside of the rule or not, with a 95 % interval; by "
+    "subset simulation where that is rare. The neighbourhood is that of one object with all others as found.",
     "Features: height_px, aspect (width by height), across (0 left, 1 right) of the label's box; lightness and "
     "contrast of the picture in it; distance_m; yaw_deg; codes of paint, weather and foliage. A rule names what "
     "tells failures best from the rest; what goes along with it may be the reason.",
@@ -34,7 +34,7 @@ def answer_of(out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed
             if hole.probability is None
             else f"{100 * hole.probability:.0f} [{_percent(hole.low)}, {_percent(hole.high)}]",
             "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
-            f"{100 * hole.share:.1f}",
+            f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
             str(len(hole.failures)),
             str(len(hole.frames)),
         )
@@ -69,6 +69,8 @@ def _flat(hole: Hole) -> dict[str, Any]:
         "high": hole.high,
         "samples": hole.count,
         "outside": hole.outside,
-        "share": hole.share,
+        "size": hole.lost.probability,
+        "size_low": hole.lost.low,
+        "size_high": hole.lost.high,
         "failures": "; ".join(hole.failures),
     }

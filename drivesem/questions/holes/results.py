@@ -8,20 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from drivesem.run.records import dump_record, load_record
+from drivesem.truth.rare import Share
 from drivesem.truth.rules import Flags, Floats
 
-SCHEMA = 1
+SCHEMA = 2
 HOLES = "holes.json"
 """The file that marks a frame as done."""
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """names: of features; values: a row a sample; fails: whether the object was not found in it."""
+    """names: of features; values: a row a sample; margins: logits beyond t*, below 0 where the object was not
+    found."""
 
     names: tuple[str, ...]
     values: tuple[tuple[float, ...], ...]
-    fails: tuple[bool, ...]
+    margins: tuple[float, ...]
 
     def columns(self) -> dict[str, Floats]:
         """Features (n,) by name."""
@@ -31,15 +33,15 @@ class Samples:
     @property
     def failing(self) -> Flags:
         """(n,)."""
-        return np.array(self.fails, np.bool_)
+        return np.array(self.margins, np.float64) < 0
 
 
 @dataclass(frozen=True, slots=True)
 class Around:
     """Around one certain failure. index: of the object; error, grade: of the failure; asked: samples of the whole
     neighbourhood; near: of the part of it around the failure, as a hole may be small; where: the rule of both;
-    fresh: further ones of the whole, inside of the rule, which it is held against; tried: states that were looked
-    at for these.
+    fresh: further ones of the whole, inside of the rule, which it is held against; lost: in how much of the whole
+    the object is lost.
     """
 
     index: int
@@ -50,7 +52,7 @@ class Around:
     near: Samples
     where: dict[str, tuple[float, float]]
     fresh: Samples
-    tried: int
+    lost: Share
 
 
 @dataclass(frozen=True, slots=True)

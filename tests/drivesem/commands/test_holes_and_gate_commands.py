@@ -140,7 +140,8 @@ def test_the_feature_and_the_band_are_named(attacked: Path, looked: Path, blind:
     assert first["probability"] >= 0.8
     assert first["interval"][0] <= first["probability"] <= first["interval"][1]
     assert first["outside"] < 0.05
-    assert 0 < first["share"] < 0.7
+    size = first["size"]
+    assert size["interval"][0] < size["probability"] < size["interval"][1] < 0.7
     assert first["frames"] == ["demo-000"]
     rows = list(csv.DictReader((looked / "holes.csv").read_text().splitlines()))
     assert rows[0]["where"].startswith("lightness")

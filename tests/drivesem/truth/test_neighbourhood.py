@@ -76,3 +76,25 @@ def test_features_are_those_of_the_state(objective: Objective, theta: torch.Tens
     assert sample.features["weather.fog"] == pytest.approx(float(scene.environment.weather[0]))
     assert sample.features["paint.lightness"] == pytest.approx(float(scene.objects.texture_code[CAR, 0]))
     assert isinstance(near.fails(sample), bool)
+
+
+def test_the_margin_says_whether_it_fails(objective: Objective, theta: torch.Tensor) -> None:
+    near = around(objective, theta)
+    samples = [near.sample(number) for number in range(6)]
+    margins = [near.margin(sample) for sample in samples if sample is not None]
+    assert [margin < 0 for margin in margins] == [near.fails(sample) for sample in samples if sample is not None]
+    assert len(set(margins)) == len(margins)
+
+
+def test_a_place_in_a_draw_is_a_sample(objective: Objective, theta: torch.Tensor) -> None:
+    near = around(objective, theta)
+    numbered, placed, moved = (
+        near.sample(2),
+        near.sample_at(near.place(2), 2),
+        near.sample_at(1 - near.place(2), 2),
+    )
+    assert numbered is not None
+    assert placed is not None
+    assert moved is not None
+    assert torch.equal(numbered.exposure.picture, placed.exposure.picture)
+    assert not torch.equal(numbered.exposure.picture, moved.exposure.picture)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from drivesem.questions.holes.merged import merged, of_kitti
 from drivesem.questions.holes.results import Around, Samples
+from drivesem.truth.rare import Share
 
 NAMES = ("height_px", "lightness")
 NOTHING = Samples((), (), ())
 
 
 def samples(height: list[float], fails: list[bool]) -> Samples:
-    return Samples(NAMES, tuple((h, 0.5) for h in height), tuple(fails))
+    return Samples(NAMES, tuple((h, 0.5) for h in height), tuple(-1.0 if lost else 1.0 for lost in fails))
 
 
 def around(low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, label: str = "Car") -> Around:
@@ -21,7 +24,9 @@ def around(low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, l
     heights = np.linspace(0, wide, 100).tolist()
     fresh = samples([(low + high) / 2] * 10, [i < fresh_fails for i in range(10)])
     asked = samples(heights, [low <= h <= high for h in heights])
-    return Around(0, label, "missed", "certain", asked, NOTHING, {"height_px": (low, high)}, fresh, 20)
+    size = (high - low) / wide
+    lost = Share(size, size / 2, size * 2, "samples", 0)
+    return Around(0, label, "missed", "certain", asked, NOTHING, {"height_px": (low, high)}, fresh, lost)
 
 
 def test_bands_that_overlap_are_one_hole() -> None:
@@ -33,8 +38,7 @@ def test_bands_that_overlap_are_one_hole() -> None:
     assert hole.low is not None
     assert hole.high is not None
     assert hole.low < 0.8 < hole.high
-    # Of 200 samples those that lie in both bands fail and count as inside; the rest of either band is outside.
-    assert hole.share == pytest.approx(0.19, abs=0.015)
+    assert (hole.lost.probability, hole.lost.low, hole.lost.high) == pytest.approx((0.2, 0.1, 0.4))
     assert hole.outside is not None
     assert 0 < hole.outside < 0.03
 
@@ -51,11 +55,11 @@ def test_the_largest_first_and_copies_last() -> None:
 
 
 def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
-    one = Around(
-        0, "Car", "missed", "certain", samples([1, 2, 3, 4], [True, True, False, True]), NOTHING, {}, NOTHING, 0
-    )
+    four = samples([1, 2, 3, 4], [True, True, False, True])
+    lost = Share(0.75, 0.3, 0.95, "samples", 0)
+    one = Around(0, "Car", "missed", "certain", four, NOTHING, {}, NOTHING, lost)
     (hole,) = merged({"a": [one]})
-    assert (hole.words, hole.probability, hole.outside, hole.share) == ("anywhere", None, None, 0.75)
+    assert (hole.words, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
 
 
 def test_kitti_knows_some_features() -> None:
@@ -64,3 +68,11 @@ def test_kitti_knows_some_features() -> None:
     near, far = of_kitti({"distance_m": (5.0, 25.0)}), of_kitti({"distance_m": (60.0, 80.0)})
     assert near["distance_m"] > 4 * far["distance_m"] > 0
     assert of_kitti({"yaw_deg": (-180.0, 180.0)})["yaw_deg"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_sizes_by_samples_and_by_simulation_are_told_together() -> None:
+    rare = replace(around(22, 42), lost=Share(0.01, 0.002, 0.05, "subset simulation", 90))
+    (hole,) = merged({"a": [around(20, 40), rare]})
+    size = hole.to_json()["size"]
+    assert [size["probability"], *size["interval"]] == pytest.approx([0.105, 0.051, 0.225])
+    assert (size["by"], hole.lost.asked) == ("samples and subset simulation", 90)
