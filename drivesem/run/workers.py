@@ -39,8 +39,9 @@ def outcomes(
     blame is raised as UnforeseenError, which says where it arose.
     """
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
-    threads = max((os.cpu_count() or 1) // config.processes, 1)
+    # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.
     before = torch.get_num_threads()
+    threads = max(min((os.cpu_count() or 1) // config.processes, before), 1)
     torch.set_num_threads(threads)
     try:
         yield from _outcomes(work, build, jobs, config, threads)

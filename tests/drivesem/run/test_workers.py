@@ -81,6 +81,16 @@ def test_threads_are_shared_among_processes_only_while_they_work(jobs: list[int]
         torch.set_num_threads(before)
 
 
+def test_no_more_threads_are_taken_than_torch_was_left() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)  # as OMP_NUM_THREADS=1 has it
+        for _ in outcomes(square, partial(build, 0), [1, 2], Sharing(workers=1)):
+            assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
 def stumble(job: int) -> int:
     return 12 // job
 
