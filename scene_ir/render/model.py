@@ -170,7 +170,7 @@ RAIN_EXTINCTION_PER_M = 0.006
 """Haze of strong rain at rain code 1."""
 RAIN_AIR = 0.8
 """Brightness of that haze, of the airlight."""
-STREAKS = 0.22
+STREAKS = 0.11
 """Opacity of the streaks of rain 1."""
 FOG_EXTINCTION_PER_M = 0.03
 """Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""

@@ -136,7 +136,7 @@ def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environ
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
         light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)
-        light += 0.25 * rain * _drops(*light.shape[:2])[..., None] * (air - light)
+        light += 0.12 * rain * _drops(*light.shape[:2])[..., None] * (air - light)
     if fog:
         light += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - light)
     return (light ** (1 / _GAMMA)).astype(np.float32)
