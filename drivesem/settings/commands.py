@@ -54,6 +54,10 @@ COUNTED = (*GRADIENT_FREE, "scw", "subsets")
 """Attacks that end after --queries."""
 RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
 """Attacks that may begin elsewhere."""
+Search = Literal[
+    "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "corners", "climb"
+]  # fmt: skip
+"""Attacks that look for failures; the placebo looks for none."""
 
 _RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
 Runs = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
@@ -68,21 +72,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
-    method: Literal[
-        "si-fgsm",
-        "apgd",
-        "fgsm",
-        "sgd",
-        "scw",
-        "subsets",
-        "random",
-        "halton",
-        "sobol",
-        "cma-es",
-        "corners",
-        "climb",
-        "placebo",
-    ] = "si-fgsm"
+    method: Literal[Search, "placebo"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
     (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
