@@ -54,6 +54,10 @@ COUNTED = (*GRADIENT_FREE, "scw", "subsets")
 """Attacks that end after --queries."""
 RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
 """Attacks that may begin elsewhere."""
+Search = Literal[
+    "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "corners", "climb"
+]  # fmt: skip
+"""Attacks that look for failures; the placebo looks for none."""
 
 _RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
 Runs = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
@@ -69,21 +73,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size, with
     --budget street alone."""
-    method: Literal[
-        "si-fgsm",
-        "apgd",
-        "fgsm",
-        "sgd",
-        "scw",
-        "subsets",
-        "random",
-        "halton",
-        "sobol",
-        "cma-es",
-        "corners",
-        "climb",
-        "placebo",
-    ] = "si-fgsm"
+    method: Literal[Search, "placebo"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
     (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
@@ -148,15 +138,16 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
 
     name: Annotated[
         tyro.conf.Positional[
-            Literal["single", "multi", "grades", "samples", "steps", "labels", "transfer", "retrain"]
+            Literal["single", "multi", "grades", "searches", "samples", "steps", "labels", "transfer", "retrain"]
         ],
-        tyro.conf.arg(metavar="{single,multi,grades,samples,steps,labels,transfer,retrain}"),
+        tyro.conf.arg(metavar="{single,multi,grades,searches,samples,steps,labels,transfer,retrain}"),
     ]
     """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
-    gradient, sampling and placebo; samples: success against queries for each algorithm; steps: success against
-    number and size of steps; labels: what labels that stay behind make of an attack; transfer: counterexamples of
-    combination 2 before other detectors; retrain: detectors trained on with counterexamples, before benign frames,
-    known and fresh counterexamples."""
+    gradient, sampling and placebo; searches: which method finds failures that hold, at as many passes each;
+    samples: success against queries for each algorithm; steps: success against number and size of steps; labels:
+    what labels that stay behind make of an attack; transfer: counterexamples of combination 2 before other
+    detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
+    counterexamples."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
@@ -166,6 +157,11 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Steps of the attack; steps goes twice as far."""
     queries: Count = 64
     """Samples: queries of each method without gradient."""
+    passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
+    """Searches: passes of the detector that each method may take for a frame, a gradient counted as 3."""
+    params: str | None = None
+    """Searches: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by default as
+    combination 2."""
     objective_labels: LabelMode = "moved"
     """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
     method: Literal["si-fgsm", "apgd"] = "si-fgsm"

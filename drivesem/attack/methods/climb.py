@@ -10,15 +10,13 @@ pass tries another change of each.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.stats import qmc
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, check_counts
-from drivesem.attack.methods.margin_search import FAR, FINAL_PASSES, LEAST_PASSES, SURE, MarginSearch
+from drivesem.attack.methods.margin_search import FAR, FINAL_PASSES, SURE, MarginSearch, OfMargins
 
 _SCOUTS = 0.3
 """Share of the passes that look around."""
@@ -33,28 +31,14 @@ _KEPT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Climb(Attack):
-    """passes: of the detector in all, a gradient counted as 3. gradient: whether to ask for gradients at all; a
-    detector without one is searched by differences alone. RangeError for fewer than LEAST_PASSES, and for a
-    problem without views.
-    """
+class Climb(OfMargins):
+    """gradient: whether to ask for gradients at all; a detector without one is searched by differences alone."""
 
-    passes: int = 90
     gradient: bool = True
 
-    needs_gradient: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_counts(LEAST_PASSES, passes=self.passes)
-
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        search = MarginSearch.of(problem, theta0, generator, self.passes)
-        if search is None:
-            return Proposals((), (), 0)
+    def _found(self, search: MarginSearch) -> Tensor:
         place = _look_around(search, max(int(_SCOUTS * self.passes), 1))
-        place = _Descent(search, self.gradient and search.views.differentiable).descend(place)
-        theta, active = search.theta(place)
-        return Proposals((theta,), (None,), search.spent, active)
+        return _Descent(search, self.gradient and search.views.differentiable).descend(place)
 
 
 def _look_around(search: MarginSearch, count: int) -> Tensor:

@@ -3,39 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from scipy.linalg import hadamard
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, check_counts
-from drivesem.attack.methods.margin_search import FINAL_PASSES, LEAST_PASSES, MarginSearch
+from drivesem.attack.methods.margin_search import FINAL_PASSES, MarginSearch, OfMargins
 
 
 @dataclass(frozen=True, slots=True)
-class Corners(Attack):
+class Corners(OfMargins):
     """Sees objects at corners of the bounds, each in another draw, and puts the worst corner of each together.
 
     Proposed is the best of these and of the best corner, in draws of their own. What is not feasible is projected,
-    as everything is. passes: of the detector in all. RangeError for fewer than LEAST_PASSES, and for a problem
-    without views.
+    as everything is.
     """
 
-    passes: int = 90
-
-    needs_gradient: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_counts(LEAST_PASSES, passes=self.passes)
-
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        search = MarginSearch.of(problem, theta0, generator, self.passes)
-        if search is None:
-            return Proposals((), (), 0)
-        places = corners(search.at.owner, search.left - FINAL_PASSES, generator).to(search.at.start)
-        theta, active = search.theta(search.best(search.candidates(places)))
-        return Proposals((theta,), (None,), search.spent, active)
+    def _found(self, search: MarginSearch) -> Tensor:
+        places = corners(search.at.owner, search.left - FINAL_PASSES, search.generator).to(search.at.start)
+        return search.best(search.candidates(places))
 
 
 def corners(owner: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -5,12 +5,14 @@ Objects are nearly independent, so that the worst place of each can be put toget
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Problem, Views
+from drivesem.attack.methods.base import Attack, Problem, Proposals, Views, check_counts
 from drivesem.attack.methods.unit_box import UnitBox
 from scene_ir.errors import RangeError
 
@@ -115,3 +117,28 @@ class MarginSearch:
         best = held.argmin(dim=0)
         row = torch.where(self.at.owner < 0, scene, best.to(self.at.owner.device)[self.at.owner.clamp_min(0)])
         return places.gather(0, row[None].to(places.device))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class OfMargins(Attack):
+    """A search on margins, which proposes one place. passes: of the detector in all, a gradient counted as 3.
+    RangeError for fewer than LEAST_PASSES, and for a problem without views.
+    """
+
+    passes: int = 90
+
+    needs_gradient: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_counts(LEAST_PASSES, passes=self.passes)
+
+    @abstractmethod
+    def _found(self, search: MarginSearch) -> Tensor:
+        """The place u (K,) that is proposed; the last comparison (`MarginSearch.best`) takes FINAL_PASSES."""
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        search = MarginSearch.of(problem, theta0, generator, self.passes)
+        if search is None:
+            return Proposals((), (), 0)
+        theta, active = search.theta(self._found(search))
+        return Proposals((theta,), (None,), search.spent, active)

@@ -23,6 +23,8 @@ RANDOM, PLACEBO = "random", "placebo"
 one random edit as large as the attack's own."""
 _LONGER = 4
 """Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
+SEARCHES = ("climb", "corners", "si-fgsm", "apgd", "halton", "cma-es")
+"""Methods of the study `searches`; the placebo is as large as what the first finds."""
 _FAR = 2
 """Steps of the study `steps`, in multiples of --steps: far enough to see where more are of no use."""
 
@@ -63,6 +65,8 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
         return _controlled(multi, out) if study.controls else multi
     if study.name == "grades":
         return _grades(base, out)
+    if study.name == "searches":
+        return _searches(base, study, out)
     if study.name == "samples":
         return _samples(replace(base, combo=DEFAULT_COMBO), study)
     if study.name == "transfer":
@@ -130,6 +134,15 @@ def _grades(base: Attack, out: Path) -> list[Arm]:
         arms += _controlled([_arm(f"{name}, apgd", apgd)], out, (PLACEBO,))
         arms.append(_arm(f"{name}, halton", halton))
     return arms
+
+
+def _searches(base: Attack, study: Study, out: Path) -> list[Arm]:
+    """Methods that look for failures of the same parameters, at as many passes each."""
+    combo = DEFAULT_COMBO if study.params is None else None
+    config = replace(base, combo=combo, params=study.params, passes=study.passes)
+    first, *others = (_arm(method, replace(config, method=method)) for method in SEARCHES)
+    (searching, placebo) = _controlled([first], out, (PLACEBO,))
+    return [searching, *others, replace(placebo, config=replace(placebo.config, passes=None))]
 
 
 def _samples(base: Attack, study: Study) -> list[Arm]:

@@ -23,6 +23,7 @@ from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, Told
 from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
+from drivesem.questions.study.searches import costs_of, depths_of, standing_of
 from drivesem.questions.study.success import against, curve_of
 from drivesem.questions.transfer.asking import DETECTIONS
 from drivesem.questions.transfer.plot import write_heatmap
@@ -33,7 +34,10 @@ from drivesem.settings.text import command_line
 from drivesem.truth.redraw.choose import SecondRenderers
 
 _PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
-_TABLES = ("study.md", "study.csv", "curves.csv", "label_sets.csv")
+_TABLES = (
+    "study.md",
+    *(f"{name}.csv" for name in ("study", "curves", "label_sets", "grades", "searches", "standing")),
+)
 _WRITTEN = (*(_PICTURE, _FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
 _FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
@@ -67,7 +71,7 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
         SecondRenderers(workers[0].config.dataset, workers[0].config.root).check()
     ran = run_arms(arms, workers, out)
-    found = replace(_findings(config, ran), confirmed=_confirmed(config, ran, out))
+    found = replace(_findings(config, ran, out), confirmed=_confirmed(config, ran, out))
     write_largest(out / _LARGEST, largest(ran.runs, out))
     return found.to_json(), report.told(found), partial(write_plot, found=found)
 
@@ -103,12 +107,15 @@ _STUDIES = {"transfer": _transfer, "retrain": _retrain}
 """Studies that are more than attacks side by side."""
 
 
-def _findings(config: Study, ran: Ran) -> Findings:
+def _findings(config: Study, ran: Ran, out: Path) -> Findings:
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     grades = [grades_of(one, draws, config.seed) for one in ran.runs if not one.summary.frames_ungraded]
     found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
     if config.name == "labels":
         return replace(found, label_sets=[label_sets(one) for one in ran.runs])
+    if config.name == "searches":
+        standing = standing_of(ran.runs, depths_of(ran.runs[0], out))
+        return replace(found, costs=costs_of(ran.runs, draws, config.seed), standing=standing)
     if config.name not in ("samples", "steps"):
         return found
     found = replace(found, curves=[curve_of(one, draws, config.seed) for one in ran.runs])

@@ -36,7 +36,7 @@ def write_plot(path: Path, found: Findings) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    sure = found.grades if found.study.name == "grades" else ()
+    sure = found.grades if found.study.name in ("grades", "searches") else ()
     groups = 0 if found.curves else len(sure or found.label_sets or found.rows)
     width = max(_LEAST_WIDTH_IN, _GROUP_IN * groups)
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]

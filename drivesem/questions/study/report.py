@@ -15,6 +15,7 @@ from drivesem.questions.study.grades import ArmGrades
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.rows import FIGURES, MODES, StudyRow, feasible_fraction
 from drivesem.questions.study.running import Ran
+from drivesem.questions.study.searches import SearchCost, Standing
 from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.answer import Answer
@@ -28,8 +29,8 @@ OWN_PROTOCOL = (
     "Ours, own protocol: not comparable with the paper's figures, which stand beside its own protocol only "
     "(--config configs/paper.yaml)."
 )
-_ARM, _MEASURE = "arm", "figure"
-_WORDS = (_ARM, _MEASURE)
+_ARM, _MEASURE, _CLASS = "arm", "figure", "class"
+_WORDS = (_ARM, _MEASURE, _CLASS)
 _MARKS = (1, 2, 5, 10, 20, 64)
 """Queries at which a curve is told in a table."""
 
@@ -53,7 +54,8 @@ class Told:
 class Findings:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
     within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
-    second renderers' pictures say, by arm. grades: how sure failures are, of every arm, controls included.
+    second renderers' pictures say, by arm. grades: how sure failures are, of every arm, controls included. costs,
+    standing: of the study `searches`.
     """
 
     study: Study
@@ -66,6 +68,8 @@ class Findings:
     label_sets: Sequence[LabelSets] = ()
     confirmed: Mapping[str, Confirmation] = field(default_factory=dict)
     grades: Sequence[ArmGrades] = ()
+    costs: Sequence[SearchCost] = ()
+    standing: Sequence[Standing] = ()
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -86,6 +90,9 @@ class Findings:
             data["label_sets"] = [one.flat() for one in self.label_sets]
         if self.grades:
             data["grades"] = [one.flat() for one in self.grades]
+        if self.costs:
+            data["searches"] = [one.flat() for one in self.costs]
+            data["standing"] = [one.flat() for one in self.standing]
         return data
 
     def flat_rows(self) -> list[dict[str, Any]]:
@@ -106,8 +113,10 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
         tables.append(_success(found))
     if found.label_sets:
         tables += [_label_sets(found.label_sets), _counterexamples(found.label_sets)]
-    if found.grades and (whole or found.study.name == "grades"):
+    if found.grades and (whole or found.study.name in ("grades", "searches")):
         tables += [_grades(found.grades) if whole else _grades_short(found.grades), _kinds(found.grades)]
+    if found.costs:
+        tables += [_costs(found.costs), _standing(found.standing)]
     tables.append(_precision(found.rows))
     if any(row.controls for row in found.rows):
         tables.append(_controls(found.rows))
@@ -204,6 +213,41 @@ def _kinds(grades: Sequence[ArmGrades]) -> Sheet:
 def _by_grade(counts: Sequence[int]) -> str:
     """`7 / 3 / 2`, or a dash where there is none."""
     return " / ".join(map(str, counts)) if any(counts) else "-"
+
+
+def _costs(costs: Sequence[SearchCost]) -> Sheet:
+    lines = []
+    for one in costs:
+        ahead = (
+            "-"
+            if one.ahead is None
+            else bounded(Interval(one.name, one.ahead.difference, one.ahead.low, one.ahead.high))
+        )
+        lines.append((one.name, f"{one.seconds:.1f}", *map(_number, (one.per_100_passes, one.per_minute)), ahead))
+    columns = (
+        _ARM,
+        "s a frame",
+        "certain for 100 passes",
+        "certain a minute",
+        f"{costs[0].name} less this, % of objects",
+    )
+    return Sheet("What certain failures cost", columns, tuple(lines))
+
+
+def _number(one: Interval) -> str:
+    """`0.52 [0.31, 0.70]`."""
+    if one.value is None or one.low is None or one.high is None:
+        return "-" if one.value is None else f"{one.value:.2f}"
+    return f"{one.value:.2f} [{one.low:.2f}, {one.high:.2f}]"
+
+
+def _standing(classes: Sequence[Standing]) -> Sheet:
+    lines = [(one.name, str(one.objects), str(one.lost), bounded(one.standing)) for one in classes]
+    return Sheet(
+        "Objects that no method brings to fall for certain",
+        (_CLASS, "found", "lost to any", "standing, %"),
+        tuple(lines),
+    )
 
 
 def _further(rows: Sequence[StudyRow]) -> Sheet:
@@ -318,6 +362,12 @@ def notes(found: Findings) -> list[str]:
             "Kinds leave out what a person would not call a failure: found as far as it shows, on a real object, "
             "suspect before."
         )
+    if found.costs:
+        told.append(
+            "Passes: of the detector, a gradient counted as 3; certificates are not counted. Seconds: all that a "
+            "frame takes on this machine, certificates included. Found: objects that the detector finds in the "
+            "photograph; in brackets Wilson's 95 %."
+        )
     unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
     if unknown:
         told.append(f"Grades unknown, of an older version: {', '.join(unknown)}.")
@@ -338,6 +388,9 @@ def told(found: Findings) -> Told:
         tables["label_sets"] = [one.flat() for one in found.label_sets]
     if found.grades:
         tables["grades"] = [one.flat() for one in found.grades]
+    if found.costs:
+        tables["searches"] = [one.flat() for one in found.costs]
+        tables["standing"] = [one.flat() for one in found.standing]
     return Told(found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS)
 
 

@@ -168,3 +168,16 @@ def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture
 def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
     line = refused("study", *words)
     assert any(part in line for part in message.split("|"))
+
+
+@pytest.mark.slow
+def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first three arms: a search, its baseline and a gradient, within the passes that were asked for."""
+    words = ["study", "searches", "--params", "color", "--passes", "24", "--limit", "1", "--workers", "1"]
+    found = study([*words, "--bootstrap", "5", "--json", "--out", str(tmp_path / "a")], capsys)
+    assert [row["name"] for row in found["searches"]] == ["climb", "corners", "si-fgsm"]
+    assert all(row["passes"] <= 24 for row in found["grades"])
+    assert found["standing"][0]["objects"] == sum(
+        row["objects"] for row in found["standing"] if row["name"].startswith("distance")
+    )
+    assert (tmp_path / "a" / "standing.csv").is_file()

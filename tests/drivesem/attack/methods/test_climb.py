@@ -11,6 +11,7 @@ from torch import Tensor
 from drivesem.attack.methods.base import Group
 from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.margin_search import LEAST_PASSES
+from drivesem.settings import commands
 from scene_ir.errors import RangeError
 from tests.drivesem.attack.methods.street import CARS, DIM, Street
 
@@ -121,6 +122,11 @@ def test_modes_are_what_is_searched() -> None:
     assert bool(bent.any())
     torch.testing.assert_close(bent[:, 0], bent[:, 1])
     torch.testing.assert_close(bent[:, 2], -bent[:, 3])
+
+
+def test_the_least_of_passes_is_the_command_lines() -> None:
+    """Written twice: options load no torch, and searches know no options."""
+    assert commands.LEAST_PASSES == LEAST_PASSES
 
 
 def test_what_cannot_be() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, arms_of
+from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, SEARCHES, arms_of
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.protocol import PROTOCOL
 from drivesem.settings.commands import Study
@@ -85,7 +85,16 @@ def test_grades_compare_methods_at_the_same_cost() -> None:
     assert all(arm.config.confirm for arm in arms.values())
 
 
-@pytest.mark.parametrize("name", ["samples", "steps", "grades"])
+def test_searches_take_as_many_passes_each() -> None:
+    arms = arms_of(Study(name="searches", passes=40, params="color"), OUT)
+    assert [arm.name for arm in arms] == [*SEARCHES, "climb placebo"]
+    assert [arm.config.method for arm in arms] == [*SEARCHES, "placebo"]
+    assert {arm.config.passes for arm in arms[:-1]} == {40}
+    assert {(arm.config.params, arm.config.combo) for arm in arms} == {("color", None)}
+    assert {arm.config.combo for arm in arms_of(Study(name="searches"), OUT)} == {2}
+
+
+@pytest.mark.parametrize("name", ["samples", "steps", "grades", "searches"])
 def test_these_name_their_own_methods(name: str) -> None:
     assert arms_of(Study(name=name), OUT) == arms_of(Study(name=name, method="apgd"), OUT)
 

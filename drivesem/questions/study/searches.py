@@ -1,0 +1,153 @@
+"""Who finds failures that hold: by passes of the detector and by seconds, and what nobody can bring to fall."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from detectors.types import CLASSES
+from drivesem.evaluation import failures
+from drivesem.evaluation.instances import Floats
+from drivesem.evaluation.resampling import Difference, Interval, differences, intervals, rate, wilson
+from drivesem.questions.study.running import ARMS, ArmRun
+from drivesem.run.folder import FRAMES
+from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.results import FrameResult
+from drivesem.run.tally import at_least, certain_losses
+from drivesem.truth.grades import Grade
+from scene_ir.io import load_scene
+
+_HEIGHTS_PX = (25.0, 40.0, 80.0)
+"""Edges of classes by size: the first two are those of KITTI's difficulties."""
+_DEPTHS_M = (15.0, 30.0)
+"""Edges of classes by distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchCost:
+    """What an arm's certain failures cost. seconds: all that a frame took on average, certificates included;
+    per_100_passes, per_minute: certain failures; ahead: certain failures an object, the first arm's less this
+    one's, None for the first.
+    """
+
+    name: str
+    seconds: float
+    per_100_passes: Interval
+    per_minute: Interval
+    ahead: Difference | None
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON."""
+        found: dict[str, Any] = {"name": self.name, "seconds": self.seconds}
+        for key, one in (("per_100_passes", self.per_100_passes), ("per_minute", self.per_minute)):
+            found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
+        if self.ahead is not None:
+            found |= {"ahead": self.ahead.difference, "ahead_low": self.ahead.low, "ahead_high": self.ahead.high}
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Objects of a class by size or distance, of those that the detector finds as photographed. lost: for certain,
+    to any arm; standing: the share that none brought to fall, with Wilson's interval.
+    """
+
+    name: str
+    objects: int
+    lost: int
+
+    @property
+    def standing(self) -> Interval:
+        """The share that withstood; None where there are no objects."""
+        if not self.objects:
+            return Interval(self.name, None, None, None)
+        kept = self.objects - self.lost
+        return Interval(self.name, kept / self.objects, *wilson(kept, self.objects))
+
+    def flat(self) -> dict[str, Any]:
+        """Numbers by name, for CSV and JSON."""
+        one = self.standing
+        return {
+            "name": self.name,
+            "objects": self.objects,
+            "lost": self.lost,
+            "standing": one.value,
+            "low": one.low,
+            "high": one.high,
+        }
+
+
+def costs_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[SearchCost]:
+    """Of arms on the same frames, the first of which the others are compared with."""
+    first = _certain(runs[0].results)
+    objects = np.array([len(_objects(runs[0], result)) for result in runs[0].results], np.float64)
+    found = []
+    for run in runs:
+        certain, seconds = _certain(run.results), np.array([result.seconds for result in run.results])
+        passes = np.array([result.passes or 0 for result in run.results], np.float64)
+        figures = [rate("passes", certain, passes / 100), rate("minute", certain, seconds / 60)]
+        by_pass, by_minute = intervals(figures, len(certain), draws, np.random.default_rng(seed))
+        pair = [rate("certain", certain, objects)], [rate("certain", first, objects)]
+        (ahead,) = differences(*pair, len(certain), draws, np.random.default_rng(seed))
+        mean = float(seconds.mean()) if len(seconds) else 0.0
+        found.append(SearchCost(run.arm.name, mean, by_pass, by_minute, None if run is runs[0] else ahead))
+    return found
+
+
+def depths_of(run: ArmRun, out: Path) -> dict[str, list[float]]:
+    """Distances, m, of the objects of each frame by name, as photographed. out: the study's folder."""
+    frames = out / ARMS / run.arm.folder / FRAMES
+    names = [result.identifier for result in run.results]
+    scenes = ((name, load_scene(frames / name / "scene").as_photographed()) for name in names)
+    return {name: scene.objects.translation[:, 2].tolist() for name, scene in scenes}
+
+
+def standing_of(runs: Sequence[ArmRun], depths: Mapping[str, Sequence[float]]) -> list[Standing]:
+    """By size and by distance, of all arms that are no controls. depths: as of `depths_of`."""
+    searching = [run for run in runs if run.arm.control is None]
+    first = searching[0]
+    told: list[tuple[float, float, bool]] = []
+    for place, result in enumerate(first.results):
+        lost = {failure.index for run in searching for failure in certain_losses(run.results[place])}
+        depth = depths[result.identifier]
+        told += [(height, depth[i], i in lost) for i, height in _objects(first, result).items()]
+    by_height = _classes("height", "px", _HEIGHTS_PX, [(height, lost) for height, _, lost in told])
+    by_depth = _classes("distance", "m", _DEPTHS_M, [(depth, lost) for _, depth, lost in told])
+    return [_standing("all", [lost for _, _, lost in told]), *by_height, *by_depth]
+
+
+def _certain(results: Sequence[FrameResult]) -> Floats:
+    certain = at_least(Grade.CERTAIN)
+    return np.array([sum(map(certain, result.failures)) for result in results], np.float64)
+
+
+def _objects(run: ArmRun, result: FrameResult) -> Mapping[int, float]:
+    """Heights, px, of the judged objects by index that the detector finds in the photograph."""
+    targets = run.judged.targets(as_targets(result.targets_benign, CLASSES))
+    seen = as_detections(result.detections_benign, run.judged.names)
+    found = failures.judge(targets, seen, run.summary.t_star).found.tolist()
+    return {
+        box.index: box.xyxy[3] - box.xyxy[1]
+        for box, hit in zip(result.targets_benign, found, strict=False)  # further rows stand at the end
+        if hit and box.index is not None
+    }
+
+
+def _classes(name: str, unit: str, edges: Sequence[float], of: Sequence[tuple[float, bool]]) -> list[Standing]:
+    """Objects (value, lost) between edges, and beyond them."""
+    bounds = (-np.inf, *edges, np.inf)
+    found = []
+    for low, high in pairwise(bounds):
+        between = f"{low:g} to {high:g}" if low > -np.inf and high < np.inf else ""
+        words = between or (f"below {high:g}" if high < np.inf else f"from {low:g}")
+        found.append(_standing(f"{name} {words} {unit}", [lost for value, lost in of if low <= value < high]))
+    return found
+
+
+def _standing(name: str, lost: Sequence[bool]) -> Standing:
+    return Standing(name, len(lost), sum(lost))
