@@ -541,6 +541,11 @@ class Bench(Regions, Scenes, FrameCommand):
     """Planted: passes of the detector that each attack may take for a fault, a gradient counted as 3."""
     params: str = "color,weather,foliage,translate,rotate,mesh"
     """Planted: what attacks may move, with commas."""
+    faults: Count | None = None
+    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    naming: Flag = False
+    """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
+    of the detector without a fault."""
     limit: Count | None = None
     """Planted: the first N frames; by default 3."""
 
