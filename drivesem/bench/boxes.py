@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tarfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -28,17 +28,13 @@ from scene_ir.derender.derender import VEHICLES, DerenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.templates import template
-from scene_ir.render import blend, surfaces
-from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.sources import analytic_shadows, solve_sources
+from scene_ir.render.sources import from_own_picture
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
     TEXTURE_DIM,
     WEATHER_DIM,
     Camera,
-    Crop,
     Environment,
     Labels,
     Objects,
@@ -162,22 +158,7 @@ def frames_of(path: Path, count: int) -> list[Labelled]:
 
 def scene_of(frame: Labelled, seed: int) -> SceneIR:
     """The frame's vehicles before noise, photographed and taken apart."""
-    bare = _bare(frame, seed)
-    compositor = Compositor(bare)
-    shot = compositor.render(bare)
-    objects = bare.objects
-    order = blend.paint_order(
-        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(bare.camera.matrix)
-    )
-    clear, mattes = torch.ones_like(bare.depth), list(shot.opacity)
-    for i in reversed(order):
-        crop = shot.opacity[i]
-        rows, columns = crop.values.shape[1:]
-        window = clear[crop.y0 : crop.y0 + rows, crop.x0 : crop.x0 + columns]
-        mattes[i] = Crop(crop.values * window, crop.x0, crop.y0)
-        window *= 1 - crop.values[0]
-    taken = replace(bare, photograph=(shot.image * 255).round() / 255)
-    return solve_sources(taken, mattes, analytic_shadows(bare, RenderSettings()))
+    return from_own_picture(_bare(frame, seed))
 
 
 def measure(

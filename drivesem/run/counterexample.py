@@ -29,7 +29,7 @@ from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.tally import graded
 from drivesem.scenes.scene import Scene, png
-from drivesem.settings.commands import Attack
+from drivesem.settings.commands import Attack, Search
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir.io import to_uint8
@@ -41,20 +41,7 @@ class AttackOptions(TypedDict, total=False):
 
     combo: int
     params: str
-    method: Literal[
-        "si-fgsm",
-        "apgd",
-        "fgsm",
-        "sgd",
-        "scw",
-        "subsets",
-        "random",
-        "halton",
-        "sobol",
-        "cma-es",
-        "corners",
-        "climb",
-    ]
+    method: Search
     steps: int
     queries: int
     passes: int

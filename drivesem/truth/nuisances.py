@@ -1,7 +1,7 @@
 """What a camera does between two frames, and what nobody could set up more exactly: draws of it.
 
 A draw is a set of numbers, made from a name and a number alone, so that it can be made again: `Nuisances.draw`. It
-is applied to a picture (`Draw.picture`, differentiable by kornia), to boxes in it (`Draw.boxes`) and to the scene
+is applied to a picture (`Draw.picture`, differentiable), to boxes in it (`Draw.boxes`) and to the scene
 before it is rendered (`Draw.scene`).
 """
 
@@ -10,18 +10,28 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from typing import Any
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from drivesem.attack.space import ground_axes
 from drivesem.settings.errors import UsageError
+from drivesem.truth.banded import Matrix, Separable
+from drivesem.truth.jpeg import Codec
 from scene_ir.types import LATTICE, SceneIR
 
 _GENTLEST_JPEG = 95
+_DARKEST = 1e-6
+"""Of a picture's values before gamma: it has a slope there."""
+_TAPS = 2
+"""Pixels either way that a blur takes."""
+_NOTHING = 1e-9
+"""Weight beside the largest that a picture does not show; products with subnormal ones take ten times as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +108,7 @@ class Nuisances:
             blur_px=self.blur_px * abs(camera[5]),
             jpeg=round(quality) if self.jpeg else None,
             noise=self.noise / 255,
-            noise_seed=seed + 1,
+            noise_field=NoiseField(seed + 1),
             position_m=self.position_m * position,
             angle=math.radians(self.angle_deg) * angle,
             size=self.size * size,
@@ -106,6 +116,22 @@ class Nuisances:
             weather=self.code * weather,
             foliage=self.code * foliage,
         )
+
+
+class NoiseField:
+    """Standard normal numbers of a seed, made when they are first asked for and kept: a search goes round in a few
+    draws, and random numbers take longer than all else that is done to a picture.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._kept: Tensor | None = None
+
+    def of(self, image: Tensor) -> Tensor:
+        """As many as an image has, of its dtype."""
+        if self._kept is None or self._kept.shape != image.shape:
+            self._kept = torch.randn(image.shape, generator=torch.Generator().manual_seed(self._seed))
+        return self._kept.to(image)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +149,7 @@ class Draw:
     blur_px: float
     jpeg: int | None
     noise: float
-    noise_seed: int
+    noise_field: NoiseField
     position_m: Tensor
     angle: Tensor
     size: Tensor
@@ -151,29 +177,18 @@ class Draw:
         """What the camera makes of a picture (3, H, W) in [0, 1], on the 8-bit grid but where it carries a
         gradient.
 
-        Differentiable: JPEG is kornia's then, libjpeg's otherwise. At the border the last pixels are repeated.
+        Differentiable: JPEG is `jpeg.Codec`'s then, libjpeg's otherwise. Beyond the border, the last pixels go on.
         """
-        here = image[None]
-        if self.shift_px != (0, 0) or self.zoom != 1:
-            matrix = self._matrix(here)
-            here = kornia.geometry.warp_affine(here, matrix, self.hw, padding_mode="border", align_corners=True)
-        if self.blur_px > 0:
-            here = kornia.filters.gaussian_blur2d(
-                here, (5, 5), (self.blur_px, self.blur_px), border_type="replicate"
-            )
-        if self.gain != 1 or self.gamma != 1:
-            here = self.gain * here.clamp(1e-6, 1) ** self.gamma
-        if self.noise:
-            generator = torch.Generator().manual_seed(self.noise_seed)
-            here = here + self.noise * torch.randn(here.shape, generator=generator).to(here)
-        here = here.clamp(0, 1)
-        if self.jpeg is not None and image.requires_grad:
-            quality = here.new_tensor([float(self.jpeg)])
-            here = kornia.enhance.jpeg_codec_differentiable(here, quality)
+        here = image
+        if self.shift_px != (0, 0) or self.zoom != 1 or self.blur_px > 0:
+            here = _lens(self.hw, self.shift_px, self.zoom, self.blur_px, image.dtype, image.device)(here)
+        noise = self.noise_field.of(image) if self.noise else None
+        here = _Developed.apply(here, self.gain, self.gamma, self.noise, noise)
+        assert isinstance(here, Tensor)
         if image.requires_grad:
-            return here[0].clamp(0, 1)
-        levels = (here[0] * 255).round()
-        return (levels if self.jpeg is None else _jpeg(levels, self.jpeg)) / 255
+            return here if self.jpeg is None else Codec.of(self.hw, self.jpeg, image)(here)
+        levels = (255 * here).round_()
+        return (levels if self.jpeg is None else _jpeg(levels, self.jpeg)).div_(255)
 
     def boxes(self, boxes_xyxy: Tensor) -> Tensor:
         """Where boxes (M, 4) px of the picture are in what the camera makes of it, cut at its border."""
@@ -193,12 +208,69 @@ def _nudged(code: Tensor, change: Tensor, low: float) -> Tensor:
     return torch.where(code == 0, code, (code + change.to(code)).clamp(low, 1))
 
 
+class _Developed(torch.autograd.Function):
+    """Gain and gamma of an image, noise of that standard deviation from a field, and what is left in [0, 1]."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, gain: float, gamma: float, noise: float, field: Tensor | None) -> Tensor:
+        result, slope = image.clone(), None
+        if gain != 1 or gamma != 1:
+            result.clamp_(_DARKEST, 1).log_().mul_(gamma).exp_().mul_(gain)
+            if ctx.needs_input_grad[0]:
+                within = (image >= _DARKEST) & (image <= 1)
+                slope = (gamma * result).div_(image.clamp_min(_DARKEST)).mul_(within)
+        if field is not None:
+            result.add_(field, alpha=noise)
+        if ctx.needs_input_grad[0]:
+            within = ((result >= 0) & (result <= 1)).to(image)
+            ctx.save_for_backward(within if slope is None else slope.mul_(within))
+        return result.clamp_(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor, None, None, None, None]:
+        (slope,) = ctx.saved_tensors
+        return gradients[0] * slope, None, None, None, None
+
+
+@lru_cache(maxsize=32)
+def _lens(
+    hw: tuple[int, int],
+    shift_px: tuple[float, float],
+    zoom: float,
+    blur_px: float,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Separable:
+    """The frame moved and enlarged about its centre, by linear interpolation, then blurred."""
+    rows, columns = (_seen(size, shift, zoom, blur_px) for size, shift in zip(hw, reversed(shift_px), strict=True))
+    return Separable.of(rows, columns, torch.empty(0, dtype=dtype, device=device))
+
+
+def _seen(size: int, shift_px: float, zoom: float, blur_px: float) -> Matrix:
+    """The same along one side: what each pixel (size,) is made of."""
+    middle, pixels = (size - 1) / 2, np.arange(size)
+    place = np.clip((pixels - middle - shift_px) / zoom + middle, 0, size - 1)
+    first = np.minimum(np.floor(place).astype(np.int64), size - 2)
+    taps = np.arange(-_TAPS, _TAPS + 1)
+    weights = np.exp(-0.5 * (taps / blur_px) ** 2) if blur_px > 0 else (taps == 0).astype(np.float64)
+    weights[weights < _NOTHING] = 0
+    matrix = np.zeros((size, size))
+    for tap, weight in zip(taps, weights / weights.sum(), strict=True):
+        source = np.clip(pixels + tap, 0, size - 1)
+        matrix[pixels, first[source]] += weight * (first[source] + 1 - place[source])
+        matrix[pixels, first[source] + 1] += weight * (place[source] - first[source])
+    return matrix
+
+
 def _jpeg(levels: Tensor, quality: int) -> Tensor:
     """Levels (3, H, W) in [0, 255] through libjpeg."""
-    bgr = np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).to(torch.uint8).cpu().numpy())
-    packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    decoded = np.ascontiguousarray(np.flip(cv2.imdecode(packed, cv2.IMREAD_COLOR), axis=2))  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return torch.from_numpy(decoded).permute(2, 0, 1).to(levels)
+    red, green, blue = levels.to(torch.uint8).cpu().numpy()
+    packed = cv2.imencode(".jpg", cv2.merge((blue, green, red)), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    decoded = cv2.split(cv2.imdecode(packed, cv2.IMREAD_COLOR))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return torch.from_numpy(np.stack(decoded[::-1])).to(levels)
 
 
 _AT_REST = torch.cartesian_prod(*(torch.linspace(0, 1, n) for n in LATTICE)) - torch.tensor([0.5, 1.0, 0.5])

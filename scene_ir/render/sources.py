@@ -78,6 +78,26 @@ def solve_sources(
         return _solve(scene, list(alphas), list(shadows), margins, settings)
 
 
+def from_own_picture(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
+    """`bare` after a photograph of it, of 8 bit and drawn by the compositor itself, was taken apart. bare: its
+    objects stand before its background, and have no sources. backend: see `RenderSettings`.
+    """
+    settings, objects = RenderSettings(backend), bare.objects
+    with torch.no_grad():
+        shot = Compositor(bare, settings).render(bare)
+    order = blend.paint_order(
+        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(bare.camera.matrix)
+    )
+    clear, mattes = torch.ones_like(bare.depth), list(shot.opacity)
+    for i in reversed(order):  # the nearest hides the others
+        opacity = shot.opacity[i]
+        window = _window(clear[None], opacity)
+        mattes[i] = replace(opacity, values=opacity.values * window)
+        window *= 1 - opacity.values
+    taken = replace(bare, photograph=(shot.image * _LEVELS).round() / _LEVELS)
+    return solve_sources(taken, mattes, analytic_shadows(bare, settings), SolveSettings(backend=backend))
+
+
 def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> tuple[Crop, ...]:
     """For each object a Crop (3, h, w): the factor by which its box, in the scene's sun, darkens the ground."""
     bare = replace(scene, objects=replace(scene.objects, source=()))

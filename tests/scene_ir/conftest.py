@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
 
-from scene_ir.raster.verbs import Backend
-from scene_ir.render import blend, surfaces
-from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
-from scene_ir.types import Camera, Crop, Environment, Mesh, Objects, Part, SceneIR
+from scene_ir.render.sources import from_own_picture
+from scene_ir.types import Camera, Environment, Mesh, Objects, Part, SceneIR
 
 HEIGHT, WIDTH, FOCAL, EYE_M = 80, 144, 110.0, 1.65
 
@@ -80,27 +75,6 @@ def bare_scene(dtype: torch.dtype = torch.float64) -> SceneIR:
     return SceneIR(camera, meshes, objects, environment, picture, picture, depth, torch.zeros(0, 4, dtype=dtype))
 
 
-def photographed_scene(scene: SceneIR, backend: Backend) -> SceneIR:
-    """`scene` after a photograph of it, 8 bit, was taken and taken apart."""
-    settings = RenderSettings(backend=backend)
-    shot = Compositor(scene, settings).render(scene)
-    objects = scene.objects
-    order = blend.paint_order(
-        objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)
-    )
-    clear = torch.ones_like(scene.depth)
-    mattes = list(shot.opacity)
-    for i in reversed(order):
-        crop = shot.opacity[i]
-        h, w = crop.values.shape[1:]
-        window = clear[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
-        mattes[i] = Crop(crop.values * window, crop.x0, crop.y0)
-        window *= 1 - crop.values[0]
-    taken = replace(scene, photograph=(shot.image * 255).round() / 255)
-    shadows = analytic_shadows(scene, settings)
-    return solve_sources(taken, mattes, shadows, SolveSettings(backend=backend))
-
-
 @pytest.fixture(scope="session")
 def street() -> Callable[[torch.dtype], SceneIR]:
     """The small street, not photographed, in a dtype."""
@@ -110,4 +84,4 @@ def street() -> Callable[[torch.dtype], SceneIR]:
 @pytest.fixture(scope="session")
 def photographed() -> SceneIR:
     """The small street photographed, float64, for the reference backend."""
-    return photographed_scene(bare_scene(), "reference")
+    return from_own_picture(bare_scene(), "reference")

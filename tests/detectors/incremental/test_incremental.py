@@ -21,6 +21,7 @@ from detectors.incremental.reference import AGREES, LIMIT_MB, Reference
 from detectors.incremental.regions import Rect, Region
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
+from detectors.types import Detections, Targets
 from detectors.yolov3.yolov3 import YoloV3
 
 FIELDS = ("boxes_xyxy", "deltas", "class_logits", "confidence_logits")
@@ -314,11 +315,11 @@ class Counting(Detector):
     def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
         return self.inner.trunk(image_hw)
 
-    def loss(self, raw: RawPredictions, targets: Sequence[object]) -> dict[str, Tensor]:
-        raise NotImplementedError
+    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        return self.inner.loss(raw, targets)
 
-    def decode(self, raw: RawPredictions) -> list[object]:
-        raise NotImplementedError
+    def decode(self, raw: RawPredictions) -> list[Detections]:
+        return self.inner.decode(raw)
 
 
 def counting() -> Counting:

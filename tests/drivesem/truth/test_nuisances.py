@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import kornia
 import pytest
 import torch
 from torch import Tensor
@@ -97,6 +98,47 @@ def test_the_differentiable_picture_is_nearly_the_other(scene: SceneIR) -> None:
     assert smooth.requires_grad
     # JPEG codecs differ in rounding and in how they thin colour out.
     assert float((exact - smooth.detach()).abs().mean()) < 2.5 / 255
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_the_picture_is_that_of_kornias_operations(scene: SceneIR, number: int) -> None:
+    draw = dataclasses.replace(Nuisances().draw("kornia", number, scene), jpeg=None)
+    image = (0.01 + 0.98 * scene.photograph.double()).requires_grad_(True)
+    move = [
+        (side - 1) / 2 * (1 - draw.zoom) + shift for side, shift in zip(draw.hw[::-1], draw.shift_px, strict=True)
+    ]
+    matrix = image.new_tensor([[[draw.zoom, 0, move[0]], [0, draw.zoom, move[1]]]])
+    warped = kornia.geometry.warp_affine(image[None], matrix, draw.hw, padding_mode="border", align_corners=True)
+    blurred = kornia.filters.gaussian_blur2d(
+        warped, (5, 5), (draw.blur_px, draw.blur_px), border_type="replicate"
+    )[0]
+    noise = draw.noise * draw.noise_field.of(image)
+    expected = (draw.gain * blurred.clamp(1e-6, 1) ** draw.gamma + noise).clamp(0, 1)
+    picture = draw.picture(image)
+    torch.testing.assert_close(picture, expected, atol=1e-7, rtol=0)
+    cotangent = torch.randn(image.shape, generator=torch.Generator().manual_seed(number)).to(image)
+    (gradient,) = torch.autograd.grad(expected, image, cotangent)
+    (found,) = torch.autograd.grad(picture, image, cotangent)
+    torch.testing.assert_close(found, gradient, atol=1e-6, rtol=0)
+    # Without a gradient, the same on the 8-bit grid.
+    levels = draw.picture(image.detach()) * 255
+    torch.testing.assert_close(levels, expected.detach() * 255, atol=0.5 + 1e-4, rtol=0)
+
+
+def test_noise_is_kept_with_its_draw(scene: SceneIR) -> None:
+    draw = Nuisances().draw("kept", 0, scene)
+    field = draw.noise_field.of(scene.photograph)
+    assert draw.noise_field.of(scene.photograph) is field
+    assert torch.equal(Nuisances().draw("kept", 0, scene).noise_field.of(scene.photograph), field)
+    assert draw.noise_field.of(scene.photograph[:, :8]).shape == (3, 8, field.shape[2])
+
+
+def test_hardly_any_blur_has_no_subnormal_weights(scene: SceneIR) -> None:
+    draw = dataclasses.replace(OFF.draw("test", 0, scene), blur_px=0.15, shift_px=(0.5, 0.5))
+    image = torch.zeros_like(scene.photograph)
+    image[:, 100, 100] = 1
+    seen = dataclasses.replace(draw, noise=0.0).picture(image.requires_grad_(True)).detach()
+    assert float(seen[seen > 0].min()) > 1e-9
 
 
 def test_gradient_against_differences(scene: SceneIR) -> None:

@@ -53,6 +53,9 @@ def test_a_number_is_one_draw(views: DrawnViews, objective: Objective) -> None:
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert views.passes == before + 3
+    # What was kept of a draw changes nothing.
+    anew = DrawnViews.of(objective, Nuisances(), "search:demo-000:0")
+    assert torch.equal(anew.margins(objective.space.theta0, 3), one)
 
 
 def test_gradients_against_differences(objective: Objective) -> None:
