@@ -27,8 +27,8 @@ def told_of(attacked: AttackedScene, index: int, samples: int, seed: int) -> tup
 
 
 def agrees(where: Where, fault: PlantedFault, bands: Sequence[Band]) -> tuple[bool, bool]:
-    """Whether a rule names a fault: wholly, in part. bands: where it hides cars, by features of their labels; without
-    any nothing is right.
+    """Whether a rule names a fault: wholly, in part. bands: where it hides cars, by features of their labels;
+    without any nothing is right.
     """
     true = {band.feature: (band.low, band.high) for band in bands}
     right = [name for name in where if name in true and overlap({name: where[name]}, {name: true[name]}) >= ENOUGH]
