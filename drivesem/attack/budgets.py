@@ -19,7 +19,15 @@ from typing import Any
 
 from drivesem.attack.feasibility_check import Reach
 from drivesem.attack.space import Budget, Parameter
-from drivesem.settings.edits import ANGLE_UNITS, LENGTH_UNITS, finite_number, load_yaml, mapping_of, measure
+from drivesem.settings.edits import (
+    ANGLE_UNITS,
+    LENGTH_UNITS,
+    SHARE_UNITS,
+    finite_number,
+    load_yaml,
+    mapping_of,
+    measure,
+)
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 
@@ -29,11 +37,12 @@ PRESETS: Mapping[str, Budget] = {
     # What a parked car's place may well differ by, and no driver would notice.
     PARKING: Budget(translate_m=0.5, rotate=math.radians(5)),
     # Where pictures of moved cars still hold: docs/attacks.md has the measurement.
-    STREET: Budget(translate=1.5, translate_m=4.0, across_m=1.0, of_distance=0.3, partly=0.25),
+    STREET: Budget(translate=1.5, translate_m=4.0, across_m=1.0, of_distance=0.3, partly=0.25, size=0.1),
 }
 _UNITS: Mapping[Parameter, Mapping[str, float]] = {
     Parameter.TRANSLATE: LENGTH_UNITS,
     Parameter.ROTATE: ANGLE_UNITS,
+    Parameter.SIZE: SHARE_UNITS,
 }
 
 
@@ -102,6 +111,9 @@ def _budget(where: str, content: Any, preset: Budget = PRESETS[PAPER]) -> Budget
         else:
             limit, key = finite_number(f"{where}: {name}", value), name
         widest = getattr(preset, key)
+        if widest == 0:
+            held = f"{STREET},{name}={value}, since only {STREET} lets it change"
+            raise FormatError(f"{where}: {name}", held, value)
         if not 0 < limit <= widest:
             most = "" if widest == math.inf else f" of at most {widest:g}"
             raise FormatError(f"{where}: {name}", f"a positive number{most}", value)

@@ -82,7 +82,7 @@ class Reach:
     """How far a change may go at most: by default as far as the paper's budget. translate: own lengths, along and
     across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
     partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
-    boxes, of a lattice offset; codes: their largest values.
+    boxes, of a lattice offset; size: share of its own; codes: their largest values.
     """
 
     translate: float = 0.25
@@ -95,6 +95,7 @@ class Reach:
     across_m: float = math.inf
     of_distance: float = math.inf
     partly: float = math.inf
+    size: float = 0.0
 
 
 PAPERS = Reach()
@@ -254,7 +255,6 @@ def _polygon_area(polygon: Array) -> float:
 def _unchanged(base: SceneIR, perturbed: SceneIR) -> list[str]:
     """What no parameter may touch."""
     pairs = {
-        "objects.size_lhw": (base.objects.size_lhw, perturbed.objects.size_lhw),
         "objects.mesh_index": (base.objects.mesh_index, perturbed.objects.mesh_index),
         "photograph": (base.photograph, perturbed.photograph),
         "camera": (base.camera.matrix, perturbed.camera.matrix),
@@ -361,6 +361,11 @@ def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
     bent = float(np.abs(new.lattice - old.lattice).max())
     if bent > reach.mesh + REACH_TOLERANCE:
         found.append(f"lattice bent by {bent:.3f} unit boxes")
+    grown = new.size / old.size - 1
+    if np.abs(grown).max() > (reach.size + REACH_TOLERANCE if reach.size else 0.0):
+        found.append(f"size changed by {100 * grown[np.abs(grown).argmax()]:.1f} %")
+    elif np.ptp(grown) > REACH_TOLERANCE:
+        found.append("size changed, and not alike in length, height and width")
     return found
 
 

@@ -264,11 +264,11 @@ def to_kitti_labels(
     if labels.mode == "moved":
         low0, high0 = _unit_extents(base)
         low, high = _unit_extents(perturbed)
-        yaw = perturbed.objects.yaw
+        yaw, grown_lhw = perturbed.objects.yaw, perturbed.objects.size_lhw
         # The lowest layer is fixed: only length and width can shift the middle of the bottom face.
-        shift = (0.5 * ((low + high) - (low0 + high0)) * size_lhw) * size_lhw.new_tensor([1.0, 0.0, 1.0])
+        shift = 0.5 * ((low + high) * grown_lhw - (low0 + high0) * size_lhw) * size_lhw.new_tensor([1.0, 0.0, 1.0])
         translation = perturbed.objects.translation + (yaw_matrix(yaw) @ shift[:, :, None])[:, :, 0]
-        size_lhw = size_lhw * ((high - low) / (high0 - low0))
+        size_lhw = grown_lhw * ((high - low) / (high0 - low0))
         turns = torch.round(yaw / (2 * torch.pi))
         yaw = torch.where(yaw.abs() > torch.pi, yaw - turns * 2 * torch.pi, yaw)
     return Labels(

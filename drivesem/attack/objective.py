@@ -212,7 +212,7 @@ class Objective:
     def _group(self, parameter: Parameter, where: slice) -> Group:
         owners = self.space.count if SPECS[parameter].per_object else 0
         modes = ffd.low_modes() if parameter is Parameter.MESH else None
-        smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE)
+        smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.SIZE)
         return Group(parameter.value, where, owners, modes, smooth)
 
     def raw(self, render: Render) -> RawPredictions:

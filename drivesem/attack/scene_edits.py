@@ -63,11 +63,13 @@ def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
         turn = summed([[(0.0,), *((c.rotate,) for c in row)] for row in changes])[:, 0]
         none = (0.0,) * ffd.SYMMETRIC_DIM
         bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
+        grown = summed([[(1.0,), *((c.size,) for c in row)] for row in changes])
         paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
         touched = {
             "translation": objects.translation + shift.sum(dim=1),
             "yaw": objects.yaw + turn,
             "ffd": objects.ffd + ffd.from_symmetric(bend),
+            "size_lhw": objects.size_lhw * grown,
             "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
         }
     weather = environment.weather + environment.weather.new_tensor(edit.weather)

@@ -1,4 +1,4 @@
-"""What an attack may move: the six parameters, their units and bounds, and theta, the flat vector of all of them.
+"""What an attack may move: the parameters, their units and bounds, and theta, the flat vector of all of them.
 
 theta is flat for the attack and readable for people: every coordinate has a name, a unit and bounds. The scene as
 photographed is theta = 0. What is *feasible* inside the bounds is decided by `drivesem.attack.feasible`.
@@ -29,6 +29,11 @@ class Parameter(StrEnum):
     TRANSLATE = "translate"
     ROTATE = "rotate"
     MESH = "mesh"
+    SIZE = "size"
+
+
+SIX = tuple(p for p in Parameter if p is not Parameter.SIZE)
+"""The paper's parameters. The others need a budget that goes beyond the paper's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +67,7 @@ SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.TRANSLATE: ParameterSpec(2, True, "own lengths", ("translate.along", "translate.across")),
     Parameter.ROTATE: ParameterSpec(1, True, "rad", ("yaw",)),
     Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", _lattice_names()),
+    Parameter.SIZE: ParameterSpec(1, True, "share of its own", ("size",)),
 }
 
 COMBOS: dict[int, tuple[Parameter, ...]] = {
@@ -84,7 +90,8 @@ class Budget:
     own lengths; translate_m: metres, the same for long and short cars; across_m: metres, across alone;
     of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
     not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
-    `drivesem.attack.feasible` is the one that binds).
+    `drivesem.attack.feasible` is the one that binds); size: share of a car's own, larger or smaller, 0 where
+    sizes are held.
     """
 
     color: float = 1.0
@@ -93,18 +100,27 @@ class Budget:
     translate: float = 0.25
     rotate: float = 0.35
     mesh: float = 0.25
+    size: float = 0.0
     translate_m: float = math.inf
     across_m: float = math.inf
     of_distance: float = math.inf
     partly: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_positive("budget", self, unbounded=("translate_m", "across_m", "of_distance", "partly"))
+        unbounded = ("translate_m", "across_m", "of_distance", "partly")
+        _check_positive("budget", self, unbounded, may_be_held=("size",))
+
+    def check(self, params: Iterable[Parameter]) -> None:
+        """FormatError where one of the parameters is held by this budget."""
+        for parameter in params:
+            if getattr(self, parameter.value) == 0:
+                expected = f"a budget in which {parameter} may change, such as street"
+                raise FormatError(f"params: {parameter}", expected, f"one that holds {parameter}")
 
 
 @dataclass(frozen=True, slots=True)
 class StepSizes:
-    """The paper's step alpha for each parameter, in theta's units."""
+    """The step alpha for each parameter, in theta's units: the paper's, and of sizes as long as that of places."""
 
     color: float = 0.05
     weather: float = 0.25
@@ -112,22 +128,26 @@ class StepSizes:
     translate: float = 0.01
     rotate: float = 0.01
     mesh: float = 0.025
+    size: float = 0.01
 
     def __post_init__(self) -> None:
         _check_positive("steps", self)
 
 
-def _check_positive(what: str, values: Budget | StepSizes, unbounded: Collection[str] = ()) -> None:
+def _check_positive(
+    what: str, values: Budget | StepSizes, unbounded: Collection[str] = (), may_be_held: Collection[str] = ()
+) -> None:
     for entry in fields(values):
         value = getattr(values, entry.name)
-        if not (value > 0 and (math.isfinite(value) or entry.name in unbounded)):
+        positive = value > 0 or (value == 0 and entry.name in may_be_held)
+        if not (positive and (math.isfinite(value) or entry.name in unbounded)):
             raise RangeError(f"{what}.{entry.name}", "a positive number", value)
 
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
     """theta by parameter; None where a parameter is held. color (N, 5), weather (4,), foliage (3,),
-    translate (N, 2), rotate (N, 1), mesh (N, 96): changes from the photographed scene.
+    translate (N, 2), rotate (N, 1), mesh (N, 96), size (N, 1): changes from the photographed scene.
     """
 
     color: Tensor | None = None
@@ -136,6 +156,7 @@ class Perturbation:
     translate: Tensor | None = None
     rotate: Tensor | None = None
     mesh: Tensor | None = None
+    size: Tensor | None = None
 
 
 def normalise_params(params: Iterable[str]) -> tuple[Parameter, ...]:
@@ -168,7 +189,7 @@ class ParameterSpace:
     """The vector theta (D,) of one scene: names, bounds, steps, and the way from theta to a perturbed scene.
 
     Blocks follow each other in the order of `Parameter`; a block of a parameter of cars is (N, size), row-major.
-    dtype and device are those of the scene.
+    dtype and device are those of the scene. Raises FormatError for a parameter that the budget holds.
     """
 
     def __init__(
@@ -181,6 +202,7 @@ class ParameterSpace:
         self.scene = scene
         self.params = normalise_params(params)
         self.budget = budget or Budget()
+        self.budget.check(self.params)
         self.steps = steps or StepSizes()
         self.count = len(scene.objects)
         self._slices: dict[Parameter, slice] = {}
@@ -260,7 +282,8 @@ class ParameterSpace:
         """The scene at theta (D,); differentiable to theta. At theta = 0 all tensors equal the originals exactly.
 
         A translation is a fraction of the car's own length, along and across its photographed heading; the car
-        keeps its height above the ground plane. Mesh offsets are symmetric left to right, added to the source's.
+        keeps its height above the ground plane, and a size grows from its bottom face: the wheels stay where they
+        are. Mesh offsets are symmetric left to right, added to the source's.
         Raises ShapeError, and RangeError naming a coordinate that is not finite.
         """
         finite = torch.isfinite(theta)
@@ -277,6 +300,8 @@ class ParameterSpace:
             changes["yaw"] = objects.yaw + part.rotate[:, 0]
         if part.mesh is not None:
             changes["ffd"] = objects.ffd + ffd.from_symmetric(part.mesh)
+        if part.size is not None:
+            changes["size_lhw"] = objects.size_lhw * (1 + part.size)
         if part.color is not None:
             changes["texture_code"] = _within(
                 objects.texture_code, part.color, -self.budget.color, self.budget.color
@@ -292,7 +317,7 @@ class ParameterSpace:
         return scene.with_environment(**codes) if codes else scene
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
-        """`value` of coordinate `i` in metres ("m") or degrees ("deg"), or None where it is a bare code."""
+        """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a bare code."""
         parameter, owner, k = self._locate(i)
         size_lhw = self.scene.objects.size_lhw
         if parameter is Parameter.TRANSLATE:
@@ -301,15 +326,17 @@ class ParameterSpace:
             return math.degrees(value), "deg"
         if parameter is Parameter.MESH:
             return value * float(size_lhw[owner, k % 3]), "m"
+        if parameter is Parameter.SIZE:
+            return 100 * value, "%"
         return None
 
     def display(self, i: int, value: float) -> str:
-        """`value` of coordinate `i` as people write it: `0.21 m`, `5.7 deg`, `0.25`."""
+        """`value` of coordinate `i` as people write it: `0.21 m`, `5.7 deg`, `3 %`, `0.25`."""
         physical = self.physical(i, value)
         return f"{value:.3g}" if physical is None else f"{physical[0]:.3g} {physical[1]}"
 
     def theta_by_name(self, theta: Tensor) -> dict[str, dict[str, float | str]]:
-        """theta (D,) for people: name -> value, unit, lower, upper, and display in metres or degrees."""
+        """theta (D,) for people: name -> value, unit, lower, upper, and display in metres, degrees or percent."""
         check_finite("theta", theta)
         self.unflatten(theta)
         lower, upper = self.lower.tolist(), self.upper.tolist()

@@ -31,7 +31,7 @@ from detectors.base import RawPredictions
 from detectors.squeezedet import Assignment, SqueezeDet
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
-from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
+from drivesem.attack.space import COMBOS, SIX, Parameter, ParameterSpace
 from scene_ir.errors import RangeError
 from scene_ir.raster.verbs import Backend
 from scene_ir.render.compositor import Compositor
@@ -150,7 +150,7 @@ class _Path:
         self.dtype = torch.float64 if backend == "reference" else torch.float32
         device = next(detector.parameters()).device
         self.scene = scene_to(scene, self.dtype, device)
-        self.space = ParameterSpace(self.scene, tuple(Parameter))
+        self.space = ParameterSpace(self.scene, SIX)
         self.detector = detector
         self.weights, self._dither = weights.to(device, self.dtype), dither.to(device, self.dtype)
         self.compositor = Compositor(self.scene, RenderSettings(backend=backend))
@@ -239,7 +239,7 @@ class SceneCheck:
         where = self.space.slice_of(parameter)
         assert where is not None
         size = where.stop - where.start
-        generator = _generator(self._seed, 2 + list(Parameter).index(parameter))
+        generator = _generator(self._seed, 2 + SIX.index(parameter))
         chosen = orthonormal(size, min(self._count, size), generator)
         slopes, noise = [], []
         for step in STEPS[parameter]:

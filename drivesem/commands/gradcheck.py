@@ -18,7 +18,7 @@ from rich.table import Table
 from detectors.base import DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
-from drivesem.attack.space import Parameter, StepSizes
+from drivesem.attack.space import SIX, Parameter, StepSizes
 from drivesem.bench.gradcheck import (
     FUNCTIONALS,
     LOSS,
@@ -169,7 +169,7 @@ def _check_all(
     worker: GradcheckWorker, names: Sequence[str]
 ) -> tuple[dict[str, tuple[GradcheckRow, ...]], dict[str, str]]:
     """The rows of each scene, and why others have none."""
-    parts = (None, *Parameter)
+    parts = (None, *SIX)
     per_scene = [tuple(_Task(name, at, part) for at in POINTS for part in parts) for name in names]
     if len(names) >= worker.config.processes:
         jobs = per_scene
@@ -189,7 +189,7 @@ def _check_all(
         results.update(zip(tasks, outcomes, strict=True))
 
     def rows(name: str, at: Point) -> tuple[GradcheckRow, ...]:
-        differences = {p: results[_Task(name, at, p)] for p in Parameter}
+        differences = {p: results[_Task(name, at, p)] for p in SIX}
         return rows_of(name, at, results[_Task(name, at, None)], differences)
 
     scenes = {

@@ -46,6 +46,7 @@ _PARAMETERS = {
     "translate": "translate",
     "yaw": "rotate",
     "ffd": "mesh",
+    "size": "size",
 }
 """The parameter by the first word of a coordinate's name, after the object it belongs to."""
 _FAILED = ("lost", "phantom")

@@ -34,7 +34,7 @@ from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
 from drivesem.attack.objective import GRADIENT_PASSES, OF_DETECTIONS
-from drivesem.attack.space import Parameter, combo, parse_params
+from drivesem.attack.space import SIX, Parameter, combo, parse_params
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import FRAMES, claim
 from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
@@ -118,10 +118,17 @@ def _attacked(
 
 
 def _params(config: Attack) -> tuple[Parameter, ...]:
+    """What is to move. Raises FormatError where the budget holds it."""
+    params = _named_params(config)
+    budget_of(config.budget).check(params)
+    return params
+
+
+def _named_params(config: Attack) -> tuple[Parameter, ...]:
     if config.params is not None:
         return parse_params(config.params)
     if config.method == "subsets" and config.combo is None:
-        return tuple(Parameter)
+        return SIX
     return combo(config.combo or DEFAULT_COMBO)
 
 
@@ -147,10 +154,10 @@ class Worker:
         used, SceneError for a source that cannot be read.
         """
         config = _settled(config)
-        source, method = open_source(config), attack_method(config)
+        params, source, method = _params(config), open_source(config), attack_method(config)
         detector = _load(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
-        return cls(config, _params(config), method, source, detector, grader_of(config, detector))
+        return cls(config, params, method, source, detector, grader_of(config, detector))
 
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""

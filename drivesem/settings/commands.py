@@ -71,7 +71,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
-    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh."""
+    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size, with
+    --budget street alone."""
     method: Literal[Search, "placebo"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
@@ -282,6 +283,8 @@ class Holes(FrameCommand):
     """States around each failure, within what the run could change; each is seen once, with nuisances."""
     fresh: Count = 32
     """Further ones inside of the rule that was found, which it is held against."""
+    recheck: Count | None = None
+    """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
     reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
     """How far from the counterexample, as a share of each bound's width, within the bounds."""
 

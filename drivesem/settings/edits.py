@@ -7,12 +7,14 @@ An edit of one frame, as YAML or as nested mappings:
     objects:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
+      3: {size: 5%}                 # larger by so much, on its wheels; -5% is smaller
       5: {remove: true}
       all: {rotate: 0.05}
 
 translate is along the vehicle's length and across to its left (+z of its own axes), on the ground; rotate is about
-its ground centre. Text needs a unit: m, deg or rad. A bare number of a YAML file is in theta's units: own lengths,
-rad. On the command line everything is text: `objects[2].translate=0.5m,0m`, `weather=fog`, `weather.rain=0.4`.
+its ground centre. Text needs a unit: m, deg, rad or %. A bare number of a YAML file is in theta's units: own
+lengths, rad, shares. On the command line everything is text: `objects[2].translate=0.5m,0m`, `weather=fog`,
+`weather.rain=0.4`.
 """
 
 from __future__ import annotations
@@ -42,10 +44,13 @@ WEATHERS: Mapping[str, Mapping[str, float]] = {
     "twilight": {"time": 1.0},
 }
 """Weather by name, as codes; those not named are 0."""
-OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "remove")
+OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
 FRAME_KEYS = ("objects", "weather", "foliage")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
+SHARE_UNITS = {"%": 0.01}
+MOST_GROWN = 0.5
+"""Share by which an edit may make a vehicle larger or smaller: beyond it is no vehicle of its kind."""
 _PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage)\.(\w+)")
 _TRUTH = {"true": True, "false": False}
 
@@ -53,7 +58,8 @@ _TRUTH = {"true": True, "false": False}
 @dataclass(frozen=True, slots=True)
 class ObjectEdit:
     """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
-    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none.
+    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none; size:
+    share by which it grows.
     """
 
     translate: tuple[float, float] = (0.0, 0.0)
@@ -61,6 +67,7 @@ class ObjectEdit:
     rotate: float = 0.0
     color: tuple[float, ...] = (0.0,) * TEXTURE_DIM
     mesh: tuple[float, ...] = ()
+    size: float = 0.0
     remove: bool = False
 
     def __post_init__(self) -> None:
@@ -68,6 +75,8 @@ class ObjectEdit:
             raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
+        if not abs(self.size) <= MOST_GROWN:
+            raise RangeError("edit size", f"a share of at most {MOST_GROWN:.0%} either way", self.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +210,7 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             rotate=_angle(f"{where}: rotate", entry.get("rotate", 0)),
             color=_floats(f"{where}: color", entry.get("color", [0] * TEXTURE_DIM), TEXTURE_DIM),
             mesh=() if mesh in (None, []) else _floats(f"{where}: mesh", mesh, SYMMETRIC_DIM),
+            size=_share(f"{where}: size", entry.get("size", 0)),
             remove=remove,
         )
     except RangeError as error:
@@ -240,6 +250,10 @@ def finite_number(where: str, value: Any) -> float:
 
 def _angle(where: str, value: Any) -> float:
     return measure(where, value, ANGLE_UNITS) if isinstance(value, str) else finite_number(where, value)
+
+
+def _share(where: str, value: Any) -> float:
+    return measure(where, value, SHARE_UNITS) if isinstance(value, str) else finite_number(where, value)
 
 
 def measure(where: str, text: str, units: Mapping[str, float]) -> float:

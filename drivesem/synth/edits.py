@@ -78,6 +78,7 @@ def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
     along, across = (a * length + b for a, b in zip(edit.translate, edit.translate_m, strict=True))
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
     x, z = actor.position_xz
+    long, high, wide = (side * (1 + edit.size) for side in actor.size_lhw)
     bent = actor.ffd
     if edit.mesh:
         added = from_symmetric(torch.tensor(edit.mesh, dtype=torch.float64)).reshape(-1)
@@ -89,6 +90,7 @@ def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
         yaw=(actor.yaw + edit.rotate + math.pi) % (2 * math.pi) - math.pi,
         paint=_painted(actor.paint, edit.color),
         ffd=bent,
+        size_lhw=(long, high, wide),
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from detectors.training import Sample
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attack.space import SIX, Parameter, ParameterSpace
 from drivesem.data import kitti
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, training_targets
@@ -24,7 +24,7 @@ from scene_ir.types import Frame, Labels
 
 VARIANTS = 4
 """Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
-PARAMETERS = tuple(Parameter)
+PARAMETERS = SIX
 _BENT_BY = 0.3
 """Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same
 bound on strain."""

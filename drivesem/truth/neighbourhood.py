@@ -140,4 +140,7 @@ class Neighbourhood:
         if Parameter.TRANSLATE in self._objective.space.params:
             still = self._objective.space.scene.objects.translation[i]
             found["moved_m"] = float((objects.translation[i] - still).norm())
+        if Parameter.SIZE in self._objective.space.params:
+            still = self._objective.space.scene.objects.size_lhw[i]
+            found["grown_percent"] = 100 * float((objects.size_lhw[i] / still).mean() - 1)
         return found

@@ -1,4 +1,4 @@
-"""Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all six kinds of parameter.
+"""Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all that may be perturbed.
 
 In the order of work: `prepare`, then `reference` (plain torch, says what is right) or `fast` (kernels), here for
 several scenes in one go, then `blend` and `environment`.
@@ -56,8 +56,8 @@ class Compositor(Prepared):
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
-        moving = {n: getattr(objects, n).to(self.like) for n in ("translation", "yaw", "ffd", "texture_code")}
-        return replace(self.scene.objects, **moving)
+        names = ("translation", "yaw", "size_lhw", "ffd", "texture_code")
+        return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: Layers | None) -> Render:
         """The picture of drawn objects. perturbed: for its environment; layers: None where there are no

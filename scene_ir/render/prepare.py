@@ -147,7 +147,7 @@ class Drawn:
 class Prepared:
     """One scene, made ready to draw its perturbations: all that no parameter touches.
 
-    A perturbed scene may differ from `scene` in objects.translation, yaw, ffd, texture_code and in
+    A perturbed scene may differ from `scene` in objects.translation, yaw, size_lhw, ffd, texture_code and in
     environment.weather, foliage. With backend `warp` the scene is worked on in float32.
     """
 
@@ -326,8 +326,9 @@ class Prepared:
 
     def local(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""
-        bent = objects.ffd.requires_grad or not torch.equal(objects.ffd, self._base_ffd)
-        return self.fleet.local(objects.ffd, objects.size_lhw) if bent else self._base_local
+        shapes = ((objects.ffd, self._base_ffd), (objects.size_lhw, self.size))
+        changed = any(now.requires_grad or not torch.equal(now, then) for now, then in shapes)
+        return self.fleet.local(objects.ffd, objects.size_lhw) if changed else self._base_local
 
     def brighter(self, objects: Objects) -> Tensor:
         """By how much (V,) the surfaces are brighter than in the photograph, since they turned: see
@@ -353,11 +354,12 @@ class Prepared:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
         A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
-        sun: the patch is sheared the more, the farther out.
+        sun: the patch is sheared the more, the farther out. It grows with its object.
         """
         ground = self.scene.environment.ground
         offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self.size[:, 1])
         corners = self.corners + self.outwards[..., None] * (offset - self.sun_offset)[:, None]
+        corners = corners * (objects.size_lhw / self.size)[:, None, ::2]
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
 
@@ -372,7 +374,8 @@ class Prepared:
         if not objects.source:
             return [0.0] * len(objects)
         distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
-        return (self.halo / distance).clamp(max=HALO_MAX_PX).tolist()
+        halo = self.halo * (objects.size_lhw / self.size).detach().amax(dim=1)
+        return (halo / distance).clamp(max=HALO_MAX_PX).tolist()
 
     def own_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.PLAIN): the templates' own looks. normals (V, 3); depth (V,) m."""

@@ -34,7 +34,7 @@ from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
 from drivesem.synth.layout import Actor, Road, clearance, footprint
 from drivesem.synth.view import blocks
-from scene_ir import ffd, files
+from scene_ir import files
 from scene_ir.derender import silhouette
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import RangeError
@@ -42,7 +42,7 @@ from scene_ir.geometry import project_boxes, yaw_matrix
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
-from scene_ir.types import LATTICE, Crop, Frame, Labels, SceneIR
+from scene_ir.types import Crop, Frame, Labels, SceneIR
 from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
 
 Mask = NDArray[np.bool_]
@@ -110,19 +110,12 @@ ABLATIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One vehicle's edit. shift_m: (along, across); turn: rad; stretch: of its sizes, as a share."""
+    """One vehicle's edit. shift_m: (along, across); turn: rad; size: share by which it grows."""
 
     track: int
     shift_m: tuple[float, float]
     turn: float
-    stretch: float = 0.0
-
-    @property
-    def mesh(self) -> Tensor:
-        """The lattice code (96,) of the stretch: linear in where a lattice point is, from the ground's middle."""
-        length, height, width = (torch.linspace(0, 1, n, dtype=torch.float64) for n in LATTICE)
-        points = torch.stack(torch.meshgrid(length - 0.5, height - 1, width - 0.5, indexing="ij"), dim=-1)
-        return ffd.to_symmetric(self.stretch * points.reshape(-1, 3))
+    size: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,8 +314,7 @@ def _seen(truths: Sequence[Truth]) -> bool:
 
 def edit_of(move: Move) -> FrameEdit:
     """The move as the generator takes it."""
-    mesh = tuple(move.mesh.tolist()) if move.stretch else ()
-    return FrameEdit({move.track: ObjectEdit(translate_m=move.shift_m, rotate=move.turn, mesh=mesh)})
+    return FrameEdit({move.track: ObjectEdit(translate_m=move.shift_m, rotate=move.turn, size=move.size)})
 
 
 def _promising(plan: Plan) -> bool:
@@ -505,7 +497,7 @@ def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequenc
 
 
 def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
-    """The scene with its vehicle moved by the same vector and angle as the true one, and stretched alike."""
+    """The scene with its vehicle moved by the same vector and angle as the true one, and grown alike."""
     if case.move.track not in tracks:
         return scene
     i = list(tracks).index(case.move.track)
@@ -513,9 +505,9 @@ def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
     translation, yaw = scene.objects.translation.clone(), scene.objects.yaw.clone()
     translation[i] += torch.from_numpy(new.translation - old.translation).to(translation)
     yaw[i] += case.move.turn
-    offsets = scene.objects.ffd.clone()
-    offsets[i] += ffd.from_symmetric(case.move.mesh).to(offsets)
-    return scene.with_objects(translation=translation, yaw=yaw, ffd=offsets)
+    size_lhw = scene.objects.size_lhw.clone()
+    size_lhw[i] *= 1 + case.move.size
+    return scene.with_objects(translation=translation, yaw=yaw, size_lhw=size_lhw)
 
 
 def _removable(frame: SynthFrame) -> list[int]:

@@ -57,8 +57,8 @@ METHOD = (
     "Frames as those of derender, half of the generator's training pools, half of the held-out ones; labels as"
     " far off. One well visible vehicle a frame is changed in every way of the table that keeps it free of "
     "collision, off kerbs, at least half visible and in the picture, and at least 0.6 times as high; signs by "
-    "seed. Nearer and farther: along its heading, towards the camera or away. Size: all three, through its "
-    "lattice. Anywhere in a budget: along, across and turned at random within it. In the box: PSNR in the "
+    "seed. Nearer and farther: along its heading, towards the camera or away. Size: all three. "
+    "Anywhere in a budget: along, across, turned and grown at random within it. In the box: PSNR in the "
     "vehicle's true new box, ours to the generator's picture of the changed street; tail: the 10th percentile;"
     " unchanged: the photograph as the answer; all that changed: the region of derender, with the ground that "
     "it left. The detector looks at both pictures: how many it finds in the generator's (a Car above 0.3, IoU "
@@ -71,7 +71,7 @@ Split = Literal["train", "heldout"]
 _ALONG_M = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 _ACROSS_M = (0.5, 1.0, 1.5)
 _TURNS_DEG = (5, 10, 20, 30)
-_STRETCHES = (0.05, 0.1)
+_SIZES = (0.05, 0.1, 0.2)
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
 """Of a car's distance from the camera, by which it is brought nearer: bounds of what is counted together."""
 _VISIBLE, _CUT, _HEIGHT_KEPT = 0.5, 0.5, 0.6
@@ -193,7 +193,7 @@ def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[Mo
     either += [
         (f"{d} degrees", lambda sign, d=d: Move(track, (0.0, 0.0), sign * math.radians(d))) for d in _TURNS_DEG
     ]
-    either += [(f"{s:.0%} in size", lambda sign, s=s: Move(track, (0.0, 0.0), 0.0, sign * s)) for s in _STRETCHES]
+    either += [(f"{s:.0%} in size", lambda sign, s=s: Move(track, (0.0, 0.0), 0.0, sign * s)) for s in _SIZES]
     for name, of in either:
         sign = float(rng.choice((-1.0, 1.0)))
         yield name, [of(sign), of(-sign)]
@@ -202,9 +202,9 @@ def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[Mo
         budget = PRESETS[name]
         distance_m = float(np.linalg.norm(old.translation))
         along = min(budget.translate * length_m, budget.translate_m, budget.of_distance * distance_m)
-        most = np.array([along, min(along, budget.across_m), budget.rotate])
-        drawn = rng.uniform(-most, most, (_TRIES, 3)).tolist()
-        yield f"anywhere in {name}", [Move(track, (x, z), turn) for x, z, turn in drawn]
+        most = np.array([along, min(along, budget.across_m), budget.rotate, budget.size])
+        drawn = rng.uniform(-most, most, (_TRIES, len(most))).tolist()
+        yield f"anywhere in {name}", [Move(track, (x, z), turn, size) for x, z, turn, size in drawn]
 
 
 def changed_case(case: Case, move: Move) -> Case | None:
@@ -248,7 +248,7 @@ def summary(rows: Sequence[MovedRow]) -> list[dict[str, Any]]:
     """A line a change and split, in the order in which they were tried, then those nearer by share of distance."""
     order = [f"{m:g} m {way}" for m in _ALONG_M for way in ("nearer", "farther")]
     order += [f"{m:g} m across" for m in _ACROSS_M] + [f"{d} degrees" for d in _TURNS_DEG]
-    order += [f"{s:.0%} in size" for s in _STRETCHES] + [f"anywhere in {name}" for name in _BUDGETS]
+    order += [f"{s:.0%} in size" for s in _SIZES] + [f"anywhere in {name}" for name in _BUDGETS]
     lines = []
     for split in SPLITS:
         own = [row for row in rows if row.split == split]

@@ -90,7 +90,7 @@ class FeasibleSet:
         """The nearest feasible theta (D,) we can find; `theta` itself where it is feasible.
 
         Deterministic and idempotent. First the bounds, then weather, then the strain of each mesh, scaled back car
-        by car; then the cars that violate something go back to the photograph and take mesh, rotation and
+        by car; then the cars that violate something go back to the photograph and take mesh, size, rotation and
         translation up again, each as far as all constraints allow. Raises ShapeError; RangeError naming a
         coordinate that is not finite.
         """
@@ -180,6 +180,9 @@ class FeasibleSet:
         """The cars at theta; `surface`: their deformed points, None where they are as photographed."""
         rotate, translate = self._block(values, Parameter.ROTATE), self._block(values, Parameter.TRANSLATE)
         low, high = extents(self._surface.rest if surface is None else surface)
+        size = self._block(values, Parameter.SIZE)
+        if size is not None:
+            low, high = low * (1 + size), high * (1 + size)
         yaw = self._yaw if rotate is None else self._yaw + rotate[:, 0]
         translation = self._translation if translate is None else self._moved(translate, slice(None))
         return Cars.of(low, high, yaw, translation.copy())
@@ -239,6 +242,15 @@ class FeasibleSet:
             offenders = joined
         if surface is not None:
             self._take_up_mesh(cars, values, surface, offenders)
+        size = self._block(values, Parameter.SIZE)
+        if size is not None:
+            low, high = cars.low.copy(), cars.high.copy()
+
+            def grow(moved: Indices) -> None:
+                cars.low[moved] = low[moved] * (1 + size[moved])
+                cars.high[moved] = high[moved] * (1 + size[moved])
+
+            self._take_up(cars, offenders, size, grow)
         rotate, translate = self._block(values, Parameter.ROTATE), self._block(values, Parameter.TRANSLATE)
         if rotate is not None:
 

@@ -12,7 +12,7 @@ import torch
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attack.space import SIX, ParameterSpace
 from drivesem.bench.reach.slopes import Slopes, measure, probes
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
 from drivesem.settings.blocks import Scenes
@@ -64,7 +64,7 @@ class ReachWorker:
         scene = self.source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
-        space = ParameterSpace(scene, tuple(Parameter))
+        space = ParameterSpace(scene, SIX)
         objective = Objective(Compositor(scene), space, self.detector)
         views = DrawnViews.of(objective, Nuisances(), f"reach:{name}:{self.config.seed}")
         generator = torch.Generator().manual_seed(self.config.seed)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivesem.attack.objective import GRADIENT_PASSES
-from drivesem.attack.space import Parameter
+from drivesem.attack.space import SIX, Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.protocol import follows_paper
@@ -55,7 +55,7 @@ def arms_of(study: Study, out: Path) -> list[Arm]:
     """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
     base = attack_of(study)
     if study.name == "single":
-        single = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in Parameter]
+        single = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
         return _controlled(single, out) if study.controls else single
     if study.name == "multi":
         multi = [_combo(base, number) for number in COMBO_NUMBERS]
@@ -124,7 +124,7 @@ def _grades(base: Attack, out: Path) -> list[Arm]:
     sets = {
         f"combo {DEFAULT_COMBO}": replace(base, combo=DEFAULT_COMBO),
         "weather": replace(base, params=Parameter.WEATHER.value),
-        "all six": replace(base, params=",".join(p.value for p in Parameter)),
+        "all six": replace(base, params=",".join(p.value for p in SIX)),
     }
     arms: list[Arm] = []
     for name, config in sets.items():

@@ -22,7 +22,7 @@ BOUND = 1e-6
 """Slack of theta's bounds, in its units: far above float32's rounding at their size, far below a sign step."""
 SCENE = 1e-5
 """By how much the scene that theta gives may differ from the saved one (m, rad, unit boxes, codes)."""
-_MOVED = ("translation", "yaw", "ffd", "texture_code")
+_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code")
 _CODES = ("weather", "foliage")
 
 

@@ -41,9 +41,10 @@ def carried(still: SceneIR, changed: SceneIR, planned: Planned) -> Carried:
         move = (after.translation[i] - before.translation[i]).detach().double()
         turn = float(after.yaw[i] - before.yaw[i])
         bend = (after.ffd[i] - before.ffd[i]).detach().double()
+        grown = float((after.size_lhw[i] / before.size_lhw[i]).mean()) - 1
         paint = (after.texture_code[i] - before.texture_code[i]).detach()
         if track is None:
-            if turn or bool(move.any()) or bool(bend.any()) or bool(paint.any()):
+            if turn or grown or bool(move.any()) or bool(bend.any()) or bool(paint.any()):
                 missing.append(f"objects[{i}]: the generator's plan has no such vehicle")
             continue
         actor = actors[track]
@@ -54,6 +55,7 @@ def carried(still: SceneIR, changed: SceneIR, planned: Planned) -> Carried:
             rotate=turn,
             color=tuple(paint.clamp(-1, 1).tolist()),
             mesh=tuple(ffd.to_symmetric(bend).tolist()) if bool(bend.any()) else (),
+            size=grown,
         )
     environment, then = changed.environment, still.environment
     edit = FrameEdit(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivesem.attack.budgets import PRESETS, budget_of, written
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attack.space import SIX, Budget, Parameter, ParameterSpace
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, RangeError
 
@@ -80,12 +80,24 @@ def test_a_preset_can_be_narrowed_and_not_widened():
             budget_of(text)
 
 
+def test_sizes_change_in_street_alone():
+    assert budget_of("street").size == 0.1
+    assert budget_of("paper").size == budget_of("parking").size == 0
+    narrowed = budget_of("street,size=5%")
+    assert narrowed == replace(PRESETS["street"], size=0.05) == budget_of(written(narrowed))
+    assert written(narrowed) == "street,size=0.05"
+    with pytest.raises(FormatError, match=r"--budget: size: expected street,size=5%, since only street lets it"):
+        budget_of("size=5%")
+    with pytest.raises(FormatError, match=r"--budget: size: expected a positive number of at most 0.1, found 20%"):
+        budget_of("street,size=20%")
+
+
 _LIMITS = st.floats(1e-6, 0.25)
 
 
 @given(
     preset=st.sampled_from(["paper", "street"]),
-    narrowed=st.dictionaries(st.sampled_from([p.value for p in Parameter]), _LIMITS),
+    narrowed=st.dictionaries(st.sampled_from([p.value for p in SIX]), _LIMITS),
     metres=st.none() | st.floats(1e-3, 1),
 )
 def test_what_is_written_reads_back(preset, narrowed, metres):
@@ -124,8 +136,11 @@ def test_a_street_is_longer_along_than_across(street):
     assert along_m == pytest.approx([float(away_m[0]), float(away_m[1]), budget.translate * 1.6, 4.0])
     assert across_m == pytest.approx([1.0] * 4)
     # All else goes as far as the paper's.
-    papers = ParameterSpace(scene, tuple(Parameter))
-    wider = papers.upper != space.upper
+    papers = ParameterSpace(scene, SIX)
+    size = space.slice_of(Parameter.SIZE)
+    assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
+    assert size.stop == space.dim
+    wider = papers.upper != space.upper[: size.start]
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
 
 

@@ -26,7 +26,7 @@ from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.cars import Cars
 from drivesem.attack.feasible.collisions import gap_between, shared_ground
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import COMBOS, ParameterSpace, ground_axes
+from drivesem.attack.space import COMBOS, Budget, ParameterSpace, ground_axes
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 
@@ -252,7 +252,7 @@ def test_the_second_check_shares_no_code():
         (lambda o: {"translation": o.translation + torch.tensor([0.0, 0.1, 0.0])}, "off the ground"),
         (lambda o: {"translation": o.translation + torch.tensor([0.0, 0.0, 1.2])}, "own lengths"),
         (lambda o: {"yaw": o.yaw + 0.5}, "turned by 0.500 rad"),
-        (lambda o: {"size_lhw": o.size_lhw * 1.1}, "objects.size_lhw: changed"),
+        (lambda o: {"size_lhw": o.size_lhw * 1.1}, "size changed by 10.0 %"),
         (lambda o: {"texture_code": o.texture_code + 2}, "objects.texture_code: outside"),
         (lambda o: {"ffd": o.ffd + 0.3 * torch.randn(o.ffd.shape, generator=_generator())}, "strain in"),
         (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.05, 0.0])}, "lowest lattice layer"),
@@ -294,6 +294,37 @@ def test_the_second_check_finds_collisions_roads_and_hiding(street):
 
 
 STREET = reach_of(PRESETS["street"])
+
+
+@pytest.mark.parametrize(
+    ("factors", "said"),
+    [
+        ((1.1, 1.1, 1.1), []),
+        ((0.9, 0.9, 0.9), []),
+        ((1.11, 1.11, 1.11), ["objects[0]: size changed by 11.0 %"]),
+        ((0.88, 0.88, 0.88), ["objects[0]: size changed by -12.0 %"]),
+        ((1.1, 1.0, 1.0), ["objects[0]: size changed, and not alike in length, height and width"]),
+    ],
+)
+def test_the_second_check_bounds_sizes_by_the_budget(street, factors, said):
+    scene = street(positions_xz=((0.0, 12.0),))
+    grown = scene.with_objects(size_lhw=scene.objects.size_lhw * torch.tensor(factors))
+    assert check_scene(scene, grown, reach=STREET) == said
+
+
+def test_a_car_grows_until_it_meets_another(street):
+    # They stand 0.3 m apart, side by side, each 1.75 m wide.
+    scene = street(positions_xz=((-1.025, 12.0), (1.025, 12.0)), yaw=-math.pi / 2)
+    budget = Budget(size=0.4)
+    feasible = FeasibleSet(ParameterSpace(scene, ("size",), budget))
+    once = feasible.project(torch.tensor([0.35, 0.35]))
+    assert {"objects[0]: collision", "objects[1]: collision"} == set(once.active)
+    assert feasible.violations(torch.tensor([0.35, 0.35]))
+    assert feasible.violations(once.theta) == ()
+    assert float(once.theta.max()) < 0.3
+    grown = feasible.space.apply(scene, once.theta)
+    assert check_scene(scene, grown, reach=reach_of(budget)) == []
+    assert feasible.project(torch.tensor([0.1, 0.1])).theta.tolist() == pytest.approx([0.1, 0.1])
 
 
 def _moved(scene, along=0.0, across=0.0):

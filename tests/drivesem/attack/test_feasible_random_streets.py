@@ -29,7 +29,8 @@ def test_projection_is_idempotent_inside_and_feasible(street, seed, count, names
     scene = street(positions_xz=places.tolist(), road_edge_x_m=edge)
     scene = scene.with_objects(yaw=(torch.rand(count, generator=generator) - 0.5) * 6)
     scene = scene.with_objects(occlusion=torch.randint(0, 2, (count,), generator=generator))
-    space = ParameterSpace(scene, tuple(names), PRESETS[budget])
+    allowed = tuple(name for name in names if getattr(PRESETS[budget], name.value) > 0) or (Parameter.MESH,)
+    space = ParameterSpace(scene, allowed, PRESETS[budget])
     feasible = FeasibleSet(space)
     far = torch.maximum(10 * space.step, space.upper / 2)
     theta = torch.randn(space.dim, generator=generator) * scale * far

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from detectors.types import CLASSES
 from drivesem.attack.labels import Difficulty, Labeller, hidden_share, targets, to_kitti_labels
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import place, project_boxes, to_clip
@@ -51,7 +51,7 @@ def test_moved_labels_at_theta0_are_the_benign_ones_to_the_bit(street, seed):
         occlusion=torch.randint(0, 4, (4,), generator=generator),
         ffd=0.02 * torch.randn(4, 64, 3, generator=generator),
     )
-    space = ParameterSpace(scene, tuple(Parameter))
+    space = ParameterSpace(scene, tuple(Parameter), Budget(size=0.1))
     moved = targets(scene, space.apply(scene, space.theta0))
     assert torch.equal(moved.boxes_xyxy, scene.objects.box2d)
     assert torch.equal(moved.truncation, scene.objects.truncation)
@@ -63,6 +63,21 @@ def test_moved_labels_at_theta0_are_the_benign_ones_to_the_bit(street, seed):
     assert torch.equal(kitti.translation, benign.translation)
     assert torch.equal(kitti.yaw, benign.yaw)
     assert torch.equal(kitti.size_lhw, benign.size_lhw)
+
+
+def test_a_car_that_grows_has_a_larger_box_on_the_same_ground(street):
+    scene = street()
+    space = ParameterSpace(scene, ("size",), Budget(size=0.1))
+    after = space.apply(scene, space.upper)
+    moved = targets(scene, after)
+    (x0, y0, x1, y1), (a0, b0, a1, b1) = scene.objects.box2d[3].tolist(), moved.boxes_xyxy[3].tolist()
+    assert (a1 - a0) / (x1 - x0) == pytest.approx(1.1, abs=0.02)
+    assert (b1 - b0) / (y1 - y0) == pytest.approx(1.1, abs=0.02)
+    # The far wheels stay; what comes nearer lies lower in the picture, by little.
+    assert abs(b1 - y1) < 0.1 * (b1 - b0) < b1 - b0 - (y1 - y0) + 1
+    kitti = to_kitti_labels(moved, scene, after)
+    assert torch.allclose(kitti.size_lhw, 1.1 * scene.objects.size_lhw)
+    assert torch.equal(kitti.translation[:, 1], scene.objects.translation[:, 1])
 
 
 def test_paper_labels_stay_and_moved_ones_go_along(street):

@@ -6,10 +6,11 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.space import COMBOS, Budget, Parameter, ParameterSpace, Perturbation, combo, parse_params
+from drivesem.attack.space import COMBOS, SIX, Budget, Parameter, ParameterSpace, Perturbation, combo, parse_params
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 ALL = tuple(Parameter)
+WIDE = Budget(size=0.1)
 
 
 def test_parse_params_is_in_thetas_order_whatever_is_typed():
@@ -20,7 +21,10 @@ def test_parse_params_is_in_thetas_order_whatever_is_typed():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("translate,spin", "expected names among color, weather, foliage, translate, rotate, mesh, found 'spin'"),
+        (
+            "translate,spin",
+            "expected names among color, weather, foliage, translate, rotate, mesh, size, found 'spin'",
+        ),
         ("", "at least one of color"),
         ("mesh,mesh", "expected each parameter once"),
     ],
@@ -41,8 +45,8 @@ def test_unknown_combo_and_budget():
 
 
 def test_cardinality_bounds_and_steps(street):
-    space = ParameterSpace(street(), ALL)
-    assert space.dim == 4 * 5 + 4 + 3 + 4 * 2 + 4 * 1 + 4 * 96
+    space = ParameterSpace(street(), ALL, WIDE)
+    assert space.dim == 4 * 5 + 4 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1
     for tensor in (space.theta0, space.lower, space.upper, space.step):
         assert tuple(tensor.shape) == (space.dim,)
     assert bool((space.lower <= 0).all())
@@ -53,6 +57,7 @@ def test_cardinality_bounds_and_steps(street):
     steps = {p.value: float(space.step[space.slice_of(p)][0]) for p in ALL}
     assert steps == pytest.approx(
         {"color": 0.05, "weather": 0.25, "foliage": 0.1, "translate": 0.01, "rotate": 0.01, "mesh": 0.025}
+        | {"size": 0.01}
     )
 
 
@@ -71,7 +76,7 @@ def test_codes_end_at_the_same_value_wherever_they_start(street):
 
 
 def test_every_coordinate_has_a_name_a_unit_and_bounds(street):
-    space = ParameterSpace(street(), ALL)
+    space = ParameterSpace(street(), ALL, WIDE)
     names = [space.name(i) for i in range(space.dim)]
     assert len(set(names)) == space.dim
     yaw3 = space.slice_of(Parameter.ROTATE).start + 3
@@ -99,7 +104,9 @@ def test_theta_by_name_speaks_metres_and_degrees(street):
     count=st.integers(0, 5),
 )
 def test_flatten_is_the_inverse_of_unflatten(street, seed, names, count):
-    space = ParameterSpace(street(positions_xz=[(2.0 * i - 5, 8.0 + 5 * i) for i in range(count)]), tuple(names))
+    space = ParameterSpace(
+        street(positions_xz=[(2.0 * i - 5, 8.0 + 5 * i) for i in range(count)]), tuple(names), WIDE
+    )
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(seed))
     parts = space.unflatten(theta)
     assert torch.equal(space.flatten(parts), theta)
@@ -138,9 +145,9 @@ def test_theta0_changes_nothing_to_the_bit(street, dtype):
         texture_code=torch.rand(4, 5, generator=generator, dtype=dtype) - 0.5,
     )
     scene = scene.with_environment(weather=torch.rand(4, generator=generator, dtype=dtype))
-    space = ParameterSpace(scene, ALL)
+    space = ParameterSpace(scene, ALL, WIDE)
     same = space.apply(scene, space.theta0)
-    for name in ("translation", "yaw", "ffd", "texture_code"):
+    for name in ("translation", "yaw", "ffd", "size_lhw", "texture_code"):
         assert torch.equal(getattr(same.objects, name), getattr(scene.objects, name)), name
     assert torch.equal(same.environment.weather, scene.environment.weather)
     assert torch.equal(same.environment.foliage, scene.environment.foliage)
@@ -184,18 +191,38 @@ def test_mesh_offsets_are_symmetric_and_added_to_the_sources(street):
 
 def test_apply_has_the_gradient_of_its_differences(street):
     scene = street(positions_xz=((0.0, 12.0),), dtype=torch.float64, tilt=0.03)
-    space = ParameterSpace(scene, ALL)
+    space = ParameterSpace(scene, ALL, WIDE)
     generator = torch.Generator().manual_seed(5)
-    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 5, 4, 3)]
+    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 4, 3)]
 
     def functional(theta):
         s = space.apply(scene, theta)
-        fields = (s.objects.translation, s.objects.yaw, s.objects.ffd, s.objects.texture_code)
-        fields = (*fields, s.environment.weather, s.environment.foliage)
+        fields = (s.objects.translation, s.objects.yaw, s.objects.ffd, s.objects.size_lhw)
+        fields = (*fields, s.objects.texture_code, s.environment.weather, s.environment.foliage)
         return sum((w * f.reshape(-1).sin()).sum() for w, f in zip(weights, fields, strict=True))
 
     theta = torch.rand(space.dim, generator=generator, dtype=torch.float64) * 0.2 * space.upper
     assert torch.autograd.gradcheck(functional, theta.requires_grad_(True))
+
+
+def test_a_size_is_a_share_of_its_own_and_shown_in_percent(street):
+    scene = street(dtype=torch.float64)
+    space = ParameterSpace(scene, ("size",), WIDE)
+    theta = torch.tensor([0.1, -0.05, 0.0, 0.0], dtype=torch.float64)
+    after = space.apply(scene, theta).objects
+    grown = after.size_lhw / scene.objects.size_lhw
+    assert grown.T.tolist() == [pytest.approx([1.1, 0.95, 1.0, 1.0])] * 3
+    # It stands where it stood: y = 0 of its own frame is the ground.
+    assert torch.equal(after.translation, scene.objects.translation)
+    assert space.theta_by_name(theta)["objects[1].size"]["display"] == "-5 %"
+    assert space.describe(0) == "objects[0].size, share of its own, [-0.1, 0.1]"
+
+
+def test_what_a_budget_holds_is_refused(street):
+    with pytest.raises(FormatError, match="params: size: expected a budget in which size may change"):
+        ParameterSpace(street(), ("rotate", "size"))
+    assert Parameter.SIZE not in SIX
+    assert len(SIX) == 6
 
 
 def test_gradient_passes_at_a_bound(street):
@@ -225,7 +252,7 @@ def test_a_scene_without_cars_has_an_empty_theta(street):
 def test_scenes_are_left_as_they_were(street):
     scene = street()
     before = replace(scene.objects)
-    space = ParameterSpace(scene, ALL)
+    space = ParameterSpace(scene, ALL, WIDE)
     space.apply(scene, 0.5 * space.upper)
     assert torch.equal(scene.objects.translation, before.translation)
     assert not torch.equal(space.apply(scene, 0.5 * space.upper).objects.translation, before.translation)

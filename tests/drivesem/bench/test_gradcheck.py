@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.space import Parameter
+from drivesem.attack.space import SIX, Parameter
 from drivesem.bench import gradcheck
 from drivesem.bench.gradcheck import LOSS, PICTURE, Differences, GradcheckRow, rows_of, worst
 from drivesem.cli import main
@@ -209,7 +209,7 @@ def test_a_whole_check_passes(capsys: pytest.CaptureFixture[str], tmp_path: Path
     assert summary == json.loads((tmp_path / "out" / "gradcheck.json").read_text())
     assert summary["passed"] is True
     names = {row["name"] for row in summary["rows"]}
-    assert names == {*(p.value for p in Parameter), "combo 2 detector loss"}
+    assert names == {*(p.value for p in SIX), "combo 2 detector loss"}
     assert len(summary["rows"]) == len(summary["scenes"]["street"]) == 2 * 2 * (2 * 6 + 1)
     silent = {row["name"] for row in summary["rows"] if row["cosine"] is None}
     assert silent == {"foliage"}, "a street without leaves"

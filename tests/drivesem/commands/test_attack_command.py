@@ -290,6 +290,8 @@ def test_what_cannot_grade_is_refused(
         (["--method", "random", "--precision", "bfloat16"], "--precision: expected float32 with random"),
         (["--method", "fgsm", "--early-stop"], "--early-stop: expected a method of several steps"),
         (["--method", "corners", "--early-stop"], "--early-stop: expected a method that may end at the first"),
+        (["--params", "rotate,size"], "params: size: expected a budget in which size may change, such as street"),
+        (["--budget", "size=5%"], "--budget: size: expected street,size=5%, since only street lets it change"),
         (["--t-star", "1.5"], "--t-star: expected a score in (0, 1], found 1.5"),
     ],
 )

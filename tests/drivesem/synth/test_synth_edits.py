@@ -44,6 +44,13 @@ def test_translate_is_along_the_length_and_across_to_the_left(plan):
     assert shift @ left == pytest.approx(0.25)
 
 
+def test_a_size_is_of_all_three_sides(plan):
+    actor = plan.actors[0]
+    grown = apply_edit(plan, FrameEdit(objects={actor.track: ObjectEdit(size=0.1)})).actors[0]
+    assert grown.size_lhw == pytest.approx([1.1 * side for side in actor.size_lhw])
+    assert grown.position_xz == actor.position_xz
+
+
 def test_it_moves_as_the_compositor_moves_it(plan):
     from drivesem.attack.space import ground_axes
 

@@ -7,7 +7,7 @@ import torch
 
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace
+from drivesem.attack.space import Budget, ParameterSpace
 from drivesem.synth.demo import demo_scene
 from drivesem.truth.neighbourhood import Neighbourhood
 from drivesem.truth.nuisances import Nuisances
@@ -19,7 +19,7 @@ CAR = 3
 @pytest.fixture(scope="module")
 def objective() -> Objective:
     scene = demo_scene(0, 0)
-    space = ParameterSpace(scene, ("color", "weather", "translate"))
+    space = ParameterSpace(scene, ("color", "weather", "translate", "size"), Budget(size=0.1))
     return Objective(Compositor(scene), space, load_detector("squeezedet"))
 
 
@@ -73,6 +73,9 @@ def test_features_are_those_of_the_state(objective: Objective, theta: torch.Tens
     assert sample.features["height_px"] == pytest.approx(y1 - y0, rel=1e-4)
     assert sample.features["aspect"] == pytest.approx((x1 - x0) / (y1 - y0), rel=1e-4)
     assert sample.features["distance_m"] == pytest.approx(float(scene.objects.translation[CAR, 2]))
+    grown = scene.objects.size_lhw[CAR] / objective.space.scene.objects.size_lhw[CAR] - 1
+    assert sample.features["grown_percent"] == pytest.approx(100 * float(grown.mean()))
+    assert sample.features["grown_percent"] != 0
     assert sample.features["weather.fog"] == pytest.approx(float(scene.environment.weather[0]))
     assert sample.features["paint.lightness"] == pytest.approx(float(scene.objects.texture_code[CAR, 0]))
     assert isinstance(near.fails(sample), bool)

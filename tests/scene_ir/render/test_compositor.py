@@ -118,6 +118,33 @@ def test_moved_vehicles_look_like_the_truth(
     assert float((truth.depth - seen.depth)[both].abs().median()) < 0.1
 
 
+@pytest.mark.parametrize("grown", [1.1, 0.9])
+def test_vehicles_that_grow_look_like_the_truth(street: Street, photographed: SceneIR, grown: float) -> None:
+    """Against the same street drawn with larger or smaller vehicles, and their shadows, which grow along."""
+    drawn = street(torch.float64)
+    truth = Compositor(drawn, REFERENCE).render(drawn.with_objects(size_lhw=grown * drawn.objects.size_lhw))
+    lhw = grown * photographed.objects.size_lhw
+    seen = Compositor(photographed, REFERENCE).render(photographed.with_objects(size_lhw=lhw))
+    vehicles = (truth.object_id > 0) | (seen.object_id > 0)
+    error = (truth.image - seen.image).abs().mean(dim=0)
+    assert float(error[vehicles].mean()) < 0.03
+    assert float(error.mean()) < 0.5 * float((truth.image - photographed.photograph).abs().mean())
+    assert float((truth.object_id == seen.object_id).to(torch.float64).mean()) > 0.98
+    # They stand where they stood: no row of the picture below their wheels is theirs.
+    still = Compositor(photographed, REFERENCE).render(photographed)
+    feet = [int((picture.object_id == 1).any(dim=1).nonzero()[-1]) for picture in (still, seen)]
+    assert abs(feet[1] - feet[0]) <= 2
+
+
+def test_shadows_grow_with_their_vehicle(photographed: SceneIR) -> None:
+    dark = []
+    for grown in (1.0, 1.1):
+        scene = photographed.with_objects(size_lhw=grown * photographed.objects.size_lhw)
+        layers = Compositor(photographed, REFERENCE).layers(scene.objects)
+        dark.append(float((1 - layers.shadow).sum()))
+    assert 1.1 < dark[1] / dark[0] < 1.35
+
+
 def test_turned_vehicles_have_no_cracks(street: Street, photographed: SceneIR) -> None:
     """Well inside the mesh a turned vehicle is opaque, also along what used to be its outline."""
     turned = _moved(photographed, dyaw=0.3)

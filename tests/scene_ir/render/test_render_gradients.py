@@ -59,6 +59,7 @@ PARAMETERS = {
     "translate": Parameter(6, _translate, 1e-4, 0.3),
     "rotate": Parameter(3, lambda s, t: s.with_objects(yaw=s.objects.yaw + t), 1e-4, 0.12),
     "mesh": Parameter(15, _ffd, 1e-4, 0.01),
+    "size": Parameter(3, lambda s, t: s.with_objects(size_lhw=s.objects.size_lhw * (1 + t)[:, None]), 1e-4, 0.1),
 }
 
 

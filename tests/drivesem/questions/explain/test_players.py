@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from drivesem.attack.space import ParameterSpace
+from drivesem.attack.space import Budget, ParameterSpace
 from drivesem.questions.explain.players import cells, objects, parameters, sizes
 
 TWO = ((-2.5, 9.0), (2.5, 12.0))
@@ -70,3 +70,10 @@ def test_sizes_in_metres_and_degrees(space):
     assert found["mesh", 0].steps == pytest.approx(4)
     assert (found["color", 0].value, found["color", 0].unit) == (pytest.approx(0.2), "code")
     assert found["color", 0].owner == "objects[0]"
+
+
+def test_sizes_of_cars_are_in_percent(street):
+    space = ParameterSpace(street(), ("size",), Budget(size=0.1))
+    (grown,) = sizes(space, torch.tensor([0.0, -0.04, 0.0, 0.0]))
+    assert (grown.parameter, grown.object, grown.unit) == ("size", 1, "%")
+    assert (grown.value, grown.steps) == (pytest.approx(4), pytest.approx(4))

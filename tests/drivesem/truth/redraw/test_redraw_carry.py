@@ -75,6 +75,17 @@ def test_vehicles_go_the_same_way(plan: Plan, scene: SceneIR) -> None:
     assert after.actors[COUNT:] == plan.actors[COUNT:]
 
 
+def test_vehicles_grow_by_the_same_share(plan: Plan, scene: SceneIR) -> None:
+    factors = torch.tensor([1.1, 0.95, 1.0], dtype=torch.float64)
+    changed = scene.with_objects(size_lhw=scene.objects.size_lhw * factors[:, None])
+    after = apply_edit(plan, carried(scene, changed, planned(plan, *tracks_of(plan))).edit)
+    for old, new, factor in zip(plan.actors, after.actors, factors.tolist(), strict=False):
+        assert new.size_lhw == pytest.approx([factor * side for side in old.size_lhw])
+    assert carried(scene, changed, planned(plan, None, None, None)).missing == tuple(
+        f"objects[{i}]: the generator's plan has no such vehicle" for i in (0, 1)
+    )
+
+
 @pytest.mark.parametrize("behind", [False, True])
 def test_the_same_metal_is_bent_whichever_way_a_fit_turned_the_car(
     behind: bool, plan: Plan, scene: SceneIR
