@@ -17,9 +17,9 @@ METHOD = (
     "can bring one in. Every method attacks each frame with each fault. Found: cars lost for certain that the "
     "detector without the fault sees in the same picture. Passes: of the detector, a gradient counted as 3; "
     "certificates are not counted. Intervals: 95 %, by bootstrap over frames. Told: a rule of features tells the "
-    "failing states around the first car found from the others; named: its features are the fault's, each about where its "
-    "band is (half of both bands' hull); in part: at least one. Faults none: the detector as it is, whose certain "
-    "losses, and what is told of them, nobody planted."
+    "failing states around the first car found from the others; named: its features are the fault's, each about "
+    "where its band is (half of both bands' hull); in part: at least one. Faults none: the detector as it is, "
+    "whose certain losses, and what is told of them, nobody planted."
 )
 TITLE = "planted faults found, by method"
 COLUMNS: Columns = {
