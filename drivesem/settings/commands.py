@@ -535,6 +535,11 @@ class Bench(Regions, Scenes, FrameCommand):
     """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
     params: str = "color,weather,foliage,translate,rotate,mesh"
     """Climb and planted: what attacks may move, with commas."""
+    faults: Count | None = None
+    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    naming: Flag = False
+    """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
+    of the detector without a fault."""
     limit: Count | None = None
     """Planted: the first N frames; by default 3."""
 
