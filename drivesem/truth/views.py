@@ -82,18 +82,22 @@ class DrawnViews:
         draw, scene, render = self._drawn(theta, number)
         return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, SHARPNESS)
 
-    def _drawn(self, theta: Tensor, number: int) -> tuple[Draw, SceneIR, Render]:
-        space = self.objective.space
+    def draw(self, number: int) -> Draw:
+        """The number-th draw."""
         if number not in self._draws:
-            self._draws[number] = self.nuisances.draw(self.stream, number, space.scene)
-        draw = self._draws[number]
+            self._draws[number] = self.nuisances.draw(self.stream, number, self.objective.space.scene)
+        return self._draws[number]
+
+    def _drawn(self, theta: Tensor, number: int) -> tuple[Draw, SceneIR, Render]:
+        space, draw = self.objective.space, self.draw(number)
         scene = draw.scene(space.apply(space.scene, theta))
         return draw, scene, self.objective.compositor.render(scene)
 
     def _candidates(self, image: Tensor) -> Candidates:
         detector, judged = self.objective.detector, self.objective.judged
         if self.differentiable:
-            return self.objective.differentiable.candidates(self.objective.differentiable(image[None]))
+            known = self.objective.differentiable
+            return known.candidates(known(image[None]) if image.requires_grad else known.glance(image[None]))
         return goals.of_detections(judged.detections(predict(detector, image[None])[0]), len(judged.names))
 
     def _margins(
