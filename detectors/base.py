@@ -230,6 +230,13 @@ class Detector(nn.Module, ABC):
         """
         raise DetectorError(f"detector {self.name}: expected one that tells its candidates")
 
+    @torch.no_grad()
+    def glance(self, images: Tensor) -> Any:
+        """What `forward` gives, without a gradient, for searches, which judge nothing: in the precision of
+        gradients, where that is another.
+        """
+        return self(images)
+
     def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
         """The detector taken apart for images (height, width), as its weights are; None where it cannot be."""
         return None

@@ -82,7 +82,8 @@ class YoloV3(Detector):
     """The network of a `.cfg` with its loss and decoding.
 
     In eval mode with all weights frozen, normalisation is folded into the convolutions. gradient_precision: what
-    passes compute in that a gradient to the images may follow; the others, which judge, use the weights' own.
+    passes compute in that a gradient to the images may follow, and `glance`; the others, which judge, use the
+    weights' own.
     """
 
     name = "yolov3"
@@ -139,19 +140,30 @@ class YoloV3(Detector):
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
         height, width = int(images.shape[2]), int(images.shape[3])
         stride = self.cfg.stride
-        frozen = not self.training and not any(p.requires_grad for p in self.network.parameters())
-        dtype = next(self.network.parameters()).dtype
-        if not frozen:
+        if not self._is_frozen():
             return self._interpret(self.network(_padded(images, stride)), (height, width))
-        if self.gradient_precision is not None and torch.is_grad_enabled() and images.requires_grad:
+        return self._passed(images, torch.is_grad_enabled() and images.requires_grad)
+
+    @torch.no_grad()
+    def glance(self, images: Tensor) -> RawPredictions:
+        """See `Detector`."""
+        return self._passed(images, coarse=True) if self._is_frozen() else self(images)
+
+    def _is_frozen(self) -> bool:
+        return not self.training and not any(p.requires_grad for p in self.network.parameters())
+
+    def _passed(self, images: Tensor, coarse: bool) -> RawPredictions:
+        """By folded convolutions; coarse: in the precision of gradients."""
+        dtype = next(self.network.parameters()).dtype
+        if coarse and self.gradient_precision is not None:
             dtype = self.gradient_precision
         scaled = _Scale()
         x = images
         if dtype in _HALF:
             x = _ToHalf.apply(images, dtype, scaled)  # pyright: ignore[reportAssignmentType]
         with torch.autocast(images.device.type, enabled=False):
-            outputs = self._folded(dtype)(_padded(x, stride))
-        return self._interpret(outputs, (height, width), scaled)
+            outputs = self._folded(dtype)(_padded(x, self.cfg.stride))
+        return self._interpret(outputs, (int(images.shape[2]), int(images.shape[3])), scaled)
 
     def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
         """The whole network; None with another precision for gradients."""

@@ -211,3 +211,16 @@ def wilson(found: int, count: int) -> tuple[float, float]:
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = _Z_95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def newcombe(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
+    """The 95 % interval of how much larger the second of two independent shares is, each so many found of a count:
+    of both shares' `wilson` intervals, after Newcombe (1998), method 10. ValueError as of `wilson`.
+    """
+    (low, high), (lower, upper) = wilson(*first), wilson(*second)
+    one, other = first[0] / first[1], second[0] / second[1]
+    difference = other - one
+    return (
+        difference - math.hypot(other - lower, high - one),
+        difference + math.hypot(upper - other, one - low),
+    )

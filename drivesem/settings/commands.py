@@ -283,6 +283,8 @@ class Holes(FrameCommand):
     """States around each failure, within what the run could change; each is seen once, with nuisances."""
     fresh: Count = 32
     """Further ones inside of the rule that was found, which it is held against."""
+    recheck: Count | None = None
+    """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
     reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
     """How far from the counterexample, as a share of each bound's width, within the bounds."""
 

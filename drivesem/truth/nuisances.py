@@ -28,6 +28,8 @@ from scene_ir.types import LATTICE, SceneIR
 _GENTLEST_JPEG = 95
 _DARKEST = 1e-6
 """Of a picture's values before gamma: it has a slope there."""
+_PART = 1 << 17
+"""Numbers that a processor's second cache holds: one operation after the other on so many, not on all."""
 _TAPS = 2
 """Pixels either way that a blur takes."""
 _NOTHING = 1e-9
@@ -213,17 +215,20 @@ class _Developed(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, gain: float, gamma: float, noise: float, field: Tensor | None) -> Tensor:
-        result, slope = image.clone(), None
-        if gain != 1 or gamma != 1:
-            result.clamp_(_DARKEST, 1).log_().mul_(gamma).exp_().mul_(gain)
-            if ctx.needs_input_grad[0]:
-                within = (image >= _DARKEST) & (image <= 1)
-                slope = (gamma * result).div_(image.clamp_min(_DARKEST)).mul_(within)
-        if field is not None:
-            result.add_(field, alpha=noise)
+        result, toned = image.clone(memory_format=torch.contiguous_format), gain != 1 or gamma != 1
+        noises = [None] if field is None else field.flatten().split(_PART)
+        parts = result.flatten().split(result.numel() if field is None else _PART)
+        for part, random in zip(parts, noises, strict=True):
+            if toned:
+                part.clamp_(_DARKEST, 1).log_().mul_(gamma).exp_().mul_(gain)
+            if random is not None:
+                part.add_(random, alpha=noise)
         if ctx.needs_input_grad[0]:
-            within = ((result >= 0) & (result <= 1)).to(image)
-            ctx.save_for_backward(within if slope is None else slope.mul_(within))
+            slope = ((result >= 0) & (result <= 1)).to(image)
+            if toned:
+                known = image.clamp(_DARKEST, 1)
+                slope.mul_(known == image).mul_(known.log_().mul_(gamma - 1).exp_().mul_(gain * gamma))
+            ctx.save_for_backward(slope)
         return result.clamp_(0, 1)
 
     @staticmethod

@@ -93,7 +93,8 @@ class DrawnViews:
     def _candidates(self, image: Tensor) -> Candidates:
         detector, judged = self.objective.detector, self.objective.judged
         if self.differentiable:
-            return self.objective.differentiable.candidates(self.objective.differentiable(image[None]))
+            known = self.objective.differentiable
+            return known.candidates(known(image[None]) if image.requires_grad else known.glance(image[None]))
         return goals.of_detections(judged.detections(predict(detector, image[None])[0]), len(judged.names))
 
     def _margins(

@@ -66,9 +66,9 @@ class _Clamp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
         (image,) = ctx.saved_tensors
-        away = (image - 0.5).abs()
-        passing = (away <= 0.5 + SATURATED).to(image) + (away < 0.5 - SATURATED)
-        return grad_outputs[0] * (0.5 * passing)
+        away = (image - 0.5).abs_()
+        passing = (away <= 0.5 + SATURATED).to(image).add_(away < 0.5 - SATURATED).mul_(0.5)
+        return passing.mul_(grad_outputs[0])
 
 
 def clamp_colour(image: Tensor) -> Tensor:

@@ -107,7 +107,8 @@ class Compositor(Prepared):
         image = canvas
         if weather:
             changed = replace(self.scene.environment, weather=environment.weather.to(self.like))
-            image = apply_weather(canvas[:3], canvas[3], changed, self.air, backend)
+            colour, inverse = canvas.split([3, 1])
+            image = apply_weather(colour, inverse[0], changed, self.air, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
         return Render(image, depth, number, opacity, drawn)

@@ -116,11 +116,11 @@ def test_onednns_order_of_the_weights_changes_no_number_but_by_rounding(
     images = smooth(batch, height, width, torch.float32)
     detector = shipped(torch.float32)
     raw, slope = gradient(detector, images)
-    assert detector._frozen(images).stem.weight.is_mkldnn
+    assert detector._frozen(coarse=False).stem.weight.is_mkldnn
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
     other = shipped(torch.float32)
     plain_raw, plain = gradient(other, images)
-    assert not other._frozen(images).stem.weight.is_mkldnn
+    assert not other._frozen(coarse=False).stem.weight.is_mkldnn
     for field in FIELDS:
         assert difference(getattr(raw, field), getattr(plain_raw, field)) < 1e-5
     assert difference(slope, plain) < 1e-4
@@ -152,14 +152,18 @@ def test_a_frozen_detector_prepares_no_gradient_of_a_weight() -> None:
     assert all(p.grad is None for p in detector.parameters())
 
 
-def test_bfloat16_is_for_gradients_only() -> None:
+def test_bfloat16_is_for_gradients_and_glances_only() -> None:
     coarse = load_detector("squeezedet", gradient_precision=torch.bfloat16)
     assert isinstance(coarse, SqueezeDet)
     exact, images = shipped(torch.float32), smooth(1, 120, 200, torch.float32)
     with torch.no_grad():
         assert torch.equal(coarse(images).confidence_logits, exact(images).confidence_logits)
+        assert torch.equal(exact.glance(images).confidence_logits, exact(images).confidence_logits)
     raw, slope = gradient(coarse, images)
     expected_raw, expected = gradient(exact, images)
+    glance = coarse.glance(images)
+    assert not glance.confidence_logits.requires_grad
+    assert torch.equal(glance.confidence_logits, raw.confidence_logits)
     assert raw.boxes_xyxy.dtype == slope.dtype == torch.float32
     assert 0 < difference(raw.confidence_logits, expected_raw.confidence_logits) < 0.02
     assert float(F.cosine_similarity(slope.flatten(), expected.flatten(), dim=0)) > 0.9

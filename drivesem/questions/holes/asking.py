@@ -8,10 +8,19 @@ from pathlib import Path
 from rich.console import Console
 
 from drivesem.attack.space import parse_params
-from drivesem.questions.holes.frame import Effort, look_around
+from drivesem.questions.holes.frame import Effort, look_again, look_around
 from drivesem.questions.holes.merged import merged
 from drivesem.questions.holes.report import answer_of
-from drivesem.questions.holes.results import HOLES, Around, FrameHoles, load
+from drivesem.questions.holes.results import (
+    HOLES,
+    RECHECK,
+    Around,
+    FrameHoles,
+    FrameRecheck,
+    Samples,
+    load,
+    load_recheck,
+)
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
@@ -19,8 +28,8 @@ from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Holes
 
-_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs")
-_FREE = (*PRESENTATION, "runs")
+_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs", "rechecks")
+_FREE = (*PRESENTATION, "runs", "recheck")
 
 
 def holes_run(config: Holes) -> Answer:
@@ -33,7 +42,8 @@ def holes_run(config: Holes) -> Answer:
     _tell_effort(runs, config)
     found: dict[str, list[Around]] = {}
     failed: dict[str, str] = {}
-    results: list[FrameHoles] = []
+    results: list[FrameHoles | FrameRecheck] = []
+    again: dict[tuple[str, int], Samples] = {}
     for place, run in enumerate(runs):
         below = out / "runs" / str(place)
         build = partial(HolesWorker, config, run, below)
@@ -45,6 +55,14 @@ def holes_run(config: Holes) -> Answer:
         found |= {mark + one.identifier: list(one.around) for one in kept}
         failed |= {mark + name: reason for name, reason in left.items()}
         results += kept
+        if config.recheck is not None:
+            beside = out / "rechecks" / str(config.recheck) / str(place)
+            checks, left = _rechecked(config, run, kept, below, beside)
+            for check in checks:
+                inside = zip(check.indices, check.inside, strict=True)
+                again |= {(mark + check.identifier, index): samples for index, samples in inside}
+            failed |= {mark + name: reason for name, reason in left.items()}
+            results += checks
     facts = {
         "out": str(out),
         "runs": [str(run.folder) for run in runs],
@@ -55,7 +73,7 @@ def holes_run(config: Holes) -> Answer:
         "passes": sum(one.passes for one in results),
         "frames_failed": failed,
     }
-    answer = answer_of(out, merged(found), facts, failed)
+    answer = answer_of(out, merged(found, again), facts, failed)
     answer.write()
     return answer
 
@@ -75,6 +93,30 @@ class HolesWorker:
         look_around(folder, self.attack, self.params, self.detector, self.effort, self.out / FRAMES / name)
 
 
+class RecheckWorker(HolesWorker):
+    """The same for further samples. known: where rules are kept."""
+
+    def __init__(self, config: Holes, run: Run, known: Path, out: Path) -> None:
+        super().__init__(config, run, out)
+        self.known, self.draws = known, config.recheck or 0
+
+    def __call__(self, name: str) -> None:
+        """One frame, of which rules are known."""
+        folder, known = self.run.folder / FRAMES / name, load(self.known / FRAMES / name / HOLES)
+        out = self.out / FRAMES / name
+        look_again(folder, self.attack, self.params, self.detector, self.effort, known, self.draws, out)
+
+
+def _rechecked(
+    config: Holes, run: Run, known: list[FrameHoles], below: Path, out: Path
+) -> tuple[list[FrameRecheck], dict[str, str]]:
+    """Further samples of the frames that are known, kept in `out`, and why there are none of others."""
+    build = partial(RecheckWorker, config, run, below, out)
+    names = [one.identifier for one in known]
+    bar = Bar(f"checking rules of {run.name}", remaining=True)
+    return KeptFrames(run, out, RECHECK, load_recheck).ask(names, build(), build, config, bar)
+
+
 def _chosen(run: Run) -> list[str]:
     return [frame.result.identifier for frame in run.frames if certain_losses(frame.result)]
 
@@ -84,7 +126,7 @@ def _tell_effort(runs: list[Run], config: Holes) -> None:
     count = sum(len(certain_losses(frame.result)) for run in runs for frame in run.frames)
     results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
     seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
-    wanted = count * (config.samples + config.fresh)
+    wanted = count * (config.samples + config.fresh + (config.recheck or 0))
     minutes = wanted * seconds / passes / 60 if passes else None
     pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
     told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare"

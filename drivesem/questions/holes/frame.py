@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +12,18 @@ import numpy as np
 from detectors.base import Predictor
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.space import Parameter
-from drivesem.questions.holes.results import HOLES, Around, FrameHoles, Samples, dump
+from drivesem.questions.holes.results import (
+    HOLES,
+    RECHECK,
+    Around,
+    FrameHoles,
+    FrameRecheck,
+    Samples,
+    dump,
+)
 from drivesem.run.frame import RESULT
 from drivesem.run.rebuilt import rebuilt
-from drivesem.run.results import Failure, load_frame
+from drivesem.run.results import Failure, FrameResult, load_frame
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Attack
 from drivesem.truth.neighbourhood import NEAR, Neighbourhood, Sample
@@ -26,6 +34,8 @@ from scene_ir import files
 
 _TRIES = 6
 """States that may be looked at for each fresh sample inside of a rule."""
+_TRIES_AGAIN = 20
+"""The same for a recheck: a rule may hold as little as a twentieth of the samples it is made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,16 +62,8 @@ def look_around(
     """
     start = time.perf_counter()
     result = load_frame(folder / RESULT)
-    objective, theta = rebuilt(result, folder, attack, params, detector)
-    limits = Limits(joint_weather=result.joint_weather)
-    feasible = objective.feasible_set(limits, attack.project == "bounds")
     around, passes = [], 0
-    for failure in certain_losses(result):
-        assert failure.index is not None
-        name = f"{result.identifier}:{failure.index}:{effort.seed}"
-        near = Neighbourhood(
-            objective, feasible, theta, failure.index, Nuisances.of(attack.nuisances), name, effort.reach
-        )
+    for failure, near in _neighbourhoods(result, folder, attack, params, detector, effort):
         one = _around(failure, near, effort)
         passes += sum(len(seen.margins) for seen in (one.asked, one.near, one.fresh)) + one.lost.asked
         around.append(one)
@@ -75,6 +77,59 @@ def look_around(
     with files.whole_folder(out) as part:
         files.write_text(part / HOLES, dump(found))
     return found
+
+
+def look_again(
+    folder: Path,
+    attack: Attack,
+    params: Sequence[Parameter],
+    detector: Predictor,
+    effort: Effort,
+    known: FrameHoles,
+    draws: int,
+    out: Path,
+) -> FrameRecheck:
+    """Draw up to so many states inside of each rule that is known of a frame, by seeds of their own, and write the
+    folder `out`, whole or not at all. Else as `look_around`.
+    """
+    start = time.perf_counter()
+    result = load_frame(folder / RESULT)
+    inside = []
+    around = _neighbourhoods(result, folder, attack, params, detector, effort, ":recheck")
+    for one, (_, near) in zip(known.around, around, strict=True):
+        samples, _ = _seen(near, range(_TRIES_AGAIN * draws), draws if one.fresh.margins else 0, one.where)
+        inside.append(samples)
+    found = FrameRecheck(
+        identifier=result.identifier,
+        source=files.digest(folder / RESULT),
+        indices=tuple(one.index for one in known.around),
+        inside=tuple(inside),
+        passes=sum(len(samples.margins) for samples in inside),
+        seconds=round(time.perf_counter() - start, 3),
+    )
+    with files.whole_folder(out) as part:
+        files.write_text(part / RECHECK, dump(found))
+    return found
+
+
+def _neighbourhoods(
+    result: FrameResult,
+    folder: Path,
+    attack: Attack,
+    params: Sequence[Parameter],
+    detector: Predictor,
+    effort: Effort,
+    stream: str = "",
+) -> Iterator[tuple[Failure, Neighbourhood]]:
+    """Of each certain failure, in their order. stream: of the seeds."""
+    objective, theta = rebuilt(result, folder, attack, params, detector)
+    limits = Limits(joint_weather=result.joint_weather)
+    feasible = objective.feasible_set(limits, attack.project == "bounds")
+    nuisances = Nuisances.of(attack.nuisances)
+    for failure in certain_losses(result):
+        assert failure.index is not None
+        name = f"{result.identifier}:{failure.index}:{effort.seed}{stream}"
+        yield failure, Neighbourhood(objective, feasible, theta, failure.index, nuisances, name, effort.reach)
 
 
 def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:

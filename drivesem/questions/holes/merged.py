@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.evaluation.resampling import wilson
-from drivesem.questions.holes.results import Around
+from drivesem.evaluation.resampling import newcombe, wilson
+from drivesem.questions.holes.results import Around, Samples
 from drivesem.synth.compare import QUANTITIES, reference
 from drivesem.truth.rare import Share
 from drivesem.truth.rules import Rule, counted, overlap
@@ -24,6 +24,48 @@ _OF_KITTI = {
 """Features of which KITTI's distribution is known: its name there, and how many of its units one of ours is."""
 
 Where = dict[str, tuple[float, float]]
+Again = Mapping[tuple[str, int], Samples]
+"""Of a recheck: samples inside of the rule around a failure, by frame and object."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recheck:
+    """A hole's probability beside that of draws which had no part in it. stated, again: failures and samples."""
+
+    stated: tuple[int, int]
+    again: tuple[int, int]
+
+    @property
+    def probability(self) -> float:
+        """Share of failures among the new draws."""
+        return self.again[0] / self.again[1]
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's of it, 95 %."""
+        return wilson(*self.again)
+
+    @property
+    def difference(self) -> tuple[float, float]:
+        """The 95 % interval of how much more often new draws fail than is stated."""
+        return newcombe(self.stated, self.again)
+
+    @property
+    def holds(self) -> bool:
+        """Whether chance alone may explain the difference: 0 lies in its interval."""
+        low, high = self.difference
+        return low <= 0 <= high
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object."""
+        return {
+            "draws": self.again[1],
+            "failures": self.again[0],
+            "probability": self.probability,
+            "interval": list(self.interval),
+            "difference": list(self.difference),
+            "holds": self.holds,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +74,7 @@ class Hole:
     label: class of the objects; probability, low, high: of failing in fresh samples inside, with Wilson's 95 %
     interval, of `count` samples; outside: share of failures outside of it; lost: how large it is, the
     share of the neighbourhoods in which the object is lost; kitti: share of KITTI's vehicles inside, by feature;
-    failures, frames: that led to it.
+    failures, frames: that led to it; recheck: None where none was asked for, or nothing is stated.
     """
 
     where: Where
@@ -46,6 +88,7 @@ class Hole:
     kitti: dict[str, float]
     failures: tuple[str, ...]
     frames: tuple[str, ...]
+    recheck: Recheck | None = None
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
@@ -56,6 +99,7 @@ class Hole:
             "probability": self.probability,
             "interval": [self.low, self.high],
             "samples": self.count,
+            "recheck": None if self.recheck is None else self.recheck.to_json(),
             "outside": self.outside,
             "size": {
                 "probability": self.lost.probability,
@@ -75,9 +119,9 @@ class Hole:
         )
 
 
-def merged(found: Mapping[str, Sequence[Around]]) -> list[Hole]:
+def merged(found: Mapping[str, Sequence[Around]], again: Again | None = None) -> list[Hole]:
     """Holes of all frames, by name, largest first; what is told by the same features as a larger one comes after
-    those that are not.
+    those that are not. again: samples of a recheck.
     """
     groups: list[list[tuple[str, Around]]] = []
     for frame, arounds in found.items():
@@ -87,7 +131,7 @@ def merged(found: Mapping[str, Sequence[Around]]) -> list[Hole]:
                 groups.append([(frame, around)])
             else:
                 like.append((frame, around))
-    holes = sorted((_hole(group) for group in groups), key=lambda hole: -hole.lost.probability)
+    holes = sorted((_hole(group, again or {}) for group in groups), key=lambda hole: -hole.lost.probability)
     seen: set[tuple[str, ...]] = set()
     first: list[Hole] = []
     copies: list[Hole] = []
@@ -103,7 +147,7 @@ def _alike(one: Around, other: Around) -> bool:
     return same and overlap(one.where, other.where) >= ONE
 
 
-def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
+def _hole(group: Sequence[tuple[str, Around]], again: Again) -> Hole:
     members = [around for _, around in group]
     # Of bounds that differ a little from failure to failure, the ones in the middle.
     where: Where = {
@@ -116,10 +160,8 @@ def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
     asked = [
         counted(where, around.asked.columns(), around.asked.failing) for around in members if around.asked.margins
     ]
-    fresh = [
-        counted(where, around.fresh.columns(), around.fresh.failing) for around in members if around.fresh.margins
-    ]
-    fails, count = sum(rule.fails for rule in fresh), sum(rule.count for rule in fresh)
+    fails, count = _inside(where, [around.fresh for around in members])
+    checked = _inside(where, [again[key] for frame, around in group if (key := (frame, around.index)) in again])
     low, high = wilson(fails, count) if count else (None, None)
     return Hole(
         where=where,
@@ -133,7 +175,14 @@ def _hole(group: Sequence[tuple[str, Around]]) -> Hole:
         kitti=of_kitti(where),
         failures=tuple(f"{frame}: objects[{around.index}]" for frame, around in group),
         frames=tuple(dict.fromkeys(frame for frame, _ in group)),
+        recheck=Recheck((fails, count), checked) if count and checked[1] else None,
     )
+
+
+def _inside(where: Where, samples: Sequence[Samples]) -> tuple[int, int]:
+    """Failures among samples inside of a rule, and how many these are."""
+    rules = [counted(where, some.columns(), some.failing) for some in samples if some.margins]
+    return sum(rule.fails for rule in rules), sum(rule.count for rule in rules)
 
 
 def _mean(shares: Sequence[Share]) -> Share:

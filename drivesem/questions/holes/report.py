@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.questions.holes.merged import Hole
+from drivesem.questions.holes.merged import Hole, Recheck
 from drivesem.questions.holes.plots import write_holes
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
@@ -24,8 +24,16 @@ _NOTES = (
 )
 
 
+_CHECKED = (
+    "Again: the same share in draws by seeds that neither the rule nor its probability knew. A hole holds where "
+    "chance alone may explain the difference of the two shares: its 95 % interval, of both Wilson intervals after "
+    "Newcombe, has 0 in it. One in twenty does not hold though its probability is right. {hold} of {count} hold."
+)
+
+
 def answer_of(out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
     """What is said of all frames. facts: what stands before the holes in the JSON."""
+    checks = [hole.recheck for hole in holes if hole.recheck is not None]
     lines = tuple(
         (
             hole.words,
@@ -37,23 +45,35 @@ def answer_of(out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed
             f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
             str(len(hole.failures)),
             str(len(hole.frames)),
+            *((_again(hole.recheck),) if checks else ()),
         )
         for hole in holes
     )
     columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures", "frames")
+    columns += ("again, %",) if checks else ()
+    hold = sum(check.holds for check in checks)
+    told = (_CHECKED.format(hold=hold, count=len(checks)),) if checks else ()
     title = f"Holes of {facts['detector']}, within {facts['params']}"
     return Answer(
         out=out,
         name="holes",
         heading="Holes",
-        data={**facts, "holes": [hole.to_json() for hole in holes]},
+        data={**facts, "rechecked": len(checks), "hold": hold, "holes": [hole.to_json() for hole in holes]},
         tables={"holes": [_flat(hole) for hole in holes]} if holes else {},
         sheets=[Sheet(title, columns, lines)],
-        notes=_NOTES if holes else (_NONE,),
+        notes=(*_NOTES, *told) if holes else (_NONE,),
         words=("where", "class"),
         picture=partial(write_holes, holes=holes) if holes else None,
         failed=failed,
     )
+
+
+def _again(check: Recheck | None) -> str:
+    if check is None:
+        return "-"
+    low, high = check.interval
+    share = f"{100 * check.probability:.0f} [{_percent(low)}, {_percent(high)}]"
+    return f"{share} {'holds' if check.holds else 'does not hold'}"
 
 
 def _percent(value: float | None) -> str:
@@ -61,6 +81,7 @@ def _percent(value: float | None) -> str:
 
 
 def _flat(hole: Hole) -> dict[str, Any]:
+    check = hole.recheck
     return {
         "where": hole.words,
         "class": hole.label,
@@ -68,6 +89,9 @@ def _flat(hole: Hole) -> dict[str, Any]:
         "low": hole.low,
         "high": hole.high,
         "samples": hole.count,
+        "again": None if check is None else check.probability,
+        "again_draws": None if check is None else check.again[1],
+        "holds": None if check is None else check.holds,
         "outside": hole.outside,
         "size": hole.lost.probability,
         "size_low": hole.lost.low,

@@ -12,8 +12,8 @@ from drivesem.truth.rare import Share
 from drivesem.truth.rules import Flags, Floats
 
 SCHEMA = 2
-HOLES = "holes.json"
-"""The file that marks a frame as done."""
+HOLES, RECHECK = "holes.json", "recheck.json"
+"""The files that mark a frame as done: its rules, and further samples inside of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,21 @@ class FrameHoles:
     seconds: float
 
 
-def dump(result: FrameHoles) -> str:
+@dataclass(frozen=True, slots=True)
+class FrameRecheck:
+    """Of one frame, samples inside of the rule around each of its failures, by seeds that neither the rule nor its
+    probability knew. source: digest of the run's result; indices: of the objects.
+    """
+
+    identifier: str
+    source: str
+    indices: tuple[int, ...]
+    inside: tuple[Samples, ...]
+    passes: int
+    seconds: float
+
+
+def dump(result: FrameHoles | FrameRecheck) -> str:
     """JSON text."""
     return dump_record(result, SCHEMA)
 
@@ -74,3 +88,8 @@ def dump(result: FrameHoles) -> str:
 def load(path: Path) -> FrameHoles:
     """Read what `dump` gave. Raises FormatError naming the file."""
     return load_record(path, FrameHoles, SCHEMA, "the fields of a frame's holes")
+
+
+def load_recheck(path: Path) -> FrameRecheck:
+    """The same of further samples."""
+    return load_record(path, FrameRecheck, SCHEMA, "the fields of a frame's samples inside of its rules")

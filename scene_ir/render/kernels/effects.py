@@ -533,16 +533,16 @@ class _Wet:
         radius = model.mirror_reach(height) // 2
         if road.is_cuda:  # to look where the road is would make the CPU wait
             return cls(0, height, 0, radius)
-        first, last = _rows(road > 0)
+        first, last = _rows(road, 0.0)
         if first == last:
             return cls(0, 0, 0, radius)
         bottom = min(height, max(last, radius + 1))
         return cls(max(0, max(first, radius) - 2 * radius), bottom, first, radius)
 
 
-def _rows(mask: Tensor) -> tuple[int, int]:
-    """The rows [top, bottom) of a mask (H, W) that hold all that is true."""
-    rows = mask.any(dim=1).nonzero()[:, 0]
+def _rows(values: Tensor, above: float) -> tuple[int, int]:
+    """The rows [top, bottom) of a map (H, W) that hold all that is above a number."""
+    rows = (values.amax(dim=1) > above).nonzero()[:, 0]
     return (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 0)
 
 
@@ -822,7 +822,7 @@ class _Foliage(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, code: Tensor, air: Tensor, amount: Tensor, gaps: Tensor) -> Tensor:
         height, width = image.shape[1:]
         plane = height * width
-        top, bottom = (0, height) if image.is_cuda else _rows(amount > model.FEWEST_LEAVES)
+        top, bottom = (0, height) if image.is_cuda else _rows(amount, model.FEWEST_LEAVES)
         kept_maps = [t.detach().contiguous() for t in (image, amount, gaps)]
         settings = image.new_empty(2 * LEAF_SETTINGS)
         out = kept_maps[0].clone()

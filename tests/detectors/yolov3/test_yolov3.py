@@ -339,9 +339,14 @@ def test_gradient_precision(mini: YoloV3, precision: torch.dtype) -> None:
         assert found.dtype == torch.float32
         assert float(torch.cosine_similarity(found.flatten(), exact.flatten(), 0)) > 0.98
     with torch.no_grad():  # what is judged is as precise as ever
-        judged = mini(image).boxes_xyxy
+        judged, glance = mini(image).boxes_xyxy, mini.glance(image)
         mini.gradient_precision = None
         assert torch.equal(mini(image).boxes_xyxy, judged)
+        assert torch.equal(mini.glance(image).boxes_xyxy, judged)
+    with torch.enable_grad():
+        mini.gradient_precision = precision
+        assert torch.equal(mini(image).confidence_logits, glance.confidence_logits)
+    assert not glance.confidence_logits.requires_grad
 
 
 def test_training_mode_uses_the_batch(mini: YoloV3) -> None:

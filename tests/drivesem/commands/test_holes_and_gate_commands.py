@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,7 @@ from detectors.types import Detections
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
 from drivesem.questions.gate import asking as gate_asking
-from drivesem.questions.holes.results import load
+from drivesem.questions.holes.results import load, load_recheck
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
@@ -162,6 +163,38 @@ def test_a_second_call_goes_on_and_says_the_same(
     assert kept.stat().st_mtime_ns == written
 
 
+def test_a_rule_is_checked_by_draws_of_its_own(
+    attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After the holes, which are kept: of seeds that neither the rule nor its probability knew."""
+    out, name = tmp_path / "holes", Path("0") / "frames" / "demo-000"
+    shutil.copytree(looked, out)
+    kept, checked = out / "runs" / name / "holes.json", out / "rechecks" / "16" / name / "recheck.json"
+    written = kept.stat().st_mtime_ns
+    words = [str(attacked), *HOLES, "--out", str(out)]
+    found = holes([*words, "--recheck", "16"], capsys)
+    assert kept.stat().st_mtime_ns == written
+    assert (found["rechecked"], found["hold"]) == (len(found["holes"]), len(found["holes"]))
+    again = found["holes"][0]["recheck"]
+    assert again["draws"] == 16 * len(found["holes"][0]["failures"])
+    assert again["probability"] >= 0.8
+    assert again["interval"][0] <= again["probability"] <= again["interval"][1]
+    assert again["holds"]
+    for around, inside in zip(load(kept).around, load_recheck(checked).inside, strict=True):
+        known = {*around.asked.values, *around.near.values, *around.fresh.values}
+        assert len(inside.values) == 16
+        assert not known & set(inside.values)
+    page, rows = (out / "holes.md").read_text(), (out / "holes.csv").read_text().splitlines()
+    assert "again, %" in page
+    assert f"{found['hold']} of {found['rechecked']} hold" in page
+    assert next(csv.DictReader(rows))["holds"] == "True"
+
+    checked_at = checked.stat().st_mtime_ns
+    assert holes([*words, "--recheck", "16"], capsys) == found
+    assert checked.stat().st_mtime_ns == checked_at
+    assert holes(words, capsys)["holes"][0]["recheck"] is None
+
+
 def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = []
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
@@ -247,6 +280,7 @@ def test_other_classes_are_no_comparison(
         ([], "RUN: expected folders of drivesem attack"),
         (["nowhere"], "RUN: expected a folder of drivesem attack, found nowhere"),
         (["nowhere", "--samples", "9"], "--samples: expected at least 24, of which a rule can be made, found 9"),
+        (["nowhere", "--recheck", "0"], "--recheck: expected at least 1, found 0"),
         (["nowhere", "--reach", "0"], "--reach: expected a share above 0, up to 1, found 0"),
     ],
 )

@@ -6,7 +6,16 @@ from scipy.stats import binomtest
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.kitti import evaluate
-from drivesem.evaluation.resampling import Averaged, Figure, Recalled, Sampled, differences, intervals, wilson
+from drivesem.evaluation.resampling import (
+    Averaged,
+    Figure,
+    Recalled,
+    Sampled,
+    differences,
+    intervals,
+    newcombe,
+    wilson,
+)
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
@@ -115,3 +124,19 @@ def test_wilson_is_scipys(hits: int, count: int) -> None:
 def test_wilson_of_what_is_no_share(hits: int, count: int) -> None:
     with pytest.raises(ValueError, match="share"):
         wilson(hits, count)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "low", "high"),
+    [
+        ((48, 80), (56, 70), 0.0524, 0.3339),
+        ((3, 10), (9, 10), 0.1705, 0.8090),
+        ((2, 7), (6, 7), 0.0582, 0.8062),
+        ((0, 20), (10, 10), 0.6791, 1.0),
+        ((0, 29), (5, 56), -0.0381, 0.1926),
+    ],
+)
+def test_newcombes_own_examples(first: tuple[int, int], second: tuple[int, int], low: float, high: float) -> None:
+    """Newcombe (1998), table II, method 10."""
+    assert newcombe(first, second) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))
+    assert newcombe(second, first) == (pytest.approx(-high, abs=5e-5), pytest.approx(-low, abs=5e-5))

@@ -10,6 +10,7 @@ import pytest
 from drivesem.questions.holes.merged import merged, of_kitti
 from drivesem.questions.holes.results import Around, Samples
 from drivesem.truth.rare import Share
+from drivesem.truth.rules import fit
 
 NAMES = ("height_px", "lightness")
 NOTHING = Samples((), (), ())
@@ -60,6 +61,68 @@ def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
     one = Around(0, "Car", "missed", "certain", four, NOTHING, {}, NOTHING, lost)
     (hole,) = merged({"a": [one]})
     assert (hole.words, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
+
+
+def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 100.0) -> Samples:
+    """Of a field in which an object is lost in 70 % of the states of heights from 30 to 60, and in 5 % else."""
+    heights = rng.uniform(low, high, count)
+    lost = rng.random(count) < np.where((heights > 30) & (heights < 60), 0.7, 0.05)
+    return samples(heights.tolist(), lost.tolist())
+
+
+@pytest.fixture(scope="module")
+def fields() -> list[tuple[Around, Samples]]:
+    """Rules of that field from samples, fresh ones inside of each, and those of a recheck."""
+    found = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        asked = drawn(rng, 96)
+        where = fit(asked.columns(), asked.failing).where
+        low, high = where.get("height_px", (0.0, 100.0))
+        one = replace(around(30, 60), asked=asked, where=where, fresh=drawn(rng, 32, low, high))
+        found.append((one, drawn(rng, 150, low, high)))
+    return found
+
+
+def test_a_probability_that_was_held_against_fresh_samples_holds(fields: list[tuple[Around, Samples]]) -> None:
+    held = 0
+    for one, again in fields:
+        (hole,) = merged({"a": [one]}, {("a", 0): again})
+        assert hole.recheck is not None
+        told = hole.recheck.to_json()
+        assert (told["draws"], told["failures"]) == (150, int(again.failing.sum()))
+        assert told["probability"] == told["failures"] / 150
+        assert told["interval"][0] < told["probability"] < told["interval"][1]
+        assert told["holds"] == (told["difference"][0] <= 0 <= told["difference"][1])
+        held += told["holds"]
+    assert 0.92 <= held / len(fields) <= 0.99  # 95 %: chance alone makes some that do not
+
+
+def test_a_probability_of_another_place_does_not(fields: list[tuple[Around, Samples]]) -> None:
+    """What is stated of samples anywhere, of which a third or so lie where the object is lost."""
+    held = 0
+    for one, again in fields:
+        anywhere = replace(one.asked, values=tuple((one.where["height_px"][0], 0.5) for _ in one.asked.values))
+        (hole,) = merged({"a": [replace(one, fresh=anywhere)]}, {("a", 0): again})
+        assert hole.recheck is not None
+        held += hole.recheck.holds
+    assert held / len(fields) < 0.05
+
+
+def test_a_recheck_is_of_what_the_whole_hole_says() -> None:
+    """Of a hole of two failures, draws of both count where they lie inside of the rule that is told."""
+    again = {("a", 0): samples([21.0, 30.0, 39.0], [True] * 3), ("b", 0): samples([25.0, 41.9], [False] * 2)}
+    (hole,) = merged({"a": [around(20, 40)], "b": [around(22, 42)]}, again)
+    assert hole.recheck is not None
+    assert hole.recheck.again == (3, 4)
+    assert hole.recheck.stated == (18, 20)
+
+
+def test_nothing_to_check() -> None:
+    (plain,) = merged({"a": [around(20, 40)]})
+    assert plain.to_json()["recheck"] is None
+    (unsaid,) = merged({"a": [replace(around(20, 40), fresh=NOTHING)]}, {("a", 0): samples([30.0], [True])})
+    assert (unsaid.probability, unsaid.recheck) == (None, None)
 
 
 def test_kitti_knows_some_features() -> None:
