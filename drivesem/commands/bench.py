@@ -13,7 +13,8 @@ from rich.console import Console
 
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
-from drivesem.bench import boxes, detector, memory, render, step
+from drivesem.attack.space import parse_params
+from drivesem.bench import boxes, climb, detector, memory, render, step
 from drivesem.bench.planted import summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
@@ -43,6 +44,7 @@ def run(config: Bench) -> int:
         "render": _render,
         "memory": _memory,
         "detector": _detector,
+        "climb": _climb,
         "planted": _planted,
     }
     return conduct(config, "drivesem bench", measure[config.what])
@@ -110,6 +112,22 @@ def _detector(config: Bench, console: Console) -> Measured:
     except DetectorError as error:
         raise UsageError("--detector", "a detector with gradients", error) from error
     return Measured({"rows": rows, "method": detector.METHOD}, [Section(detector.TITLE, detector.COLUMNS, rows)])
+
+
+def _climb(config: Bench, console: Console) -> Measured:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu (the processor's time is measured)", config.device)
+    try:
+        detectors = {
+            name: load_detector(config.detector, gradient_precision=dtype)
+            for name, dtype in climb.PRECISIONS.items()
+        }
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector with gradients", error) from error
+    cars, params = _sizes(config)[0], parse_params(config.params)
+    measured = climb.measure(cars, params, config.passes, 4 if config.quick else 20, detectors, config.seed)
+    rows = _dicts(watched(measured, len(cars) * len(detectors), console))
+    return Measured({"rows": rows, "method": climb.METHOD}, [Section(climb.TITLE, climb.COLUMNS, rows)])
 
 
 def _planted(config: Bench, console: Console) -> Measured:

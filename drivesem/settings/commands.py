@@ -508,10 +508,11 @@ class Synth(FrameCommand):
 class Bench(Regions, Scenes, FrameCommand):
     """Measure: one attack step, the renderer, memory, detectors, and what attacks find of known faults."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "planted"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "climb", "planted"]] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
-    memory above the detector's own; detector: forward, backward and decoding of each detector; planted: how many
-    faults that were planted into the detector each attack finds (docs/planted.md), minutes a frame."""
+    memory above the detector's own; detector: forward, backward and decoding of each detector; climb: a search by
+    climb, and the parts of its passes; planted: how many faults that were planted into the detector each attack
+    finds (docs/planted.md), minutes a frame."""
     quick: Flag = False
     """Fewer repetitions: some 50 s; planted: two faults a frame."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -531,9 +532,14 @@ class Bench(Regions, Scenes, FrameCommand):
     methods: str = "climb,corners,si-fgsm,halton,cma-es"
     """Planted: attacks to judge, with commas (drivesem attack --method)."""
     passes: Annotated[int, at_least(LEAST_PASSES)] = 90
-    """Planted: passes of the detector that each attack may take for a fault, a gradient counted as 3."""
+    """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
     params: str = "color,weather,foliage,translate,rotate,mesh"
-    """Planted: what attacks may move, with commas."""
+    """Climb and planted: what attacks may move, with commas."""
+    faults: Count | None = None
+    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    naming: Flag = False
+    """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
+    of the detector without a fault."""
     limit: Count | None = None
     """Planted: the first N frames; by default 3."""
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import math
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
@@ -14,20 +16,29 @@ from typing import Any
 import tyro
 import yaml
 
+from drivesem import __version__
 from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
+_ANY = f"one of {', '.join(COMMANDS)}"
 _FOR = "for"
 """Key of a preset: the commands that it is for. A setting that only some of them have is left out for others."""
 
 
 def parse(argv: Sequence[str]) -> Command:
-    """The settings that `argv` asks for. Raises UsageError; SystemExit(0) after `--help`."""
+    """The settings that `argv` asks for. Raises UsageError; SystemExit(0) after `--help` and `--version`."""
     words = list(argv)
-    if words and words[0] in COMMANDS:
+    if not words:
+        raise UsageError("command", _ANY, "none; drivesem --help says what each does")
+    if words[0] == "--version":
+        sys.stdout.write(f"drivesem {__version__}\n")
+        raise SystemExit(0)
+    if words[0] in COMMANDS:
         words = [words[0], *_with_presets(words[0], words[1:])]
+    elif not words[0].startswith("-"):
+        raise UsageError("command", _ANY, _meant(words[0], COMMANDS))
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
@@ -37,11 +48,32 @@ def parse(argv: Sequence[str]) -> Command:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
+        _refuse_unknown(words)
         raise UsageError(
             "command line", "known options (see drivesem --help)", _unboxed(captured.getvalue())
         ) from None
     config.check()
     return config
+
+
+def _refuse_unknown(words: Sequence[str]) -> None:
+    """Raises UsageError for the first option that the command does not have."""
+    if words[0] not in COMMANDS:
+        return
+    settings = fields(COMMANDS[words[0]])
+    known = {"--help", *(option(field.name) for field in settings)}
+    known |= {option(f"no-{field.name}") for field in settings if str(field.type) == "bool"}
+    for word in words[1:]:
+        name = word.partition("=")[0]
+        if name.startswith("--") and name.replace("_", "-") not in known:
+            expected = f"an option of drivesem {words[0]} (its --help lists them)"
+            raise UsageError("command line", expected, _meant(name, known))
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    """A word, and what it may have been meant to be."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"{word}; did you mean {near[0]}?" if near else word
 
 
 def _with_presets(command: str, words: list[str]) -> list[str]:

@@ -41,6 +41,11 @@ def contains(where: Mapping[str, tuple[float, float]], features: Mapping[str, Fl
     return inside
 
 
+def in_words(where: Mapping[str, tuple[float, float]]) -> str:
+    """A rule for people."""
+    return ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in where.items()) or "anywhere"
+
+
 def fit(features: Mapping[str, Floats], fails: Flags, most: int = MOST, only: Sequence[str] | None = None) -> Rule:
     """The rule with the highest likelihood, of two shares of failures, one inside and one outside. features: (n,)
     by name; fails: (n,). only: features that it may ask for.

@@ -82,11 +82,14 @@ class DrawnViews:
         draw, scene, render = self._drawn(theta, number)
         return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, SHARPNESS)
 
-    def _drawn(self, theta: Tensor, number: int) -> tuple[Draw, SceneIR, Render]:
-        space = self.objective.space
+    def draw(self, number: int) -> Draw:
+        """The number-th draw."""
         if number not in self._draws:
-            self._draws[number] = self.nuisances.draw(self.stream, number, space.scene)
-        draw = self._draws[number]
+            self._draws[number] = self.nuisances.draw(self.stream, number, self.objective.space.scene)
+        return self._draws[number]
+
+    def _drawn(self, theta: Tensor, number: int) -> tuple[Draw, SceneIR, Render]:
+        space, draw = self.objective.space, self.draw(number)
         scene = draw.scene(space.apply(space.scene, theta))
         return draw, scene, self.objective.compositor.render(scene)
 

@@ -16,9 +16,10 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
+from drivesem.attack.methods.corners import corners
 from drivesem.attack.methods.margin_search import FAR, FINAL_PASSES, SURE, MarginSearch, OfMargins
 
-_SCOUTS = 0.3
+_SCOUTS = 0.4
 """Share of the passes that look around."""
 _REACH = 0.2
 """Half the width of differences, as a share of the bounds."""
@@ -52,14 +53,11 @@ def _look_around(search: MarginSearch, count: int) -> Tensor:
 
 
 def _scouts(search: MarginSearch, count: int) -> Tensor:
-    """Places (count, K): corners and a scrambled Halton sequence in turn; of the first, all the scene's
-    coordinates at their upper end.
-    """
+    """Places (count, K): balanced corners and a scrambled Halton sequence in turn."""
     at = search.at
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
     places = torch.from_numpy(qmc.Halton(len(at.owner), scramble=True, rng=rng).random(count))
-    places[::2] = places[::2].round()
-    places[0, at.owner < 0] = 1.0
+    places[::2] = corners(at.owner, (count + 1) // 2, search.generator)
     return places.to(at.start)
 
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
+
+import numpy as np
 
 from detectors.base import Detector, DetectorError, predict
 from detectors.planted import PlantedDetector
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.bench.planted.naming import agrees, told_of
 from drivesem.bench.planted.plant import KINDS, FaultKind, Planting, plant
 from drivesem.bench.planted.survey import FrameSurvey
 from drivesem.evaluation import failures
@@ -19,14 +23,17 @@ from drivesem.run.attack import Worker, grader_of
 from drivesem.run.frame import AttackedScene
 from drivesem.scenes.sources import NoVehicleError
 from drivesem.settings.blocks import Scenes, shared
-from drivesem.settings.commands import Attack, Bench
+from drivesem.settings.commands import Attack, Bench, Holes
 from drivesem.settings.errors import UsageError
 from drivesem.truth.grades import Grade
+from drivesem.truth.rules import in_words
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 
 METHODS = tuple(name for name in get_args(get_type_hints(Attack)["method"]) if name != "placebo")
 """Attacks that can be judged: a placebo needs a run to be like."""
+NO_FAULT = "none"
+"""Kind and rarity of attempts on the detector as it is, beside which names are to be seen."""
 SURE = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
 QUICK_KINDS = (KINDS[2], KINDS[-2])
 """One easy, one rare: those that could be planted wherever that was tried."""
@@ -36,7 +43,9 @@ QUICK_KINDS = (KINDS[2], KINDS[-2])
 class Attempt:
     """One method on one fault of one frame. hit, sure: as of `Planting`. certain: cars lost for certain; found: of
     these, those that the detector without the fault sees in the same picture; inside: of those, the ones inside of
-    the fault's region; passes: of the detector; seconds: of the search and of certificates.
+    the fault's region; passes: of the detector; seconds: of the search and of certificates. rule: what samples
+    around the first of those found say (`naming`), None where nobody asked; named, in_part: whether that is the
+    fault, or a feature of it; naming: passes that it took.
     """
 
     frame: str
@@ -51,6 +60,10 @@ class Attempt:
     inside: int
     passes: int
     seconds: float
+    rule: str | None = None
+    named: bool = False
+    in_part: bool = False
+    naming: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +134,8 @@ class Yardstick:
     def judge(self, name: str) -> JudgedFrame:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
         asked = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
-        asked |= {key: getattr(self.config, key) for key in ("methods", "passes", "params", "detector", "quick")}
+        keys = ("methods", "passes", "params", "detector", "quick", "faults", "naming")
+        asked |= {key: getattr(self.config, key) for key in keys}
         asked.pop("limit")
         path = None if self.kept is None else self.kept / f"{name}.json"
         if path is not None and self.config.resume and path.is_file():
@@ -142,26 +156,42 @@ class Yardstick:
         survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
         attempts: list[Attempt] = []
         unplanted: list[str] = []
-        for kind in self.kinds:
+        planted = 0
+        for kind in self._kinds_of(name):
+            if planted == self.config.faults:
+                break
             planting = plant(survey, kind, self.config.seed)
             if planting is None:
                 unplanted.append(kind.text)
                 continue
+            planted += 1
             detector = PlantedDetector(self.detector, planting.fault).requires_grad_(False)
             for method, worker in self.workers.items():
                 grader = grader_of(worker.config, detector)
                 attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
                 attempts.append(self._attempt(name, method, planting, survey, attacked))
+        if self.config.naming:
+            attempts += [self._control(name, method, w.search(name, scene)) for method, w in self.workers.items()]
         return JudgedFrame(name, tuple(attempts), tuple(unplanted))
+
+    def _kinds_of(self, name: str) -> list[FaultKind]:
+        """All, or with --faults easy and rare ones in turn, in an order of the frame's own."""
+        if self.config.faults is None:
+            return list(self.kinds)
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
+        order = [self.kinds[i] for i in rng.permutation(len(self.kinds))]
+        easy, rare = ([kind for kind in order if kind.rarity == rarity] for rarity in ("easy", "rare"))
+        pairs = zip_longest(*((easy, rare) if rng.random() < 0.5 else (rare, easy)))
+        return [kind for pair in pairs for kind in pair if kind is not None]
 
     def _attempt(
         self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
     ) -> Attempt:
-        certain = [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
+        certain = _certain(attacked)
         seen = _seen_without(self.detector, attacked) if certain else ()
         found = [index for index in certain if index in seen]
         inside = survey.inside(planting.fault, attacked.search.theta) if found else None
-        return Attempt(
+        attempt = Attempt(
             frame=name,
             kind=planting.kind.text,
             rarity=planting.kind.rarity,
@@ -175,11 +205,41 @@ class Yardstick:
             passes=attacked.passes,
             seconds=round(attacked.seconds, 2),
         )
+        if not found or not self.config.naming:
+            return attempt
+        where, passes = told_of(attacked, found[0], Holes.samples, self.config.seed)
+        whole, in_part = agrees(where, planting.fault, survey.bands_by_label(planting.fault))
+        return replace(attempt, rule=in_words(where), named=whole, in_part=in_part, naming=passes)
+
+    def _control(self, name: str, method: str, attacked: AttackedScene) -> Attempt:
+        """The same without a fault: what is named then is not planted."""
+        certain = _certain(attacked)
+        where, passes = told_of(attacked, certain[0], Holes.samples, self.config.seed) if certain else (None, 0)
+        return Attempt(
+            frame=name,
+            kind=NO_FAULT,
+            rarity=NO_FAULT,
+            fault="",
+            hit=0.0,
+            sure=0.0,
+            method=method,
+            certain=len(certain),
+            found=len(certain),
+            inside=0,
+            passes=attacked.passes,
+            seconds=round(attacked.seconds, 2),
+            rule=None if where is None else in_words(where),
+            naming=passes,
+        )
 
 
 def judge_of(config: Bench) -> Callable[[str], JudgedFrame]:
     """`Yardstick.judge` of another process."""
     return Yardstick.of(config).judge
+
+
+def _certain(attacked: AttackedScene) -> list[int]:
+    return [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
 
 
 def _seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:

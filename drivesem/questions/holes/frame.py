@@ -48,6 +48,18 @@ class Effort:
     seed: int
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What samples around a failure say. asked: of the whole neighbourhood, at `states`; close: near the failure;
+    where: the rule of both.
+    """
+
+    asked: Samples
+    close: Samples
+    states: list[State]
+    where: dict[str, tuple[float, float]]
+
+
 def look_around(
     folder: Path,
     attack: Attack,
@@ -132,18 +144,24 @@ def _neighbourhoods(
         yield failure, Neighbourhood(objective, feasible, theta, failure.index, nuisances, name, effort.reach)
 
 
-def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
-    half, last = effort.samples // 2, effort.samples + _TRIES * effort.fresh
+def told_around(near: Neighbourhood, samples: int) -> Told:
+    """What so many samples around a failure tell, half of the whole neighbourhood, half close to it."""
+    half = samples // 2
     asked, states = _seen(near, range(half), half, {})
-    close, _ = _seen(near, range(half, effort.samples), effort.samples - half, {}, NEAR)
-    where = _rule(asked, close)
-    fresh, _ = _seen(near, range(effort.samples, last), effort.fresh if asked.margins else 0, where)
+    close, _ = _seen(near, range(half, samples), samples - half, {}, NEAR)
+    return Told(asked, close, states, _rule(asked, close))
+
+
+def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
+    told = told_around(near, effort.samples)
+    asked, last = told.asked, effort.samples + _TRIES * effort.fresh
+    fresh, _ = _seen(near, range(effort.samples, last), effort.fresh if asked.margins else 0, told.where)
 
     def margin(place: Floats, draw: int) -> float | None:
         sample = near.sample_at(place, draw)
         return None if sample is None else near.margin(sample)
 
-    lost = share_lost(states, margin, np.random.default_rng([effort.seed, near.index]))
+    lost = share_lost(told.states, margin, np.random.default_rng([effort.seed, near.index]))
     assert failure.index is not None
     return Around(
         index=failure.index,
@@ -151,8 +169,8 @@ def _around(failure: Failure, near: Neighbourhood, effort: Effort) -> Around:
         error=failure.error or "",
         grade=failure.grade or "",
         asked=asked,
-        near=close,
-        where=where,
+        near=told.close,
+        where=told.where,
         fresh=fresh,
         lost=lost,
     )

@@ -12,7 +12,7 @@ from drivesem.evaluation.resampling import newcombe, wilson
 from drivesem.questions.holes.results import Around, Samples
 from drivesem.synth.compare import QUANTITIES, reference
 from drivesem.truth.rare import Share
-from drivesem.truth.rules import Rule, counted, overlap
+from drivesem.truth.rules import Rule, counted, in_words, overlap
 
 ONE = 0.5
 """Overlap from which two rules of the same features are one hole."""
@@ -114,9 +114,7 @@ class Hole:
     @property
     def words(self) -> str:
         """The rule for people."""
-        return (
-            ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in self.where.items()) or "anywhere"
-        )
+        return in_words(self.where)
 
 
 def merged(found: Mapping[str, Sequence[Around]], again: Again | None = None) -> list[Hole]:

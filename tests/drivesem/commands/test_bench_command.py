@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from drivesem.attack.space import combo
-from drivesem.bench import memory, render, step
+from drivesem.bench import climb, memory, render, step
 from drivesem.bench.planted import yardstick
 from drivesem.bench.scenes import bench_scene
 from drivesem.cli import main
@@ -196,3 +196,21 @@ def test_boxes_without_an_archive_and_elsewhere(capsys: pytest.CaptureFixture[st
     assert "--boxes: expected a tar archive of KITTI's label_2 and calib" in capsys.readouterr().err
     assert main(["bench", "render", "--boxes", str(tmp_path / "none.tar.xz")]) == 2
     assert "--boxes: expected bench step, found bench render" in capsys.readouterr().err
+
+
+def test_climb(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(climb, "PRECISIONS", {"float32": None})
+    words = ["bench", "climb", "--quick", "--cars", "1", "--params", "color,weather", "--passes", "24", "--json"]
+    assert main([*words, "--threads", "1"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert (row["cars"], row["params"], row["passes"], row["precision"]) == (1, "color,weather", 24, "float32")
+    parts = row["render_ms"] + row["picture_ms"] + row["detector_ms"]
+    assert parts > 0
+    assert row["gradient_ms"] > row["detector_ms"]
+    # At least as long as its passes' detector, a gradient being one that is counted as three.
+    assert row["search_s"] * 1e3 > 24 / 3 * 0.5 * row["detector_ms"]
+
+
+def test_climb_asks_for_a_processor(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "climb", "--device", "cuda"]) == 2
+    assert "--device" in capsys.readouterr().err

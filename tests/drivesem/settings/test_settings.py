@@ -8,12 +8,14 @@ import math
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+import drivesem
 from drivesem.cli import main
 from drivesem.run.folder import attack_of
 from drivesem.settings.blocks import Command, constraints, option
@@ -23,7 +25,8 @@ from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse, preset_words
 from drivesem.settings.text import to_yaml
 
-CONFIGS = Path(__file__).parents[3] / "configs"
+ROOT = Path(__file__).parents[3]
+CONFIGS = ROOT / "configs"
 
 
 def test_defaults() -> None:
@@ -130,7 +133,11 @@ def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
         (["attack", "--detector", "retinanot"], "retinanot"),
         (["attack", "--device", "quantum"], "quantum"),
         (["frobnicate"], "frobnicate"),
-        ([], "subcommand"),
+        (["attak"], "found attak; did you mean attack?"),
+        (["attack", "--limt", "3"], "found --limt; did you mean --limit?"),
+        (["attack", "--limt=3"], "found --limt; did you mean --limit?"),
+        (["study", "multi", "--no-confirm"], "an option of drivesem study"),
+        ([], "command: expected one of attack, "),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
@@ -253,6 +260,15 @@ def test_a_run_opens_whatever_the_order_of_its_keys(tmp_path: Path) -> None:
         yaml.safe_dump({key: config[key] for key in reversed(_KEYS["attack"].split())})
     )
     assert attack_of(tmp_path) == Attack(steps=3, t_star=0.4)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"drivesem {drivesem.__version__}\n"
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert drivesem.__version__ == declared
 
 
 def test_help_is_quick() -> None:

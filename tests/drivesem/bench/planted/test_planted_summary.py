@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivesem.bench.planted.summary import kind_columns, kind_rows, rows_of
-from drivesem.bench.planted.yardstick import METHODS, Attempt, JudgedFrame
+from drivesem.bench.planted.yardstick import METHODS, NO_FAULT, Attempt, JudgedFrame
 from drivesem.bench.tables import Section, terminal
 
 FIRST = Attempt("a", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 3, 2, 1, 50, 4.0)
@@ -44,6 +44,17 @@ def test_kinds_tell_in_how_many_frames_they_could_be_planted() -> None:
     assert (rows["contrast rare"]["frames"], rows["contrast rare"]["planted"]) == (2, 1)
     section = Section("kinds", kind_columns(("halton", "climb")), list(rows.values()))
     assert terminal(section).row_count == 2
+
+
+def test_names_are_counted_where_somebody_asked() -> None:
+    told = replace(FIRST, rule="aspect 1 to 2", named=True, in_part=True, naming=90)
+    anywhere = replace(FIRST, frame="b", rule="anywhere", naming=90)
+    none = replace(FIRST, kind=NO_FAULT, rarity=NO_FAULT, fault="", rule="moved_m 0 to 1", naming=90)
+    judged = [JudgedFrame("a", (told, none), ()), JudgedFrame("b", (anywhere,), ())]
+    easy, control = rows_of(judged, ("halton",), 0)
+    assert (easy["asked"], easy["told"], easy["named"], easy["in_part"], easy["naming"]) == (2, 1, 1, 1, 180)
+    assert (control["rarity"], control["told"], control["named"]) == (NO_FAULT, 1, 0)
+    assert {row["kind"] for row in kind_rows(judged, ("halton",))} == {"aspect easy"}
 
 
 def test_what_was_judged_comes_back_from_json() -> None:
