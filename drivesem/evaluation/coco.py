@@ -1,11 +1,10 @@
-"""Average precision and recall; pycocotools is the definition, faster-coco-eval the same and faster."""
+"""Average precision and recall. pycocotools is the definition, ultrafast-pycocotools the same to the bit."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
 import io
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -15,7 +14,7 @@ import numpy as np
 from detectors.types import Detections, Targets
 from drivesem.evaluation.instances import EVERY_CLASS, Found, Integers, Truths
 
-Engine = Literal["pycocotools", "faster-coco-eval"]
+Engine = Literal["pycocotools", "ultrafast-pycocotools"]
 STATS = ("AP", "AP50", "AP75", "APs", "APm", "APl", "AR1", "AR10", "AR100", "ARs", "ARm", "ARl")
 """The twelve numbers, in pycocotools' order; -1 where there is no object."""
 IOU_THRESHOLDS = np.linspace(0.5, 0.95, round((0.95 - 0.5) / 0.05) + 1)
@@ -91,9 +90,10 @@ def evaluate(
     return Scores(headline=per_class[headline], overall=_overall(list(per_class.values())), per_class=per_class)
 
 
-def fastest_engine() -> Engine:
-    """faster-coco-eval where it is installed."""
-    return "faster-coco-eval" if importlib.util.find_spec("faster_coco_eval") else "pycocotools"
+def fastest_engine(truth_ids: Integers | None = None) -> Engine:
+    """ultrafast-pycocotools where it is installed and none of the truth_ids (M,) is 0, which it would find."""
+    fast = importlib.util.find_spec("ultrafast_pycocotools") is not None
+    return "ultrafast-pycocotools" if fast and (truth_ids is None or bool(truth_ids.all())) else "pycocotools"
 
 
 def twelve_numbers(
@@ -139,11 +139,9 @@ def twelve_numbers(
         from pycocotools.coco import COCO
         from pycocotools.cocoeval import COCOeval as Evaluator
     else:
-        from faster_coco_eval import COCO  # pyright: ignore[reportMissingImports]
-        from faster_coco_eval import COCOeval_faster as Evaluator  # pyright: ignore[reportMissingImports]
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        # faster-coco-eval warns of an id of 0, which is counted as pycocotools counts it
-        warnings.simplefilter("ignore", UserWarning)
+        from ultrafast_pycocotools import COCO  # pyright: ignore[reportMissingImports]
+        from ultrafast_pycocotools import COCOeval as Evaluator  # pyright: ignore[reportMissingImports]
+    with contextlib.redirect_stdout(io.StringIO()):
         datasets = []
         for annotations in (truth, detected):
             dataset: Any = COCO()

@@ -96,16 +96,18 @@ def overlapping(truths: Truths, found: Found, least: float, by_detection: Boolea
     by_detection (M,): truths whose overlap is the share of the detection that lies on them, not IoU.
     """
     share = np.zeros(len(truths), np.bool_) if by_detection is None else by_detection
+    # Columns on their own: most pairs are apart by their first one, and need no other.
+    a, b = (np.ascontiguousarray(of.boxes.T) for of in (truths, found))
     parts: list[Pairs] = []
     for t, f in _same_frame(truths, found):
-        a, b = truths.boxes[t], found.boxes[f]
-        width = np.minimum(a[:, 2], b[:, 2]) - np.maximum(a[:, 0], b[:, 0])
-        height = np.minimum(a[:, 3], b[:, 3]) - np.maximum(a[:, 1], b[:, 1])
-        near = (width > 0) & (height > 0)
-        t, f, a, b = t[near], f[near], a[near], b[near]
-        shared = width[near] * height[near]
-        own = b[:, 4] * b[:, 5]
-        overlap = shared / np.where(share[t], own, own + a[:, 4] * a[:, 5] - shared)
+        for low, high in ((0, 2), (1, 3)):
+            near = np.minimum(a[high, t], b[high, f]) > np.maximum(a[low, t], b[low, f])
+            t, f = t[near], f[near]
+        width = np.minimum(a[2, t], b[2, f]) - np.maximum(a[0, t], b[0, f])
+        height = np.minimum(a[3, t], b[3, f]) - np.maximum(a[1, t], b[1, f])
+        shared = width * height
+        own = b[4, f] * b[5, f]
+        overlap = shared / np.where(share[t], own, own + a[4, t] * a[5, t] - shared)
         kept = overlap >= least
         parts.append(Pairs(t[kept], f[kept], overlap[kept]))
     if not parts:

@@ -62,7 +62,7 @@ RULES = (
     Rule(
         "drivesem.evaluation",
         ("detectors.types", "detectors.boxes"),
-        ("torch", "numpy", "pycocotools", "faster_coco_eval"),
+        ("torch", "numpy", "pycocotools", "ultrafast_pycocotools"),
         never=("scene_ir", "drivesem.attack"),
     ),
     Rule("drivesem.truth", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_TRUTH)), None),

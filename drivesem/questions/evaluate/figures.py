@@ -135,8 +135,8 @@ class _Judge:
             return None, {"small_detections": self.config.small_detections}
         if self.config.protocol == "voc":
             return None, {"overlap": VOC_OVERLAP}
-        engine = coco.fastest_engine()
         ids = self.sets.truth_ids
+        engine = coco.fastest_engine(ids)
         return coco.twelve_numbers(self.truths, found, len(self.names), engine, ids), {"engine": engine}
 
     def overlap(self, name: str) -> float:

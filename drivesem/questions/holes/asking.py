@@ -129,5 +129,5 @@ def _tell_effort(runs: list[Run], config: Holes) -> None:
     wanted = count * (config.samples + config.fresh + (config.recheck or 0))
     minutes = wanted * seconds / passes / 60 if passes else None
     pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
-    told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare"
+    told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare or rules narrow"
     Console(stderr=True).print(told, soft_wrap=True)
