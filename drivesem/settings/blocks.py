@@ -236,6 +236,16 @@ class Regions(Options):
     whole: Flag = False
     """Compute the detector's whole pass for each picture; by default only what changed, with the same result,
     where its layers are known (docs/detectors.md)."""
+    incremental: Flag = False
+    """The default by its name: only what changed, also of a run with --whole."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.whole and self.incremental, "--incremental", "it or --whole", "both")
+
+    def whole_beside(self, run: bool) -> bool:
+        """Whether passes are whole in a question to a run. run: whether they were in the run."""
+        return self.whole or (run and not self.incremental)
 
 
 @dataclass(frozen=True, kw_only=True)

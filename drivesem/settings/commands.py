@@ -244,7 +244,7 @@ class Transfer(Asking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain(Bootstrap, FinishedRun, FrameCommand):
+class Explain(Regions, Bootstrap, FinishedRun, FrameCommand):
     """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
 
     frame: str | None = None
