@@ -86,7 +86,7 @@ def settings_of(config: Bench) -> Attack:
 
 def spread(names: Sequence[str], count: int) -> list[str]:
     """So many of the names, evenly; all where there are fewer."""
-    places = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    places = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int).tolist()
     return [names[i] for i in places]
 
 
