@@ -249,7 +249,8 @@ class Attacking(Regions, Threshold, Precision, Scenes):
     """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
     budget: str = "paper"
     """How far parameters may go: paper; parking (0.5 m, 5 degrees); street (4 m along, 1 m across, 20 degrees,
-    10 % in size); a YAML file; or translate=0.5m,rotate=5deg, also after a preset: street,translate=2m."""
+    10 % in size, 15 degrees of sun); a YAML file; or translate=0.5m,rotate=5deg, also after a preset:
+    street,translate=2m."""
     objective_labels: LabelMode = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (

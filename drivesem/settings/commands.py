@@ -71,8 +71,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
-    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size, with
-    --budget street alone."""
+    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size and
+    sun, with --budget street alone."""
     method: Literal[Search, "placebo"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
