@@ -114,6 +114,7 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
     problem = objective.problem(feasible, settings.keep_last, views)
     search = settings.attack(problem, space.theta0, settings.seed)
+    views.forget()
     rendered = objective.evaluate(search.theta)
     benign = objective.detect(scene.photograph)
     passes = objective.passes + 1
