@@ -86,8 +86,8 @@ def settings_of(config: Bench) -> Attack:
 
 def spread(names: Sequence[str], count: int) -> list[str]:
     """So many of the names, evenly; all where there are fewer."""
-    places = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
-    return [names[i] for i in places]
+    places = np.linspace(0, len(names) - 1, min(count, len(names))).round()
+    return [names[int(i)] for i in places]
 
 
 def timer_of(settings: Attack) -> Callable[[str], Spent | None]:

@@ -166,6 +166,15 @@ class Scenes(DataSource):
 
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+    cache: str | None = None
+    """A folder that keeps photographs as they were taken apart, for the next attack on them."""
+    cache_gb: Annotated[float, Within(0, ends="()", expected="a number above 0")] = 4.0
+    """How large --cache may grow; what was not asked for longest goes first."""
+
+    def check(self) -> None:
+        super().check()
+        useless = self.cache is not None and self.dataset == DEMO
+        refuse(useless, "--cache", "a --dataset of photographs beside it", f"--dataset {DEMO}")
 
 
 @dataclass(frozen=True, kw_only=True)

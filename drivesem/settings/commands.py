@@ -231,6 +231,7 @@ class Derender(Scenes, FrameCommand):
         refuse(self.segmenter is not None and alone and demo, "--segmenter", photographs, beside)
         refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti beside it", beside)
         refuse(self.device != "cpu", "--device", "cpu", self.device)
+        refuse(self.cache is not None, "--cache", "none: scenes are what is written", self.cache)
 
 
 @dataclass(frozen=True, kw_only=True)
