@@ -27,6 +27,7 @@ from scene_ir.meshes.load import load_mesh, save_mesh
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
+    LIGHT_DIM,
     TEXTURE_DIM,
     WEATHER_DIM,
     Camera,
@@ -41,8 +42,10 @@ from scene_ir.types import (
 )
 
 SCHEMA = "drivesem.scene"
-VERSION = 2
+VERSION = 3
 """Raise it with every change that an older reader would misread."""
+_READ = (2, VERSION)
+"""Versions that are read; before the third, no sun was moved."""
 
 _T = TypeVar("_T")
 _DTYPES = {str(d).removeprefix("torch."): d for d in (torch.float32, torch.float64, torch.int64, torch.int32)}
@@ -60,7 +63,7 @@ _OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
     "truncation": (),
     "occlusion": (),
 }
-_ENVIRONMENT_FIELDS = {"weather": WEATHER_DIM, "foliage": FOLIAGE_DIM, "sun": 3, "ground": 4}
+_ENVIRONMENT_FIELDS = {"weather": WEATHER_DIM, "foliage": FOLIAGE_DIM, "light": LIGHT_DIM, "sun": 3, "ground": 4}
 _SOURCE_FIELDS: dict[str, tuple[int, ...]] = {
     "translation": (3,),
     "yaw": (),
@@ -151,9 +154,12 @@ def load_scene(folder: Path) -> SceneIR:
             source=sources,
         )
     )
+    known = {
+        name: size for name, size in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
+    }
     environment = environment_node.build(
         lambda: Environment(
-            **{name: environment_node[name].tensor(size) for name, size in _ENVIRONMENT_FIELDS.items()},
+            **{name: environment_node[name].tensor(size) for name, size in known.items()},
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )
@@ -187,7 +193,8 @@ def _record(folder: Path) -> _Node:
     path = folder / "scene.json"
     root = _Node(str(path), files.read_json(path))
     root.expect("schema", SCHEMA)
-    root.expect("version", VERSION)
+    if root["version"].value not in _READ:
+        raise FormatError(f"{root.where}: version", f"one of {', '.join(map(str, _READ))}", root["version"].value)
     return root
 
 

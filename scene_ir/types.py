@@ -24,6 +24,8 @@ TEXTURE_DIM = 5
 """Texture code: lightness, a*, b*, gloss, dirt."""
 WEATHER_DIM = 4
 """Weather code: fog, rain, time of day, overcast."""
+LIGHT_DIM = 3
+"""Light code: the sun's azimuth (to the right), elevation (up), strength."""
 FOLIAGE_DIM = 3
 """Foliage code: hue (season), lightness, density."""
 
@@ -249,9 +251,10 @@ class Objects:
 
 @dataclass(frozen=True, slots=True)
 class Environment:
-    """What surrounds the cars. weather (4,) in [0, 1], foliage (3,) in [-1, 1], 0 is as photographed;
-    sun (3,) unit vector towards the sun in camera axes; sky, foliage_map, road: (H, W) soft maps in [0, 1].
-    ground: (4,) plane n.x + d = 0 in camera axes, n (3,) the unit normal pointing up (n_y < 0).
+    """What surrounds the cars. weather (4,) in [0, 1], foliage (3,) and light (3,) in [-1, 1], 0 is as
+    photographed; sun (3,) unit vector towards the photographed sun in camera axes; sky, foliage_map, road: (H, W)
+    soft maps in [0, 1]. ground: (4,) plane n.x + d = 0 in camera axes, n (3,) the unit normal pointing up
+    (n_y < 0).
     """
 
     weather: Tensor
@@ -261,16 +264,18 @@ class Environment:
     sky: Tensor
     foliage_map: Tensor
     road: Tensor
+    light: Tensor = field(default_factory=lambda: torch.zeros(LIGHT_DIM))
 
     def __post_init__(self) -> None:
         check_shape("environment.weather", self.weather, WEATHER_DIM)
         check_shape("environment.foliage", self.foliage, FOLIAGE_DIM)
+        check_shape("environment.light", self.light, LIGHT_DIM)
         check_shape("environment.sun", self.sun, 3)
         check_shape("environment.ground", self.ground, 4)
         check_shape("environment.sky", self.sky, None, None)
         check_shape("environment.foliage_map", self.foliage_map, *self.sky.shape)
         check_shape("environment.road", self.road, *self.sky.shape)
-        for name in ("weather", "foliage", "sun", "ground"):
+        for name in ("weather", "foliage", "light", "sun", "ground"):
             check_finite(f"environment.{name}", getattr(self, name))
 
 
@@ -332,6 +337,7 @@ class SceneIR:
             self.environment,
             weather=torch.zeros_like(self.environment.weather),
             foliage=torch.zeros_like(self.environment.foliage),
+            light=torch.zeros_like(self.environment.light),
         )
         return replace(self, objects=objects, environment=environment)
 

@@ -37,7 +37,7 @@ PRESETS: Mapping[str, Budget] = {
     # What a parked car's place may well differ by, and no driver would notice.
     PARKING: Budget(translate_m=0.5, rotate=math.radians(5)),
     # Where pictures of moved cars still hold: docs/attacks.md has the measurement.
-    STREET: Budget(translate=1.5, translate_m=4.0, across_m=1.0, of_distance=0.3, partly=0.25, size=0.1),
+    STREET: Budget(translate=1.5, translate_m=4.0, across_m=1.0, of_distance=0.3, partly=0.25, size=0.1, sun=1.0),
 }
 _UNITS: Mapping[Parameter, Mapping[str, float]] = {
     Parameter.TRANSLATE: LENGTH_UNITS,

@@ -96,6 +96,7 @@ class Reach:
     of_distance: float = math.inf
     partly: float = math.inf
     size: float = 0.0
+    sun: float = 0.0
 
 
 PAPERS = Reach()
@@ -259,6 +260,7 @@ def _unchanged(base: SceneIR, perturbed: SceneIR) -> list[str]:
         "photograph": (base.photograph, perturbed.photograph),
         "camera": (base.camera.matrix, perturbed.camera.matrix),
         "ground": (base.environment.ground, perturbed.environment.ground),
+        "sun": (base.environment.sun, perturbed.environment.sun),
     }
     return [f"{name}: changed" for name, (a, b) in pairs.items() if a.shape != b.shape or not bool((a == b).all())]
 
@@ -269,6 +271,7 @@ def _codes(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
         "objects.texture_code": (old.texture_code, new.texture_code, -reach.color, reach.color),
         "environment.weather": (before.weather, after.weather, 0.0, reach.weather),
         "environment.foliage": (before.foliage, after.foliage, -reach.foliage, reach.foliage),
+        "environment.light": (before.light, after.light, -reach.sun, reach.sun),
     }
     found = []
     for name, (start, code, low, high) in ranges.items():

@@ -229,6 +229,11 @@ class Objective:
         """Whether the detector is to see only what changes."""
         return render.drawn is not None and self._kept() is not None
 
+    @property
+    def whole(self) -> bool:
+        """Whether the detector always sees whole pictures."""
+        return self._whole
+
     def forget(self) -> None:
         """Let go of the benign picture's layers, which are made anew when they are asked for."""
         self._reference = None

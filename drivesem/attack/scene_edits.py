@@ -75,7 +75,9 @@ def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
     weather = environment.weather + environment.weather.new_tensor(edit.weather)
     foliage = environment.foliage + environment.foliage.new_tensor(edit.foliage)
     return scene.with_objects(**touched).with_environment(
-        weather=weather.clamp(0.0, limits.weather), foliage=foliage.clamp(-limits.foliage, limits.foliage)
+        weather=weather.clamp(0.0, limits.weather),
+        foliage=foliage.clamp(-limits.foliage, limits.foliage),
+        light=(environment.light + environment.light.new_tensor(edit.sun)).clamp(-1.0, 1.0),
     )
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import yaw_matrix
-from scene_ir.types import FOLIAGE_DIM, LATTICE, TEXTURE_DIM, WEATHER_DIM, SceneIR, check_finite
+from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR, check_finite
 
 
 class Parameter(StrEnum):
@@ -30,9 +30,10 @@ class Parameter(StrEnum):
     ROTATE = "rotate"
     MESH = "mesh"
     SIZE = "size"
+    SUN = "sun"
 
 
-SIX = tuple(p for p in Parameter if p is not Parameter.SIZE)
+SIX = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
 """The paper's parameters. The others need a budget that goes beyond the paper's."""
 
 
@@ -68,6 +69,9 @@ SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.ROTATE: ParameterSpec(1, True, "rad", ("yaw",)),
     Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", _lattice_names()),
     Parameter.SIZE: ParameterSpec(1, True, "share of its own", ("size",)),
+    Parameter.SUN: ParameterSpec(
+        LIGHT_DIM, False, "code", tuple(f"sun.{n}" for n in ("azimuth", "elevation", "strength"))
+    ),
 }
 
 COMBOS: dict[int, tuple[Parameter, ...]] = {
@@ -91,7 +95,7 @@ class Budget:
     of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
     not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
     `drivesem.attack.feasible` is the one that binds); size: share of a car's own, larger or smaller, 0 where
-    sizes are held.
+    sizes are held; sun: codes, 0 where it is held.
     """
 
     color: float = 1.0
@@ -101,6 +105,7 @@ class Budget:
     rotate: float = 0.35
     mesh: float = 0.25
     size: float = 0.0
+    sun: float = 0.0
     translate_m: float = math.inf
     across_m: float = math.inf
     of_distance: float = math.inf
@@ -108,7 +113,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "of_distance", "partly")
-        _check_positive("budget", self, unbounded, may_be_held=("size",))
+        _check_positive("budget", self, unbounded, may_be_held=("size", "sun"))
 
     def check(self, params: Iterable[Parameter]) -> None:
         """FormatError where one of the parameters is held by this budget."""
@@ -120,7 +125,8 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class StepSizes:
-    """The step alpha for each parameter, in theta's units: the paper's, and of sizes as long as that of places."""
+    """The step alpha for each parameter, in theta's units: the paper's, of sizes as long as that of places, of the
+    sun as that of leaves."""
 
     color: float = 0.05
     weather: float = 0.25
@@ -129,6 +135,7 @@ class StepSizes:
     rotate: float = 0.01
     mesh: float = 0.025
     size: float = 0.01
+    sun: float = 0.10
 
     def __post_init__(self) -> None:
         _check_positive("steps", self)
@@ -147,7 +154,8 @@ def _check_positive(
 @dataclass(frozen=True, slots=True)
 class Perturbation:
     """theta by parameter; None where a parameter is held. color (N, 5), weather (4,), foliage (3,),
-    translate (N, 2), rotate (N, 1), mesh (N, 96), size (N, 1): changes from the photographed scene.
+    translate (N, 2), rotate (N, 1), mesh (N, 96), size (N, 1), sun (3,): changes from the
+    photographed scene.
     """
 
     color: Tensor | None = None
@@ -157,6 +165,7 @@ class Perturbation:
     rotate: Tensor | None = None
     mesh: Tensor | None = None
     size: Tensor | None = None
+    sun: Tensor | None = None
 
 
 def normalise_params(params: Iterable[str]) -> tuple[Parameter, ...]:
@@ -314,6 +323,9 @@ class ParameterSpace:
         if part.foliage is not None:
             limit = self.budget.foliage
             codes["foliage"] = _within(environment.foliage, part.foliage, -limit, limit)
+        if part.sun is not None:
+            light = environment.light.to(part.sun)
+            codes["light"] = _within(light, part.sun, -self.budget.sun, self.budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
@@ -370,6 +382,8 @@ class ParameterSpace:
             start, low = self.scene.environment.weather, 0.0
         elif parameter is Parameter.FOLIAGE:
             start, low = self.scene.environment.foliage, -limit
+        elif parameter is Parameter.SUN:
+            start, low = self.scene.environment.light.to(self.scene.objects.yaw), -limit
         elif parameter is Parameter.TRANSLATE:
             budget, objects = self.budget, self.scene.objects
             length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()

@@ -14,13 +14,14 @@ from rich.console import Console
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.attack.space import parse_params
-from drivesem.bench import boxes, climb, detector, memory, render, step
+from drivesem.bench import boxes, climb, detector, memory, night, render, step
 from drivesem.bench.planted import summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
+from drivesem.scenes.sources import open_source
 from drivesem.settings.commands import Bench
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
@@ -46,6 +47,7 @@ def run(config: Bench) -> int:
         "detector": _detector,
         "climb": _climb,
         "planted": _planted,
+        "night": _night,
     }
     return conduct(config, "drivesem bench", measure[config.what])
 
@@ -151,6 +153,29 @@ def _planted(config: Bench, console: Console) -> Measured:
         [
             Section(summary.TITLE, summary.COLUMNS, rows),
             Section(summary.KINDS_TITLE, summary.kind_columns(methods), kinds),
+        ],
+    )
+
+
+def _night(config: Bench, console: Console) -> Measured:
+    settings = night.settings_of(config)
+    time_frame = night.timer_of(settings)
+    names, without, failed = select_frames(open_source(settings), settings)
+    count = config.count or len(names)
+    chosen = night.spread(names, config.limit or night.FRAMES)
+    console.print(f"{len(chosen)} of {len(names)} frames with vehicles tell; {without} without are passed over")
+    build = partial(night.timer_of, settings)
+    asked = ask(chosen, time_frame, build, config, Bar("frames", remaining=True))
+    spent = [one for one in asked.results.values() if one is not None]
+    night.check_some(spent)
+    processes = min(config.processes, len(chosen))
+    parts, nights = night.part_rows(spent), night.night_rows(spent, count, processes, config.seed)
+    told = {"parts": parts, "nights": nights, "measured": _dicts(spent), "failed": failed | asked.failed}
+    return Measured(
+        told | {"method": night.METHOD},
+        [
+            Section(night.PARTS_TITLE, night.PARTS_COLUMNS, parts),
+            Section(night.NIGHTS_TITLE, night.NIGHTS_COLUMNS, nights),
         ],
     )
 

@@ -47,6 +47,7 @@ _PARAMETERS = {
     "yaw": "rotate",
     "ffd": "mesh",
     "size": "size",
+    "sun": "sun",
 }
 """The parameter by the first word of a coordinate's name, after the object it belongs to."""
 _FAILED = ("lost", "phantom")

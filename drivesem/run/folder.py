@@ -24,7 +24,7 @@ CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
 FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
-PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json")
+PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json", "cache", "cache_gb", "incremental")
 """Settings that change no frame's result: a run may be continued with others."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,6 +14,7 @@ from scene_ir.errors import SceneError
 from scene_ir.types import Frame, SceneIR
 
 if TYPE_CHECKING:
+    from drivesem.scenes.kept import KeptScenes
     from scene_ir.derender.derender import DerenderSettings
 
 DEMO_SCENES = 10
@@ -68,6 +70,7 @@ class PhotographSource:
         points = isinstance(config, Derender) and config.velodyne
         self._dataset = open_dataset(config.dataset, Path(config.root or ""), with_points=points)
         self._settings = _settings(config)
+        self._kept = _kept_scenes(config)
 
     def identifiers(self) -> Iterator[str]:
         return iter(self._dataset.identifiers)
@@ -80,7 +83,9 @@ class PhotographSource:
     def scene(self, identifier: str) -> SceneIR:
         from scene_ir.derender.derender import derender
 
-        return derender(self._dataset.frame(identifier), self._settings)
+        frame = self._dataset.frame(identifier)
+        make = partial(derender, frame, self._settings)
+        return make() if self._kept is None else self._kept.scene((frame, self._settings), make)
 
 
 class PlainPhotograph:
@@ -140,6 +145,14 @@ def _settings(config: Scenes) -> DerenderSettings:
     if isinstance(config, Derender):
         return derender_settings(config.fit, config.meshes, config.segmenter)
     return derender_settings(config.fit)
+
+
+def _kept_scenes(config: Scenes) -> KeptScenes | None:
+    if config.cache is None:
+        return None
+    from drivesem.scenes.kept import KeptScenes
+
+    return KeptScenes(Path(config.cache), config.cache_gb)
 
 
 def open_source(config: Scenes) -> SceneSource:

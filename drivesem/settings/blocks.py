@@ -166,6 +166,15 @@ class Scenes(DataSource):
 
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
+    cache: str | None = None
+    """A folder that keeps photographs as they were taken apart, for the next attack on them."""
+    cache_gb: Annotated[float, Within(0, ends="()", expected="a number above 0")] = 4.0
+    """How large --cache may grow; what was not asked for longest goes first."""
+
+    def check(self) -> None:
+        super().check()
+        useless = self.cache is not None and self.dataset == DEMO
+        refuse(useless, "--cache", "a --dataset of photographs beside it", f"--dataset {DEMO}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,6 +245,16 @@ class Regions(Options):
     whole: Flag = False
     """Compute the detector's whole pass for each picture; by default only what changed, with the same result,
     where its layers are known (docs/detectors.md)."""
+    incremental: Flag = False
+    """The default by its name: only what changed, also of a run with --whole."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.whole and self.incremental, "--incremental", "it or --whole", "both")
+
+    def whole_beside(self, run: bool) -> bool:
+        """Whether passes are whole in a question to a run. run: whether they were in the run."""
+        return self.whole or (run and not self.incremental)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +268,8 @@ class Attacking(Regions, Threshold, Precision, Scenes):
     """Steps, each one query of the detector's gradient; FGSM goes as far in one; of scw, for each constant."""
     budget: str = "paper"
     """How far parameters may go: paper; parking (0.5 m, 5 degrees); street (4 m along, 1 m across, 20 degrees,
-    10 % in size); a YAML file; or translate=0.5m,rotate=5deg, also after a preset: street,translate=2m."""
+    10 % in size, 15 degrees of sun); a YAML file; or translate=0.5m,rotate=5deg, also after a preset:
+    street,translate=2m."""
     objective_labels: LabelMode = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (

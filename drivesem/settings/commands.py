@@ -71,8 +71,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
-    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size, with
-    --budget street alone."""
+    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size and
+    sun, with --budget street alone."""
     method: Literal[Search, "placebo"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
     (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
@@ -231,6 +231,7 @@ class Derender(Scenes, FrameCommand):
         refuse(self.segmenter is not None and alone and demo, "--segmenter", photographs, beside)
         refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti beside it", beside)
         refuse(self.device != "cpu", "--device", "cpu", self.device)
+        refuse(self.cache is not None, "--cache", "none: scenes are what is written", self.cache)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +245,7 @@ class Transfer(Asking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain(Bootstrap, FinishedRun, FrameCommand):
+class Explain(Regions, Bootstrap, FinishedRun, FrameCommand):
     """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
 
     frame: str | None = None
@@ -506,13 +507,16 @@ class Synth(FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Regions, Scenes, FrameCommand):
-    """Measure: one attack step, the renderer, memory, detectors, and what attacks find of known faults."""
+    """Measure: an attack step, the renderer, memory, detectors, what attacks find of known faults, a night."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "climb", "planted"]] = "step"
+    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "climb", "planted", "night"]] = (
+        "step"
+    )
     """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
     memory above the detector's own; detector: forward, backward and decoding of each detector; climb: a search by
     climb, and the parts of its passes; planted: how many faults that were planted into the detector each attack
-    finds (docs/planted.md), minutes a frame."""
+    finds (docs/planted.md), minutes a frame; night: how long an attack on all frames of --root takes, told by
+    some."""
     quick: Flag = False
     """Fewer repetitions: some 50 s; planted: two faults a frame."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -541,13 +545,17 @@ class Bench(Regions, Scenes, FrameCommand):
     """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
     of the detector without a fault."""
     limit: Count | None = None
-    """Planted: the first N frames; by default 3."""
+    """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all."""
+    count: Count | None = None
+    """Night: how many frames to foretell; by default all that have vehicles."""
+    attack: str | None = None
+    """Night: a preset of drivesem attack (YAML), by default its defaults, but for data, device and workers."""
 
     def check(self) -> None:
         super().check()
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
-        only = "--dataset demo, but for bench planted"
-        refuse(self.what != "planted" and self.dataset != DEMO, "--dataset", only, self.dataset)
+        only = "--dataset demo, but for bench planted and bench night"
+        refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ An edit of one frame, as YAML or as nested mappings:
 
     weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast; or a name, such as sunset
     foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
+    sun: {azimuth: -0.5}            # codes in [-1, 1]: azimuth, elevation, strength
     objects:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
@@ -36,6 +37,7 @@ from scene_ir.types import TEXTURE_DIM
 ALL = "all"
 WEATHER_NAMES = ("fog", "rain", "time", "overcast")
 FOLIAGE_NAMES = ("hue", "lightness", "density")
+SUN_NAMES = ("azimuth", "elevation", "strength")
 WEATHERS: Mapping[str, Mapping[str, float]] = {
     "fog": {"fog": 0.6, "overcast": 0.4},
     "rain": {"rain": 0.8, "overcast": 0.6},
@@ -45,13 +47,13 @@ WEATHERS: Mapping[str, Mapping[str, float]] = {
 }
 """Weather by name, as codes; those not named are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
-FRAME_KEYS = ("objects", "weather", "foliage")
+FRAME_KEYS = ("objects", "weather", "foliage", "sun")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
 SHARE_UNITS = {"%": 0.01}
 MOST_GROWN = 0.5
 """Share by which an edit may make a vehicle larger or smaller: beyond it is no vehicle of its kind."""
-_PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage)\.(\w+)")
+_PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage|sun)\.(\w+)")
 _TRUTH = {"true": True, "false": False}
 
 
@@ -82,12 +84,13 @@ class ObjectEdit:
 @dataclass(frozen=True, slots=True)
 class FrameEdit:
     """What happens to one frame. objects: by track (generated streets) or row (scenes), or "all"; weather (4,) in
-    [0, 1]; foliage (3,) in [-1, 1].
+    [0, 1]; foliage (3,), sun (3,) in [-1, 1].
     """
 
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
     weather: tuple[float, ...] = (0.0,) * len(WEATHER_NAMES)
     foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_NAMES)
+    sun: tuple[float, ...] = (0.0,) * len(SUN_NAMES)
 
 
 Edits = Mapping[int | str, FrameEdit]
@@ -125,7 +128,7 @@ def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
     if not equals or not value or match is None:
         raise FormatError(
             f"{setting} {text}",
-            f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=... or foliage.CODE=...",
+            f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=..., foliage.CODE=... or sun.CODE=...",
             "no value" if match is not None else "an unknown parameter",
         )
     row, parameter, weather, environment, code = match.groups()
@@ -180,6 +183,7 @@ def frame_edit(where: str, value: Any) -> FrameEdit:
         },
         weather=_codes(f"{where}: weather", _weather(weather), WEATHER_NAMES, 0.0),
         foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_NAMES, -1.0),
+        sun=_codes(f"{where}: sun", entry.get("sun"), SUN_NAMES, -1.0),
     )
 
 

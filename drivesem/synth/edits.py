@@ -29,7 +29,8 @@ from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
 from scene_ir.render.environment import time_gain
-from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M
+from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH
+from scene_ir.render.sun import moved_sun
 from scene_ir.render.texture import apply_texture_code
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
@@ -61,7 +62,7 @@ def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
                 changed = _edited(changed, edit.objects[key])
         if changed is not None:
             actors.append(changed)
-    light = _weathered(plan.setting.light, edit.weather)
+    light = _weathered(_under_sun(plan.setting.light, edit.sun), edit.weather)
     response = plan.setting.response
     rain = edit.weather[1]
     if rain > 0:
@@ -104,6 +105,17 @@ def _painted(paint: tuple[float, float, float], code: tuple[float, ...]) -> tupl
     changed = apply_texture_code(shown, one, row, one, 0.5 * one, 50.0 * one)[0]
     red, green, blue = (changed.clamp(0.0, 1.0) ** _GAMMA).tolist()
     return red, green, blue
+
+
+def _under_sun(light: Light, code: tuple[float, ...]) -> Light:
+    """Light under a light code: the sun moved as the compositor moves it, its light as much stronger."""
+    if not any(code):
+        return light
+    sun, up, change = (
+        torch.tensor(np.asarray(value), dtype=torch.float64) for value in (light.sun, light.up, code)
+    )
+    strength = 1 + SUN_STRENGTH * code[2]
+    return replace(light, sun=moved_sun(sun, up, change).numpy(), sun_colour=light.sun_colour * strength)
 
 
 def _weathered(light: Light, code: tuple[float, ...]) -> Light:

@@ -133,6 +133,7 @@ class Neighbourhood:
             Parameter.COLOR: objects.texture_code[i],
             Parameter.WEATHER: environment.weather,
             Parameter.FOLIAGE: environment.foliage,
+            Parameter.SUN: environment.light,
         }
         for parameter, values in codes.items():
             if parameter in self._objective.space.params:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import Candidates, Detector, predict
+from detectors.incremental.reference import LIMIT_MB, Reference
 from drivesem.attack import goals
 from drivesem.attack.labels import shown_boxes
 from drivesem.attack.objective import GRADIENT_PASSES, Objective
@@ -21,12 +22,15 @@ from scene_ir.types import Render, SceneIR
 
 SHARPNESS = 4.0
 """Of the soft maximum over candidates in gradients, 1 / logits."""
+_MOST_KEPT_MB = 800.0
+"""Of the layers that are kept of pictures: SqueezeDet's are 24 MB a draw at 1242 x 375 px."""
 
 
 @dataclass(frozen=True)
 class DrawnViews:
     """`attack.methods.base.Views` of an objective. stream: name of the draws, which are kept with their noise:
-    5.6 MB each at 1242 x 375 px, and a search goes round in twelve.
+    5.6 MB each at 1242 x 375 px, and a search goes round in twelve. Where neither weather nor foliage changes, the
+    detector's layers of a draw's first picture are kept too, and further ones are seen where they differ from it.
     """
 
     objective: Objective
@@ -34,6 +38,7 @@ class DrawnViews:
     stream: str
     judged: Tensor
     _draws: dict[int, Draw] = field(default_factory=dict[int, Draw])
+    _first: dict[int, Reference] = field(default_factory=dict[int, Reference])
 
     @classmethod
     def of(cls, objective: Objective, nuisances: Nuisances, stream: str) -> DrawnViews:
@@ -61,7 +66,9 @@ class DrawnViews:
         """See `Views`."""
         draw, scene, render = self._drawn(theta, number)
         self.objective.passes += 1
-        return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, None)
+        return self._margins(
+            self._candidates(draw.picture(render.image), number, render), draw, scene, render, None
+        )
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         """See `Views`; the gradient is that of soft margins. RangeError for a detector without a gradient."""
@@ -80,7 +87,19 @@ class DrawnViews:
         (D,) carries a gradient; differentiable.
         """
         draw, scene, render = self._drawn(theta, number)
-        return self._margins(self._candidates(draw.picture(render.image)), draw, scene, render, SHARPNESS)
+        return self._margins(
+            self._candidates(draw.picture(render.image), number, render), draw, scene, render, SHARPNESS
+        )
+
+    def forget(self) -> None:
+        """Let go of what is kept of draws, which is made anew when it is asked for."""
+        self._draws.clear()
+        self._first.clear()
+
+    @property
+    def kept_mb(self) -> float:
+        """Of layers."""
+        return sum(reference.bytes for reference in self._first.values()) / 1e6
 
     def draw(self, number: int) -> Draw:
         """The number-th draw."""
@@ -93,12 +112,24 @@ class DrawnViews:
         scene = draw.scene(space.apply(space.scene, theta))
         return draw, scene, self.objective.compositor.render(scene)
 
-    def _candidates(self, image: Tensor) -> Candidates:
+    def _candidates(self, image: Tensor, number: int, render: Render) -> Candidates:
         detector, judged = self.objective.detector, self.objective.judged
         if self.differentiable:
-            known = self.objective.differentiable
-            return known.candidates(known(image[None]) if image.requires_grad else known.glance(image[None]))
+            known, first = self.objective.differentiable, None
+            if image.requires_grad:
+                return known.candidates(known(image[None]))
+            if render.drawn is not None and not self.objective.whole:
+                first = self._kept(known, image, number)
+            return known.candidates(known.glance(image[None]) if first is None else first(image[None], []))
         return goals.of_detections(judged.detections(predict(detector, image[None])[0]), len(judged.names))
+
+    def _kept(self, detector: Detector, image: Tensor, number: int) -> Reference | None:
+        """A draw's first picture; None where its layers are not known, or there is no room for them."""
+        if number not in self._first and self.kept_mb + LIMIT_MB <= _MOST_KEPT_MB:
+            first = Reference.of(detector, image[None])
+            if first is not None:
+                self._first[number] = first
+        return self._first.get(number)
 
     def _margins(
         self, candidates: Candidates, draw: Draw, scene: SceneIR, render: Render, sharpness: float | None

@@ -17,6 +17,7 @@ from scene_ir.raster.layout import Layout
 from scene_ir.render import blend, fast, reference
 from scene_ir.render.environment import apply_foliage, apply_weather, shadow_softening
 from scene_ir.render.prepare import Layers, Pack, Prepared, RenderSettings, active, joined
+from scene_ir.render.sun import Sun
 from scene_ir.render.texture import Regions
 from scene_ir.types import Crop, Objects, Render, SceneIR
 
@@ -39,17 +40,18 @@ class Compositor(Prepared):
                 self._fixed = fast.Fixed.of(self)
         return self._fixed
 
-    def layers(self, objects: Objects) -> Layers:
-        """The objects drawn one by one, not yet blended."""
+    def layers(self, objects: Objects, sun: Sun | None = None) -> Layers:
+        """The objects drawn one by one, not yet blended. sun: as of `sun_of`."""
         fixed = self.fixed
         if fixed is None:
-            return reference.layers(self, objects, self.draw(objects))
-        return _layers([self], self.pack, fixed, [objects])[0]
+            return reference.layers(self, objects, self.draw(objects, sun), sun)
+        return _layers([self], self.pack, fixed, [objects], [sun])[0]
 
     def render(self, perturbed: SceneIR) -> Render:
         """The picture of a perturbed scene; with nothing perturbed, the photograph."""
         objects = self.moved(perturbed)
-        return self.compose(perturbed, objects, self.layers(objects) if len(objects) else None)
+        sun = self.sun_of(perturbed.environment)
+        return self.compose(perturbed, objects, self.layers(objects, sun) if len(objects) else None)
 
     def moved(self, perturbed: SceneIR) -> Objects:
         """The objects of a perturbed scene in this one's dtype. Raises ShapeError where it has other objects."""
@@ -78,6 +80,10 @@ class Compositor(Prepared):
             opacity: tuple[Crop, ...] = ()
         else:
             factors = layers.shadow
+            sun = self.sun_of(environment)
+            if sun is not None:
+                own = self.casts[layers.shadow_layout.draw()]
+                factors = (factors - (1.0 - factors) * own * (sun.shade - 1.0)).clamp(min=0.0)
             if weather:
                 factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self.like))
             order = blend.paint_order(
@@ -109,10 +115,17 @@ class Compositor(Prepared):
 
 
 def _layers(
-    members: Sequence[Compositor], pack: Pack, fixed: fast.Fixed, objects: Sequence[Objects]
+    members: Sequence[Compositor],
+    pack: Pack,
+    fixed: fast.Fixed,
+    objects: Sequence[Objects],
+    suns: Sequence[Sun | None],
 ) -> list[Layers]:
     """The layers of each member by the fast kernels, all of them in one go."""
-    drawn = pack.draw(objects, with_ground=False)
+    drawn = pack.draw(objects, suns, with_ground=False)
+    sun = fixed.sun
+    if any(one is not None for one in suns):
+        sun = joined([m.lights(one) for m, one in zip(members, suns, strict=True)])
     code = None
     if any(active(o.texture_code) for o in objects):
         regions = [m.regions for m in members]
@@ -122,7 +135,7 @@ def _layers(
             Regions.joined([r for r in regions if r is not None]),
         )
     yaw = joined([o.yaw for o in objects])
-    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, code)
+    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, sun, code)
     if len(members) == 1:
         return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
     layouts, grounds = (
@@ -153,5 +166,6 @@ def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
     if not together:
         return [c.render(scene) for c, scene in pairs]
     objects = [c.moved(scene) for c, scene in pairs]
-    layers = _layers(members, *_together(members), objects)
+    suns = [c.sun_of(scene.environment) for c, scene in pairs]
+    layers = _layers(members, *_together(members), objects, suns)
     return [c.compose(p, o, part) for (c, p), o, part in zip(pairs, objects, layers, strict=True)]

@@ -43,7 +43,6 @@ class Fixed:
         assert prepared.texels is not None
         assert prepared.shadows is not None
         height, width = prepared.frame_hw
-        sun = prepared.scene.environment.sun.to(prepared.like)
         return cls(
             faces=fleet.faces.to(torch.int32).contiguous(),
             base_clip=base.clip,
@@ -57,7 +56,7 @@ class Fixed:
             patches=patches(base.ground_clip),
             dark=(prepared.shadows.values, prepared.shadows.rects, prepared.shadows.offsets),
             frame_wh=prepared.like.new_tensor([width, height]).expand(count, 2).contiguous(),
-            sun=torch.cat([sun.expand(count, 3), prepared.sunlight[:, None]], dim=1),
+            sun=prepared.lights(),
             unproject=prepared.unproject.expand(count, 3, 3).contiguous(),
         )
 
@@ -102,12 +101,13 @@ def photographed(
     drawn: Drawn,
     reach_px: Sequence[float],
     yaw: Tensor,
+    sun: Tensor,
     code: Code | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors
     (Ts, 3) by which their shadows darken the ground.
 
-    reach_px: of each halo; code: texture codes, if there are any.
+    reach_px: of each halo; sun (N, 4): as in `Fixed`, or another; code: texture codes, if there are any.
     """
     from scene_ir.render.kernels.photographed import Photographed, Setting
 
@@ -143,12 +143,12 @@ def photographed(
         inside=inside.detach().contiguous(),
         reach_px=reach_px,
         painter=paint if code is not None else None,
-        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
+        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name not in ("patches", "sun")},
     )
     geometry = drawn.geometry
     codes = code.values if code is not None else yaw.new_zeros(0)
     return Photographed.apply(
-        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, setting
+        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, sun, setting
     )
 
 

@@ -7,6 +7,8 @@ A pair (low, high) is where a `texture.smoothstep` begins and ends. Colours are 
 
 from __future__ import annotations
 
+import math
+
 # --------------------------------------------------------------------------- what the photograph knows of a pixel
 
 DEPTH_TOLERANCE_M = (0.25, 0.6)
@@ -93,6 +95,10 @@ GLINT = (0.35, 0.5)
 RELIT = (0.3, 0.6)
 """Share of the change of light that a photographed colour follows, of all but paint and of paint: glass and rubber
 show less of it, and the sun that the shading knows may be behind a tree. Held against generated truth."""
+SUN_TURN_RAD, SUN_RISE_RAD, SUN_STRENGTH = math.radians(15.0), math.radians(7.5), 0.2
+"""Of light code 1: turn of the sun about the vertical, rise above the horizon, share of its light that it adds."""
+OWN_SHADOW = 0.9
+"""Cosine between a photographed shadow and that of the vehicle's box, from which on it is the vehicle's own."""
 RELIT_MOST = 0.5
 """Largest share by which a photographed colour brightens or darkens as its surface turns."""
 

@@ -24,9 +24,10 @@ from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import sky_colour
+from scene_ir.render.sun import Sun
 from scene_ir.render.surfaces import Fleet, Rig, Surface
 from scene_ir.render.texture import Regions, Texels, smoothstep
-from scene_ir.types import Crop, Objects, SceneIR, scene_to
+from scene_ir.types import Crop, Environment, Objects, SceneIR, scene_to
 
 HALO_MAX_PX = 64.0
 """However near a vehicle is, its halo reaches no farther: of a car that fills the picture's height this is a
@@ -148,7 +149,7 @@ class Prepared:
     """One scene, made ready to draw its perturbations: all that no parameter touches.
 
     A perturbed scene may differ from `scene` in objects.translation, yaw, size_lhw, ffd, texture_code and in
-    environment.weather, foliage. With backend `warp` the scene is worked on in float32.
+    environment.weather, foliage, light. With backend `warp` the scene is worked on in float32.
     """
 
     def __init__(
@@ -197,6 +198,7 @@ class Prepared:
             self.corners = self._trimmed_corners(objects, base)
         self.outwards = surfaces.outwards(self.corners, base.size_lhw, self.sun_offset)
         self._lit: Tensor | None = None
+        self._casts: Tensor | None = None
         self.base_yaw = base.yaw
         self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
         self.size = base.size_lhw
@@ -318,11 +320,17 @@ class Prepared:
         return paint
 
     def _place(self, objects: Objects) -> Geometry:
-        return self.pack.place([objects])
+        return self.pack.place([objects], [None])
 
-    def draw(self, objects: Objects) -> Drawn:
-        """Find which surfaces the pixels see."""
-        return self.pack.draw([objects])
+    def draw(self, objects: Objects, sun: Sun | None = None) -> Drawn:
+        """Find which surfaces the pixels see. sun: as of `sun_of`."""
+        return self.pack.draw([objects], [sun])
+
+    def sun_of(self, environment: Environment) -> Sun | None:
+        """The sun of a perturbed scene; None where it is the photograph's."""
+        if not len(self.sunlight) or not active(environment.light):
+            return None
+        return Sun.of(replace(self.scene.environment, light=environment.light), self.like, self.sunlight.mean())
 
     def local(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""
@@ -330,38 +338,73 @@ class Prepared:
         changed = any(now.requires_grad or not torch.equal(now, then) for now, then in shapes)
         return self.fleet.local(objects.ffd, objects.size_lhw) if changed else self._base_local
 
-    def brighter(self, objects: Objects) -> Tensor:
-        """By how much (V,) the surfaces are brighter than in the photograph, since they turned: see
-        `texture.brightened`."""
+    def brighter(self, objects: Objects, sun: Sun | None = None) -> Tensor:
+        """By how much (V,) the surfaces are brighter than in the photograph, since they or the sun turned, or its
+        light changed: see `texture.brightened`."""
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
-        if not objects.source or not turned:
+        if not objects.source or not (turned or sun is not None):
             return self.like.new_zeros(self.fleet.owner.shape[0])
         if self._lit is None:
             self._lit = self._sun_on(self.base_yaw)
         sunlight = self.fleet.spread(self.sunlight)
         then = model.AMBIENT[0] + model.AMBIENT[1] * (0.5 - 0.5 * self.smooth[:, 1]) + sunlight * self._lit
-        return texture.brightened(sunlight * (self._sun_on(objects.yaw) - self._lit) / then, self.fleet.paint)
+        now = self._sun_on(objects.yaw, sun)
+        more = now - self._lit if sun is None else now - self._lit + (sun.strength - 1.0) * now
+        return texture.brightened(sunlight * more / then, self.fleet.paint)
 
-    def _sun_on(self, yaw: Tensor) -> Tensor:
+    def _sun_on(self, yaw: Tensor, moved: Sun | None = None) -> Tensor:
         """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
-        sun = self.scene.environment.sun.to(self.like).expand(len(yaw), 3)
+        direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
+        sun = direction.expand(len(yaw), 3)
         x, y, z = self.fleet.spread(surfaces.rotate(sun, -yaw)).unbind(-1)
         # Written out: sums along an axis may differ in their last bit with the number of rows.
         soft = self.smooth[:, 0] * x + self.smooth[:, 1] * y + self.smooth[:, 2] * z
         return texture.sunward(soft)
 
-    def ground(self, objects: Objects) -> Tensor:
+    def ground(self, objects: Objects, sun: Sun | None = None) -> Tensor:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
         A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
-        sun: the patch is sheared the more, the farther out. It grows with its object.
+        sun: the patch is sheared the more, the farther out. It grows with its object. Where the sun moves, only
+        shadows that are the objects' own follow (`casts`).
         """
         ground = self.scene.environment.ground
         offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self.size[:, 1])
+        if sun is not None:
+            offset = offset + self.casts * (
+                surfaces.sun_offset(sun.direction, objects.yaw, self.size[:, 1]) - offset
+            )
         corners = self.corners + self.outwards[..., None] * (offset - self.sun_offset)[:, None]
         corners = corners * (objects.size_lhw / self.size)[:, None, ::2]
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
+
+    @property
+    def casts(self) -> Tensor:
+        """(N, 1): 1 where the photographed shadow is that of the object's box in the scene's sun, 0 where it is
+        much else's too, such as a house's, or the picture's border cuts it; found on first use."""
+        if self._casts is None:
+            with torch.no_grad():
+                self._casts = self._found_casts()
+        return self._casts
+
+    def _found_casts(self) -> Tensor:
+        source, casts = self.scene.objects.source, self.like.new_ones(len(self.scene.objects), 1)
+        if not source:
+            return casts
+        drawn = self.draw(photographed(self.scene.objects))
+        density, rects = self.ground_density(drawn), drawn.ground_layout.rects.tolist()
+        for i, (packed, size) in enumerate(drawn.ground_layout.spans()):
+            shadow = source[i].shadow
+            if shadow is None or not shadow.values.numel() or not min(size):
+                continue
+            (x0, y0), (h, w) = (shadow.x0, shadow.y0), shadow.values.shape[1:]
+            cut = min(x0, y0) <= 0 or x0 + w >= self.frame_hw[1] or y0 + h >= self.frame_hw[0]
+            inverted = replace(shadow, values=1.0 - shadow.values.to(self.like))
+            dark = texture.crop_of(inverted, tuple(rects[i]), self.frame_hw).mean(dim=0).flatten()
+            alike = torch.nn.functional.cosine_similarity(dark, density[packed], dim=0)
+            casts[i] = float(alike >= model.OWN_SHADOW and not cut)
+        return casts
 
     def shadowless(self) -> list[bool]:
         """Which objects darken no ground."""
@@ -391,17 +434,22 @@ class Prepared:
         """Unit normals (V, 3) of objects where they stand, with sharp edges."""
         return surfaces.rotate(self.sharp, self.fleet.spread(objects.yaw))
 
-    def own_colour(self, xy: Tensor, owner: Tensor, own: Tensor) -> Tensor:
+    def lights(self, sun: Sun | None = None) -> Tensor:
+        """(N, 4): direction and strength of the sun on each object."""
+        direction = self.scene.environment.sun.to(self.like) if sun is None else sun.direction
+        strength = self.sunlight if sun is None else self.sunlight * sun.strength
+        return torch.cat([direction.expand(len(strength), 3), strength[:, None]], dim=1)
+
+    def own_colour(self, xy: Tensor, owner: Tensor, own: Tensor, sun: Sun | None = None) -> Tensor:
         """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
         `own_attributes` (K, ...)."""
-        sunlight = self.sunlight.index_select(0, owner)
+        light = self.lights(sun).index_select(0, owner)
         albedo, normal = own[:, : channels.NORMAL], own[:, channels.NORMAL : channels.OWN_PAINT]
         sheen, height = own[:, channels.OWN_PAINT : channels.OWN_DEPTH], own[:, channels.OWN_HEIGHT]
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self.unproject.T
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
         to_eye = -torch.nn.functional.normalize(ray, dim=-1)
-        sun = self.scene.environment.sun.to(self.like)
-        return texture.shade(normal, to_eye, albedo, sheen, height, sun, sunlight)
+        return texture.shade(normal, to_eye, albedo, sheen, height, light[:, :3], light[:, 3])
 
     @torch.no_grad()
     def photographed_paint(self) -> list[Crop]:
@@ -504,22 +552,23 @@ class Pack:
         self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self.counts))]
         self._shadowless = [s for m in members for s in m.shadowless()]
 
-    def place(self, objects: Sequence[Objects]) -> Geometry:
-        """Where the vertices of perturbed objects, of each member, come to lie."""
+    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None]) -> Geometry:
+        """Where the vertices of perturbed objects, of each member, come to lie, and the light on them."""
         local = joined([m.local(o) for m, o in zip(self._members, objects, strict=True)])
         yaw, translation = joined([o.yaw for o in objects]), joined([o.translation for o in objects])
-        ground = joined([m.ground(o) for m, o in zip(self._members, objects, strict=True)])
+        lit = list(zip(self._members, objects, suns, strict=True))
+        ground = joined([m.ground(o, sun) for m, o, sun in lit])
         clip, cos = surfaces.place(self._rig, local, yaw, translation, self._backend if len(yaw) else "reference")
-        brighter = joined([m.brighter(o) for m, o in zip(self._members, objects, strict=True)])
+        brighter = joined([m.brighter(o, sun) for m, o, sun in lit])
         return Geometry(clip, cos, ground, brighter)
 
     def reach_px(self, objects: Sequence[Objects]) -> list[float]:
         """How far the halo of each object reaches beyond its mesh."""
         return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
 
-    def draw(self, objects: Sequence[Objects], with_ground: bool = True) -> Drawn:
+    def draw(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool = True) -> Drawn:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
-        geometry, backend, reach = self.place(objects), self._backend, self.reach_px(objects)
+        geometry, backend, reach = self.place(objects, suns), self._backend, self.reach_px(objects)
         rects = surfaces.crop_rects(
             geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
             [2.0 + r for r in reach],

@@ -13,6 +13,7 @@ from torch import Tensor
 from scene_ir.raster import verbs
 from scene_ir.render import channels, model, texture
 from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
+from scene_ir.render.sun import Sun
 from scene_ir.render.texture import smoothstep
 from scene_ir.types import Objects
 
@@ -93,16 +94,17 @@ class _Fringe:
         return known.index_add(0, self.row, (1.0 - self.own)[:, None] * (mean - known[self.row]))
 
 
-def layers(prepared: Prepared, objects: Objects, drawn: Drawn) -> Layers:
+def layers(prepared: Prepared, objects: Objects, drawn: Drawn, sun: Sun | None = None) -> Layers:
     """`layers` in plain torch."""
     rows = _rows(prepared, drawn, bool(objects.source))
     size = drawn.mesh.layout.size
     if objects.source:
-        shaded = _photographed_rows(prepared, objects, drawn, rows)
+        shaded = _photographed_rows(prepared, objects, drawn, rows, sun)
     else:
         plain = prepared.own_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
         own = _mesh_attributes(prepared, drawn, rows, plain)
-        colour, z = prepared.own_colour(rows.xy, rows.owner, own).clamp(0.0, 1.0), own[:, channels.OWN_DEPTH]
+        colour = prepared.own_colour(rows.xy, rows.owner, own, sun).clamp(0.0, 1.0)
+        z = own[:, channels.OWN_DEPTH]
         shaded = _Shaded(colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT])
     colour, depth = shaded.colour, shaded.depth
     if active(objects.texture_code):
@@ -159,7 +161,9 @@ def _mesh_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: 
     return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
 
-def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows) -> _Shaded:
+def _photographed_rows(
+    prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows, sun: Sun | None
+) -> _Shaded:
     """All rows, coloured by the photograph, and completed where it did not see the mesh."""
     geometry, base, fleet, m = drawn.geometry, prepared.base, prepared.fleet, rows.mesh_rows
     turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, prepared.height, geometry.brighter], dim=1)
@@ -201,7 +205,7 @@ def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows:
     need = (fill != 0.0).nonzero()[:, 0]
     if need.numel():
         filled = fill.index_select(0, need)
-        completed = _completion(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m])
+        completed = _completion(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m], sun)
         colour = colour.index_add(0, need, filled[:, None] * completed)
         opacity = opacity.index_add(0, need, filled)
     assert prepared.regions is not None
@@ -213,7 +217,13 @@ def _photographed_rows(prepared: Prepared, objects: Objects, drawn: Drawn, rows:
 
 
 def _completion(
-    prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows, need: Tensor, cos_now: Tensor
+    prepared: Prepared,
+    objects: Objects,
+    drawn: Drawn,
+    rows: _Rows,
+    need: Tensor,
+    cos_now: Tensor,
+    sun: Sun | None,
 ) -> Tensor:
     """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
     template in the car's own finish.
@@ -223,7 +233,7 @@ def _completion(
     attributes = prepared.all_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
     own = _mesh_attributes(prepared, drawn, rows, attributes)[need]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
-    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], own), gain, lift)
+    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], own, sun), gain, lift)
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)

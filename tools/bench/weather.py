@@ -1,13 +1,15 @@
-"""The compositor's weather beside the generator's: brightness, contrast and a detector's scores, code by code.
+"""The compositor's weather and sun beside the generator's: brightness, contrast and a detector's scores.
 
 A failure that only the compositor's weather causes does not survive the second renderer. This says where the two
-part: for each effect, at half and at full strength, in the boxes of the labelled vehicles.
+part: for each effect, at half and at full strength, in the boxes of the labelled vehicles; and how far the sun can
+be moved, while the shadows of all but vehicles stay those of the photograph.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from drivesem.truth.margin import of_objects
 from scene_ir.derender.derender import derender
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.model import LUMA
+from scene_ir.render.model import LUMA, SUN_RISE_RAD, SUN_STRENGTH, SUN_TURN_RAD
 from scene_ir.types import Frame, SceneIR
 from tools.bench.pictures import Strip, psnr, sheet
 from tools.bench.settings import BenchTool
@@ -39,31 +41,51 @@ from tools.bench.settings import BenchTool
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-TITLE = "Weather, ours beside the generator's"
+TITLE = "Weather and sun, ours beside the generator's"
 COLUMNS: Columns = {
     "pool": ("pool", "pool"), "weather": ("weather", "weather"), "frames": ("frames", "frames"),
     "cars": ("vehicles", "cars"), "psnr_db": ("PSNR in the boxes, dB", "PSNR"),
+    "tail_db": ("tail", "tail"), "unchanged_db": ("unchanged", "unchanged"),
     "mean": ("brightness in the boxes, ours", "mean"), "mean_true": ("the generator's", "true"),
     "contrast": ("contrast in the boxes, ours", "contrast"), "contrast_true": ("the generator's ", "true"),
     "margin": ("margin, ours, logits", "margin"), "margin_true": ("the generator's  ", "true"),
 }  # fmt: skip
 METHOD = (
-    "Clear generated frames of both pools, taken apart with their labels alone; a code of weather is drawn by the "
-    "compositor on the photograph and by the generator in its world. In the boxes of labelled "
+    "Clear generated frames of both pools, taken apart with their labels alone; a code of weather or another sun "
+    "is drawn by the compositor on the photograph and by the generator in its world. In the boxes of labelled "
     "vehicles, at least 25 px high and half in view, grown by 15 % of their size each way: mean luma and its "
-    "standard deviation (contrast), display values of [0, 1], and PSNR of one picture to the other. Margin: the "
+    "standard deviation (contrast), display values of [0, 1], and PSNR of one picture to the other; tail: "
+    "the 10th percentile; unchanged: the photograph as the answer. Margin: the "
     "logit of the best detection of the vehicle less that of the detector's t*, from -8; means over vehicles."
 )
 QUICK_FRAMES, FULL_FRAMES = 4, 24
-CODES: dict[str, tuple[float, float, float, float]] = {
-    "none": (0, 0, 0, 0),
+_SUN_CORNERS = ((1, 1, 1), (1, -1, 1), (-1, 1, -1), (-1, -1, -1))
+CODES: dict[str, FrameEdit] = {
+    "none": FrameEdit(),
     **{
-        f"{name} {code:g}": tuple(code if i == at else 0.0 for i in range(4))  # pyright: ignore[reportAssignmentType]
+        f"{name} {code:g}": FrameEdit(weather=tuple(code if i == at else 0.0 for i in range(4)))
         for at, name in enumerate(("fog", "rain", "time", "overcast"))
         for code in (0.5, 1.0)
     },
-    "fog and rain 0.5": (0.5, 0.5, 0, 0),
+    "fog and rain 0.5": FrameEdit(weather=(0.5, 0.5, 0, 0)),
+    **{
+        f"sun {degrees} degrees to the {side}": FrameEdit(sun=(sign * math.radians(degrees) / SUN_TURN_RAD, 0, 0))
+        for degrees in (20, 40, 60)
+        for side, sign in (("right", 1), ("left", -1))
+    },
+    **{
+        f"sun {degrees} degrees {way}": FrameEdit(sun=(0, sign * math.radians(degrees) / SUN_RISE_RAD, 0))
+        for degrees in (10, 20)
+        for way, sign in (("higher", 1), ("lower", -1))
+    },
+    **{
+        f"sun {share:.0%} {way}": FrameEdit(sun=(0, 0, sign * share / SUN_STRENGTH))
+        for share in (0.3, 0.6)
+        for way, sign in (("stronger", 1), ("weaker", -1))
+    },
+    **{f"corner {n} of the codes of suns": FrameEdit(sun=corner) for n, corner in enumerate(_SUN_CORNERS)},
 }
+"""What is tried: codes of weather, and suns, some beyond their codes' ends."""
 _SEED = 59
 """Of the frames: of no training and no other test."""
 _LEAST_PX, _LEAST_SEEN, _GROWN = 25.0, 0.5, 0.15
@@ -71,7 +93,7 @@ _LEAST_PX, _LEAST_SEEN, _GROWN = 25.0, 0.5, 0.15
 
 @dataclass(frozen=True, slots=True)
 class WeatherRow:
-    """One weather of one frame; figures are means over its vehicles."""
+    """One weather of one frame; figures are means over its vehicles, but for what begins with `each`."""
 
     pool: str
     frame: str
@@ -84,6 +106,8 @@ class WeatherRow:
     contrast_true: float
     margin: float
     margin_true: float
+    unchanged_db: float
+    each_db: tuple[float, ...]
 
 
 def measure(config: BenchTool, frames: int, sheets: Path | None) -> Iterator[list[WeatherRow]]:
@@ -107,10 +131,10 @@ def rows_of(
         return []
     compositor = Compositor(scene)
     rows, strips = [], []
-    for name, code in CODES.items():
-        ours = to_uint8(compositor.render(_in_weather(scene, code)).image)
-        truth = _rendered(apply_edit(plan, FrameEdit(weather=code)), street).image
-        rows.append(_row((pool, f"{number:03d}", name), ours, truth, shown, detector))
+    for name, edit in CODES.items():
+        ours = to_uint8(compositor.render(_under(scene, edit)).image)
+        truth = _rendered(apply_edit(plan, edit), street).image
+        rows.append(_row((pool, f"{number:03d}", name), made.image, ours, truth, shown, detector))
         region = np.ones(ours.shape[:2], bool)
         strips.append(Strip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
     if sheets is not None:
@@ -121,7 +145,16 @@ def rows_of(
 def summary(rows: Sequence[WeatherRow]) -> list[dict[str, Any]]:
     """Means over vehicles, by pool and weather."""
     out: list[dict[str, Any]] = []
-    figures = ("psnr_db", "mean", "mean_true", "contrast", "contrast_true", "margin", "margin_true")
+    figures = (
+        "psnr_db",
+        "mean",
+        "mean_true",
+        "contrast",
+        "contrast_true",
+        "margin",
+        "margin_true",
+        "unchanged_db",
+    )
     for pool in SPLITS:
         for name in CODES:
             chosen = [row for row in rows if (row.pool, row.weather) == (pool, name)]
@@ -130,13 +163,19 @@ def summary(rows: Sequence[WeatherRow]) -> list[dict[str, Any]]:
             cars = [row.cars for row in chosen]
             table = np.array([[getattr(row, figure) for figure in figures] for row in chosen])
             means = np.average(table, axis=0, weights=cars).round(3).tolist()
-            row = {"pool": pool, "weather": name, "frames": len(chosen), "cars": sum(cars)}
+            row: dict[str, Any] = {"pool": pool, "weather": name, "frames": len(chosen), "cars": sum(cars)}
+            row["tail_db"] = round(float(np.percentile([db for one in chosen for db in one.each_db], 10)), 3)
             out.append({**row, **dict(zip(figures, means, strict=True))})
     return out
 
 
 def _row(
-    name: tuple[str, str, str], ours: Picture, truth: Picture, shown: Sequence[Truth], detector: Predictor
+    name: tuple[str, str, str],
+    before: Picture,
+    ours: Picture,
+    truth: Picture,
+    shown: Sequence[Truth],
+    detector: Predictor,
 ) -> WeatherRow:
     figures = []
     margins = [_margins(picture, shown, detector) for picture in (ours, truth)]
@@ -145,9 +184,9 @@ def _row(
         lights = [(picture[region] @ np.array(LUMA)) / 255 for picture in (ours, truth)]
         spread = [value for light in lights for value in (light.mean(), light.std())]
         figures.append([psnr(ours, truth, region), spread[0], spread[2], spread[1], spread[3]])
-        figures[-1] += [float(margin[i]) for margin in margins]
+        figures[-1] += [float(margin[i]) for margin in margins] + [psnr(before, truth, region)]
     means = np.mean(figures, axis=0).round(4).tolist()
-    return WeatherRow(*name, len(shown), *means)
+    return WeatherRow(*name, len(shown), *means, each_db=tuple(round(float(f[0]), 4) for f in figures))
 
 
 def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
@@ -171,9 +210,9 @@ def _shown(truth: Truth) -> bool:
     return truth.labelled and truth.actor.label in VEHICLES and bool(tall) and truth.visible >= _LEAST_SEEN
 
 
-def _in_weather(scene: SceneIR, code: tuple[float, ...]) -> SceneIR:
-    weather = torch.tensor(code).to(scene.environment.weather)
-    return replace(scene, environment=replace(scene.environment, weather=weather))
+def _under(scene: SceneIR, edit: FrameEdit) -> SceneIR:
+    like = scene.environment.weather
+    return scene.with_environment(weather=like.new_tensor(edit.weather), light=like.new_tensor(edit.sun))
 
 
 def _rendered(plan: Plan, street: generated.Street) -> SynthFrame:

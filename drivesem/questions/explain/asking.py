@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -56,7 +57,8 @@ class ExplainWorker:
     """What one process needs: built once, used for many frames."""
 
     def __init__(self, config: Explain, attack: Attack, params: tuple[Parameter, ...], out: Path) -> None:
-        self.config, self.attack, self.params, self.out = config, attack, params, out
+        self.config, self.params, self.out = config, params, out
+        self.attack = replace(attack, whole=config.whole_beside(attack.whole), incremental=False)
         self.detector = detector_of(attack, config.device)
 
     def __call__(self, name: str) -> None:

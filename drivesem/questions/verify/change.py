@@ -23,7 +23,7 @@ BOUND = 1e-6
 SCENE = 1e-5
 """By how much the scene that theta gives may differ from the saved one (m, rad, unit boxes, codes)."""
 _MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code")
-_CODES = ("weather", "foliage")
+_CODES = ("weather", "foliage", "light")
 
 
 def check_change(

@@ -62,6 +62,7 @@ def carried(still: SceneIR, changed: SceneIR, planned: Planned) -> Carried:
         objects=edits,
         weather=tuple((environment.weather - then.weather).detach().clamp(0, 1).tolist()),
         foliage=tuple((environment.foliage - then.foliage).detach().clamp(-1, 1).tolist()),
+        sun=tuple((environment.light - then.light).detach().clamp(-1, 1).tolist()),
     )
     return Carried(edit, tuple(missing))
 

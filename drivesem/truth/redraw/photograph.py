@@ -78,9 +78,9 @@ class PhotographRedraw:
         self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), before)
 
     def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
-        """Nothing is left out."""
-        del changed
-        return ()
+        """The sun: textures that are baked from the photograph keep its light."""
+        moved = not torch.equal(changed.environment.light, self._still.environment.light)
+        return ("the sun, whose light is baked into the textures",) if moved else ()
 
     @torch.no_grad()
     def redraw(self, changed: SceneIR) -> Redrawn:

@@ -46,7 +46,6 @@ class Setting:
     texels: tuple[Tensor, Tensor, Tensor]
     dark: tuple[Tensor, Tensor, Tensor]
     frame_wh: Tensor
-    sun: Tensor
     unproject: Tensor
     painter: Painter | None
 
@@ -86,12 +85,12 @@ class Photographed(torch.autograd.Function):
     """All pixels of photographed objects, and of their shadows.
 
     clip (V, 3), facing (V,), brighter (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `ground.Ground`),
-    code (N, 5) or (0,): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth
+    code (N, 5) or (0,), sun (N, 4): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth
     (T, 4), opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
     """
 
     @staticmethod
-    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, s: Setting):
+    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, sun, s: Setting):
         size, device = coverage.shape[0], clip.device
         clip, facing, brighter, coverage = (t.detach().contiguous() for t in (clip, facing, brighter, coverage))
         parts = _Parts(s, code if s.painter is not None else None)
@@ -107,7 +106,9 @@ class Photographed(torch.autograd.Function):
         shadow = clip.new_empty(s.ground.size, 3)
         pixels = _struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
         vertices = _struct(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
-        photograph = _struct(shading.Photograph, *s.texels, s.frame_wh, turn, s.sun, s.unproject)
+        photograph = _struct(
+            shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
+        )
         looks = _struct(shading.Looks, found, look, mesh, halo, fill)
         layers = _struct(shading.Layers, colour, opacity, depth)
         patches = _struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
@@ -171,11 +172,12 @@ class Photographed(torch.autograd.Function):
         grad_clip = zeros(count, 3, dtype=torch.float64)
         grad_then = torch.zeros_like(s.inside)
         grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
+        grad_sun = torch.zeros(len(kept.turn), 4, dtype=torch.float64, device=device)
         to_layers = shading.Layers()
         to_layers.colour, to_layers.opacity = field(grad_colour, wp.vec4f), field(grad_opacity)
         grads = _struct(
             *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
-            *(grad_clip, grad_facing, grad_brighter, grad_turn),
+            *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
         shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
 
@@ -219,7 +221,7 @@ class Photographed(torch.autograd.Function):
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
-        return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, None
+        return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
 
 
 def _struct(kind: Any, *tensors: Tensor) -> Any:

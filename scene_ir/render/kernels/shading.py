@@ -128,6 +128,7 @@ class Gradients:
     facing: wp.array(dtype=wp.float32)
     brighter: wp.array(dtype=wp.float32)
     turn: wp.array(dtype=wp.vec2d)
+    sun: wp.array(dtype=wp.vec4d)
 
 
 @wp.func
@@ -882,6 +883,8 @@ def complete_backward_kernel(
     to_look[ch.COS_THEN] = to_facing
     wp.atomic_add(grads.look, i, to_look)
     wp.atomic_add(grads.turn, o, wp.vec2d(wp.float64(to_turn[0]), wp.float64(to_turn[1])))
+    light = wp.vec4d(wp.float64(to_sun[0]), wp.float64(to_sun[1]), wp.float64(to_sun[2]), wp.float64(to_sun[3]))
+    wp.atomic_add(grads.sun, o, light)
 
 
 # --------------------------------------------------------------------------------------------- mesh and halo as one

@@ -80,9 +80,13 @@ def test_a_preset_can_be_narrowed_and_not_widened():
             budget_of(text)
 
 
-def test_sizes_change_in_street_alone():
+def test_sizes_and_the_sun_change_in_street_alone():
     assert budget_of("street").size == 0.1
     assert budget_of("paper").size == budget_of("parking").size == 0
+    assert (budget_of("street").sun, budget_of("paper").sun) == (1, 0)
+    assert budget_of("street,sun=0.5") == replace(PRESETS["street"], sun=0.5)
+    with pytest.raises(FormatError, match=r"--budget: sun: expected street,sun=0.5, since only street lets it"):
+        budget_of("sun=0.5")
     narrowed = budget_of("street,size=5%")
     assert narrowed == replace(PRESETS["street"], size=0.05) == budget_of(written(narrowed))
     assert written(narrowed) == "street,size=0.05"
@@ -139,7 +143,7 @@ def test_a_street_is_longer_along_than_across(street):
     papers = ParameterSpace(scene, SIX)
     size = space.slice_of(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
-    assert size.stop == space.dim
+    assert space.upper[size.stop :].tolist() == [1.0] * 3  # the sun's
     wider = papers.upper != space.upper[: size.start]
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
 

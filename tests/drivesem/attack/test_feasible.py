@@ -312,6 +312,16 @@ def test_the_second_check_bounds_sizes_by_the_budget(street, factors, said):
     assert check_scene(scene, grown, reach=STREET) == said
 
 
+def test_the_second_check_bounds_the_sun_by_the_budget(street):
+    scene = street()
+    moved = scene.with_environment(light=torch.tensor([1.0, -1.0, 0.5]))
+    assert check_scene(scene, moved, reach=STREET) == []
+    assert check_scene(scene, moved) == ["environment.light: outside [-0, 0]"]
+    assert check_scene(scene, moved, reach=reach_of(Budget(sun=0.6))) == ["environment.light: outside [-0.6, 0.6]"]
+    other = scene.with_environment(sun=torch.tensor([0.6, -0.8, 0.0]))
+    assert check_scene(scene, other, reach=STREET) == ["sun: changed"]
+
+
 def test_a_car_grows_until_it_meets_another(street):
     # They stand 0.3 m apart, side by side, each 1.75 m wide.
     scene = street(positions_xz=((-1.025, 12.0), (1.025, 12.0)), yaw=-math.pi / 2)

@@ -10,7 +10,7 @@ from drivesem.attack.space import COMBOS, SIX, Budget, Parameter, ParameterSpace
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 ALL = tuple(Parameter)
-WIDE = Budget(size=0.1)
+WIDE = Budget(size=0.1, sun=1.0)
 
 
 def test_parse_params_is_in_thetas_order_whatever_is_typed():
@@ -23,7 +23,7 @@ def test_parse_params_is_in_thetas_order_whatever_is_typed():
     [
         (
             "translate,spin",
-            "expected names among color, weather, foliage, translate, rotate, mesh, size, found 'spin'",
+            "expected names among color, weather, foliage, translate, rotate, mesh, size, sun, found 'spin'",
         ),
         ("", "at least one of color"),
         ("mesh,mesh", "expected each parameter once"),
@@ -46,7 +46,7 @@ def test_unknown_combo_and_budget():
 
 def test_cardinality_bounds_and_steps(street):
     space = ParameterSpace(street(), ALL, WIDE)
-    assert space.dim == 4 * 5 + 4 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1
+    assert space.dim == 4 * 5 + 4 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1 + 3
     for tensor in (space.theta0, space.lower, space.upper, space.step):
         assert tuple(tensor.shape) == (space.dim,)
     assert bool((space.lower <= 0).all())
@@ -57,7 +57,7 @@ def test_cardinality_bounds_and_steps(street):
     steps = {p.value: float(space.step[space.slice_of(p)][0]) for p in ALL}
     assert steps == pytest.approx(
         {"color": 0.05, "weather": 0.25, "foliage": 0.1, "translate": 0.01, "rotate": 0.01, "mesh": 0.025}
-        | {"size": 0.01}
+        | {"size": 0.01, "sun": 0.1}
     )
 
 
@@ -121,7 +121,7 @@ def test_flatten_is_the_inverse_of_unflatten(street, seed, names, count):
         assert torch.equal(theta[where], block)
         owners = [space.name(i).split(".")[0] for i in range(where.start, where.stop)]
         size = len(block) // max(count, 1)
-        known = (Parameter.WEATHER, Parameter.FOLIAGE)
+        known = (Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN)
         expected = [parameter.value if parameter in known else f"objects[{i // size}]" for i in range(len(block))]
         assert owners == expected
 
@@ -151,6 +151,7 @@ def test_theta0_changes_nothing_to_the_bit(street, dtype):
         assert torch.equal(getattr(same.objects, name), getattr(scene.objects, name)), name
     assert torch.equal(same.environment.weather, scene.environment.weather)
     assert torch.equal(same.environment.foliage, scene.environment.foliage)
+    assert torch.equal(same.environment.light, scene.environment.light.to(dtype))
 
 
 def test_translation_goes_along_the_heading_by_own_lengths(street):
@@ -193,12 +194,18 @@ def test_apply_has_the_gradient_of_its_differences(street):
     scene = street(positions_xz=((0.0, 12.0),), dtype=torch.float64, tilt=0.03)
     space = ParameterSpace(scene, ALL, WIDE)
     generator = torch.Generator().manual_seed(5)
-    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 4, 3)]
+    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 4, 3, 3)]
 
     def functional(theta):
         s = space.apply(scene, theta)
         fields = (s.objects.translation, s.objects.yaw, s.objects.ffd, s.objects.size_lhw)
-        fields = (*fields, s.objects.texture_code, s.environment.weather, s.environment.foliage)
+        fields = (
+            *fields,
+            s.objects.texture_code,
+            s.environment.weather,
+            s.environment.foliage,
+            s.environment.light,
+        )
         return sum((w * f.reshape(-1).sin()).sum() for w, f in zip(weights, fields, strict=True))
 
     theta = torch.rand(space.dim, generator=generator, dtype=torch.float64) * 0.2 * space.upper
@@ -218,10 +225,23 @@ def test_a_size_is_a_share_of_its_own_and_shown_in_percent(street):
     assert space.describe(0) == "objects[0].size, share of its own, [-0.1, 0.1]"
 
 
+def test_the_sun_is_the_scenes_and_ends_at_its_codes(street):
+    scene = street().with_environment(light=torch.tensor([0.5, 0.0, -1.0]))
+    space = ParameterSpace(scene, ("sun",), WIDE)
+    assert [space.name(i) for i in range(3)] == ["sun.azimuth", "sun.elevation", "sun.strength"]
+    assert space.upper.tolist() == [0.5, 1.0, 2.0]
+    assert space.lower.tolist() == [-1.5, -1.0, 0.0]
+    assert space.apply(scene, space.upper).environment.light.tolist() == [1.0, 1.0, 1.0]
+    assert space.apply(scene, 3 * space.lower).environment.light.tolist() == [-1.0, -1.0, -1.0]
+
+
 def test_what_a_budget_holds_is_refused(street):
     with pytest.raises(FormatError, match="params: size: expected a budget in which size may change"):
         ParameterSpace(street(), ("rotate", "size"))
+    with pytest.raises(FormatError, match="params: sun: expected a budget in which sun may change"):
+        ParameterSpace(street(), ("sun",))
     assert Parameter.SIZE not in SIX
+    assert Parameter.SUN not in SIX
     assert len(SIX) == 6
 
 

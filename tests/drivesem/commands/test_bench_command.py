@@ -214,3 +214,17 @@ def test_climb(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
 def test_climb_asks_for_a_processor(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "climb", "--device", "cuda"]) == 2
     assert "--device" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_night(capsys: pytest.CaptureFixture[str]) -> None:
+    """Two embedded frames tell of a thousand."""
+    words = ["bench", "night", "--limit", "2", "--count", "1000", "--workers", "1", "--json"]
+    assert main(words) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["measured"]) == 2
+    assert [row["part"] for row in result["parts"]] == ["derender", "search", "certify", "write"]
+    asked = result["nights"][0]
+    whole = sum(row["mean_s"] for row in result["parts"])
+    assert asked["hours"] == pytest.approx(whole * 1000 / 3600)
+    assert 0 < whole < 300

@@ -126,7 +126,7 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
         "--queries",
         "2",
         "--params",
-        "translate,weather,size",
+        "translate,weather,size,sun",
         "--budget",
         "street",
         "--seed",
@@ -140,12 +140,14 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     theta = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.endswith("along")]
     assert max(abs(c.value) for c in theta) > 0.25
     assert max(c.upper for c in theta) > 0.5
+    sun = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.startswith("sun.")]
+    assert 0.1 < max(abs(c.value) for c in sun) <= 1
     grown = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.endswith("size")]
     assert 1 < max(abs(float(c.display.removesuffix(" %"))) for c in grown) <= 10
     assert verify(out, code=0)["differences"] == []
     # What is asked of it next looks as far as it went.
     result, attack = load_frame(out / FRAME / "result.json"), run_folder.attack_of(out)
-    again, _ = rebuilt(result, out / FRAME, attack, parse_params("translate,weather,size"), Drifting())
+    again, _ = rebuilt(result, out / FRAME, attack, parse_params("translate,weather,size,sun"), Drifting())
     assert again.space.budget == PRESETS["street"]
     # The same scenes do not pass for a run in a budget as narrow as the paper's, nor for one that holds sizes.
     change_text = (out / "config.yaml").read_text().replace("budget: street", "budget: street,translate=0.25")

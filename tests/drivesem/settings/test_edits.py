@@ -64,6 +64,16 @@ def test_settings_of_the_scene() -> None:
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_NAMES)
 
 
+def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
+    edit = edit_of("sun.azimuth=-0.5", "sun.strength=1")
+    assert edit == FrameEdit(sun=(-0.5, 0.0, 1.0))
+    assert edited(street(), edit).scene.environment.light.tolist() == [-0.5, 0.0, 1.0]
+    with pytest.raises(FormatError, match=r"sun: height: expected one of azimuth, elevation, strength"):
+        edit_of("sun.height=1")
+    with pytest.raises(FormatError, match=r"sun.azimuth: expected a code in \[-1, 1\], found 2.0"):
+        edit_of("sun.azimuth=2")
+
+
 def test_later_settings_of_the_same_thing_win() -> None:
     assert edit_of("objects[1].rotate=1deg", "objects[1].rotate=2deg").objects[1].rotate == math.radians(2)
     both = edit_of("objects[1].rotate=1deg", "objects[1].translate=1m,0m").objects[1]
@@ -128,7 +138,7 @@ def test_a_bad_setting_is_one_line_that_repeats_it(text: str, message: str) -> N
     ("text", "message"),
     [
         ("objects: [1]", "objects: expected a mapping, found list"),
-        ("frames: {}", "frames: expected one of objects, weather, foliage, found an unknown key"),
+        ("frames: {}", "frames: expected one of objects, weather, foliage, sun, found an unknown key"),
         ("objects: {1: {rotate: '10'}}", "object 1: rotate: expected a unit"),
         ("- 1", "expected a mapping, found list"),
         ("{", "expected YAML"),

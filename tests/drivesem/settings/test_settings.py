@@ -19,7 +19,7 @@ import drivesem
 from drivesem.cli import main
 from drivesem.run.folder import attack_of
 from drivesem.settings.blocks import Command, constraints, option
-from drivesem.settings.commands import COMMANDS, Attack, Study, Synth
+from drivesem.settings.commands import COMMANDS, Attack, Explain, Study, Synth
 from drivesem.settings.constraints import Constraint, Folder, Of, OneOf, Required, Within
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse, preset_words
@@ -282,3 +282,26 @@ def _seconds(words: list[str]) -> float:
     assert "attack" in finished.stdout
     after = os.times()
     return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+@pytest.mark.parametrize(
+    ("words", "of_run", "whole"),
+    [
+        ((), False, False),
+        ((), True, True),
+        (("--incremental",), True, False),
+        (("--incremental",), False, False),
+        (("--whole",), False, True),
+    ],
+)
+def test_a_question_may_look_otherwise_than_its_run(words: tuple[str, ...], of_run: bool, whole: bool) -> None:
+    asked = parse(["explain", "--run", "run", *words])
+    assert isinstance(asked, Explain)
+    assert asked.whole_beside(of_run) is whole
+
+
+@pytest.mark.parametrize("command", [("attack",), ("study", "single"), ("bench",), ("explain", "--run", "run")])
+def test_incremental_and_whole_exclude_each_other(command: tuple[str, ...]) -> None:
+    parse([*command, "--incremental"])
+    with pytest.raises(UsageError, match="--incremental: expected it or --whole, found both"):
+        parse([*command, "--incremental", "--whole"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -49,6 +50,20 @@ def test_a_size_is_of_all_three_sides(plan):
     grown = apply_edit(plan, FrameEdit(objects={actor.track: ObjectEdit(size=0.1)})).actors[0]
     assert grown.size_lhw == pytest.approx([1.1 * side for side in actor.size_lhw])
     assert grown.position_xz == actor.position_xz
+
+
+def test_the_sun_moves_about_the_vertical_and_shines_stronger(plan):
+    light = plan.setting.light
+    moved = apply_edit(plan, FrameEdit(sun=(1.0, 0.5, 1.0))).setting.light
+    rise = math.degrees(math.asin(moved.sun @ light.up) - math.asin(light.sun @ light.up))
+    assert rise == pytest.approx(3.75, abs=0.01)
+    flat = [sun - (sun @ light.up) * light.up for sun in (light.sun, moved.sun)]
+    flat = [way / np.linalg.norm(way) for way in flat]
+    assert math.degrees(math.acos(flat[0] @ flat[1])) == pytest.approx(15, abs=0.01)
+    # To the right: x is right, z ahead.
+    assert np.cross(flat[0], flat[1]) @ light.up < 0
+    assert moved.sun_colour == pytest.approx(1.2 * light.sun_colour)
+    assert np.linalg.norm(moved.sun) == pytest.approx(1)
 
 
 def test_it_moves_as_the_compositor_moves_it(plan):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+import drivesem.truth.views as module
+from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
 from drivesem.attack.aims import Aim
 from drivesem.attack.objective import Objective
@@ -77,3 +79,56 @@ def test_gradients_against_differences(objective: Objective) -> None:
 
     slope = (total(theta + reach * way) - total(theta - reach * way)) / float(2 * reach)
     assert slope == pytest.approx(float(gradient @ way), rel=0.02)
+
+
+def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, detector = demo_scene(0, 0), load_detector("squeezedet")
+    space = ParameterSpace(scene, ("color", "translate"))
+    of_regions, of_all = (Objective(Compositor(scene), space, detector, whole=whole) for whole in (False, True))
+    regional, whole = (DrawnViews.of(o, Nuisances(), "search") for o in (of_regions, of_all))
+    generator = torch.Generator().manual_seed(0)
+    places = [torch.rand(space.dim, generator=generator) * space.upper for _ in range(3)]
+    for number in (0, 1):
+        for place in (*places, places[-1]):
+            torch.testing.assert_close(
+                regional.margins(place, number), whole.margins(place, number), atol=1e-4, rtol=0
+            )
+    kept = [regional.kept_mb, whole.kept_mb]
+    regional.forget()
+    kept.append(regional.kept_mb)
+    assert kept[0] > 0
+    assert kept[1:] == [0, 0]
+
+
+def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, detector = demo_scene(0, 0), load_detector("squeezedet")
+    space = ParameterSpace(scene, ("translate",))
+    views = DrawnViews.of(Objective(Compositor(scene), space, detector), Nuisances(), "search")
+    views.margins(space.theta0, 0)
+
+    def whole(*_: object) -> None:
+        raise AssertionError("a whole pass")
+
+    monkeypatch.setattr(type(detector), "forward", whole)
+    views.margins(0.1 * space.upper, 0)
+    with pytest.raises(AssertionError, match="a whole pass"):  # with a gradient
+        views.margins_and_grad(space.theta0, 0, torch.ones(len(views.judged)))
+
+
+def test_weather_has_no_regions(objective: Objective) -> None:
+    views = DrawnViews.of(objective, Nuisances(), "search")
+    views.margins(0.5 * objective.space.upper, 0)
+    kept = views.kept_mb
+    assert kept == 0
+
+
+def test_no_more_layers_are_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_KEPT_MB", LIMIT_MB + 1.0)
+    scene = demo_scene(0, 0)
+    space = ParameterSpace(scene, ("translate",))
+    views = DrawnViews.of(Objective(Compositor(scene), space, load_detector("squeezedet")), Nuisances(), "search")
+    kept = []
+    for number in range(2):
+        views.margins(space.theta0, number)
+        kept.append(views.kept_mb)
+    assert kept[0] == kept[1] > 0

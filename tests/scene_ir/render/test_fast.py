@@ -15,7 +15,7 @@ from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, SceneIR, scene_to
 
-PARAMETERS = ("translation", "yaw", "ffd", "size", "texture_code", "weather", "foliage")
+PARAMETERS = ("translation", "yaw", "ffd", "size", "texture_code", "weather", "foliage", "light")
 VALUE, GRADIENT = 2e-4, 1e-4
 """Largest difference of a pixel; of a gradient, relative to its length. Both sides are float32."""
 BAND = 4
@@ -33,7 +33,7 @@ def perturbed(scene: SceneIR, values: dict[str, Tensor]) -> SceneIR:
         "size_lhw": objects.size_lhw * (1 + values["size"])[:, None],
         "texture_code": objects.texture_code + values["texture_code"],
     }
-    environment = {"weather": values["weather"], "foliage": values["foliage"]}
+    environment = {name: values[name] for name in ("weather", "foliage", "light")}
     return scene.with_objects(**moved).with_environment(**environment)
 
 
@@ -43,16 +43,16 @@ def draws(scene: SceneIR, seed: int, spread: float, active: tuple[str, ...]) -> 
     count = len(scene.objects)
     shapes = {
         "translation": (count, 3), "yaw": (count,), "ffd": (count, 96), "texture_code": (count, 5), "weather":
-        (4,), "foliage": (3,), "size": (count,),
+        (4,), "foliage": (3,), "light": (3,), "size": (count,),
     }  # fmt: skip
     scales = {
         "translation": 0.5, "yaw": 0.3, "ffd": 0.03, "size": 0.1, "texture_code": 0.4, "weather": 0.4,
-        "foliage": 0.5,
+        "foliage": 0.5, "light": 0.5,
     }  # fmt: skip
     out = {}
     for name, shape in shapes.items():
         noise = torch.randn(shape, generator=generator) * scales[name] * spread
-        if name in ("weather", "foliage", "texture_code"):
+        if name in ("weather", "foliage", "light", "texture_code"):
             noise = (noise.abs() if name == "weather" else noise).clamp(-1.0, 1.0)
         out[name] = noise if name in active else torch.zeros(shape)
     return out

@@ -13,7 +13,7 @@ from torch import Tensor
 from scene_ir.ffd import from_symmetric
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import FOLIAGE_DIM, LATTICE, TEXTURE_DIM, WEATHER_DIM, SceneIR
+from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
 FUNCTIONALS = 3
 COSINE, RELATIVE = 0.99, 0.05
@@ -56,6 +56,7 @@ PARAMETERS = {
     "texture": Parameter(3 * TEXTURE_DIM, _texture, 1e-4, 0.4),
     "weather": Parameter(WEATHER_DIM, lambda s, t: s.with_environment(weather=t), 1e-4, 0.5, True),
     "foliage": Parameter(FOLIAGE_DIM, lambda s, t: s.with_environment(foliage=t), 1e-4, 0.5),
+    "sun": Parameter(LIGHT_DIM, lambda s, t: s.with_environment(light=t), 1e-4, 0.9),
     "translate": Parameter(6, _translate, 1e-4, 0.3),
     "rotate": Parameter(3, lambda s, t: s.with_objects(yaw=s.objects.yaw + t), 1e-4, 0.12),
     "mesh": Parameter(15, _ffd, 1e-4, 0.01),

@@ -75,6 +75,12 @@ def test_vehicles_go_the_same_way(plan: Plan, scene: SceneIR) -> None:
     assert after.actors[COUNT:] == plan.actors[COUNT:]
 
 
+def test_the_sun_is_carried(plan: Plan, scene: SceneIR) -> None:
+    changed = scene.with_environment(light=torch.tensor([0.5, -1.0, 0.25]))
+    found = carried(scene, changed, planned(plan, *tracks_of(plan)))
+    assert (found.edit.sun, found.missing) == ((0.5, -1.0, 0.25), ())
+
+
 def test_vehicles_grow_by_the_same_share(plan: Plan, scene: SceneIR) -> None:
     factors = torch.tensor([1.1, 0.95, 1.0], dtype=torch.float64)
     changed = scene.with_objects(size_lhw=scene.objects.size_lhw * factors[:, None])

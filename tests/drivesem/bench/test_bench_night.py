@@ -1,0 +1,59 @@
+"""How long a night's work takes, reckoned from hand-made frames; and two real frames in the command's tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivesem.bench import night
+from drivesem.bench.night import Spent
+from drivesem.settings.commands import Bench
+from drivesem.settings.errors import UsageError
+
+FRAMES = [Spent(2.0, 4.0, 3.0, 1.0, 1.0), Spent(4.0, 8.0, 1.0, 1.0, 1.0)]
+
+
+def test_where_the_time_goes() -> None:
+    rows = {row["part"]: row for row in night.part_rows(FRAMES)}
+    assert [row["mean_s"] for row in rows.values()] == [3.0, 6.0, 2.0, 1.0]
+    assert rows["search"]["share"] == pytest.approx(12 / 24)
+    assert sum(row["share"] for row in rows.values()) == pytest.approx(1.0)
+
+
+def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(night.os, "cpu_count", lambda: 4)
+    first, *others = night.night_rows(FRAMES, 600, 2, 0)
+    assert (first["how"], first["processes"], first["frames"]) == ("as asked", 2, 600)
+    assert first["hours"] == pytest.approx(12 * 600 / 2 / 3600)
+    assert first["low"] <= first["hours"] <= first["high"]
+    hours = {row["how"]: row["hours"] * 3600 * 2 / 600 for row in others}
+    assert hours == pytest.approx(
+        {"--no-fit": 10.0, "half the steps": 9.0, "frames taken apart before": 9.0, "--workers": 6.0}
+    )
+    assert [row["hours"] for row in others] == sorted((row["hours"] for row in others), reverse=True)
+
+
+def test_frames_that_were_not_fitted_have_no_faster_way() -> None:
+    rows = night.night_rows([Spent(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
+    assert [row["how"] for row in rows] == ["as asked", "half the steps", "frames taken apart before"]
+
+
+def test_frames_lie_evenly() -> None:
+    names = [f"{i:02d}" for i in range(11)]
+    assert night.spread(names, 3) == ["00", "05", "10"]
+    assert night.spread(names, 50) == names
+    assert night.spread([], 3) == []
+
+
+def test_no_frame_with_a_vehicle() -> None:
+    with pytest.raises(UsageError, match="frames with vehicles"):
+        night.check_some([])
+
+
+def test_the_attack_is_the_presets_on_this_commands_frames(tmp_path: Path) -> None:
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("method: climb\nparams: weather\nseed: 4\n")
+    settings = night.settings_of(Bench(what="night", attack=str(preset), seed=9, workers=2))
+    assert (settings.method, settings.params, settings.seed, settings.workers) == ("climb", "weather", 9, 2)
+    assert night.settings_of(Bench(what="night")).method == "si-fgsm"

@@ -1,0 +1,134 @@
+"""Scenes that are kept: once for the same content, made again for any other, within a limit."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from drivesem.cli import main
+from drivesem.scenes.kept import KeptScenes, digest_of
+from drivesem.scenes.sources import PhotographSource
+from drivesem.settings.commands import Attack
+from drivesem.synth.demo import demo_scene
+from scene_ir import files
+from scene_ir.derender import derender as derendering
+from scene_ir.types import SceneIR
+
+
+@dataclass(frozen=True)
+class Thing:
+    name: str
+    at: torch.Tensor
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneIR:
+    return demo_scene(0, 0)
+
+
+@dataclass
+class Maker:
+    scene: SceneIR
+    calls: int = 0
+
+    def __call__(self) -> SceneIR:
+        self.calls += 1
+        return self.scene
+
+
+def test_the_same_content_has_the_same_digest() -> None:
+    thing = Thing("a", torch.tensor([1.0, 2.0]))
+    assert digest_of(thing) == digest_of(replace(thing, at=thing.at.clone()))
+    others = [
+        replace(thing, name="b"),
+        replace(thing, at=torch.tensor([1.0, 2.5])),
+        replace(thing, at=torch.tensor([1.0, 2.0], dtype=torch.float64)),
+        replace(thing, at=torch.tensor([[1.0, 2.0]])),
+        (thing,),
+        {"a": thing},
+    ]
+    assert len({digest_of(one) for one in [thing, *others]}) == 1 + len(others)
+    assert digest_of(["ab", "c"]) != digest_of(["a", "bc"])
+    assert digest_of({"a": 1, "b": 2}) == digest_of({"b": 2, "a": 1})
+    with pytest.raises(TypeError, match="plain values"):
+        digest_of(object())
+
+
+def test_a_scene_is_made_once(scene: SceneIR, tmp_path: Path) -> None:
+    kept, make = KeptScenes(tmp_path / "kept", 1.0), Maker(scene)
+    first, second = kept.scene(("a", 1), make), kept.scene(("a", 1), make)
+    assert make.calls == 1
+    torch.testing.assert_close(second.photograph, first.photograph, rtol=0, atol=0)
+    torch.testing.assert_close(second.objects.translation, first.objects.translation, rtol=0, atol=0)
+    kept.scene(("a", 2), make)
+    assert make.calls == 2
+
+
+def test_a_damaged_scene_is_made_again(scene: SceneIR, tmp_path: Path) -> None:
+    kept, make = KeptScenes(tmp_path, 1.0), Maker(scene)
+    kept.scene("a", make)
+    (folder,) = tmp_path.iterdir()
+    (folder / "scene.json").write_text("{")
+    kept.scene("a", make)
+    kept.scene("a", make)
+    assert make.calls == 2
+
+
+def test_what_was_not_asked_for_longest_goes_first(scene: SceneIR, tmp_path: Path) -> None:
+    make = Maker(scene)
+    KeptScenes(tmp_path, 1.0).scene("old", make)
+    (old,) = tmp_path.iterdir()
+    size = sum(file.stat().st_size for file in old.rglob("*") if file.is_file()) / 1e9
+    KeptScenes(tmp_path, 1.0).scene("asked for", make)
+    for age, path in enumerate(tmp_path.iterdir()):
+        os.utime(path, (age, 1000 if path == old else 0))
+    kept = KeptScenes(tmp_path, 2.5 * size)
+    kept.scene("old", make)
+    kept.scene("new", make)
+    assert make.calls == 3
+    kept.scene("old", make)
+    kept.scene("new", make)
+    assert make.calls == 3, "both are there"
+    assert len(list(tmp_path.iterdir())) == 2
+    KeptScenes(tmp_path, 1e-9).scene("newest", make)
+    assert len(list(tmp_path.iterdir())) == 1, "the newest stays, however large"
+
+
+def test_photographs_are_taken_apart_once(scene: SceneIR, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not for other labels or settings: those make other scenes."""
+    image = np.full((60, 200, 3), 90, np.uint8)
+    folder = tmp_path / "D" / "training"
+    files.write_png(folder / "image_2/000000.png", image)
+    files.write_text(folder / "label_2/000000.txt", "")
+    files.write_text(folder / "calib/000000.txt", "P2: 90 0 100 0 0 90 30 0 0 0 1 0\n")
+    make = Maker(scene)
+    monkeypatch.setattr(derendering, "derender", lambda *_: make())
+    config = Attack(dataset="kitti", root=str(tmp_path / "D"), cache=str(tmp_path / "kept"))
+    PhotographSource(config).scene("000000")
+    PhotographSource(config).scene("000000")
+    assert make.calls == 1
+    PhotographSource(replace(config, fit=False)).scene("000000")
+    assert make.calls == 2
+    files.write_text(folder / "label_2/000000.txt", "DontCare -1 -1 -10 5 5 9 9 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    PhotographSource(config).scene("000000")
+    assert make.calls == 3
+    PhotographSource(replace(config, cache=None)).scene("000000")
+    assert make.calls == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["attack", "--cache", "c"], "--cache: expected a --dataset of photographs"),
+        (["derender", "--dataset", "kitti", "--root", ".", "--cache", "c"], "--cache: expected none"),
+        (["attack", "--cache-gb", "0"], "--cache-gb: expected a number above 0"),
+    ],
+)
+def test_bad_input(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
