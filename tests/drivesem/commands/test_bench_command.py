@@ -171,8 +171,10 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     (summed,) = result["rows"]
     assert (summed["found"], summed["faults"], summed["found_per_100"]) == (2, 2, 2.0)
     assert result["kinds"][1]["planted"] == 0
-    assert main([*words, "--out", str(tmp_path), "--passes", "48"]) == 0
-    assert len(asked) == 4
+    capsys.readouterr()
+    assert main([*words, "--out", str(tmp_path), "--faults", "1", "--naming"]) == 0
+    assert len(asked) == 4, "other settings, other frames"
+    assert "4 attacks of 90 passes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
