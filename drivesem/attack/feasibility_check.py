@@ -82,7 +82,8 @@ class Reach:
     """How far a change may go at most: by default as far as the paper's budget. translate: own lengths, along and
     across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
     partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
-    boxes, of a lattice offset; size: share of its own; codes: their largest values.
+    boxes, of a lattice offset; size: share of its own, of a car that is neither hidden nor cut; codes: their
+    largest values.
     """
 
     translate: float = 0.25
@@ -365,7 +366,7 @@ def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
     if bent > reach.mesh + REACH_TOLERANCE:
         found.append(f"lattice bent by {bent:.3f} unit boxes")
     grown = new.size / old.size - 1
-    if np.abs(grown).max() > (reach.size + REACH_TOLERANCE if reach.size else 0.0):
+    if np.abs(grown).max() > (reach.size + REACH_TOLERANCE if reach.size and old.whole else 0.0):
         found.append(f"size changed by {100 * grown[np.abs(grown).argmax()]:.1f} %")
     elif np.ptp(grown) > REACH_TOLERANCE:
         found.append("size changed, and not alike in length, height and width")

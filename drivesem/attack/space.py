@@ -95,7 +95,7 @@ class Budget:
     of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
     not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
     `drivesem.attack.feasible` is the one that binds); size: share of a car's own, larger or smaller, 0 where
-    sizes are held; sun: codes, 0 where it is held.
+    sizes are held, as they are of cars that are not shown whole; sun: codes, 0 where it is held.
     """
 
     color: float = 1.0
@@ -393,6 +393,9 @@ class ParameterSpace:
             partly = ~shown_whole(self.scene)
             reach[partly] = reach[partly].clamp(max=budget.partly)
             return -reach.reshape(-1), reach.reshape(-1)
+        elif parameter is Parameter.SIZE:
+            grown = torch.where(shown_whole(self.scene), limit, 0.0)
+            return -grown, grown
         else:
             return -limit, limit
         start = start.detach()

@@ -365,8 +365,8 @@ class Prepared:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
         A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
-        sun: the patch is sheared the more, the farther out. It grows with its object. Where the sun moves, only
-        shadows that are the objects' own follow (`casts`).
+        sun: the patch is sheared the more, the farther out. It grows with its object, and hardly shrinks. Where
+        the sun moves, only shadows that are the objects' own follow (`casts`).
         """
         ground = self.scene.environment.ground
         offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self.size[:, 1])
@@ -375,7 +375,11 @@ class Prepared:
                 surfaces.sun_offset(sun.direction, objects.yaw, self.size[:, 1]) - offset
             )
         corners = self.corners + self.outwards[..., None] * (offset - self.sun_offset)[:, None]
-        corners = corners * (objects.size_lhw / self.size)[:, None, ::2]
+        more = (objects.size_lhw / self.size - 1.0)[:, None, ::2]
+        # Softly no less than 0, and 0 where it is 0: a patch that shrank would leave its photographed rim behind.
+        soft = torch.full_like(more, model.SHRUNK)
+        more = 0.5 * (more + (more.square() + soft.square()).sqrt() - soft.square().sqrt())
+        corners = corners + more * corners
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
 

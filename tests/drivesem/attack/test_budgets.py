@@ -11,7 +11,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, budget_of, written
+from drivesem.attack.budgets import PRESETS, budget_of, reach_of, written
+from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import SIX, Budget, Parameter, ParameterSpace
 from drivesem.settings.errors import UsageError
@@ -156,6 +157,12 @@ def test_a_car_that_is_partly_shown_goes_no_farther_than_the_papers(street):
     along = space.upper.reshape(4, 2)[:, 0].tolist()
     assert along[1] == along[2] == 0.25
     assert 0.5 < along[0] < along[3]
+    # Its size is held: what grows out of its hiding place was not photographed.
+    assert ParameterSpace(scene, ("size",), budget_of("street")).upper.tolist() == pytest.approx([0.1, 0, 0, 0.1])
+    sizes = scene.objects.size_lhw.clone()
+    sizes[1] *= 1.05
+    found = check_scene(scene, scene.with_objects(size_lhw=sizes), reach=reach_of(budget_of("street")))
+    assert found == ["objects[1]: size changed by 5.0 %"]
     # In the paper's budget it makes no difference.
     assert ParameterSpace(scene, ("translate",)).upper.tolist() == [0.25] * 8
 

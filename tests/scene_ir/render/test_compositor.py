@@ -136,13 +136,15 @@ def test_vehicles_that_grow_look_like_the_truth(street: Street, photographed: Sc
     assert abs(feet[1] - feet[0]) <= 2
 
 
-def test_shadows_grow_with_their_vehicle(photographed: SceneIR) -> None:
+def test_shadows_grow_with_their_vehicle_and_hardly_shrink(photographed: SceneIR) -> None:
     dark = []
-    for grown in (1.0, 1.1):
+    for grown in (1.0, 1.1, 0.9):
         scene = photographed.with_objects(size_lhw=grown * photographed.objects.size_lhw)
         layers = Compositor(photographed, REFERENCE).layers(scene.objects)
         dark.append(float((1 - layers.shadow).sum()))
     assert 1.1 < dark[1] / dark[0] < 1.35
+    # Its photographed rim would be left behind.
+    assert 0.95 < dark[2] / dark[0] <= 1
 
 
 def test_turned_vehicles_have_no_cracks(street: Street, photographed: SceneIR) -> None:
