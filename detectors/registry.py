@@ -36,6 +36,14 @@ DARKNET = "darknet:"
 """Before Darknet's files: darknet:FILE.cfg,FILE.weights, or the former alone where the latter has its name."""
 
 
+def code_of(name_or_path: str | Path) -> str | None:
+    """The module or file whose code loading a detector of that name would run; None where there is only data."""
+    name = str(name_or_path)
+    if name.startswith(planted.PREFIX):
+        return code_of(planted.parts_of(name)[1])
+    return name.partition(":")[2] if choose.kind_of(name) in choose.RUNS_CODE else None
+
+
 def load_predictor(
     name_or_path: str | Path, device: str | torch.device = "cpu", tiling: str = "auto"
 ) -> Predictor:

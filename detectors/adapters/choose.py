@@ -8,6 +8,8 @@ from detectors.base import Detector, DetectorError, Predictor
 
 KINDS = ("onnx", "torchvision", "ultralytics", "torchscript", "export", "module")
 """Words before the colon."""
+RUNS_CODE = ("ultralytics", "torchscript", "export", "module")
+"""Kinds whose files hold code or pickles: loading one runs what is in it."""
 WITHOUT_GRADIENT = ("onnx",)
 SPEC_SUFFIXES = (".yaml", ".yml")
 

@@ -17,6 +17,11 @@ from drivesem.settings.devices import check_device
 _MOST_SHOWN = 30
 """Differences that are told on a terminal; verify.json has them all."""
 
+_UNSEALED = (
+    "manifest.json is of an earlier version, with hashes of pictures, labels and theta.json alone: settings, loss "
+    "traces, active constraints, overlays and second opinions were not checked"
+)
+
 
 def run(config: Verify) -> int:
     """Check, report; exit code 0, or 1 where something differs or a frame could not be read. Raises UsageError or
@@ -50,4 +55,6 @@ def _print(data: dict[str, Any], console: Console) -> None:
         console.print(f"{ungraded} frame{'' if ungraded == 1 else 's'}: {UNKNOWN}")
     for name, reason in data["frames_failed"].items():
         console.print(f"frame {name} could not be checked: {reason}", soft_wrap=True, markup=False)
+    if not data["sealed"]:
+        console.print(_UNSEALED, soft_wrap=True)
     console.print("all agree" if data["agree"] else "the run is not what it says it is")

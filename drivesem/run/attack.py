@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from detectors.base import Detector, DetectorError, Predictor
-from detectors.registry import ONNX, load_detector, load_predictor
+from detectors.registry import load_detector, load_predictor
 from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of, written
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
@@ -38,6 +36,7 @@ from drivesem.attack.space import SIX, Parameter, combo, parse_params
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import FRAMES, claim
 from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
+from drivesem.run.manifest import manifest_of
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
@@ -60,16 +59,6 @@ PEERS = ("yolov3-slim", "squeezedet")
 _AROUND = 3
 """Passes of a frame in which no method has a say."""
 WRITTEN = ("metrics.json", "manifest.json", "report.html", FRAMES)
-_PACKAGES = (
-    "drivesem",
-    "torch",
-    "kornia",
-    "numpy",
-    "scipy",
-    "opencv-contrib-python-headless",
-    "warp-lang",
-    "pycocotools",
-)
 
 
 def attack_run(config: Attack) -> RunSummary:
@@ -108,16 +97,21 @@ def _attacked(
     empty = {name for name, result in answers.results.items() if result is None}
     done = [name for name in names if name not in failed and name not in empty]
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
-    summary = _summary(
-        config, worker.params, worker.detector, results, without_vehicles + len(empty), failed, out, start
+    summary = replace(
+        summary_of(config, worker.params, worker.detector, results),
+        out=str(out),
+        frames_without_vehicles=without_vehicles + len(empty),
+        frames_failed=dict(sorted(failed.items())),
+        seconds=round(time.perf_counter() - start, 3),
     )
-    files.write_json(out / "metrics.json", summary.to_json())
-    files.write_json(out / "manifest.json", _manifest(config, out, done))
+    metrics = summary.to_json()
+    files.write_json(out / "metrics.json", metrics)
+    files.write_json(out / "manifest.json", manifest_of(config, out, done, metrics))
     write_run(out, config, summary, results)
     return summary
 
 
-def _params(config: Attack) -> tuple[Parameter, ...]:
+def params_of(config: Attack) -> tuple[Parameter, ...]:
     """What is to move. Raises FormatError where the budget holds it."""
     params = _named_params(config)
     budget_of(config.budget).check(params)
@@ -154,7 +148,7 @@ class Worker:
         used, SceneError for a source that cannot be read.
         """
         config = _settled(config)
-        params, source, method = _params(config), open_source(config), attack_method(config)
+        params, source, method = params_of(config), open_source(config), attack_method(config)
         detector = _load(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
         return cls(config, params, method, source, detector, grader_of(config, detector))
@@ -162,7 +156,7 @@ class Worker:
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""
         config = _settled(config)
-        return replace(self, config=config, params=_params(config), method=attack_method(config))
+        return replace(self, config=config, params=params_of(config), method=attack_method(config))
 
     def attack(self, identifier: str, out: Path) -> FrameResult | None:
         """One frame, from the source to its folder; None where it has no vehicle to attack."""
@@ -366,40 +360,20 @@ def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
     return f"{config.dataset}-{'-'.join(params)}{method}-seed{config.seed}"
 
 
-def _summary(
-    config: Attack,
-    params: tuple[Parameter, ...],
-    detector: Predictor,
-    results: Sequence[FrameResult],
-    without_vehicles: int,
-    failed: dict[str, str],
-    out: Path,
-    start: float,
+def summary_of(
+    config: Attack, params: tuple[Parameter, ...], detector: Predictor, results: Sequence[FrameResult]
 ) -> RunSummary:
+    """The figures of a run, as far as they follow from its settings and its frames."""
     t_star = t_star_of(detector, config.t_star)
     return RunSummary(
-        out=str(out),
+        out="",
         dataset=config.dataset,
         params=tuple(str(p) for p in params),
         detector=config.detector,
         headline=HEADLINE,
         t_star=t_star,
-        frames_without_vehicles=without_vehicles,
-        frames_failed=dict(sorted(failed.items())),
-        seconds=round(time.perf_counter() - start, 3),
+        frames_without_vehicles=0,
+        frames_failed={},
+        seconds=0.0,
         **tally(results, JudgedClasses.of(detector), t_star, HEADLINE),
     )
-
-
-def _manifest(config: Attack, out: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Versions, seed and hashes: what a second run must reproduce to the byte."""
-    hashed = [f"{name}.png" for name in ("benign", "rerender", "counterexample")]
-    hashed += ["theta.json", "labels_paper.txt", "labels_moved.txt"]
-    packages = [*_PACKAGES]
-    packages += ["cma"] if config.method == "cma-es" else []
-    packages += ["onnxruntime"] if config.detector.startswith(ONNX) else []
-    return {
-        "versions": {package: importlib.metadata.version(package) for package in packages},
-        "seed": config.seed,
-        "frames": {name: {part: files.digest(out / FRAMES / name / part) for part in hashed} for name in names},
-    }

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from detectors.base import DetectorError, Predictor
-from detectors.registry import load_predictor
+from detectors.registry import code_of, load_predictor
 from drivesem.attack.judging import JudgedClasses
 from drivesem.run.lock import LOCK, hold
 from drivesem.settings.blocks import Output
@@ -24,7 +24,18 @@ CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
 FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
-PRESENTATION = ("out", "limit", "workers", "keep_going", "resume", "json", "cache", "cache_gb", "incremental")
+PRESENTATION = (
+    "out",
+    "limit",
+    "workers",
+    "keep_going",
+    "resume",
+    "json",
+    "cache",
+    "cache_gb",
+    "incremental",
+    "trust",
+)
 """Settings that change no frame's result: a run may be continued with others."""
 
 
@@ -76,6 +87,19 @@ def attack_of(run: Path) -> Attack:
     return Attack(**loaded)
 
 
+def trusted_attack(run: Path, trust: bool) -> Attack:
+    """The same, to load its detectors: a run comes from anywhere, and so would code that its settings name.
+    trust: whether that may run. Raises UsageError as `attack_of`, and where it may not.
+    """
+    attack = attack_of(run)
+    for setting in ("detector", "peer", "witness"):
+        code = code_of(getattr(attack, setting) or "")
+        if code is not None and not trust:
+            expected = f"a detector that is data alone, or --trust, which lets this run the code in {code}"
+            raise UsageError(f"{run / CONFIG}: {setting}", expected, getattr(attack, setting))
+    return attack
+
+
 def detector_of(attack: Attack, device: str) -> Predictor:
     """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
 
@@ -89,16 +113,18 @@ def detector_of(attack: Attack, device: str) -> Predictor:
     return detector
 
 
-def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
-    def identity(settings: dict[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in settings.items() if key not in presentation}
+def settings_of(config: Output, presentation: Collection[str] = PRESENTATION) -> dict[str, Any]:
+    """The settings that may change a frame's result, by name."""
+    return {key: value for key, value in asdict(config).items() if key not in presentation}
 
+
+def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
     before = yaml.safe_load(files.read_text(path))
     # A setting that came with a later version had its default before.
     defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
-    known = identity(defaults | before) if isinstance(before, dict) else {}
-    wanted = identity(asdict(config))
-    if known != wanted:
+    known = defaults | before if isinstance(before, dict) else {}
+    wanted = settings_of(config, presentation)
+    if {key: value for key, value in known.items() if key not in presentation} != wanted:
         changed = [key for key, value in wanted.items() if known.get(key) != value]
         raise UsageError(
             str(path),

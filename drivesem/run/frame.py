@@ -178,7 +178,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
         success_paper=search.success_paper,
         success_moved=search.success_moved,
-        identity_psnr_db=_psnr_in_boxes(scene, objective.benign.render.image),
+        identity_psnr_db=psnr_in_boxes(scene, objective.benign.render.image),
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
         checked_by=judge_at_hand(),
@@ -351,7 +351,7 @@ def _xyxy(box: Tensor) -> tuple[float, float, float, float]:
     return x0, y0, x1, y1
 
 
-def _psnr_in_boxes(scene: SceneIR, image: Tensor) -> float | None:
+def psnr_in_boxes(scene: SceneIR, image: Tensor) -> float | None:
     """PSNR in dB of a re-render against the photograph, inside the vehicles' boxes; None where they are equal."""
     inside = torch.zeros(scene.camera.height, scene.camera.width, dtype=torch.bool)
     for x0, y0, x1, y1 in scene.objects.box2d.tolist():

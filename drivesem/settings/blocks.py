@@ -239,6 +239,14 @@ class FinishedRun(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Trust(Options):
+    """Whether a run may bring code of its own."""
+
+    trust: Flag = False
+    """Run the code that a run's settings name as its detector (module:, torchscript:, export:, ultralytics:)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Regions(Options):
     """How detectors look at changed pictures."""
 

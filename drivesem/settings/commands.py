@@ -36,6 +36,7 @@ from drivesem.settings.blocks import (
     Sharing,
     Tiles,
     Training,
+    Trust,
 )
 from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within, at_least
 from drivesem.settings.errors import refuse
@@ -245,7 +246,7 @@ class Transfer(Asking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain(Regions, Bootstrap, FinishedRun, FrameCommand):
+class Explain(Trust, Regions, Bootstrap, FinishedRun, FrameCommand):
     """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
 
     frame: str | None = None
@@ -265,7 +266,7 @@ class Explain(Regions, Bootstrap, FinishedRun, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Confirm(FinishedRun, FrameCommand):
+class Confirm(Trust, FinishedRun, FrameCommand):
     """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
 
     run: Run = None
@@ -275,7 +276,7 @@ class Confirm(FinishedRun, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Holes(FrameCommand):
+class Holes(Trust, FrameCommand):
     """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
 
     runs: Runs = ()
@@ -422,7 +423,7 @@ class SurveyResults(Draws, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verify(Device, Sharing, FinishedRun, Command):
+class Verify(Trust, Device, Sharing, FinishedRun, Command):
     """Is a finished run what it says it is? Every frame computed again from its files; exit code 1 where not."""
 
     out: str | None = None
@@ -787,7 +788,7 @@ class Train(Training, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retrain(Training, FrameCommand):
+class Retrain(Trust, Training, FrameCommand):
     """Train a detector on with a run's counterexamples, and attack it again. Defaults: the paper's protocol."""
 
     run: str

@@ -20,7 +20,7 @@ from drivesem.data.registry import open_dataset
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
 from drivesem.report.tables import Sheet, csv_text, percent
 from drivesem.run.attack import Worker, attack_frames
-from drivesem.run.folder import attack_of, claim
+from drivesem.run.folder import claim, trusted_attack
 from drivesem.run.frame import as_targets
 from drivesem.settings.commands import Attack, Retrain
 from drivesem.settings.errors import UsageError
@@ -39,7 +39,7 @@ FRESH, CACHE = "fresh", "cache"
 _FRESH_OF = "fresh_of.txt"
 """Digest of the weights that the new attack was against."""
 _WRITTEN = (WEIGHTS, FIGURES, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES, FRESH, CACHE)
-_FREE = ("out", "workers", "keep_going", "resume", "json", "minutes", "checkpoint_every", "fresh")
+_FREE = ("out", "workers", "keep_going", "resume", "json", "minutes", "checkpoint_every", "fresh", "trust")
 """Settings that a run may change on the way."""
 
 
@@ -64,7 +64,7 @@ class RetrainRow:
 
 def retrain_run(config: Retrain, console: Console) -> tuple[dict[str, Any], list[RetrainRow]]:
     """Retrain, or go on with it: the JSON's form, and its rows. Raises UsageError or SceneError for bad input."""
-    attack = attack_of(Path(config.run))
+    attack = trusted_attack(Path(config.run), config.trust)
     frames = frames_of(Path(config.run))
     kept_out, learned = _divided(frames, config)
     start = config.start or attack.detector

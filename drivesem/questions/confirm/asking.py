@@ -12,7 +12,7 @@ from drivesem.questions.confirm.results import Confirmed, load
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import METRICS, Run, load_runs
-from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of
+from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, trusted_attack
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import Confirm
 from drivesem.settings.errors import UsageError
@@ -54,7 +54,7 @@ class ConfirmWorker:
     """What one process needs: built once, used for many frames."""
 
     def __init__(self, config: Confirm, run: Run, out: Path) -> None:
-        attack = attack_of(run.folder)
+        attack = trusted_attack(run.folder, config.trust)
         self.run, self.out = run, out
         self.frames = {frame.result.identifier: frame for frame in run.frames}
         if attack.dataset == DEMO and config.root is not None:

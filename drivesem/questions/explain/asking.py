@@ -14,7 +14,7 @@ from drivesem.questions.explain.results import EXPLANATION, read_explanation
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
-from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of
+from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, trusted_attack
 from drivesem.settings.commands import Attack, Explain
 from drivesem.settings.errors import UsageError
 
@@ -30,7 +30,7 @@ def explain_run(config: Explain) -> Answer:
     (run,) = load_runs([config.run or ""])
     names = _chosen(run, config)
     out = Path(config.out) if config.out else run.folder / "explain"
-    build = partial(ExplainWorker, config, attack_of(run.folder), parse_params(run.params), out)
+    build = partial(ExplainWorker, config, trusted_attack(run.folder, config.trust), parse_params(run.params), out)
     work = build()
     claim(out, config, _WRITTEN, _FREE)
     frames = KeptFrames(run, out, EXPLANATION, read_explanation)

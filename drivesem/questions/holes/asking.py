@@ -24,7 +24,7 @@ from drivesem.questions.holes.results import (
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
-from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, detector_of, folder_of
+from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, folder_of, trusted_attack
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Holes
 
@@ -38,6 +38,8 @@ def holes_run(config: Holes) -> Answer:
     """
     runs = load_runs(config.runs, config.limit, "RUN")
     out = folder_of(config.out, runs[0].folder / "holes")
+    for run in runs:
+        trusted_attack(run.folder, config.trust)  # before anything is written
     claim(out, config, _WRITTEN, _FREE)
     _tell_effort(runs, config)
     found: dict[str, list[Around]] = {}
@@ -84,7 +86,7 @@ class HolesWorker:
     def __init__(self, config: Holes, run: Run, out: Path) -> None:
         self.run, self.out = run, out
         self.effort = Effort(config.samples, config.fresh, config.reach, config.seed)
-        self.attack, self.params = attack_of(run.folder), parse_params(run.params)
+        self.attack, self.params = trusted_attack(run.folder, config.trust), parse_params(run.params)
         self.detector = detector_of(self.attack, config.device)
 
     def __call__(self, name: str) -> None:

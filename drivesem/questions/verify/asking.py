@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,22 +12,24 @@ from typing import Any
 from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import t_star_of
-from drivesem.attack.space import parse_params
 from drivesem.questions.verify.differences import CHECKS, CheckLog, Disagreement
 from drivesem.questions.verify.frame import BOX_PX, DRAWS, LABEL, LEVELS, SCORE, Checked, Given, check_frame
 from drivesem.run.ask import Bar, ask
-from drivesem.run.attack import grader_of
+from drivesem.run.attack import grader_of, params_of, summary_of
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
-from drivesem.run.folder import FRAMES, attack_of, detector_of
-from drivesem.run.results import FrameResult
-from drivesem.run.tally import graded
-from drivesem.settings.commands import Verify
+from drivesem.run.folder import CONFIG, FRAMES, detector_of, settings_of, trusted_attack
+from drivesem.run.manifest import digest_of
+from drivesem.run.results import SCHEMA
+from drivesem.settings.commands import Attack, Verify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 _WHOLE_RUN = "(run)"
 """Stands for a frame's name where a difference is the run's."""
+_NOT_COMPUTED = ("schema", "out", "seconds", "frames_without_vehicles", "frames_failed")
+"""Of metrics.json: what does not follow from the frames. The last two are in its hash."""
+_ROUNDING = 1e-9
 
 
 def verify_run(config: Verify) -> tuple[dict[str, Any], Path]:
@@ -42,7 +45,7 @@ def verify_run(config: Verify) -> tuple[dict[str, Any], Path]:
     names = [frame.result.identifier for frame in run.frames][: config.limit]
     answers = ask(names, worker, build, config, Bar("checking frames", stays=False))
     checked = [answers.results[name] for name in names if name in answers.results]
-    data = _data(run, checked, _totals(run, worker.given.t_star), answers.failed)
+    data = _data(run, checked, worker.given.sealed, _totals(run, worker), answers.failed)
     files.write_json(out, data)
     return data, out
 
@@ -51,18 +54,20 @@ class VerifyWorker:
     """What one process needs: built once, used for many frames."""
 
     def __init__(self, config: Verify, run: Run) -> None:
-        attack = attack_of(run.folder)
+        attack = trusted_attack(run.folder, config.trust)
         detector = detector_of(attack, config.device)
-        self.run = run
+        self.run, self.attack = run, attack
+        self.manifest = Manifest.read(run.folder / MANIFEST)
         self.given = Given(
             detector=detector,
             device=config.device,
             backend=attack.backend,
-            params=parse_params(run.params),
+            params=params_of(attack),
             budget=budget_of(attack.budget),
             aim=Aim.of(attack.target_objects, attack.target_classes),
             t_star=t_star_of(detector, attack.t_star),
-            hashes=_hashes(run),
+            hashes=self.manifest.frames,
+            sealed=self.manifest.settings is not None,
             grader=grader_of(replace(attack, confirm=False), detector),
         )
 
@@ -71,38 +76,67 @@ class VerifyWorker:
         return check_frame(name, self.run.folder / FRAMES / name, self.given)
 
 
-def _hashes(run: Run) -> Mapping[str, Mapping[str, str]]:
-    frames = files.read_json(run.folder / MANIFEST)["frames"]
-    if not isinstance(frames, dict) or not all(isinstance(part, dict) for part in frames.values()):
-        raise FormatError(f"{run.folder / MANIFEST}: frames", "hashes by frame and file", "something else")
-    return frames
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What manifest.json says. settings, metrics: those of the run and the digest of its figures, None in runs of
+    earlier versions, which hashed pictures, labels and theta.json alone; frames: hashes by frame and file.
+    """
+
+    settings: Mapping[str, Any] | None
+    metrics: str | None
+    frames: Mapping[str, Mapping[str, str]]
+
+    @classmethod
+    def read(cls, path: Path) -> Manifest:
+        """Raises FormatError where the file is damaged."""
+        data = files.read_json(path)
+        frames, settings = data.get("frames"), data.get("settings")
+        if not isinstance(frames, dict) or not all(isinstance(part, dict) for part in frames.values()):
+            raise FormatError(f"{path}: frames", "hashes by frame and file", "something else")
+        if not isinstance(settings, dict | None):
+            raise FormatError(f"{path}: settings", "settings by name", type(settings).__name__)
+        return cls(settings, data.get("metrics"), frames)
 
 
-def _totals(run: Run, t_star: float) -> CheckLog:
-    """metrics.json against what all frames of the run hold."""
+def _totals(run: Run, worker: VerifyWorker) -> CheckLog:
+    """config.yaml, and metrics.json against what all frames of the run hold."""
+    log, metrics, manifest = CheckLog(), files.read_json(run.folder / METRICS), worker.manifest
+    if manifest.settings is not None:
+        log.same("files", METRICS, manifest.metrics, digest_of(metrics))
+        now = settings_of(worker.attack)
+        # A setting that came with a later version had its default before.
+        before = settings_of(Attack()) | dict(manifest.settings)
+        for name in sorted(now.keys() | before.keys()):
+            log.same("settings", f"{CONFIG}: {name}", now.get(name), before.get(name))
     results = [frame.result for frame in run.frames]
-    log, metrics = CheckLog(), files.read_json(run.folder / METRICS)
-    grades = graded(results) if "grades" in metrics else {}
-    for name, found in {**_added_up(results), **grades, "t_star": t_star}.items():
-        log.same("totals", f"{METRICS}: {name}", metrics.get(name), found)
+    figures = summary_of(worker.attack, worker.given.params, worker.given.detector, results).to_json()
+    for name in _NOT_COMPUTED:
+        del figures[name]
+    told = dict(_leaves("", metrics))
+    for name, found in _leaves("", figures):
+        if name in told or metrics.get("schema") == SCHEMA:
+            log.told("totals", f"{METRICS}: {name}", told.get(name), found, agrees=_equal(told.get(name), found))
     return log
 
 
-def _added_up(results: Sequence[FrameResult]) -> dict[str, Any]:
-    failures = [failure.kind for result in results for failure in result.failures]
-    return {
-        "frames": len(results),
-        "objects": sum(result.objects for result in results),
-        "lost_objects": failures.count("lost"),
-        "phantoms": failures.count("phantom"),
-        "successes_paper": sum(result.success_paper for result in results),
-        "successes_moved": sum(result.success_moved for result in results),
-        "feasible_fraction": sum(result.feasible for result in results) / len(results),
-        "queries": sum(result.queries for result in results),
-    }
+def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """What an object holds, by the path to it."""
+    if isinstance(value, dict) and value:
+        for key, part in value.items():
+            yield from _leaves(f"{name}.{key}" if name else key, part)
+    else:
+        yield name, value
 
 
-def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[str, str]) -> dict[str, Any]:
+def _equal(told: Any, found: Any) -> bool:
+    """Whether a figure is what was found; floating-point numbers up to how a processor rounds."""
+    numbers = isinstance(told, int | float) and isinstance(found, float)
+    return math.isclose(told, found, rel_tol=_ROUNDING, abs_tol=_ROUNDING) if numbers else told == found
+
+
+def _data(
+    run: Run, checked: Sequence[Checked], sealed: bool, totals: CheckLog, failed: dict[str, str]
+) -> dict[str, Any]:
     """JSON's form."""
     differences: list[tuple[str, Disagreement]] = [(c.identifier, d) for c in checked for d in c.differences]
     differences += [(_WHOLE_RUN, d) for d in totals.differences]
@@ -137,6 +171,7 @@ def _data(run: Run, checked: Sequence[Checked], totals: CheckLog, failed: dict[s
         },
         "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL, "draws": DRAWS},
         "differences": [{"frame": name, **asdict(d)} for name, d in differences],
+        "sealed": sealed,
         "frames_ungraded": sum(not frame.result.graded for frame in run.frames),
         "frames_failed": failed,
     }

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 CHECKS: Mapping[str, str] = {
-    "files": "pictures, labels and theta.json have the hashes of manifest.json",
+    "files": "all files of the frames, and metrics.json, have the hashes of manifest.json",
+    "settings": "config.yaml has the settings of manifest.json",
     "pictures": "the saved scene, rendered again, gives the three pictures",
     "detections": "the detector finds in the three pictures what is recorded",
     "labels": "the saved scene gives both label files and the recorded targets",
@@ -14,7 +15,7 @@ CHECKS: Mapping[str, str] = {
     "grades": "the draws of each certificate, taken again, say the same; grades follow from what they rest on",
     "feasibility": "the second check says the same of the saved scene, and all lies within the budget",
     "theta": "theta.json, result.json and the saved scene say the same change",
-    "totals": "metrics.json adds up what the frames hold",
+    "totals": "metrics.json is what the frames add up to, and names what config.yaml names",
 }
 """Names of the checks, in the order in which they are told, and what holds where nothing differs."""
 

@@ -28,9 +28,11 @@ from drivesem.run.frame import (
     case_of,
     detection_records,
     failure_records,
+    psnr_in_boxes,
     target_records,
 )
 from drivesem.run.looking import as_picture, detections_in
+from drivesem.run.manifest import frame_hashes
 from drivesem.run.results import BoxRecord, Failure, FrameResult, load_frame
 from drivesem.truth.certificate import Rule
 from drivesem.truth.grades import Count, Grade
@@ -50,6 +52,11 @@ BOX_PX, SCORE = 0.05, 1e-3
 """By how much a detection may differ: another number of threads adds up in another order."""
 LABEL = 1e-3
 """Of numbers in label files, which have three decimals, and of recorded targets, in the label's units."""
+IDENTITY_DB = 0.1
+"""Of the PSNR of a re-render."""
+_EXACT_DB = 120.0
+"""A PSNR from which on, or without one, a re-render is the photograph."""
+_NO_FILE = "no file"
 DRAWS = 1
 """By how many draws a certificate may differ, whose scores lie that near to t*."""
 _DETECTIONS = {
@@ -64,7 +71,8 @@ _LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "size_l
 @dataclass(frozen=True)
 class Given:
     """What the run's settings say. hashes: of files in frames' folders, by frame and name, as the manifest has
-    them; t_star: score from which a detection counts; grader: of certificates alone.
+    them; sealed: whether that is all of their files; t_star: score from which a detection counts; grader: of
+    certificates alone.
     """
 
     detector: Predictor
@@ -75,6 +83,7 @@ class Given:
     aim: Aim
     t_star: float
     hashes: Mapping[str, Mapping[str, str]]
+    sealed: bool
     grader: Grader
 
 
@@ -111,9 +120,9 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     perturbed = load_scene(folder / "scene")
     base = perturbed.as_photographed()
     log = CheckLog()
-    for name, expected in given.hashes.get(identifier, {}).items():
-        found = files.digest(folder / name)
-        log.same("files", name, expected, found)
+    known, found = given.hashes.get(identifier, {}), frame_hashes(folder)
+    for name in sorted(known.keys() | found.keys()) if given.sealed else known:
+        log.same("files", name, known.get(name, _NO_FILE), found.get(name, _NO_FILE))
     check_change(log, folder, result, base, perturbed, given.params, given.budget)
     check_feasibility(log, result, base, perturbed, given.budget)
     size = (base.camera.height, base.camera.width)
@@ -121,6 +130,7 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     with torch.no_grad():
         difficulty = Difficulty(min_contrast=result.min_contrast)
         drawn = _render(log, pictures, _Scenes(base, perturbed), difficulty, given.backend)
+        _identity(log, result, base, drawn.before)
         seen = {
             name: detections_in(given.detector, as_picture(image, given.device))
             for name, image in pictures.items()
@@ -175,6 +185,13 @@ def _render(
     return _Drawn(CompositorDraw(compositor, labeller), before, after, labels, levels)
 
 
+def _identity(log: CheckLog, result: FrameResult, base: SceneIR, before: Render) -> None:
+    """The PSNR of the re-render, in the boxes of the vehicles."""
+    pair = [result.identity_psnr_db, psnr_in_boxes(base, before.image)]
+    told, found = (_EXACT_DB if value is None else min(value, _EXACT_DB) for value in pair)
+    log.told("pictures", "identity_psnr_db", *pair, agrees=abs(told - found) <= IDENTITY_DB)
+
+
 def _grades(
     log: CheckLog,
     result: FrameResult,
@@ -205,6 +222,7 @@ def _grades(
         return
     for i, (recorded, failure) in enumerate(zip(result.failures, again, strict=True)):
         log.same("grades", f"failures[{i}].error", recorded.error, failure.error)
+        log.same("grades", f"failures[{i}].index", recorded.index, failure.index)
         ours, theirs = _draws(recorded), _draws(failure)
         near = all(abs(a - b) <= DRAWS for a, b in zip(ours, theirs, strict=True))
         log.told("grades", f"failures[{i}].count", ours, theirs, agrees=near)

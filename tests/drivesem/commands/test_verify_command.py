@@ -91,6 +91,18 @@ def change(path: Path, edit: Callable[[Any], None]) -> None:
     path.write_text(json.dumps(data))
 
 
+def unseal(run: Path) -> None:
+    """Make a run's manifest as earlier versions wrote it."""
+
+    def earlier(data: dict[str, Any]) -> None:
+        del data["settings"], data["metrics"]
+        kept = {"benign.png", "rerender.png", "counterexample.png", "theta.json", "labels_paper.txt"}
+        for name, hashes in data["frames"].items():
+            data["frames"][name] = {part: hashes[part] for part in hashes.keys() & {*kept, "labels_moved.txt"}}
+
+    change(run / "manifest.json", earlier)
+
+
 def told(data: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Differences by field; all of them are in the first frame or the run's."""
     assert {one["frame"] for one in data["differences"]} <= {"demo-000", "(run)"}
@@ -171,6 +183,7 @@ def earlier(drifting: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
     for field in ("min_contrast", "joint_weather"):
         change(out / FRAME / "result.json", lambda data, field=field: data.pop(field))
+    unseal(out)
     monkeypatch.undo()
     monkeypatch.setattr(run_folder, "load_predictor", lambda *_: Drifting())
     return out
@@ -238,7 +251,8 @@ def test_an_object_struck_from_the_labels_and_another_sum(
     path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines()[1:]))
     change(run / "metrics.json", lambda data: data.update(successes_paper=7))
     data = verify(run)
-    assert set(told(data)) == {path.name, f"{path.name}: type", "metrics.json: successes_paper"}
+    found = {path.name, f"{path.name}: type", "metrics.json", "metrics.json: successes_paper"}
+    assert set(told(data)) == found
     assert data["differences"][-1]["expected"] == "7"
 
 
@@ -253,9 +267,10 @@ def test_a_success_that_is_none(run: Path, verify: Callable[..., dict[str, Any]]
         "success_moved",
         "success_moved by labels_moved.txt",
         "metrics.json: successes_moved",
+        "result.json",
     }
     assert (found["success_moved"]["expected"], found["success_moved"]["found"]) == ("False", "True")
-    assert checks(data) == {"success", "totals"}
+    assert checks(data) == {"files", "success", "totals"}
 
 
 def test_failures_detections_and_targets_that_are_others(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
@@ -287,17 +302,18 @@ def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, 
         return told(data)
 
     found = spoil(grade="certain")
-    assert set(found) == {"failures[0].grade", "metrics.json: grades"}
+    assert set(found) == {"result.json", "failures[0].grade", "metrics.json: grades.certain"}
     assert (found["failures[0].grade"]["expected"], found["failures[0].grade"]["found"]) == (
         "certain",
         "threshold",
     )
     found = spoil(error="missed")
-    assert set(found) == {"failures[0].error", "metrics.json: kinds"}
+    kinds = {f"metrics.json: kinds.{kind}" for kind in ("background", "missed")}
+    assert set(found) == {"result.json", "failures[0].error", *kinds}
     # As many draws as a certificate needs, and the grade that would follow from them.
     held = {"before": 16, "before_draws": 16, "after": 16, "after_draws": 16}
     found = spoil(count={**asdict(failure.count), **held}, grade="certain")
-    assert set(found) == {"failures[0].count", "metrics.json: grades"}
+    assert set(found) == {"result.json", "failures[0].count", "metrics.json: grades.certain"}
     verify(run, code=0)
 
 
@@ -314,12 +330,94 @@ def test_a_run_of_the_first_schema_has_no_grades_to_check(
 
     for path in (run / FRAME / "result.json", run / "metrics.json"):
         change(path, older)
+    assert {"result.json", "metrics.json"} <= set(told(verify(run)))
+    unseal(run)
     data = verify(run, code=0)
+    assert not data["sealed"]
     assert data["frames_ungraded"] == 1
     assert {row["name"]: row["compared"] for row in data["checks"]}["grades"] == 0
     capsys.readouterr()
     assert main(["verify", "--run", str(run), "--workers", "1"]) == 0
-    assert "1 frame: grades unknown: run of an older version" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 frame: grades unknown: run of an older version" in said
+    assert "manifest.json is of an earlier version" in said
+
+
+def nested(*keys: Any, value: Any) -> Callable[[Any], None]:
+    """An edit of one value, by the keys to it."""
+
+    def edit(data: Any) -> None:
+        for key in keys[:-1]:
+            data = data[key]
+        data[keys[-1]] = value
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "field"),
+    [
+        (nested("attacked", "moved", "ap50", value=0.05), "metrics.json: attacked.moved.ap50"),
+        (nested("benign", "overall", "objects", value=7), "metrics.json: benign.overall.objects"),
+        (nested("detector", value="yolov3-slim"), "metrics.json: detector"),
+        (nested("dataset", value="kitti"), "metrics.json: dataset"),
+        (nested("headline", value="Van"), "metrics.json: headline"),
+        (nested("params", value=["weather", "mesh"]), "metrics.json: params"),
+        (nested("t_star", value=0.6), "metrics.json: t_star"),
+        (nested("passes", value=1), "metrics.json: passes"),
+        (nested("phantoms_by_class", "Car", value=5), "metrics.json: phantoms_by_class.Car"),
+        (nested("frames_without_vehicles", value=9), "metrics.json"),
+        (nested("frames_failed", value={"demo-007": "why"}), "metrics.json"),
+    ],
+)
+def test_each_figure_of_the_run(
+    run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
+) -> None:
+    change(run / "metrics.json", edit)
+    assert field in told(verify(run))
+
+
+@pytest.mark.parametrize(
+    ("edit", "field"),
+    [
+        (nested("loss_trace", value=[9.0]), "result.json"),
+        (nested("queries", value=1), "metrics.json: queries"),
+        (nested("active_constraints", value=["objects[0]: road"]), "result.json"),
+        (nested("identity_psnr_db", value=31.0), "identity_psnr_db"),
+        (nested("failures", 0, "index", value=1), "failures[0].index"),
+        (
+            nested("failures", 0, "peer", value={"by": "yolov3-slim", "before": 8, "after": 8, "draws": 8}),
+            "result.json",
+        ),
+        (nested("grade_notes", value=["no peer"]), "result.json"),
+    ],
+)
+def test_each_figure_of_a_frame(
+    run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
+) -> None:
+    change(run / FRAME / "result.json", edit)
+    assert {field, "result.json"} <= set(told(verify(run)))
+
+
+def test_settings_overlays_and_files_that_were_added_or_taken_away(
+    run: Path, verify: Callable[..., dict[str, Any]]
+) -> None:
+    settings = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99").replace("limit: 1", "limit: 7"))
+    files.write_png(run / FRAME / "overlay.png", files.read_image(run / FRAME / "benign.png"))
+    (run / FRAME / "difference.png").unlink()
+    (run / FRAME / "scene" / "more.txt").write_text("more")
+    change(run / FRAME / "result.json", nested("seconds", value=1e6))  # no two runs take as long
+    found = told(verify(run))
+    assert set(found) == {"config.yaml: steps", "overlay.png", "difference.png", "scene/more.txt"}
+    assert (found["config.yaml: steps"]["expected"], found["config.yaml: steps"]["found"]) == ("99", "10")
+    assert found["difference.png"]["found"] == found["scene/more.txt"]["expected"] == "no file"
+
+
+def test_times_and_places_may_be_others(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    change(run / FRAME / "result.json", nested("seconds", value=1.0))
+    change(run / "metrics.json", lambda data: data.update(seconds=1.0, out="elsewhere"))
+    verify(run, code=0)
 
 
 def shift(data: dict[str, Any], metres: float) -> None:
@@ -358,7 +456,7 @@ def test_theta_beyond_the_budget_and_another_in_its_own_file(
     found = told(verify(run))
     assert set(found) == {
         *("weather.fog, budget", "weather.fog, bounds", "theta.json: weather.fog", "scene: weather"),
-        *("theta.json", f"theta.json: {name}"),
+        *("theta.json", f"theta.json: {name}", "result.json"),
     }
     assert found["weather.fog, budget"]["expected"] == "a value in [0, 0.5]"
 
