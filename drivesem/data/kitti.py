@@ -46,7 +46,7 @@ from drivesem.data.label_table import (
 from drivesem.data.truth import SKY_CM, Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.types import Camera, Frame, Labels
+from scene_ir.types import FOCAL_PX, Camera, Frame, Labels
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 """What KITTI labels."""
@@ -389,8 +389,10 @@ def read_calib(path: Path) -> Calibration:
     if "P2" not in found:
         raise FormatError(f"{path}: P2", "12 numbers", f"no such key (only {', '.join(found) or 'none'})")
     projection = found["P2"]
-    if not (projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0):
-        raise FormatError(f"{path}: P2", "positive focal lengths", projection.diagonal().tolist())
+    least, most = FOCAL_PX
+    if not (least <= projection[0, 0] <= most and least <= projection[1, 1] <= most and projection[2, 2] > 0):
+        expected = f"positive focal lengths, {least:g} to {most:g} px"
+        raise FormatError(f"{path}: P2", expected, projection.diagonal().tolist())
     return Calibration(projection, found.get("R0_rect"), found.get("Tr_velo_to_cam"))
 
 

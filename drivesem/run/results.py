@@ -11,6 +11,7 @@ from typing import Any, Literal
 from drivesem.evaluation.coco import Scores
 from drivesem.run.records import from_json
 from drivesem.truth.grades import Agreement, Count
+from scene_ir import files
 from scene_ir.errors import FormatError
 
 SCHEMA = 2
@@ -184,13 +185,7 @@ def dump_frame(result: FrameResult) -> str:
 
 def load_frame(path: Path) -> FrameResult:
     """Read what `dump_frame` wrote. Raises FormatError naming the file and the field."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FormatError(str(path), "a frame's result as JSON", error) from error
+    data = files.read_json(path)
     if not isinstance(data, dict) or data.pop("schema", None) not in (1, SCHEMA):
         raise FormatError(f"{path}: schema", f"1 or {SCHEMA}", "another one")
-    try:
-        return from_json(FrameResult, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "the fields of a frame's result", error) from error
+    return from_json(FrameResult, data, str(path))
