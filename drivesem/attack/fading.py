@@ -37,7 +37,8 @@ class Fading:
         at = tuple(torch.from_numpy(np.concatenate([place[k] for place in places])) for k in range(2))
         self._image, self._inverse_depth = render.image.detach()[:, *at], 1 / render.depth.detach()[at]
         nothing = torch.zeros_like(self._inverse_depth)
-        self._environment = replace(environment, sky=environment.sky[at], road=nothing, foliage_map=nothing)
+        sky = environment.sky[at] * (render.object_id[at] == 0)
+        self._environment = replace(environment, sky=sky, road=nothing, foliage_map=nothing)
         start = self._contrasts(environment.weather.detach())
         self._least = np.minimum(_MARGIN * least, start)
 

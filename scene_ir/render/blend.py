@@ -80,6 +80,16 @@ def clamp_colour(image: Tensor) -> Tensor:
     return _Clamp.apply(image)
 
 
+def uncovered(opacity: Tensor, plan: Plan, frame_hw: tuple[int, int]) -> Tensor:
+    """How much of what lies behind all layers shows, (H, W). opacity: (T,). Differentiable to opacity."""
+    shows = opacity.new_ones(frame_hw)
+    for i in plan.order:
+        packed, (rows, columns), size = plan.spans[i]
+        # A copy, as the product's factors must outlive what is written over them.
+        shows[rows, columns] = shows[rows, columns].clone() * (1.0 - opacity[packed].reshape(size))
+    return shows
+
+
 def composite(
     canvas: Tensor,
     depth: Tensor,

@@ -73,6 +73,7 @@ class Compositor(Prepared):
         if self.standing is not None:
             layers = self.standing.before(layers, canvas[:3] - self.canvas[:3] if foliage else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
+        behind = self.scene.environment
         if layers is None:
             with torch.no_grad():
                 depth = self.scene.depth.clone()
@@ -98,6 +99,11 @@ class Compositor(Prepared):
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
             number = number if self.standing is None else number.masked_fill(number > len(objects), 0)
+            if weather:  # what stands before the sky is not covered with it, nor what stands on a wet road wet
+                shows = blend.uncovered(layers.opacity, plan, self.frame_hw)
+                behind = replace(
+                    behind, sky=behind.sky.to(self.like) * shows, road=behind.road.to(self.like) * shows
+                )
             opacity = tuple(
                 Crop(crop.reshape(1, *size), window[1].start, window[0].start)
                 for crop, (_, window, size) in zip(
@@ -106,7 +112,7 @@ class Compositor(Prepared):
             )[: len(objects)]
         image = canvas
         if weather:
-            changed = replace(self.scene.environment, weather=environment.weather.to(self.like))
+            changed = replace(behind, weather=environment.weather.to(self.like))
             colour, inverse = canvas.split([3, 1])
             image = apply_weather(colour, inverse[0], changed, self.air, backend)
         if weather or layers is None:

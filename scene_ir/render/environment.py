@@ -93,7 +93,8 @@ def apply_weather(
     """The picture (3, H, W) under `environment.weather`, (4,): fog, rain, time of day, overcast, each in [0, 1].
 
     inverse_depth: (H, W) 1/m of what is seen, 0 in the sky; air: (3,) RGB, the airlight. Differentiable to all,
-    with backend `warp` (float32, fused) to all but the airlight and the maps.
+    the environment's maps of sky and road included; with backend `warp` (float32, fused) to all but the airlight,
+    and to the road only where there is some.
     """
     if backend == "warp":
         streaks = _streaks(*environment.sky.shape).to(image)

@@ -266,7 +266,7 @@ def wet_kernel(
 
 @wp.func
 def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
-    """Of `before`: the gradient to x, and to rain, time and overcast (3)."""
+    """Of `before`: the gradient to x, to rain, time and overcast (3), and to sky."""
     overcast = load(settings, OVERCAST)
     damping = model.DAMP * load(settings, WET)
     gain = load3(settings, GAIN, 1)
@@ -279,7 +279,8 @@ def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array
     flat = (1.0 - sky) * timed
     grey_slope = FLAT_GREY * total(flat) + model.COVER_STRUCTURE * sky * total(timed)
     out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
-    return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change))
+    g_sky = overcast * wp.dot(timed, cover_change(x, 1.0, settings) - cover_change(x, 0.0, settings))
+    return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change)), g_sky
 
 
 @wp.func
@@ -292,7 +293,7 @@ def after_adjoint(
     g: wp.vec3f,
     settings: wp.array(dtype=wp.float32),
 ):
-    """Of `shiny` and `hazed`: the gradient to x, to mirrored, to (fog, rain, time, overcast), to inverse."""
+    """Of `shiny` and `hazed`: gradients to x, to mirrored, to (fog, rain, time, overcast), to inverse, to road."""
     rain = load(settings, WET)
     fog = load(settings, MIST)
     air = load3(settings, AIR, 1)
@@ -331,7 +332,8 @@ def after_adjoint(
     bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
     g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
-    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, code, g_inverse
+    g_road = g_sheen * rain * grazing_at(depth)
+    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, code, g_inverse, g_road
 
 
 @wp.kernel
@@ -347,20 +349,24 @@ def dry_adjoint_kernel(
     grad_image: wp.array(dtype=wp.float32),
     grad_inverse: wp.array(dtype=wp.float32),
     shares: wp.array(dtype=wp.float32),
+    grad_maps: wp.array(dtype=wp.float32),
 ):
-    """shares: each pixel's part of the gradients to fog, rain, time, overcast, a plane each."""
+    """shares: each pixel's part of the gradients to fog, rain, time, overcast, a plane each; grad_maps: to sky and
+    road, likewise."""
     i = start + wp.tid()
     colour = load3(image, i, plane)
     cover = load(sky, i)
     x = before(colour, cover, settings)
-    g, _mirrored, code, g_inverse = after_adjoint(
+    g, _mirrored, code, g_inverse, _road = after_adjoint(
         x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
     )
-    g_colour, parts = before_adjoint(colour, cover, g, settings)
+    g_colour, parts, g_sky = before_adjoint(colour, cover, g, settings)
     store3(grad_image, i, plane, g_colour)
     store(grad_inverse, i, g_inverse)
     store(shares, i, code[0])
     store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]) + parts)
+    store(grad_maps, i, g_sky)
+    store(grad_maps, i + plane, 0.0)
 
 
 @wp.kernel
@@ -381,11 +387,12 @@ def wet_adjoint_kernel(
     grad_image: wp.array(dtype=wp.float32),
     grad_inverse: wp.array(dtype=wp.float32),
     shares: wp.array(dtype=wp.float32),
+    grad_maps: wp.array(dtype=wp.float32),
 ):
     """Back to the mirror: to grad_image goes the gradient to the picture before it."""
     i = start + wp.tid()
     x = before(load3(image, i, plane), load(sky, i), settings)
-    g, g_mirrored, code, g_inverse = after_adjoint(
+    g, g_mirrored, code, g_inverse, g_road = after_adjoint(
         x,
         load3(mirrored, i - first, kept),
         load(road, i),
@@ -399,6 +406,7 @@ def wet_adjoint_kernel(
     store(grad_inverse, i, g_inverse)
     store(shares, i, code[0])
     store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]))
+    store(grad_maps, i + plane, g_road)
 
 
 @wp.kernel
@@ -413,13 +421,15 @@ def damp_adjoint_kernel(
     kept: int,
     grad_image: wp.array(dtype=wp.float32),
     shares: wp.array(dtype=wp.float32),
+    grad_maps: wp.array(dtype=wp.float32),
 ):
     """From before the mirror back to the picture; grad_damp: what comes through the mirror."""
     i = start + wp.tid()
     g = load3(grad_image, i, plane) + load3(grad_damp, i - first, kept)
-    g_colour, parts = before_adjoint(load3(image, i, plane), load(sky, i), g, settings)
+    g_colour, parts, g_sky = before_adjoint(load3(image, i, plane), load(sky, i), g, settings)
     store3(grad_image, i, plane, g_colour)
     store3(shares, i + plane, plane, load3(shares, i + plane, plane) + parts)
+    store(grad_maps, i, g_sky)
 
 
 @wp.func_native("""
@@ -613,18 +623,20 @@ class _Weather(torch.autograd.Function):
         height, width = inverse.shape
         plane, first, last = height * width, wet.top * width, wet.bottom * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
+        grad_maps = image.new_empty(2, height, width)
         scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
         parts, to_mirror, to_damp = (array(t) for t in scratch)
         inputs = [given, picture, sight, cover, drops, plane, array(grad)]
-        outputs = [array(grad_image), array(grad_inverse), parts]
+        outputs = [array(grad_image), array(grad_inverse), parts, array(grad_maps)]
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
             launch(dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
         through = [way, shown, first, last - first, to_mirror]
         launch(wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
         _mirror(wet, width, to_mirror, to_damp, False)
         inputs = [given, picture, cover, plane, to_damp, first, last - first]
-        launch(damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], parts])
-        return grad_image, grad_inverse, _row_by_row(scratch[0].view(4, height, width)), None, None, None, None
+        launch(damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], *outputs[2:]])
+        grad_code = _row_by_row(scratch[0].view(4, height, width))
+        return grad_image, grad_inverse, grad_code, None, *grad_maps, None
 
 
 def _row_by_row(shares: Tensor) -> Tensor:

@@ -62,6 +62,34 @@ def test_nothing_perturbed_gives_the_photograph(photographed: SceneIR, backend, 
     assert torch.equal(image[:, outside], scene.photograph[:, outside])
 
 
+@pytest.mark.parametrize("name", ["sky", "road"])
+def test_a_car_before_sky_and_road_is_neither(photographed: SceneIR, name: str) -> None:
+    """Overcast covers the sky behind a car, and a wet road mirrors, but the car keeps its own colours."""
+    weather = torch.tensor([0.0, 0.0, 0.0, 1.0] if name == "sky" else [0.0, 1.0, 0.0, 0.0]).double()
+
+    def drawn(value: float) -> Render:
+        maps = {"sky": 0.0, "road": 0.0} | {name: value}
+        filled = {n: torch.full_like(photographed.environment.sky, v) for n, v in maps.items()}
+        environment = replace(photographed.environment, **filled)
+        scene = replace(photographed, environment=environment)
+        changed = replace(environment, weather=weather)
+        # The same airlight, whatever counts as sky.
+        compositor = Compositor(scene, REFERENCE)
+        compositor.air = photographed.photograph.new_tensor([0.7, 0.75, 0.8])
+        return compositor.render(replace(scene, environment=changed))
+
+    without, everywhere = drawn(0.0), drawn(1.0)
+    inside = torch.zeros_like(without.object_id, dtype=torch.bool)
+    for crop in without.opacity:
+        (alpha,) = crop.values
+        inside[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] |= alpha > 1 - 1e-9
+    outside = without.object_id == 0
+    change = (everywhere.image - without.image).abs().amax(0)
+    assert int(inside.sum()) > 200
+    assert float(change[inside].max()) < 1e-9
+    assert float(change[outside].mean()) > 0.01
+
+
 @pytest.mark.parametrize("matte", ["eroded", "binary", "noisy", "empty"])
 def test_identity_holds_for_any_matte(street: Street, photographed: SceneIR, matte: str) -> None:
     bare = replace(street(torch.float64), photograph=photographed.photograph)

@@ -57,7 +57,9 @@ def _run(name: str, code: list[float], frame: tuple[int, int, int], backend: str
     live = [t.float().to(dtype).requires_grad_() for t in (image, torch.tensor(code), inverse)]
     scenery = replace(scenery, weather=scenery.weather.to(dtype), **maps)
     if name == "weather":
-        changed = replace(scenery, weather=live[1])
+        # How much of sky and road shows, as of what cars hide.
+        live.append(torch.ones_like(maps["sky"]).requires_grad_())
+        changed = replace(scenery, weather=live[1], sky=live[3] * maps["sky"], road=live[3] * maps["road"])
         out = env.apply_weather(live[0], live[2], changed, air.to(dtype), backend=backend)  # type: ignore[arg-type]
     else:
         live.pop()

@@ -52,12 +52,18 @@ def _ffd(scene: SceneIR, theta: Tensor) -> SceneIR:
     return scene.with_objects(ffd=scene.objects.ffd + offsets.reshape(3, -1, 3))
 
 
+def _in_weather(scene: SceneIR, theta: Tensor) -> SceneIR:
+    """Moved before a covered sky, on a wet road: cars hide both."""
+    return _translate(scene.with_environment(weather=theta.new_tensor([0.2, 0.6, 0.1, 0.8])), theta)
+
+
 PARAMETERS = {
     "texture": Parameter(3 * TEXTURE_DIM, _texture, 1e-4, 0.4),
     "weather": Parameter(WEATHER_DIM, lambda s, t: s.with_environment(weather=t), 1e-4, 0.5, True),
     "foliage": Parameter(FOLIAGE_DIM, lambda s, t: s.with_environment(foliage=t), 1e-4, 0.5),
     "sun": Parameter(LIGHT_DIM, lambda s, t: s.with_environment(light=t), 1e-4, 0.9),
     "translate": Parameter(6, _translate, 1e-4, 0.3),
+    "translate in weather": Parameter(6, _in_weather, 1e-4, 0.3),
     "rotate": Parameter(3, lambda s, t: s.with_objects(yaw=s.objects.yaw + t), 1e-4, 0.12),
     "mesh": Parameter(15, _ffd, 1e-4, 0.01),
     "size": Parameter(3, lambda s, t: s.with_objects(size_lhw=s.objects.size_lhw * (1 + t)[:, None]), 1e-4, 0.1),
