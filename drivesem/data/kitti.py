@@ -150,6 +150,13 @@ class _Lines:
             behind = f"{z:g} m, wholly behind it"
             require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
 
+    def check_sizes(self) -> None:
+        """FormatError for a size below 0 that is not the mark of what is unknown."""
+        for column in (7, 8, 9):
+            sizes = self.values[:, column]
+            for row in np.flatnonzero((sizes < 0) & (sizes != UNKNOWN_SIZE))[:1].tolist():
+                raise FormatError(self.where(row, FIELDS[column + 1]), "metres, or -1", f"{sizes[row]:g}")
+
     def table(self, frames: Sequence[str], scored: bool) -> LabelTable:
         """The lines as a table of `frames`, one a file. A 3D box that is marked as unknown is NaN."""
         values = self.values
@@ -221,6 +228,8 @@ def read_table(path: Path, scored: bool) -> LabelTable:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
     paths = text_files(folder)
     lines = _Lines([str(file) for file in paths], [files.read_text(file) for file in paths], scored)
+    if not scored:
+        lines.check_sizes()
     if scored and not lines.kinds:
         raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
     return lines.table([file.stem for file in paths], scored)

@@ -10,6 +10,7 @@ from typing import Any
 
 from drivesem.run.folder import CONFIG
 from drivesem.run.frame import RESULT
+from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.run.tally import graded
 from drivesem.settings.commands import Attack
@@ -136,6 +137,7 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
         identifiers, params = list(manifest["frames"].keys()), ",".join(metrics["params"])
     except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
+    from_json(float | None, metrics.get("t_star"), f"{folder / METRICS}: t_star")
     if not identifiers:
         raise UsageError(setting, "a run with frames", f"{folder}, which has none")
     return Run(

@@ -188,4 +188,11 @@ def load_frame(path: Path) -> FrameResult:
     data = files.read_json(path)
     if not isinstance(data, dict) or data.pop("schema", None) not in (1, SCHEMA):
         raise FormatError(f"{path}: schema", f"1 or {SCHEMA}", "another one")
-    return from_json(FrameResult, data, str(path))
+    result: FrameResult = from_json(FrameResult, data, str(path))
+    for i, failure in enumerate(result.failures):
+        if failure.kind not in ("lost", "phantom"):
+            raise FormatError(f"{path}: failures[{i}].kind", "lost or phantom", repr(failure.kind))
+        if failure.index is not None and not 0 <= failure.index < max(len(result.targets_moved), 1):
+            expected = f"one of {len(result.targets_moved)} targets"
+            raise FormatError(f"{path}: failures[{i}].index", expected, failure.index)
+    return result
