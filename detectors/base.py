@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
@@ -19,6 +21,18 @@ from detectors.types import Detections, Targets
 
 class DetectorError(ValueError):
     """A detector that cannot be had: no such name or file, or weights that belong to another one."""
+
+
+def raised(error: Exception) -> str:
+    """What a user's code raised, and where: `ValueError: why (mine.py:12, in forward)`. The place is the innermost
+    outside of installed libraries and of this package.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    home = str(Path(__file__).parent)
+    own = [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(home)]
+    place = (own or frames)[-1]
+    said = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {said} ({Path(place.filename).name}:{place.lineno}, in {place.name})"
 
 
 @runtime_checkable

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes
-from detectors.base import Detector, DetectorError, Plantable, Predictor, Raw, predict
+from detectors.base import Detector, DetectorError, Plantable, Predictor, Raw, predict, raised
 from detectors.types import Detections, Targets
 
 Verdict = Literal["ok", "failed", "not tried"]
@@ -124,12 +124,16 @@ def check_detector(
 
     image_hw: size of the pictures, px. plant: how a prediction is put into its raw ones, where they have no
     `planted` of their own; without either, decoding is tried only on what is found. seed: of the pictures and of
-    the directions. Never raises for what a detector does wrong: `Report.require` does.
+    the directions. Raises DetectorError for one without names of classes, and for nothing else that a detector
+    does wrong: `Report.require` does.
     """
     if isinstance(detector, nn.Module):
         detector.requires_grad_(False)
         detector.eval()
-    trial = Trial(detector, *pictures(image_hw, detector.classes, seed, device), plant, seed)
+    try:
+        trial = Trial(detector, *pictures(image_hw, detector.classes, seed, device), plant, seed)
+    except (AttributeError, TypeError) as error:
+        raise DetectorError(f"detector: classes: expected names, found {raised(error)}") from error
     # Each on pictures of its own: a detector may have drawn on those of the one before.
     findings = [_try(name, promise, replace(trial, images=trial.images.clone())) for name, promise in _PROMISES]
     return Report(str(getattr(detector, "name", "?")), isinstance(detector, Detector), tuple(findings))
@@ -165,7 +169,7 @@ def _try(name: str, promise: Callable[[Trial], str], trial: Trial) -> Finding:
     except _Broken as reason:
         return Finding(name, "failed", str(reason))
     except Exception as error:  # whatever a detector of anybody's raises is a finding
-        return Finding(name, "failed", f"{type(error).__name__}: {' '.join(str(error).split())}"[:300])
+        return Finding(name, "failed", raised(error))
 
 
 def _facts(trial: Trial) -> str:

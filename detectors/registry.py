@@ -34,6 +34,8 @@ ONNX = "onnx:"
 
 DARKNET = "darknet:"
 """Before Darknet's files: darknet:FILE.cfg,FILE.weights, or the former alone where the latter has its name."""
+_MOST_ANCHORS = 1000
+"""Of a cell: each is a candidate at every place of the picture."""
 
 
 def code_of(name_or_path: str | Path) -> str | None:
@@ -110,12 +112,16 @@ def load_detector(
             "classes": tuple(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
             "t_star": float(metadata.get("t_star", "0.5")),
         }
+        if not 0 < settings["t_star"] <= 1:
+            raise ValueError(f"t_star: expected a score in (0, 1], found {metadata['t_star']}")
         if "anchors" in metadata:
             settings["anchors"] = json.loads(metadata["anchors"])
+            if len(settings["anchors"]) > _MOST_ANCHORS:
+                raise ValueError(f"anchors: expected at most {_MOST_ANCHORS}, found {len(settings['anchors'])}")
         if "cfg" in metadata:
             settings["cfg"] = cfg.parse(metadata["cfg"])
         detector = ARCHITECTURES[architecture](**settings)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise DetectorError(
             f"{path}: expected metadata classes (list), t_star (number) and anchors (pairs, px): {error}"
         ) from None

@@ -1,4 +1,8 @@
-"""Files that appear whole or not at all, and are read with errors that name them. Light: needs no torch."""
+"""Files that appear whole or not at all, and are read with errors that name them. Light: needs no torch.
+
+What is read may come from anywhere: only regular files are, up to a size, and what they say of the size of what
+is in them is looked at before anything is made of it.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,13 @@ import filecmp
 import hashlib
 import io
 import json
+import math
 import os
+import re
 import secrets
 import shutil
+import stat
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -17,11 +25,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from scene_ir.errors import FormatError, ShapeError
 
 _NPZ_LEVEL = 1
 """zlib level: float maps shrink hardly further at higher ones, and take several times as long."""
+
+_MOST_BYTES = 1 << 30
+"""Of a file that is read whole, and of all arrays of an NPZ."""
+_MOST_PIXELS = 1 << 26
+"""Of an image: 8192 x 8192."""
+_MOST_YAML = 1 << 18
+"""Bytes of a YAML file: settings are short, and reading is slow."""
+_INTEGERS = 1 << 63
+"""Integers lie below it, as in the arrays that are made of them."""
+_ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
+"""What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
 
 def _sibling(path: Path) -> Path:
@@ -120,18 +140,47 @@ def digest(path: Path) -> str:
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
-def read_bytes(path: Path) -> bytes:
-    """The bytes of a file. FormatError where it is missing or cannot be read."""
+def below(folder: Path, name: str) -> Path:
+    """The path of what another file names in `folder`. FormatError where it leads out of it: by an absolute name,
+    `..`, or a link.
+    """
+    parts = Path(name).parts
+    if not parts or Path(name).is_absolute() or ".." in parts or "\0" in name:
+        raise FormatError(str(folder), "names of what is in there", repr(name))
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise FormatError(str(path), f"a file in {folder}", f"a link to {path.resolve()}")
+    return path
+
+
+def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
+    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a NUL, or half a character, in the name
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise FormatError(str(path), "a readable file", reason.lower()) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise FormatError(str(path), "a readable file", "is a directory")
+    if not stat.S_ISREG(status.st_mode):
+        raise FormatError(str(path), "a regular file", "a device, a pipe or a socket")
+    if status.st_size > most:
+        raise FormatError(str(path), f"at most {most:,} bytes", f"{status.st_size:,}")
+
+
+def read_bytes(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read."""
+    check_regular(path, most)
     try:
         return path.read_bytes()
     except OSError as error:
         raise FormatError(str(path), "a readable file", (error.strerror or str(error)).lower()) from error
 
 
-def read_text(path: Path) -> str:
-    """The text of a UTF-8 file. FormatError where it is missing, cannot be read or is no text."""
+def read_text(path: Path, most: int = _MOST_BYTES) -> str:
+    """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
     try:
-        return read_bytes(path).decode("utf-8")
+        return read_bytes(path, most).decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(
             str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x} at {error.start}"
@@ -139,12 +188,89 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file. FormatError naming line and column where it is none."""
-    text = read_text(path)
+    """The value in a JSON file. FormatError naming line and column where it is none; for deep nesting, integers
+    beyond 64 bits, NUL and half characters.
+    """
+    return parse_json(read_text(path), str(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """The value of JSON text. where: the file. FormatError as `read_json`."""
     try:
-        return json.loads(text)
+        value = json.loads(text, parse_int=_integer)
+        if _ODD.search(text):
+            _check_texts(value)
     except json.JSONDecodeError as error:
-        raise FormatError(f"{path}:{error.lineno}:{error.colno}", "JSON", error.msg) from error
+        raise FormatError(f"{where}:{error.lineno}:{error.colno}", "JSON", error.msg) from error
+    except UnicodeEncodeError as error:
+        raise FormatError(
+            where, "text in whole characters", f"half of one, {error.object[error.start]!r}"
+        ) from error
+    except ValueError as error:
+        raise FormatError(where, "JSON", error) from error
+    except RecursionError as error:
+        raise FormatError(where, "JSON", "lists or objects that are nested too deep") from error
+    return value
+
+
+def _integer(text: str) -> int:
+    if len(text) > len(str(_INTEGERS)) + 1 or abs(int(text)) >= _INTEGERS:
+        raise ValueError(f"an integer of {len(text)} digits, too large for 64 bits")
+    return int(text)
+
+
+def _check_texts(value: Any) -> None:
+    """ValueError for texts, keys too, with a NUL or half a character."""
+    written = json.dumps(value, ensure_ascii=False)
+    written.encode("utf-8")
+    if "\\u0000" in written:
+        raise ValueError("text with a NUL character")
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without aliases, a few of which stand for gigabytes, and with integers that fit 64 bits."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.MarkedYAMLError(problem=f"an alias (*{event.anchor})", problem_mark=event.start_mark)
+        return super().compose_node(parent, index)
+
+    def integer(self, node: Any) -> int:
+        """What the text of a node says."""
+        return _integer(str(self.construct_yaml_int(node)))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.integer)
+
+
+def read_yaml(path: Path) -> Any:
+    """The value in a YAML file. FormatError where it is none, or has aliases, deep nesting or huge integers."""
+    text = read_text(path, _MOST_YAML)
+    try:
+        return yaml.load(text, _Loader)  # noqa: S506: a subclass of SafeLoader
+    except RecursionError as error:
+        raise FormatError(str(path), "YAML", "lists or mappings that are nested too deep") from error
+    except (yaml.YAMLError, ValueError, AttributeError, TypeError) as error:
+        raise FormatError(str(path), "YAML", " ".join(str(error).split())) from error
+
+
+def check_pixels(path: Path, data: bytes) -> tuple[int, int]:
+    """Width and height that an image's header says. FormatError for no image, and one that would not fit."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
+            width, height = image.size
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        found = f"{len(data)} bytes that do not decode"
+        if isinstance(error, Image.DecompressionBombError):
+            found = "one of more"
+            raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", found) from error
+        raise FormatError(str(path), "an image", found) from error
+    if width * height > _MOST_PIXELS:
+        raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", f"{width}x{height}")
+    return width, height
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -152,6 +278,7 @@ def _decode(path: Path) -> np.ndarray:
     import cv2
 
     data = read_bytes(path)
+    check_pixels(path, data)
     whole = not (data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]) and not (
         data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-64:]
     )  # the decoder fills what is missing with grey, without a word
@@ -196,14 +323,40 @@ def read_uint16(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ. FormatError where it is none, or holds pickled objects."""
+    """The arrays of an NPZ. FormatError where it is none, holds pickled objects, or arrays of another size than
+    they say.
+    """
     data = read_bytes(path)
+    if data.startswith(np.lib.format.MAGIC_PREFIX):
+        raise FormatError(str(path), "an NPZ archive of arrays", "a single array")
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise FormatError(str(path), "an NPZ archive of arrays", "a single array")
-            return {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError) as error:
-        if isinstance(error, FormatError):
-            raise
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            total = sum(member.file_size for member in archive.infolist())
+            if total > _MOST_BYTES:
+                raise FormatError(str(path), f"arrays of at most {_MOST_BYTES:,} bytes", f"{total:,}")
+            return {
+                member.filename.removesuffix(".npy"): _array(bytearray(archive.read(member)))
+                for member in archive.infolist()
+            }
+    except FormatError:
+        raise
+    # RuntimeError, NotImplementedError: an archive with a password, or packed in another way
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, RuntimeError) as error:
         raise FormatError(str(path), "an NPZ archive of arrays", str(error).splitlines()[0]) from error
+
+
+def _array(data: bytearray) -> np.ndarray:
+    """An array of its NPY file, in the same memory. ValueError where it is none, or of another size."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read_header:
+        raise ValueError(f"an array of version {version}")
+    shape, columns_first, dtype = read_header[version](stream)
+    if dtype.hasobject:
+        raise ValueError("objects, which are pickles (allow_pickle is off)")
+    there = len(data) - stream.tell()
+    if dtype.itemsize * math.prod(shape) != there or min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape} and {dtype} in {there} bytes")
+    flat = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+    return flat.reshape(shape, order="F" if columns_first else "C")

@@ -75,6 +75,10 @@ def check_indices(name: str, indices: Tensor, count: int) -> None:
         raise RangeError(name, f"indices in [0, {count})", int(bad[0]))
 
 
+FOCAL_PX = (0.01, 1e5)
+"""Focal lengths of cameras, far beyond those of any: what is no length does not pass for one."""
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole camera.
@@ -96,8 +100,9 @@ class Camera:
             check_finite("camera.projection", self.projection)
         if self.height < 1 or self.width < 1:
             raise RangeError("camera size", "at least 1x1 px", f"{self.width}x{self.height}")
-        if float(self.intrinsics[0, 0]) <= 0 or float(self.intrinsics[1, 1]) <= 0:
-            raise RangeError("camera focal lengths", "positive px", self.intrinsics.diagonal()[:2].tolist())
+        focal = self.intrinsics.diagonal()[:2].tolist()
+        if not all(FOCAL_PX[0] <= length <= FOCAL_PX[1] for length in focal):
+            raise RangeError("camera focal lengths", f"positive px, {FOCAL_PX[0]:g} to {FOCAL_PX[1]:g}", focal)
 
     @property
     def matrix(self) -> Tensor:
@@ -306,6 +311,19 @@ class SceneIR:
         check_shape("scene.environment.sky", self.environment.sky, h, w)
         check_shape("scene.ignore", self.ignore, None, 4)
         check_indices("objects.mesh_index", self.objects.mesh_index, len(self.meshes))
+        for i, source in enumerate(self.objects.source):
+            for name in ("foreground", "shadow", "region"):
+                self._check_inside(f"objects.source[{i}].{name}", getattr(source, name))
+        for i, thing in enumerate(self.front):
+            self._check_inside(f"scene.front[{i}].foreground", thing.foreground)
+
+    def _check_inside(self, name: str, crop: Crop | None) -> None:
+        if crop is None:
+            return
+        (h, w), (height, width) = crop.values.shape[1:], (self.camera.height, self.camera.width)
+        if not (0 <= crop.x0 <= width - w and 0 <= crop.y0 <= height - h):
+            found = f"{w}x{h} px at {crop.x0}, {crop.y0}"
+            raise RangeError(name, f"a rectangle in {width}x{height} px", found)
 
     def with_objects(self, **changes: Tensor) -> SceneIR:
         """The same scene with some fields of `objects` replaced."""

@@ -12,7 +12,7 @@ from torch import nn
 
 from detectors.adapters.network import NetworkDetector
 from detectors.adapters.spec import checked, load_spec
-from detectors.base import Detector, DetectorError
+from detectors.base import Detector, DetectorError, raised
 
 
 def load(place: str, spec: Path | None = None) -> Detector:
@@ -25,7 +25,18 @@ def load(place: str, spec: Path | None = None) -> Detector:
     where, colon, name = place.rpartition(":")
     if not (colon and where and name.isidentifier()):
         raise DetectorError(f"module: expected FILE.py:CLASS or PACKAGE.MODULE:CLASS, found {place!r}")
-    made = _class(where, name)()
+    try:
+        return _made(_class(where, name)(), place, name, spec)
+    except DetectorError:
+        raise
+    except Exception as error:  # whatever a user's code raises
+        raise DetectorError(
+            f"{place}: expected a class that can be made and tried, found {raised(error)}"
+        ) from error
+
+
+def _made(made: Any, place: str, name: str, spec: Path | None) -> Detector:
+    """An instance of a user's class as a detector."""
     if isinstance(made, Detector):
         if spec is not None:
             raise DetectorError(

@@ -111,7 +111,7 @@ def load_spec(path: Path) -> dict[str, Any]:
     """The settings of a YAML file, each checked; to be laid over a format's own. DetectorError names file, key."""
     try:
         loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None
     if not isinstance(loaded, dict):
         raise DetectorError(f"{path}: expected a mapping of settings, found {type(loaded).__name__}")

@@ -19,6 +19,10 @@ _NUMBERS_A_BOX = 5
 """x, y, width, height, objectness; the classes follow."""
 
 
+_MOST_LAYERS = 1000
+"""YOLOv3 has 107."""
+
+
 @dataclass(frozen=True, slots=True)
 class Section:
     """[kind] and its `key=value` lines, in their order; line: where it stands in its file; 0 is nowhere."""
@@ -123,6 +127,8 @@ def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
     if not sections or sections[0].kind not in ("net", "network"):
         line = sections[0].line if sections else 1
         raise DetectorError(f"{source}:{line}: expected [net] first, found {_kind(sections)}")
+    if len(sections) > _MOST_LAYERS:
+        raise DetectorError(f"{source}: expected at most {_MOST_LAYERS} sections, found {len(sections)}")
     layers: list[Layer] = []
     channels: list[int] = []
     strides: list[int] = []

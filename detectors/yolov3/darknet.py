@@ -11,6 +11,9 @@ from detectors.yolov3.yolov3 import YoloV3
 
 _OURS: dict[str, str] = dict(zip(coco.NAMES, coco.CLASSES, strict=True))
 
+_MOST_TEXT = 1 << 20
+"""Bytes of a .cfg or .names file."""
+
 
 def load(cfg_path: Path, weights_path: Path | None = None) -> YoloV3:
     """The network of a `.cfg` with its weights: by default those of the same name beside it. Classes are those of
@@ -18,12 +21,7 @@ def load(cfg_path: Path, weights_path: Path | None = None) -> YoloV3:
 
     Raises DetectorError, in one line, where a file is missing, damaged, or does not fit the others.
     """
-    try:
-        text = cfg_path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "bytes that are no text"
-        raise DetectorError(f"{cfg_path}: expected a Darknet .cfg, found {reason}") from None
-    description = cfg.parse(text, str(cfg_path))
+    description = cfg.parse(_text(cfg_path, "a Darknet .cfg"), str(cfg_path))
     detector = YoloV3(_classes(cfg_path.with_suffix(".names"), description.classes), cfg=description)
     weights.read(detector.network, weights_path or cfg_path.with_suffix(".weights"))
     return detector
@@ -38,7 +36,7 @@ def save(detector: YoloV3, cfg_path: Path, seen: int = 0) -> None:
 
 def _classes(path: Path, count: int) -> tuple[str, ...]:
     if path.is_file():
-        names = tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
+        names = tuple(line.strip() for line in _text(path, "class names").splitlines() if line.strip())
         if len(names) != count:
             raise DetectorError(f"{path}: expected {count} classes as in the .cfg, found {len(names)}")
     elif count == len(coco.NAMES):
@@ -46,3 +44,16 @@ def _classes(path: Path, count: int) -> tuple[str, ...]:
     else:
         raise DetectorError(f"{path}: expected the {count} classes of the .cfg, a line each, found no file")
     return tuple(_OURS.get(name, name) for name in names)
+
+
+def _text(path: Path, what: str) -> str:
+    """A file's text. DetectorError where there is none, or too much."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file() or size > _MOST_TEXT:
+            found = f"{size:,} bytes" if path.is_file() else "no regular file"
+            raise DetectorError(f"{path}: expected {what}, found {found}")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "bytes that are no text"
+        raise DetectorError(f"{path}: expected {what}, found {reason}") from None

@@ -24,11 +24,11 @@ from drivesem.settings.edits import (
     LENGTH_UNITS,
     SHARE_UNITS,
     finite_number,
-    load_yaml,
     mapping_of,
     measure,
 )
 from drivesem.settings.errors import UsageError
+from scene_ir import files
 from scene_ir.errors import FormatError
 
 PAPER, PARKING, STREET = "paper", "parking", "street"
@@ -54,7 +54,7 @@ def budget_of(text: str) -> Budget:
     if text in PRESETS:
         return PRESETS[text]
     if Path(text).suffix in (".yaml", ".yml") or Path(text).is_file():
-        loaded = load_yaml(Path(text))
+        loaded = files.read_yaml(Path(text))
         return _budget(text, {} if loaded is None else loaded)
     first, _, rest = text.partition(",")
     preset, narrowed = (first, rest) if first in PRESETS else (PAPER, text)

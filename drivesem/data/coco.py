@@ -296,6 +296,12 @@ class _Rows:
             raise FormatError(self.at(i, key), "a whole number", json.dumps(value))
         return np.array(values, np.int64)
 
+    def texts(self, key: str) -> None:
+        """FormatError naming the first row whose value under a key is no text; a row may have none."""
+        for i, row in enumerate(self.rows):
+            if not isinstance(row.get(key, ""), str):
+                raise FormatError(self.at(i, key), "text", json.dumps(row[key])[:60])
+
     def own(self, key: str) -> NDArray[np.int64]:
         """As `whole`, each once."""
         ids = self.whole(key)
@@ -450,6 +456,8 @@ class _File:
         self.categories, self.category_ids = _by_id(tables["categories"])
         self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
         self.annotations = tables["annotations"]
+        self.images.texts("file_name")
+        self.categories.texts("name")
         self.frame = self.annotations.places("image_id", self.image_ids, "images")
         self.kind = self.annotations.places("category_id", self.category_ids, "categories")
 
@@ -590,6 +598,8 @@ class CocoDataset(Frames[_Image]):
                 if "file_name" not in record:
                     raise FormatError(told.images.at(i, "file_name"), "a value", "none")
                 name = Path(str(record["file_name"]))
+                if name.is_absolute() or ".." in name.parts:
+                    raise FormatError(told.images.at(i, "file_name"), f"a file in {folder}", repr(str(name)))
                 identifier = _identifier(record)
                 if identifier in entries:
                     found = f"{name}, twice: open one file alone"

@@ -46,7 +46,7 @@ from drivesem.data.label_table import (
 from drivesem.data.truth import SKY_CM, Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.types import Camera, Frame, Labels
+from scene_ir.types import FOCAL_PX, Camera, Frame, Labels
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 """What KITTI labels."""
@@ -150,6 +150,13 @@ class _Lines:
             behind = f"{z:g} m, wholly behind it"
             require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
 
+    def check_sizes(self) -> None:
+        """FormatError for a size below 0 that is not the mark of what is unknown."""
+        for column in (7, 8, 9):
+            sizes = self.values[:, column]
+            for row in np.flatnonzero((sizes < 0) & (sizes != UNKNOWN_SIZE))[:1].tolist():
+                raise FormatError(self.where(row, FIELDS[column + 1]), "metres, or -1", f"{sizes[row]:g}")
+
     def table(self, frames: Sequence[str], scored: bool) -> LabelTable:
         """The lines as a table of `frames`, one a file. A 3D box that is marked as unknown is NaN."""
         values = self.values
@@ -221,6 +228,8 @@ def read_table(path: Path, scored: bool) -> LabelTable:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
     paths = text_files(folder)
     lines = _Lines([str(file) for file in paths], [files.read_text(file) for file in paths], scored)
+    if not scored:
+        lines.check_sizes()
     if scored and not lines.kinds:
         raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
     return lines.table([file.stem for file in paths], scored)
@@ -389,8 +398,10 @@ def read_calib(path: Path) -> Calibration:
     if "P2" not in found:
         raise FormatError(f"{path}: P2", "12 numbers", f"no such key (only {', '.join(found) or 'none'})")
     projection = found["P2"]
-    if not (projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0):
-        raise FormatError(f"{path}: P2", "positive focal lengths", projection.diagonal().tolist())
+    least, most = FOCAL_PX
+    if not (least <= projection[0, 0] <= most and least <= projection[1, 1] <= most and projection[2, 2] > 0):
+        expected = f"positive focal lengths, {least:g} to {most:g} px"
+        raise FormatError(f"{path}: P2", expected, projection.diagonal().tolist())
     return Calibration(projection, found.get("R0_rect"), found.get("Tr_velo_to_cam"))
 
 

@@ -283,10 +283,7 @@ class YoloDataset(Frames[Path]):
 
 
 def _mapping(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(files.read_text(path))
-    except yaml.YAMLError as error:
-        raise FormatError(str(path), "YAML", str(error).splitlines()[0]) from error
+    content = files.read_yaml(path)
     if not isinstance(content, dict):
         raise FormatError(str(path), "train, val and names", type(content).__name__)
     return content

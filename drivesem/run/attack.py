@@ -72,7 +72,7 @@ def attack_run(config: Attack) -> RunSummary:
     worker = Worker.of(config)
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, WRITTEN)
-    return _attacked(worker, select_frames(worker.source, config), out, start)
+    return _attacked(worker, select_frames(worker.source, config), out, start, must_find=True)
 
 
 def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary:
@@ -85,9 +85,16 @@ def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary
 
 
 def _attacked(
-    worker: Worker, selected: tuple[list[str], int, dict[str, str]], out: Path, start: float
+    worker: Worker,
+    selected: tuple[list[str], int, dict[str, str]],
+    out: Path,
+    start: float,
+    must_find: bool = False,
 ) -> RunSummary:
-    """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames."""
+    """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames.
+
+    must_find: raise UsageError where the detector finds nothing in any photograph.
+    """
     names, without_vehicles, failed = selected
     config = worker.config
     todo = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
@@ -97,6 +104,8 @@ def _attacked(
     empty = {name for name, result in answers.results.items() if result is None}
     done = [name for name in names if name not in failed and name not in empty]
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
+    if must_find:
+        _check_sight(worker, results)
     summary = replace(
         summary_of(config, worker.params, worker.detector, results),
         out=str(out),
@@ -109,6 +118,18 @@ def _attacked(
     files.write_json(out / "manifest.json", manifest_of(config, out, done, metrics))
     write_run(out, config, summary, results)
     return summary
+
+
+def _check_sight(worker: Worker, results: Sequence[FrameResult]) -> None:
+    """UsageError for a detector that finds nothing in any photograph: it has nothing to lose, and figures of an
+    attack on it would say nothing. One frame in which nothing is found is no reason.
+    """
+    t_star = t_star_of(worker.detector, worker.config.t_star)
+    scores = [box.score or 0 for result in results for box in result.detections_benign]
+    if len(results) > 1 and max(scores, default=0) < t_star:
+        best = f"the best score is {max(scores):.3g}" if scores else "no detection at all"
+        found = f"{best} in {len(results)} photographs (is its input prepared as in training? drivesem eval)"
+        raise UsageError("--detector", f"one that finds something, with a score of {t_star:.3g} or more", found)
 
 
 def params_of(config: Attack) -> tuple[Parameter, ...]:

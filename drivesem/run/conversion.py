@@ -15,6 +15,7 @@ from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
 from drivesem.data.registry import images_beside, write_table
 from drivesem.run.labels import layout_of, read
 from drivesem.settings.errors import UsageError
+from scene_ir.errors import FormatError
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,9 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
     """
     layout = how.from_format or layout_of(source)
     table = read(source, layout, scored=how.scores)
+    odd = table.truncation[(table.truncation > 1) | ((table.truncation < 0) & (table.truncation != -1))]
+    if len(odd):
+        raise FormatError(f"{source}: truncation", "[0, 1], or -1 where it is not known", f"{odd[0]:g}")
     if how.mapping:
         table = renamed(table, how.mapping)
     found = images_in([how.images], table.frames) if how.images is not None else {}

@@ -8,10 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from drivesem.run.folder import CONFIG
 from drivesem.run.frame import RESULT
+from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.run.tally import graded
 from drivesem.settings.commands import Attack
@@ -126,10 +125,7 @@ def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "
 def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     if not (folder / CONFIG).is_file():
         raise UsageError(setting, "a folder of drivesem attack", folder)
-    try:
-        settings = yaml.safe_load(files.read_text(folder / CONFIG))
-    except yaml.YAMLError as error:
-        raise FormatError(str(folder / CONFIG), "YAML", " ".join(str(error).split())) from error
+    settings = files.read_yaml(folder / CONFIG)
     if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
     if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
@@ -138,9 +134,10 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
         )
     manifest, metrics = files.read_json(folder / MANIFEST), files.read_json(folder / METRICS)
     try:
-        identifiers, params = list(manifest["frames"]), ",".join(metrics["params"])
-    except (KeyError, TypeError) as error:
+        identifiers, params = list(manifest["frames"].keys()), ",".join(metrics["params"])
+    except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
+    from_json(float | None, metrics.get("t_star"), f"{folder / METRICS}: t_star")
     if not identifiers:
         raise UsageError(setting, "a run with frames", f"{folder}, which has none")
     return Run(
@@ -150,12 +147,12 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
         # Runs from before there was a choice followed the default.
         method=str(settings.get("method", Attack().method)),
         params=params,
-        frames=tuple(_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
+        frames=tuple(_frame(files.below(folder / "frames", identifier)) for identifier in identifiers[:limit]),
     )
 
 
 def _frame(folder: Path) -> Frame:
-    pictures = {name: folder / file for name, file in PICTURES.items()}
+    pictures = {name: files.below(folder, file) for name, file in PICTURES.items()}
     for path in pictures.values():
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Iterable
-from dataclasses import MISSING, asdict, fields
+from dataclasses import MISSING, asdict, fields, replace
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import code_of, load_predictor
 from drivesem.attack.judging import JudgedClasses
 from drivesem.run.lock import LOCK, hold
+from drivesem.run.records import from_json
 from drivesem.settings.blocks import Output
 from drivesem.settings.commands import Attack
 from drivesem.settings.errors import UsageError
@@ -80,11 +79,17 @@ def attack_of(run: Path) -> Attack:
     path = run / CONFIG
     if not path.is_file():
         raise UsageError("--run", "a run's folder, with its config.yaml", run)
-    loaded = yaml.safe_load(files.read_text(path))
+    loaded = files.read_yaml(path)
     known = {field.name for field in fields(Attack)}
     if not isinstance(loaded, dict) or not set(loaded) <= known:
         raise UsageError("--run", "a run of drivesem attack", run)
-    return Attack(**loaded)
+    attack: Attack = from_json(Attack, loaded, str(path))
+    try:
+        # The run that a placebo was like may be gone.
+        replace(attack, like=attack.like and str(run)).check()
+    except UsageError as error:
+        raise UsageError(f"{path}: {error.field}", error.expected, error.actual) from error
+    return attack
 
 
 def trusted_attack(run: Path, trust: bool) -> Attack:
@@ -119,7 +124,7 @@ def settings_of(config: Output, presentation: Collection[str] = PRESENTATION) ->
 
 
 def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
-    before = yaml.safe_load(files.read_text(path))
+    before = files.read_yaml(path)
     # A setting that came with a later version had its default before.
     defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
     known = defaults | before if isinstance(before, dict) else {}

@@ -37,6 +37,7 @@ from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.redraw.compositor import CompositorDraw
 from drivesem.truth.views import DrawnViews
 from scene_ir import files
+from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -332,7 +333,7 @@ def as_targets(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Target
     """The inverse of `target_records`."""
     return Targets(
         boxes_xyxy=torch.tensor([r.xyxy for r in records], dtype=torch.float32).reshape(-1, 4),
-        labels=torch.tensor([names.index(r.label) for r in records], dtype=torch.int64),
+        labels=_labels(records, names),
         ignore=torch.tensor([r.ignore for r in records], dtype=torch.bool),
     )
 
@@ -341,9 +342,17 @@ def as_detections(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Det
     """The inverse of `detection_records`."""
     return Detections(
         boxes_xyxy=torch.tensor([r.xyxy for r in records], dtype=torch.float32).reshape(-1, 4),
-        labels=torch.tensor([names.index(r.label) for r in records], dtype=torch.int64),
+        labels=_labels(records, names),
         scores=torch.tensor([r.score for r in records], dtype=torch.float32),
     )
+
+
+def _labels(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Tensor:
+    """The labels (N,) of records. Raises FormatError for a class that is not among `names`."""
+    for record in records:
+        if record.label not in names:
+            raise FormatError(f"{RESULT}: label", f"one of {', '.join(names)}", repr(record.label))
+    return torch.tensor([names.index(record.label) for record in records], dtype=torch.int64)
 
 
 def _xyxy(box: Tensor) -> tuple[float, float, float, float]:

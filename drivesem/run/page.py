@@ -12,7 +12,6 @@ import numpy as np
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import combo
 from drivesem.data.label_table import WEATHERS
-from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.outcome import Outcome
 from drivesem.report.grading import GradesAsked
@@ -22,6 +21,7 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
 from drivesem.run.protocol import follows_paper
+from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, graded, tally
 from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report
@@ -297,19 +297,16 @@ def _summary(path: Path) -> RunSummary:
         }
         plain |= {name: data[name] for name in ("frames_failed", "objects", "successes_paper", "successes_moved")}
         plain |= {name: data[name] for name in ("feasible_fraction", "queries", "seconds")}
-        return RunSummary(
-            **plain,
-            params=tuple(data["params"]),
-            benign=_scores(data["benign"]),
-            rerendered=_scores(data["rerendered"]),
-            attacked_paper=_scores(data["attacked"]["paper"]),
-            attacked_moved=_scores(data["attacked"]["moved"]),
-            lost_objects=dict(data["lost_objects_by_class"]),
-            phantoms=dict(data["phantoms_by_class"]),
-            **_grades(data),
-        )
-    except (KeyError, TypeError, ValueError) as error:
+        plain |= {"params": data["params"]} | _grades(data)
+        plain |= {name: _scores(data[name]) for name in ("benign", "rerendered")}
+        plain |= {f"attacked_{mode}": _scores(data["attacked"][mode]) for mode in ("paper", "moved")}
+        plain |= {name: data[f"{name}_by_class"] for name in ("lost_objects", "phantoms")}
+    except (KeyError, TypeError, AttributeError) as error:
         raise FormatError(str(path), "the figures of a run", error) from error
+    summary: RunSummary = from_json(RunSummary, plain, str(path))
+    if summary.headline not in summary.benign.per_class:
+        raise FormatError(f"{path}: headline", f"one of {', '.join(summary.benign.per_class)}", summary.headline)
+    return summary
 
 
 def _grades(data: dict[str, Any]) -> dict[str, Any]:
@@ -322,13 +319,10 @@ def _grades(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _scores(data: dict[str, Any]) -> Scores:
-    names = ("ap50", "ap70", "ap", "recall", "recall_at_t_star", "objects")
-    return Scores(
-        headline=ClassScores(**{name: data[name] for name in names}),
-        overall=ClassScores(**data["overall"]),
-        per_class={name: ClassScores(**one) for name, one in data["per_class"].items()},
-    )
+def _scores(data: dict[str, Any]) -> dict[str, Any]:
+    """The inverse of `Scores.to_json`, as plain objects."""
+    beside = {name: data[name] for name in ("overall", "per_class")}
+    return {"headline": {name: one for name, one in data.items() if name not in beside}} | beside
 
 
 def _check_photographs(runs: Sequence[ShownRun]) -> None:

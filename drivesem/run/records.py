@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -16,20 +17,49 @@ T = TypeVar("T")
 _hints = functools.cache(get_type_hints)
 
 
-def from_json(kind: Any, value: Any) -> Any:
-    """A value of a type: dataclasses, tuples and dicts of others are built again, all else is as JSON has it.
-    Raises KeyError, TypeError or AttributeError where the value was not made of the type.
+def from_json(kind: Any, value: Any, where: str) -> Any:
+    """A value of a type, of what `dataclasses.asdict` and JSON made of it: dataclasses, tuples and dicts of others
+    are built again, all else is as JSON has it. where: the file. FormatError naming a field of another type.
     """
+    origin, parts = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind):
-        return kind(**{name: from_json(_hints(kind)[name], part) for name, part in value.items()})  # pyright: ignore[reportCallIssue]
-    if get_origin(kind) is tuple:
-        return tuple(from_json(get_args(kind)[0], part) for part in value)
-    if isinstance(kind, UnionType):
-        whole = next((part for part in get_args(kind) if dataclasses.is_dataclass(part)), None)
-        return value if whole is None or value is None else from_json(whole, value)
-    if get_origin(kind) is dict:
-        return {name: from_json(get_args(kind)[1], part) for name, part in value.items()}
+        return _record(kind, value, where)
+    if origin is tuple:
+        _require(isinstance(value, list), where, "a list", value)
+        kinds = parts[:1] * len(value) if parts[1:] == (...,) else parts
+        _require(len(value) == len(kinds), where, f"{len(kinds)} values", value)
+        return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+    if origin is dict:
+        _require(isinstance(value, dict), where, "an object", value)
+        return {name: from_json(parts[1], part, f"{where}.{name}") for name, part in value.items()}
+    if isinstance(kind, UnionType) or origin is Union:
+        (whole,) = (part for part in parts if part is not NoneType)
+        return None if value is None else from_json(whole, value, where)
+    if origin is Literal:
+        _require(value in parts, where, f"one of {', '.join(map(str, parts))}", value)
+    if kind in _WORDS:
+        known = type(value) in ((int, float) if kind is float else (kind,))
+        _require(known and (kind is not float or math.isfinite(value)), where, _WORDS[kind], value)
     return value
+
+
+_WORDS = {str: "text", int: "an integer", float: "a finite number", bool: "true or false"}
+
+
+def _record(kind: Any, value: Any, where: str) -> Any:
+    _require(isinstance(value, dict), where, "an object", value)
+    own = dataclasses.fields(kind)
+    for name in value.keys() - {field.name for field in own}:
+        raise FormatError(f"{where}: {name}", f"a field of {kind.__name__}", "an unknown one")
+    for field in own:
+        optional = (field.default, field.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)
+        _require(field.name in value or optional, f"{where}: {field.name}", "a value", None)
+    return kind(**{name: from_json(_hints(kind)[name], part, f"{where}: {name}") for name, part in value.items()})
+
+
+def _require(good: bool, where: str, expected: str, found: object) -> None:
+    if not good:
+        raise FormatError(where, expected, "nothing" if found is None else repr(found)[:60])
 
 
 def dump_record(record: Any, schema: int) -> str:
@@ -37,12 +67,9 @@ def dump_record(record: Any, schema: int) -> str:
     return json.dumps({"schema": schema, **dataclasses.asdict(record)}, indent=1, allow_nan=False) + "\n"
 
 
-def load_record(path: Path, kind: type[T], schema: int, what: str) -> T:
-    """Read what `dump_record` gave. what: it is, for people. Raises FormatError naming the file."""
+def load_record(path: Path, kind: type[T], schema: int) -> T:
+    """Read what `dump_record` gave. Raises FormatError naming the file and the field."""
     data = files.read_json(path)
     if not isinstance(data, dict) or data.pop("schema", None) != schema:
         raise FormatError(f"{path}: schema", str(schema), "another one")
-    try:
-        return from_json(kind, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), what, error) from error
+    return from_json(kind, data, str(path))

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from drivesem.evaluation.coco import Scores
 from drivesem.run.records import from_json
 from drivesem.truth.grades import Agreement, Count
+from scene_ir import files
 from scene_ir.errors import FormatError
 
 SCHEMA = 2
@@ -184,13 +185,14 @@ def dump_frame(result: FrameResult) -> str:
 
 def load_frame(path: Path) -> FrameResult:
     """Read what `dump_frame` wrote. Raises FormatError naming the file and the field."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FormatError(str(path), "a frame's result as JSON", error) from error
+    data = files.read_json(path)
     if not isinstance(data, dict) or data.pop("schema", None) not in (1, SCHEMA):
         raise FormatError(f"{path}: schema", f"1 or {SCHEMA}", "another one")
-    try:
-        return from_json(FrameResult, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "the fields of a frame's result", error) from error
+    result: FrameResult = from_json(FrameResult, data, str(path))
+    for i, failure in enumerate(result.failures):
+        if failure.kind not in ("lost", "phantom"):
+            raise FormatError(f"{path}: failures[{i}].kind", "lost or phantom", repr(failure.kind))
+        if failure.index is not None and not 0 <= failure.index < max(len(result.targets_moved), 1):
+            expected = f"one of {len(result.targets_moved)} targets"
+            raise FormatError(f"{path}: failures[{i}].index", expected, failure.index)
+    return result

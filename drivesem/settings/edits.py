@@ -27,8 +27,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
@@ -102,7 +100,7 @@ def read_edits(path: Path) -> Edits:
 
     FormatError naming the file and the place in it.
     """
-    frames = mapping_of(f"{path}", load_yaml(path), ("frames",)).get("frames", {})
+    frames = mapping_of(f"{path}", files.read_yaml(path), ("frames",)).get("frames", {})
     found: dict[int | str, FrameEdit] = {}
     for key, value in mapping_of(f"{path}: frames", frames).items():
         number = _number_or_all(f"{path}: frames", key)
@@ -112,7 +110,7 @@ def read_edits(path: Path) -> Edits:
 
 def read_frame_edit(path: Path) -> dict[str, Any]:
     """The mappings of a YAML file of one frame's edit, checked. FormatError naming the file and the place."""
-    loaded = load_yaml(path)
+    loaded = files.read_yaml(path)
     content = {} if loaded is None else mapping_of(str(path), loaded, FRAME_KEYS)
     frame_edit(str(path), content)
     return content
@@ -185,14 +183,6 @@ def frame_edit(where: str, value: Any) -> FrameEdit:
         foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_NAMES, -1.0),
         sun=_codes(f"{where}: sun", entry.get("sun"), SUN_NAMES, -1.0),
     )
-
-
-def load_yaml(path: Path) -> Any:
-    """What a YAML file holds. FormatError naming the file."""
-    try:
-        return yaml.safe_load(files.read_text(path))
-    except yaml.YAMLError as error:
-        raise FormatError(str(path), "YAML", " ".join(str(error).split())) from error
 
 
 def _object_edit(where: str, value: Any) -> ObjectEdit:

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-import yaml
 
 from drivesem import __version__
 from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.errors import FormatError
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
 _ANY = f"one of {', '.join(COMMANDS)}"
@@ -123,13 +124,11 @@ def preset_words(path: str, command: str) -> list[str]:
 
 
 def _mapping(path: str) -> dict[Any, Any]:
-    """What a YAML file holds."""
+    """What a YAML file holds. Raises UsageError where it cannot be read."""
     try:
-        loaded: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(path, "a readable YAML file", error) from error
-    except yaml.YAMLError as error:
-        raise UsageError(path, "YAML", " ".join(str(error).split())) from error
+        loaded: Any = files.read_yaml(Path(path))
+    except FormatError as error:
+        raise UsageError(error.field, error.expected, error.actual) from error
     if loaded is not None and not isinstance(loaded, dict):
         raise UsageError(path, "a mapping of settings", type(loaded).__name__)
     return loaded or {}

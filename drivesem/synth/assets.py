@@ -28,7 +28,6 @@ from typing import cast
 import cv2
 import numpy as np
 import torch
-import yaml
 
 from drivesem.synth.light import Light, Panorama
 from drivesem.synth.soup import Material, Soup, creased_normals, make
@@ -190,10 +189,7 @@ def _folder(
 
 
 def _sidecar(path: Path) -> dict[str, _Entry]:
-    try:
-        raw = yaml.safe_load(files.read_text(path))
-    except yaml.YAMLError as error:
-        raise FormatError(str(path), "YAML", str(error).splitlines()[0]) from None
+    raw = files.read_yaml(path)
     if not isinstance(raw, dict):
         raise FormatError(str(path), "file names and their entries", type(raw).__name__)
     return {str(name): _entry(f"{path}: {name}", value) for name, value in raw.items()}

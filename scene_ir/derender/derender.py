@@ -213,6 +213,12 @@ class _Surroundings:
     seen: segment.Segmentation
 
 
+_LEAST_SIDE = 16
+"""Of a photograph, px: maps are made at an eighth of its size."""
+_MOST_LABELS = 500
+"""Of a frame: each vehicle takes megabytes and a second."""
+
+
 def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     """Take a photograph apart into vehicles, their shadows, and what stood behind them.
 
@@ -224,6 +230,12 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     if frame.labels is None:
         raise ShapeError(f"frame {frame.identifier}: labels", "labels with 3D boxes", "none")
     labels, camera = frame.labels, frame.camera
+    if min(camera.height, camera.width) < _LEAST_SIDE:
+        found = f"{camera.width}x{camera.height} px"
+        raise RangeError(f"frame {frame.identifier}", f"at least {_LEAST_SIDE}x{_LEAST_SIDE} px", found)
+    if len(labels.kind) > _MOST_LABELS:
+        expected = f"at most {_MOST_LABELS} labelled objects"
+        raise RangeError(f"frame {frame.identifier}: labels", expected, len(labels.kind))
     rows = _vehicle_rows(frame.identifier, labels, camera, settings)
     image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     ground = maps.fit_ground(labels, _posed_rows(labels))

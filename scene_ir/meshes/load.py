@@ -150,6 +150,7 @@ def _read(file: Path) -> trimesh.Scene:
         raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
     if not file.is_file():
         raise FormatError(str(file), "a mesh file", "no such file")
+    files.check_regular(file)
     try:
         return trimesh.load_scene(file, process=False)
     except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
@@ -168,6 +169,8 @@ def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
     part = shape.metadata.get("part")
     if not isinstance(part, list) or len(part) != len(shape.faces):
         raise FormatError(f"{file}: part", f"{len(shape.faces)} entries", "none" if part is None else len(part))
+    if not all(type(one) is int for one in part):
+        raise FormatError(f"{file}: part", "whole numbers", "others")
     rgb, uv = shape.vertex_attributes.get("_rgb"), shape.vertex_attributes.get("_uv")
     return Mesh(
         vertices=torch.from_numpy(np.array(shape.vertices, dtype=np.float32)),

@@ -49,7 +49,7 @@ _BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "sett
 MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
 """Questions that are made of others."""
 RULES = (
-    Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "trimesh", "warp")),
+    Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "PIL", "trimesh", "warp", "yaml")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
     *(Rule(package, (*_LOGIC, *_JOINED), (*_LOGIC_LIBRARIES, "cma")) for package in _JOINED),
     # the second, independent judge of what the first one, drivesem.attack.feasible, let through

@@ -276,6 +276,14 @@ BAD = [
     ("weather", edit("environment", "weather", value=[0] * 3), r"environment: weather: expected shape \(4,\)"),
     ("sources", edit("sources", 1), r"objects\.source: expected 2 entries or none, found 1"),
     ("source", edit("sources", 0, "ffd"), r"sources\[0\]: ffd: expected a value"),
+    (
+        "crop-far-away",
+        edit("sources", 0, "foreground", "x0", value=10**9),
+        r"source\[0\]\.foreground: expected a rectangle in \d+x\d+ px, found \d+x\d+ px at 1000000000",
+    ),
+    ("crop-before", edit("sources", 0, "foreground", "y0", value=-1), r"expected a rectangle in .* at \d+, -1"),
+    ("focal", edit("camera", "intrinsics", 0, 0, value=1e30), r"focal lengths: expected positive px, 0\.01 to"),
+    ("nested", lambda f: (f / "scene.json").write_text("[" * 10**5), r"scene\.json: expected JSON.*nested"),
     ("crop", edit("sources", 0, "foreground", "x0"), r"sources\[0\]: foreground: x0: expected a value"),
     (
         "image",

@@ -40,4 +40,4 @@ def dump(result: Confirmed) -> str:
 
 def load(path: Path) -> Confirmed:
     """Read what `dump` wrote. Raises FormatError naming the file."""
-    return load_record(path, Confirmed, SCHEMA, "a frame as drivesem confirm writes it")
+    return load_record(path, Confirmed, SCHEMA)

@@ -29,7 +29,7 @@ from drivesem.evaluation.results import ClassRow, KittiRow, Result
 from drivesem.questions.evaluate.report import write_report
 from drivesem.questions.evaluate.sets import EvalSet, chosen_classes, open_sets
 from drivesem.settings.commands import Eval
-from drivesem.settings.errors import UsageError
+from drivesem.settings.errors import UsageError, refuse
 
 VOC_OVERLAP = 0.5
 """At least so much must overlap (VOC)."""
@@ -113,6 +113,10 @@ class _Looked:
     rows: tuple[KittiRow, ...] = ()
 
 
+_MOST_DETECTIONS = 2000
+"""KITTI's rule plays a frame again for each of them: its cost grows with the square."""
+
+
 class _Judge:
     """One protocol's rules. names: the classes with figures, in the order of their labels after `_own`."""
 
@@ -148,6 +152,10 @@ class _Judge:
         curves: list[kitti.Curve] = []
         if self.config.protocol == "kitti":
             small = self.config.small_detections
+            of_frame_and_class = np.unique(np.stack([found.frame, found.label]), axis=1, return_counts=True)[1]
+            most = int(of_frame_and_class.max(initial=0))
+            expected = f"at most {_MOST_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
+            refuse(most > _MOST_DETECTIONS, "--pred", expected, f"{most:,}")
             curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)
             curves = [curve for curve in curves if curve.name in self.names]
             labels = self.relabel[found.label]

@@ -6,10 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from drivesem.questions.explain.players import Size
-from drivesem.run.records import from_json
+from drivesem.run.records import load_record
 from drivesem.run.results import Coordinate, Failure
 from scene_ir import files
-from scene_ir.errors import FormatError
 
 SCHEMA = 1
 EXPLANATION = "explain.json"
@@ -128,11 +127,5 @@ def write_explanation(path: Path, explanation: Explanation) -> None:
 
 
 def read_explanation(path: Path) -> Explanation:
-    """What `write_explanation` wrote. Raises FormatError naming the file."""
-    data = files.read_json(path)
-    try:
-        if data.pop("schema") != SCHEMA:
-            raise FormatError(f"{path}: schema", str(SCHEMA), "another one")
-        return from_json(Explanation, data)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(str(path), "an explanation as drivesem explain writes it", error) from error
+    """What `write_explanation` wrote. Raises FormatError naming the file and the field."""
+    return load_record(path, Explanation, SCHEMA)

@@ -42,4 +42,4 @@ def dump(result: FrameGate) -> str:
 
 def load(path: Path) -> FrameGate:
     """Read what `dump` gave. Raises FormatError naming the file."""
-    return load_record(path, FrameGate, SCHEMA, "the fields of a frame's gate")
+    return load_record(path, FrameGate, SCHEMA)

@@ -87,9 +87,9 @@ def dump(result: FrameHoles | FrameRecheck) -> str:
 
 def load(path: Path) -> FrameHoles:
     """Read what `dump` gave. Raises FormatError naming the file."""
-    return load_record(path, FrameHoles, SCHEMA, "the fields of a frame's holes")
+    return load_record(path, FrameHoles, SCHEMA)
 
 
 def load_recheck(path: Path) -> FrameRecheck:
     """The same of further samples."""
-    return load_record(path, FrameRecheck, SCHEMA, "the fields of a frame's samples inside of its rules")
+    return load_record(path, FrameRecheck, SCHEMA)

@@ -46,6 +46,10 @@ def result(name: str) -> FrameResult:
         "success_moved": False,
         "identity_psnr_db": None,
         "seconds": 0.0,
+        "checked_by": "outlines",
+        "min_contrast": 0.0,
+        "joint_weather": False,
+        "passes": None,
     }
     return FrameResult(**nothing | facts)  # pyright: ignore[reportArgumentType]
 

@@ -1,0 +1,180 @@
+"""Files that were made to break a reader: one line that names the file, soon, and without much memory."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG that has a header, and next to nothing behind it."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def npy(shape: str, dtype: str = "<f4") -> bytes:
+    """An NPY file that says it has a shape, without the numbers."""
+    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}"
+    head = head.ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
+
+
+def npz(member: bytes, said: int | None = None) -> bytes:
+    """An archive of one array. said: the size of it that the archive's directory tells."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth.npy", member)
+    data = bytearray(buffer.getvalue())
+    if said is not None:
+        at = data.index(b"PK\x01\x02")
+        data[at + 24 : at + 28] = struct.pack("<I", said)
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("[" * 200_000, "nested too deep"),
+        ('{"a":' * 200_000, "nested too deep"),
+        (f'{{"a": {"9" * 5000}}}', "an integer of 5000 digits"),
+        (f"[{1 << 63}]", "too large for 64 bits"),
+        (f"[-{1 << 63}]", "too large for 64 bits"),
+        ('{"file_name": "a\\u0000b"}', "a NUL character"),
+        ('{"file_name": "\\ud800"}', "half of one"),
+        ('{"\\udfff": 1}', "half of one"),
+    ],
+)
+def test_json(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(content)
+    with pytest.raises(FormatError, match=rf"a\.json: expected .*{said}"):
+        files.read_json(path)
+
+
+def test_json_that_is_odd_and_right(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'["\\ud83d\\ude97", "\\u00fc", {(1 << 63) - 1}, {1 - (1 << 63)}, 1e300, -0.0]')
+    assert files.read_json(path) == ["🚗", "ü", (1 << 63) - 1, 1 - (1 << 63), 1e300, -0.0]
+
+
+BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("[" * 20_000, "nested too deep"),
+        ("a: " + "9" * 5000, "digits"),
+        (f"a: {1 << 64}", "too large for 64 bits"),
+        (BOMB, r"an alias \(\*a\)"),
+        ("a: &a [*a]", r"an alias \(\*a\)"),
+        ("2026-99-99", "month must be in"),
+        ("a: !!python/object/apply:os.system [ls]", "could not determine a constructor"),
+        ("x" * (1 << 19), "524,288"),
+    ],
+)
+def test_yaml(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(content)
+    with pytest.raises(FormatError, match=rf"a\.yaml: expected .*{said}"):
+        files.read_yaml(path)
+
+
+def test_yaml_that_is_right(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 0x10\nb: [1, 2.5, true, null, text]\nc: -3\n")
+    assert files.read_yaml(path) == {"a": 16, "b": [1, 2.5, True, None, "text"], "c": -3}
+
+
+@pytest.mark.parametrize("size", [(100_000, 100_000), (30_000, 30_000), (8_193, 8_192)])
+def test_a_picture_that_says_it_is_huge(tmp_path: Path, size: tuple[int, int], recwarn: Any) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(png(*size))
+    with pytest.raises(FormatError, match=r"a\.png: expected an image of at most 67,108,864 px"):
+        files.read_image(path)
+    assert not recwarn
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (npz(npy("(1000000000000,)")), r"an array of shape \(1000000000000,\) and float32 in 0 bytes"),
+        (npz(npy("(-1,)")), r"shape \(-1,\)"),
+        (npz(npy("(-2, -3)")), r"shape \(-2, -3\)"),
+        (npz(npy("(0, 1000000000000)", "|O")), "allow_pickle"),
+        (npz(npy("(0,)") + b"rest"), "in 4 bytes"),
+        (npz(b""), "EOF"),
+        (npz(npy("(1,)"), said=(1 << 32) - 2), "4,294,967,294"),
+        (npy("(1,)"), "a single array"),
+    ],
+)
+def test_arrays(tmp_path: Path, data: bytes, said: str) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{said}"):
+        files.read_npz(path)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arrays_come_back_and_can_be_written_to(tmp_path: Path, order: Any) -> None:
+    arrays = {
+        "a": np.arange(6, dtype=np.int64).reshape(2, 3, order=order),
+        "b": np.float32(3.5),
+        "c": np.zeros((0, 2)),
+    }
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays)
+    for name, array in files.read_npz(path).items():
+        assert np.array_equal(array, arrays[name])
+        assert array.dtype == arrays[name].dtype
+        assert array.flags.writeable
+
+
+@pytest.mark.parametrize(
+    "read", [files.read_bytes, files.read_json, files.read_yaml, files.read_image, files.digest]
+)
+def test_only_regular_files(tmp_path: Path, read: Callable[[Path], Any]) -> None:
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("zero", "pipe"):
+        with pytest.raises(
+            FormatError, match=f"{name}: expected a regular file, found a device, a pipe or a socket"
+        ):
+            read(tmp_path / name)
+    with pytest.raises(FormatError, match="expected a readable file"):
+        read(tmp_path / "a\0b")
+
+
+def test_a_file_that_is_too_large(tmp_path: Path) -> None:
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate((1 << 30) + 1)
+    with pytest.raises(FormatError, match="sparse: expected at most 1,073,741,824 bytes, found 1,073,741,825"):
+        files.read_bytes(tmp_path / "sparse")
+
+
+def test_names_stay_in_their_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "a").mkdir(parents=True)
+    (folder / "out").symlink_to(tmp_path)
+    (folder / "in").symlink_to(folder / "a")
+    for name in ("/etc/passwd", "..", "../x", "a/../../x", "", "out/x", "a\0"):
+        with pytest.raises(FormatError, match="run"):
+            files.below(folder, name)
+    for name in ("a", "a/b.json", "in/b.json", "not there"):
+        assert files.below(folder, name) == folder / name
