@@ -38,7 +38,7 @@ OPTIONS = {"params": "translate,rotate", "steps": 2}
 def command_threads() -> Iterator[None]:
     """As many threads as a command with one process takes: sums are then added up alike."""
     before = torch.get_num_threads()
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(min(os.cpu_count() or 1, before))  # as the command: no more than OMP_NUM_THREADS says
     yield
     torch.set_num_threads(before)
 

@@ -24,7 +24,13 @@ def _cut_crop(crop: Crop, window: tuple[int, int, int, int]) -> Crop:
     _, h, w = crop.values.shape
     left, top = min(max(x0 - crop.x0, 0), w), min(max(y0 - crop.y0, 0), h)
     right, bottom = max(min(x1 - crop.x0, w), left), max(min(y1 - crop.y0, h), top)
-    return Crop(crop.values[:, top:bottom, left:right], crop.x0 + left - x0, crop.y0 + top - y0)
+    values = crop.values[:, top:bottom, left:right]
+    # What lies outside of the window is empty, at its border.
+    x, y = (
+        min(max(crop.x0 + left - x0, 0), x1 - x0 - right + left),
+        min(max(crop.y0 + top - y0, 0), y1 - y0 - bottom + top),
+    )
+    return Crop(values, x, y)
 
 
 def cut(scene: SceneIR, window: tuple[int, int, int, int]) -> SceneIR:
