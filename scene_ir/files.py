@@ -340,7 +340,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             }
     except FormatError:
         raise
-    # RuntimeError, NotImplementedError: an archive with a password, or packed in another way
+    # zipfile says by RuntimeError and its kin that it lacks a password, or the way in which a member is packed
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, RuntimeError) as error:
         raise FormatError(str(path), "an NPZ archive of arrays", str(error).splitlines()[0]) from error
 

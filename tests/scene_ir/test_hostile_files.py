@@ -178,3 +178,16 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
             files.below(folder, name)
     for name in ("a", "a/b.json", "in/b.json", "not there"):
         assert files.below(folder, name) == folder / name
+
+
+@pytest.mark.parametrize(("place", "value", "said"), [(6, 1, "password"), (8, 97, "compression")])
+def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: int, said: str) -> None:
+    """A member that is encrypted, or packed in a way that nobody knows, by its headers."""
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.zeros(3))
+    data = bytearray(path.read_bytes())
+    data[place] = value  # of the member's own header
+    data[data.index(b"PK\x01\x02") + 2 + place] = value  # of the archive's list
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{said}"):
+        files.read_npz(path)
