@@ -248,7 +248,7 @@ def read_yaml(path: Path) -> Any:
     """The value in a YAML file. FormatError where it is none, or has aliases, deep nesting or huge integers."""
     text = read_text(path, _MOST_YAML)
     try:
-        return yaml.load(text, _Loader)  # noqa: S506  (a subclass of SafeLoader)
+        return yaml.load(text, _Loader)  # a subclass of SafeLoader
     except RecursionError as error:
         raise FormatError(str(path), "YAML", "lists or mappings that are nested too deep") from error
     except (yaml.YAMLError, ValueError, AttributeError, TypeError) as error:
