@@ -542,9 +542,9 @@ class Bench(Regions, Scenes, FrameCommand):
     """Climb and planted: what attacks may move, with commas."""
     faults: Count | None = None
     """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
-    naming: Flag = False
-    """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
-    of the detector without a fault."""
+    naming: str | None = None
+    """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
+    whether that is the fault; the same of the detector without a fault."""
     limit: Count | None = None
     """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all."""
     count: Count | None = None
