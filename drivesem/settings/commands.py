@@ -160,6 +160,9 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Samples: queries of each method without gradient."""
     passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
     """Searches: passes of the detector that each method may take for a frame, a gradient counted as 3."""
+    pace: Annotated[str | None, Folder()] = None
+    """Searches: folder of such a study; each method takes as many more passes as fit into the seconds that the
+    slowest took there for a frame."""
     params: str | None = None
     """Searches: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by default as
     combination 2."""
@@ -197,6 +200,7 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         refuse(
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
+        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", f"study {self.name}")
 
 
 @dataclass(frozen=True, kw_only=True)
