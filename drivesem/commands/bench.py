@@ -137,8 +137,8 @@ def _planted(config: Bench, console: Console) -> Measured:
     judge = yardstick.Yardstick.of(config)
     names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
     methods = yardstick.methods_of(config)
-    sought = min(config.faults or len(judge.kinds), len(judge.kinds)) + config.naming  # once without a fault
-    count = len(names) * sought * len(methods)
+    sought = min(config.faults or len(judge.kinds), len(judge.kinds))
+    count = len(names) * (sought * len(methods) + len(judge.named))  # named ones once more without a fault
     console.print(f"{count} attacks of {config.passes} passes: about {_minutes(count * config.passes)}")
     asked = ask(names, judge.judge, partial(yardstick.judge_of, config), config, Bar("frames", remaining=True))
     judged = [asked.results[name] for name in names if name in asked.results]

@@ -171,6 +171,9 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Samples: queries of each method without gradient."""
     passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
     """Searches: passes of the detector that each method may take for a frame, a gradient counted as 3."""
+    pace: Annotated[str | None, Folder()] = None
+    """Searches: folder of such a study; each method takes as many more passes as fit into the seconds that the
+    slowest took there for a frame."""
     params: str | None = None
     """Searches: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by default as
     combination 2."""
@@ -208,6 +211,7 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         refuse(
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
+        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", f"study {self.name}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -553,9 +557,9 @@ class Bench(Regions, Scenes, FrameCommand):
     """Climb and planted: what attacks may move, with commas."""
     faults: Count | None = None
     """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
-    naming: Flag = False
-    """Planted: also ask, as drivesem holes does, what tells a failing car, and whether that is the fault; the same
-    of the detector without a fault."""
+    naming: str | None = None
+    """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
+    whether that is the fault; the same of the detector without a fault."""
     limit: Count | None = None
     """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all."""
     count: Count | None = None

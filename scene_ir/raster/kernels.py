@@ -499,13 +499,18 @@ def find_taps(
     v = local(uv[1], y0, height)
     x = wp.clamp(wp.int32(wp.floor(u)), -4, width + 3)
     y = wp.clamp(wp.int32(wp.floor(v)), -4, height + 3)
-    taps.columns = wp.vec4i(tap(x, 0, width), tap(x, 1, width), tap(x, 2, width), tap(x, 3, width)) * texel_stride
-    taps.rows = wp.vec4i(tap(y, 0, height), tap(y, 1, height), tap(y, 2, height), tap(y, 3, height))
-    taps.rows = (taps.rows * width + wp.vec4i(start, start, start, start)) * texel_stride
     taps.wx = weights(u - wp.floor(u))
     taps.wy = weights(v - wp.floor(v))
     taps.sx = slopes(u - wp.floor(u))
     taps.sy = slopes(v - wp.floor(v))
+    if x >= 1 and x + 2 < width and y >= 1 and y + 2 < height:  # nearly always
+        at = start + (y - 1) * width
+        taps.columns = wp.vec4i(x - 1, x, x + 1, x + 2) * texel_stride
+        taps.rows = wp.vec4i(at, at + width, at + 2 * width, at + 3 * width) * texel_stride
+        return taps
+    taps.columns = wp.vec4i(tap(x, 0, width), tap(x, 1, width), tap(x, 2, width), tap(x, 3, width)) * texel_stride
+    taps.rows = wp.vec4i(tap(y, 0, height), tap(y, 1, height), tap(y, 2, height), tap(y, 3, height))
+    taps.rows = (taps.rows * width + wp.vec4i(start, start, start, start)) * texel_stride
     if not clamp:
         taps.wx = trim(taps.wx, x, width)
         taps.wy = trim(taps.wy, y, height)

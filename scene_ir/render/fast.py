@@ -20,7 +20,7 @@ from scene_ir.render.prepare import Drawn, Prepared
 class Fixed:
     """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the
     camera then, paint, height; own (V, channels.OWN), with local normals, without depth; texels, dark: values (S,
-    channels.TEXEL) and (S, 3), rects (N, 4), offsets (N + 1,); patches
+    channels.TEXEL) and (S, 4), the fourth 0, rects (N, 4), offsets (N + 1,); patches
     (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
     frame_wh (N, 2) px; sun (N, 4): direction, strength; unproject (N, 3, 3).
     """
@@ -54,7 +54,11 @@ class Fixed:
                 prepared.texels.offsets[: count + 1],
             ),
             patches=patches(base.ground_clip),
-            dark=(prepared.shadows.values, prepared.shadows.rects, prepared.shadows.offsets),
+            dark=(
+                torch.nn.functional.pad(prepared.shadows.values, (0, 1)),
+                prepared.shadows.rects,
+                prepared.shadows.offsets,
+            ),
             frame_wh=prepared.like.new_tensor([width, height]).expand(count, 2).contiguous(),
             sun=prepared.lights(),
             unproject=prepared.unproject.expand(count, 3, 3).contiguous(),

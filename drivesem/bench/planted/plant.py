@@ -64,6 +64,8 @@ class Planting:
 
 def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> Planting | None:
     """A fault for this frame; None where theta brings no car into such bands. Equal arguments, equal faults."""
+    if not bool(survey.sure.any()):
+        return None
     rows = [FEATURES.index(name) for name in kind.features]
     mains = torch.stack([sighting.main[rows] for sighting in (*survey.halton, *survey.corners)])
     mostly_seen = torch.isfinite(mains).all(1).double().mean(0) > 0.5

@@ -44,10 +44,12 @@ KINDS_TITLE = "planted faults, by kind"
 
 
 def rows_of(judged: Sequence[JudgedFrame], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
-    """A row for each rarity and method; None where nothing was planted."""
+    """A row for each rarity and method that was asked; None where nothing was planted."""
     attempts = [attempt for frame in judged for attempt in frame.attempts]
+    asked = {(attempt.rarity, attempt.method) for attempt in attempts}
     rarities = dict.fromkeys(attempt.rarity for attempt in attempts)
-    return [_row(judged, method, rarity, seed) for rarity in rarities for method in methods]
+    pairs = [(method, rarity) for rarity in rarities for method in methods if (rarity, method) in asked]
+    return [_row(judged, method, rarity, seed) for method, rarity in pairs]
 
 
 def kind_rows(judged: Sequence[JudgedFrame], methods: Sequence[str]) -> list[dict[str, Any]]:

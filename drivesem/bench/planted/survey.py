@@ -135,7 +135,8 @@ class SeenFrame:
 class FrameSurvey:
     """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners. benign
     (F, N): features as photographed, by the detector's boxes; farthest, mostly (F, N): how far those of single
-    looks are off, at most and in `MOSTLY` of them; sure (N,) bool: cars found in all looks, mostly as one.
+    looks are off, at most and in `MOSTLY` of them; sure (N,) bool: cars found in all looks, mostly as one. Without
+    any there are neither Halton's draws nor corners.
     factor, shift (F, N): what makes features by the detector's boxes of those by labels, as photographed.
     """
 
@@ -167,15 +168,17 @@ class FrameSurvey:
         mains = torch.stack([look.main for look in looks])  # (LOOKS, F, N)
         off = (mains - benign).abs().nan_to_num(0.0)
         single = torch.stack([look.single for look in looks]).double().mean(0) >= MOSTLY
+        sure = frame.judged & seen.all(0) & torch.isfinite(mains).all(0).all(0) & single
+        some = bool(sure.any())  # without a car to plant a fault for nobody asks what can be reached
         return cls(
             frame=frame,
             looks=looks,
-            halton=tuple(map(frame.sighting, halton(feasible, HALTON, seed))),
-            corners=tuple(map(frame.sighting, corners(feasible, CORNERS, seed))),
+            halton=tuple(map(frame.sighting, halton(feasible, HALTON, seed))) if some else (),
+            corners=tuple(map(frame.sighting, corners(feasible, CORNERS, seed))) if some else (),
             benign=benign,
             farthest=off.amax(0),
             mostly=off.quantile(MOSTLY, 0),
-            sure=frame.judged & seen.all(0) & torch.isfinite(mains).all(0).all(0) & single,
+            sure=sure,
             factor=factor,
             shift=shift,
         )

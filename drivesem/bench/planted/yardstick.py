@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -84,9 +84,18 @@ class JudgedFrame:
 
 def methods_of(config: Bench) -> tuple[str, ...]:
     """The methods that a command names. Raises UsageError for one that is not known."""
-    names = tuple(dict.fromkeys(word.strip() for word in config.methods.split(",") if word.strip()))
-    if not names or not set(names) <= set(METHODS):
-        raise UsageError("--methods", f"names among {', '.join(METHODS)}, with commas", repr(config.methods))
+    return _names_among(METHODS, "--methods", config.methods)
+
+
+def naming_of(config: Bench) -> tuple[str, ...]:
+    """Those of its methods whose failures are to be told by rules. Raises UsageError for another one."""
+    return () if config.naming is None else _names_among(methods_of(config), "--naming", config.naming)
+
+
+def _names_among(known: Sequence[str], setting: str, text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    if not names or not set(names) <= set(known):
+        raise UsageError(setting, f"names among {', '.join(known)}, with commas", repr(text))
     return names
 
 
@@ -109,12 +118,15 @@ def attack_settings(config: Bench, method: str) -> Attack:
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What one process needs. workers: by method; kept: folder of what is done, by frame."""
+    """What one process needs. workers: by method; named: methods whose failures are to be told by rules; kept:
+    folder of what is done, by frame.
+    """
 
     config: Bench
     detector: Detector
     workers: Mapping[str, Worker]
     kinds: tuple[FaultKind, ...]
+    named: tuple[str, ...]
     kept: Path | None
 
     @classmethod
@@ -129,7 +141,7 @@ class Yardstick:
         first = Worker.of(attack_settings(config, methods[0]), detector)
         workers = {method: first.beside(attack_settings(config, method)) for method in methods}
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
-        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, kept)
+        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, naming_of(config), kept)
 
     def judge(self, name: str) -> JudgedFrame:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
@@ -170,8 +182,9 @@ class Yardstick:
                 grader = grader_of(worker.config, detector)
                 attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
                 attempts.append(self._attempt(name, method, planting, survey, attacked))
-        if self.config.naming:
-            attempts += [self._control(name, method, w.search(name, scene)) for method, w in self.workers.items()]
+        attempts += [
+            self._control(name, method, self.workers[method].search(name, scene)) for method in self.named
+        ]
         return JudgedFrame(name, tuple(attempts), tuple(unplanted))
 
     def _kinds_of(self, name: str) -> list[FaultKind]:
@@ -205,7 +218,7 @@ class Yardstick:
             passes=attacked.passes,
             seconds=round(attacked.seconds, 2),
         )
-        if not found or not self.config.naming:
+        if not found or method not in self.named:
             return attempt
         where, passes = told_of(attacked, found[0], Holes.samples, self.config.seed)
         whole, in_part = agrees(where, planting.fault, survey.bands_by_label(planting.fault))

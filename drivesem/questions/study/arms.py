@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.protocol import follows_paper
 from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
+from scene_ir import files
+from scene_ir.errors import FormatError
 
 QUICK_FRAMES, FRAMES = 6, 200
 """Frames of a study with --quick, and without."""
@@ -23,6 +26,8 @@ RANDOM, PLACEBO = "random", "placebo"
 one random edit as large as the attack's own."""
 _LONGER = 4
 """Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
+FIGURES = "study.json"
+"""A study's figures, in its folder."""
 SEARCHES = ("climb", "corners", "si-fgsm", "apgd", "halton", "cma-es")
 """Methods of the study `searches`; the placebo is as large as what the first finds."""
 _FAR = 2
@@ -137,12 +142,27 @@ def _grades(base: Attack, out: Path) -> list[Arm]:
 
 
 def _searches(base: Attack, study: Study, out: Path) -> list[Arm]:
-    """Methods that look for failures of the same parameters, at as many passes each."""
+    """Methods that look for failures of the same parameters, at as many passes each, or at as many seconds."""
     combo = DEFAULT_COMBO if study.params is None else None
-    config = replace(base, combo=combo, params=study.params, passes=study.passes)
-    first, *others = (_arm(method, replace(config, method=method)) for method in SEARCHES)
+    config = replace(base, combo=combo, params=study.params)
+    passes = dict.fromkeys(SEARCHES, study.passes) if study.pace is None else _paced(study.passes, study.pace)
+    first, *others = (_arm(name, replace(config, method=name, passes=passes[name])) for name in SEARCHES)
     (searching, placebo) = _controlled([first], out, (PLACEBO,))
     return [searching, *others, replace(placebo, config=replace(placebo.config, passes=None))]
+
+
+def _paced(passes: int, folder: str) -> dict[str, int]:
+    """Passes by method, of which as many take as long as the slowest method's, by what a study's frames took."""
+    study = Path(folder) / FIGURES
+    try:
+        rows = {row["name"]: float(row["seconds"]) for row in files.read_json(study)["searches"]}
+        seconds = {name: rows[name] for name in SEARCHES}
+    except (TypeError, KeyError, ValueError) as error:
+        raise FormatError(f"{study}: searches", f"seconds of {', '.join(SEARCHES)}", error) from error
+    if not all(0 < own < math.inf for own in seconds.values()):
+        raise FormatError(f"{study}: searches", "positive seconds", seconds)
+    slowest = max(seconds.values())
+    return {name: round(passes * slowest / own) for name, own in seconds.items()}
 
 
 def _samples(base: Attack, study: Study) -> list[Arm]:

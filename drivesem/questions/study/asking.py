@@ -14,7 +14,7 @@ from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study import report, retrain, retrain_report, transfer
-from drivesem.questions.study.arms import arms_of
+from drivesem.questions.study.arms import FIGURES, arms_of
 from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
@@ -33,12 +33,12 @@ from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line
 from drivesem.truth.redraw.choose import SecondRenderers
 
-_PICTURE, _FIGURES, _LARGEST = "study.png", "study.json", "largest.jpg"
+_PICTURE, _LARGEST = "study.png", "largest.jpg"
 _TABLES = (
     "study.md",
     *(f"{name}.csv" for name in ("study", "curves", "label_sets", "grades", "searches", "standing")),
 )
-_WRITTEN = (*(_PICTURE, _FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
+_WRITTEN = (*(_PICTURE, FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
 _FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
 _FREE_IN_RETRAIN = (

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from scene_ir.raster.kernels import Taps
 from scene_ir.raster.launch import start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import model
+from scene_ir.render.kernels.lookups import sums_of_dark
 from scene_ir.render.kernels.shading import inside_weight, rect_of, taps_at
 
 start_warp()
@@ -26,13 +26,14 @@ EXTENDED = wp.constant(wp.vec2f(*model.SHADOW_EXTENDED_PX))
 
 @wp.struct
 class Ground:
-    """Photographed shadows: what they take away, three numbers a texel, and where the crops lie; from a pixel (x, y, 1)
-    to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then, over w now.
+    """Photographed shadows: what they take away, three numbers a texel and a 0, and where the crops lie; from a pixel
+    (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then,
+    over w now.
     """
 
     inside: wp.array(dtype=wp.mat33d)
     then: wp.array(dtype=wp.mat33d)
-    dark: wp.array(dtype=wp.vec3f)
+    dark: wp.array(dtype=wp.vec4f)
     rects: wp.array2d(dtype=wp.int64)
     offsets: wp.array(dtype=wp.int64)
     frame_wh: wp.array(dtype=wp.vec2f)
@@ -50,12 +51,6 @@ def ground_place(ground: Ground, o: int, x: int, y: int):
             if r[2] > wp.float64(NEAR) * q[2]:
                 out = wp.vec3f(wp.float32(r[0] / r[2]), wp.float32(r[1] / r[2]), 1.0)
     return out
-
-
-@wp.func
-def dark_row(dark: wp.array(dtype=wp.vec3f), row: int, t: Taps, w: wp.vec4f):
-    low = dark[row + t.columns[0]] * w[0] + dark[row + t.columns[1]] * w[1]
-    return low + (dark[row + t.columns[2]] * w[2] + dark[row + t.columns[3]] * w[3])
 
 
 @wp.func
@@ -83,11 +78,8 @@ def shadow_kernel(start: int, table: wp.array(dtype=wp.vec4i), ground: Ground, o
         uv = in_frame(wp.vec2f(place[0], place[1]), wh)
         if reached(uv, rect):
             t = taps_at(uv, rect, ground.offsets[at[0]], False)
-            dark = dark_row(ground.dark, t.rows[0], t, t.wx) * t.wy[0]
-            dark += dark_row(ground.dark, t.rows[1], t, t.wx) * t.wy[1]
-            dark += dark_row(ground.dark, t.rows[2], t, t.wx) * t.wy[2]
-            dark += dark_row(ground.dark, t.rows[3], t, t.wx) * t.wy[3]
-            factor = factor - dark * inside_weight(place[0], place[1], wh, EXTENDED)
+            dark = sums_of_dark(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)[0]
+            factor = factor - wp.vec3f(dark[0], dark[1], dark[2]) * inside_weight(place[0], place[1], wh, EXTENDED)
     out[i] = factor
 
 
@@ -118,18 +110,11 @@ def shadow_backward_kernel(
         uv = in_frame(flat, wh)
         if reached(uv, rect):
             t = taps_at(uv, rect, ground.offsets[o], False)
-            dark = float(0.0)
-            to_u = float(0.0)
-            to_v = float(0.0)
-            for k in range(4):
-                e0 = wp.dot(g, ground.dark[t.rows[k] + t.columns[0]])
-                e1 = wp.dot(g, ground.dark[t.rows[k] + t.columns[1]])
-                e2 = wp.dot(g, ground.dark[t.rows[k] + t.columns[2]])
-                e3 = wp.dot(g, ground.dark[t.rows[k] + t.columns[3]])
-                along = e0 * t.wx[0] + e1 * t.wx[1] + e2 * t.wx[2] + e3 * t.wx[3]
-                dark += t.wy[k] * along
-                to_v += t.sy[k] * along
-                to_u += t.wy[k] * (e0 * t.sx[0] + e1 * t.sx[1] + e2 * t.sx[2] + e3 * t.sx[3])
+            sums = sums_of_dark(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)
+            along = wp.vec4f(g[0], g[1], g[2], 0.0)
+            dark = wp.dot(along, sums[0])
+            to_u = wp.dot(along, sums[1])
+            to_v = wp.dot(along, sums[2])
             if uv[0] != place[0]:
                 to_u = float(0.0)
             if uv[1] != place[1]:

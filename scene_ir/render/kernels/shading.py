@@ -17,11 +17,11 @@ from scene_ir.raster.launch import start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import channels as ch
 from scene_ir.render import model
+from scene_ir.render.kernels.lookups import sums_of_texels, texel_type
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "max_unroll": ch.OWN})
 
-texel_type = wp.types.vector(length=ch.TEXEL, dtype=wp.float32)
 look_type = wp.types.vector(length=ch.LOOK, dtype=wp.float32)
 own_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -378,18 +378,6 @@ def fill_backward_kernel(start: int, pixels: Pixels, looks: Looks, grads: Gradie
 # --------------------------------------------------------------------------------------- looking up the photograph
 
 
-@wp.func
-def sample(texels: wp.array(dtype=texel_type), t: Taps):
-    out = texel_type()
-    for k in range(4):
-        a = texels[t.rows[k] + t.columns[0]]
-        b = texels[t.rows[k] + t.columns[1]]
-        c = texels[t.rows[k] + t.columns[2]]
-        d = texels[t.rows[k] + t.columns[3]]
-        out += ((a * t.wx[0] + b * t.wx[1]) + (c * t.wx[2] + d * t.wx[3])) * t.wy[k]
-    return out
-
-
 @wp.struct
 class Sampled:
     """A texel between texels, and how it changes along u and v."""
@@ -400,17 +388,17 @@ class Sampled:
 
 
 @wp.func
+def sample(texels: wp.array(dtype=texel_type), t: Taps):
+    return sums_of_texels(texels, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)[0]
+
+
+@wp.func
 def sample_both(texels: wp.array(dtype=texel_type), t: Taps):
+    sums = sums_of_texels(texels, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)
     out = Sampled()
-    for k in range(4):
-        a = texels[t.rows[k] + t.columns[0]]
-        b = texels[t.rows[k] + t.columns[1]]
-        c = texels[t.rows[k] + t.columns[2]]
-        d = texels[t.rows[k] + t.columns[3]]
-        along = (a * t.wx[0] + b * t.wx[1]) + (c * t.wx[2] + d * t.wx[3])
-        out.value += along * t.wy[k]
-        out.to_v += along * t.sy[k]
-        out.to_u += ((a * t.sx[0] + b * t.sx[1]) + (c * t.sx[2] + d * t.sx[3])) * t.wy[k]
+    out.value = sums[0]
+    out.to_u = sums[1]
+    out.to_v = sums[2]
     return out
 
 

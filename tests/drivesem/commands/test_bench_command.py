@@ -172,7 +172,7 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert (summed["found"], summed["faults"], summed["found_per_100"]) == (2, 2, 2.0)
     assert result["kinds"][1]["planted"] == 0
     capsys.readouterr()
-    assert main([*words, "--out", str(tmp_path), "--faults", "1", "--naming"]) == 0
+    assert main([*words, "--out", str(tmp_path), "--faults", "1", "--naming", "halton"]) == 0
     assert len(asked) == 4, "other settings, other frames"
     assert "4 attacks of 90 passes" in capsys.readouterr().err
 
@@ -181,6 +181,10 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     ("words", "message"),
     [
         (["planted", "--methods", "halton,luck"], "--methods: expected names among"),
+        (
+            ["planted", "--methods", "halton,climb", "--naming", "corners"],
+            "--naming: expected names among halton, climb",
+        ),
         (["planted", "--passes", "3"], "--passes: expected at least"),
         (
             ["step", "--dataset", "kitti", "--root", "."],

@@ -1,14 +1,16 @@
 """Which attacks a study compares."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from drivesem.questions.study.arms import FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, SEARCHES, arms_of
+from drivesem.questions.study.arms import FIGURES, FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, SEARCHES, arms_of
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.protocol import PROTOCOL
 from drivesem.settings.commands import Study
+from scene_ir.errors import FormatError
 
 OUT = Path("out")
 NAMES = ("single", "multi", "samples", "steps", "labels")
@@ -92,6 +94,31 @@ def test_searches_take_as_many_passes_each() -> None:
     assert {arm.config.passes for arm in arms[:-1]} == {40}
     assert {(arm.config.params, arm.config.combo) for arm in arms} == {("color", None)}
     assert {arm.config.combo for arm in arms_of(Study(name="searches"), OUT)} == {2}
+
+
+def test_searches_take_as_many_seconds_each(tmp_path: Path) -> None:
+    """Twice as many passes where a method took half as long as the slowest."""
+    rows = [{"name": name, "seconds": 10.0 if name == "apgd" else 20.0} for name in (*SEARCHES, "climb placebo")]
+    (tmp_path / FIGURES).write_text(json.dumps({"searches": rows}))
+    arms = arms_of(Study(name="searches", passes=40, pace=str(tmp_path)), OUT)
+    passes = {arm.name: arm.config.passes for arm in arms[:-1]}
+    assert passes == dict.fromkeys(SEARCHES, 40) | {"apgd": 80}
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        "[]",
+        "{}",
+        '{"searches": [3]}',
+        '{"searches": [{"name": "climb", "seconds": 2.0}]}',
+        json.dumps({"searches": [{"name": name, "seconds": 0} for name in SEARCHES]}),
+    ],
+)
+def test_a_pace_without_seconds_is_refused(told: str, tmp_path: Path) -> None:
+    (tmp_path / FIGURES).write_text(told)
+    with pytest.raises(FormatError, match=r"study\.json: searches: expected"):
+        arms_of(Study(name="searches", pace=str(tmp_path)), OUT)
 
 
 @pytest.mark.parametrize("name", ["samples", "steps", "grades", "searches"])
