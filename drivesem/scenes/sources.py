@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from scene_ir.derender.derender import DerenderSettings
 
 DEMO_SCENES = 10
-_GENERATOR = ("drivesem.synth.kernels", "drivesem.synth.mesh_kernels")
-"""Modules of the kernels that the embedded scenes are generated with."""
 _MOST_FACES = 5000
 """Of a user's mesh, as of the heaviest template: more show in no photograph, and cost time in every fit."""
 
@@ -168,6 +166,7 @@ def open_source(config: Scenes) -> SceneSource:
 
 def make_ready(config: Scenes) -> None:
     """Compile or load, together, the kernels that draw the source's frames, before a frame asks for them."""
+    from drivesem.synth import kernels, mesh_kernels
     from scene_ir.render.kernels import ready
 
-    ready.make_ready(_GENERATOR if config.dataset == DEMO else ())
+    ready.make_ready((kernels, mesh_kernels) if config.dataset == DEMO else ())

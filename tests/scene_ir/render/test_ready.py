@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 
-from scene_ir.render.kernels import ready
+from scene_ir.render.kernels import colour, ready
 
 
 @pytest.mark.parametrize("takes_long", [True, False])
@@ -25,10 +25,10 @@ def test_all_modules_are_loaded_at_once_and_a_long_wait_is_told(
 
     monkeypatch.setattr(wp, "force_load", force_load)
     monkeypatch.setattr(ready, "_LONG_S", 0.05 if takes_long else 30.0)
-    ready.make_ready(["scene_ir.render.kernels.colour"])
+    ready.make_ready([colour])
     ((device, names, workers),) = asked
     assert device == "cpu"
-    assert names == ["scene_ir.render.kernels.colour", *ready.PICTURES]
+    assert names == [module.__name__ for module in (colour, *ready.PICTURES)]
     assert workers >= 1
     told = capsys.readouterr()
     assert told.out == ""
@@ -43,7 +43,7 @@ ready.make_ready()
 def loaded():
     return {name for name, module in wp._src.context.user_modules.items() if module.execs}
 before = loaded()
-assert before >= set(ready.PICTURES), before
+assert before >= {module.__name__ for module in ready.PICTURES}, before
 from drivesem.bench.scenes import bench_scene
 from scene_ir.render.compositor import Compositor
 scene = bench_scene(1, 2000, 0).scene
