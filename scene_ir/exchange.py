@@ -105,6 +105,34 @@ def with_other(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
     return changed(wider, scene, objects, f"{vehicle.mesh.name} in the place of objects[{row}]")
 
 
+@torch.no_grad()
+def with_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
+    """The scene with a load on the roof of the vehicle in `row`, of which the photograph shows all else. load: a
+    mesh in the unit box of that vehicle, and above it; it moves and bends with the vehicle. Raises as `without`.
+    """
+    _check(scene, row)
+    objects, source = scene.objects, scene.objects.source[row]
+    own = scene.meshes[int(objects.mesh_index[row])]
+    bare = replace(objects, source=(), **{n: getattr(objects, n)[row : row + 1] for n in _TENSORS})
+    bare = replace(bare, mesh_index=torch.zeros_like(bare.mesh_index))
+    top, body = (_alone(scene, bare, mesh) for mesh in (load, own))
+    size = (scene.camera.height, scene.camera.width)
+    frame = (0, 0, size[1], size[0])
+    nearer = texture.crop_of(top.nearness, frame, size) >= texture.crop_of(body.nearness, frame, size)
+    rgba = texture.crop_of(top.rgba, frame, size) * nearer
+    whole = rgba + (1.0 - rgba[3:]) * texture.crop_of(source.foreground, frame, size)
+    rows, columns = ((whole[3] > 0).any(dim=side).nonzero()[:, 0] for side in (1, 0))
+    y0, x0 = int(rows[0]), int(columns[0])
+    values = whole[:, y0 : int(rows[-1]) + 1, x0 : int(columns[-1]) + 1]
+    sources = list(objects.source)
+    sources[row] = replace(source, foreground=Crop(values.to(scene.background).contiguous(), x0, y0))
+    index = objects.mesh_index.clone()
+    index[row] = len(scene.meshes)
+    loaded = replace(scene, meshes=(*scene.meshes, _together(own, load)))
+    words = f"{load.name} on the roof of objects[{row}]"
+    return changed(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), words)
+
+
 def changed(scene: SceneIR, before: SceneIR, objects: Objects, words: str) -> SceneIR:
     """`scene` with other objects, after `before`. words: what was done, for people."""
     said = {**scene.provenance, CHANGE: words}
@@ -150,35 +178,51 @@ def _drawn(scene: SceneIR, vehicle: Vehicle) -> _Here:
     """A vehicle in the scene's light, as if it had been photographed: in the finish and the sunlight of the
     others, with a shadow as dark as theirs.
     """
-    mesh = _painted(vehicle.mesh, vehicle.paint)
-    whole = Compositor(scene.at_rest())
-    sources = scene.objects.source
-    sunlight = sources[0].sunlight if sources else model.SUNLIGHT
-    gain, lift = _exposure(scene, whole, vehicle)
+    mesh, sources = _painted(vehicle.mesh, vehicle.paint), scene.objects.source
+    here = _Here(vehicle, mesh, _blank(vehicle, mesh, _sunlight(scene)))
+    row = replace(_row(here, 0, scene), source=())
+    alone = _alone(scene, row, mesh)
+    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))[0]
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
-    here = _Here(vehicle, mesh, _blank(vehicle, mesh, sunlight))
-    objects = replace(_row(here, 0, scene), source=())
-    alone = replace(scene, meshes=(mesh,), objects=objects, front=(), before=None)
-    compositor = Compositor(alone)
-    compositor.sunlight.fill_(sunlight)
+    dark = (1.0 - shadow.values) * _darkness([sources[i] for i in nearest])
+    source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark))
+    return replace(here, source=source)
+
+
+@dataclass(frozen=True, slots=True)
+class _Alone:
+    """One object drawn by itself. rgba: Crop (4, h, w), premultiplied; nearness: Crop (1, h, w), 1 / m, 0 beside
+    it.
+    """
+
+    rgba: Crop
+    nearness: Crop
+
+
+def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
+    """`row`, one object of `mesh` that no photograph shows, in the scene's light."""
+    compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))
+    compositor.sunlight.fill_(_sunlight(scene))
     layers = compositor.layers(compositor.scene.objects)
     (packed, size), (x0, y0) = layers.layout.spans()[0], layers.layout.rects[0, :2].tolist()
     opacity = layers.opacity[packed, None].clamp(0.0, 1.0)
     light = layers.colour[packed, :3] / opacity.clamp(min=model.LEAST_ALPHA)
+    gain, lift = _exposure(scene, row.translation[0], row.size_lhw[0])
     colour = texture.finished(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
-    values = torch.cat([colour, opacity], dim=1).T.reshape(4, *size).to(scene.background)
-    foreground = Crop(values.contiguous(), x0, y0)
-    shadow = analytic_shadows(alone)[0]
-    dark = (1.0 - shadow.values) * _darkness([sources[i] for i in nearest])
-    source = replace(here.source, foreground=foreground, shadow=replace(shadow, values=1.0 - dark))
-    return replace(here, source=source)
+    values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
+    values = values.to(scene.background).contiguous()
+    return _Alone(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
 
 
-def _exposure(scene: SceneIR, whole: Compositor, vehicle: Vehicle) -> tuple[float, float]:
+def _sunlight(scene: SceneIR) -> float:
+    return scene.objects.source[0].sunlight if scene.objects.source else model.SUNLIGHT
+
+
+def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, float]:
     """Gain and lift as of `finish.exposure`: the medians of the others, of the gain as large a multiple of what
     the road shows where each stands, which differs along a street, in the shade of a house.
     """
-    objects = scene.objects
+    objects, whole = scene.objects, Compositor(scene.at_rest())
     gains, lifts = [], []
     for i, (surface, samples) in enumerate(zip(whole.fleet.surfaces, whole.samples(), strict=True)):
         found = finish.exposure(surface, samples)
@@ -187,7 +231,7 @@ def _exposure(scene: SceneIR, whole: Compositor, vehicle: Vehicle) -> tuple[floa
             lifts.append(found[1])
     if not gains:
         return 1.0, 0.0
-    gain = float(np.median(gains)) * _road_light(scene, vehicle.translation, vehicle.size_lhw)
+    gain = float(np.median(gains)) * _road_light(scene, place, size_lhw)
     return min(gain, _MOST_GAIN), float(np.median(lifts))
 
 
@@ -218,6 +262,21 @@ def _darkness(sources: Sequence[Source]) -> float:
     """
     shadows = (source.shadow.values for source in sources if source.shadow is not None)
     return next((float((1.0 - s).mean(dim=0).max()) for s in shadows if s.numel()), _STREET_SHADOW)
+
+
+def _together(body: Mesh, load: Mesh) -> Mesh:
+    """Two meshes in one unit box as one."""
+    both = (body, load)
+    grey = (
+        mesh.vertices.new_full(mesh.vertices.shape, 0.7) if mesh.colours is None else mesh.colours for mesh in both
+    )
+    return Mesh(
+        vertices=torch.cat([mesh.vertices for mesh in both]),
+        faces=torch.cat([body.faces, load.faces + len(body.vertices)]),
+        part=torch.cat([mesh.part for mesh in both]),
+        name=f"{body.name} with {load.name}",
+        colours=torch.cat(list(grey)),
+    )
 
 
 def _painted(mesh: Mesh, paint: tuple[float, float, float] | None) -> Mesh:

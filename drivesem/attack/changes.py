@@ -22,6 +22,7 @@ from scene_ir import exchange
 from scene_ir.errors import FormatError
 from scene_ir.exchange import Vehicle
 from scene_ir.meshes.load import Imported, import_mesh
+from scene_ir.meshes.loads import LOADS, load
 from scene_ir.meshes.templates import template, typical_size_lhw
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -55,13 +56,14 @@ _BESIDE = (0.4, 1.2)
 
 
 class Change(StrEnum):
-    """What may be proposed. leave: a car is gone; park: one more stands there; swap: another vehicle in its
-    place.
+    """What may be proposed. leave: a car is gone; park: one more stands there; swap: another vehicle in its place;
+    load: a box, cases or a crate on its roof.
     """
 
     LEAVE = "leave"
     PARK = "park"
     SWAP = "swap"
+    LOAD = "load"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class Changes:
 
 
 def parse_changes(text: str) -> tuple[Change, ...]:
-    """Changes from "leave,park,swap". Raises FormatError naming the unknown one and the known ones."""
+    """Changes from "leave,park,swap,load". Raises FormatError naming the unknown one and the known ones."""
     names = [part.strip() for part in text.split(",")]
     for name in names:
         if name not in list(Change) or names.count(name) > 1:
@@ -132,6 +134,13 @@ def _attempts(
         row = int(rng.choice(rows))
         if change is Change.LEAVE:
             yield exchange.without(scene, row)
+            continue
+        if change is Change.LOAD:
+            car = scene.meshes[int(scene.objects.mesh_index[row])]
+            if int(scene.objects.category[row]) == Category.CAR:
+                yield exchange.with_load(
+                    scene, row, load(str(rng.choice(LOADS)), car, scene.objects.size_lhw[row])
+                )
             continue
         category = Category(int(scene.objects.category[row]))
         if category not in _KINDS:

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.exchange import CHANGE, Vehicle, with_other, with_vehicle, without
+from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene
+from scene_ir.meshes.loads import LOADS, load
 from scene_ir.meshes.templates import template
 from scene_ir.removal import without_objects
 from scene_ir.render.compositor import Compositor
@@ -168,3 +169,45 @@ def test_what_cannot_be_changed_is_refused(scene: SceneIR) -> None:
         with_vehicle(scene.with_objects(source=()), vehicle(BEFORE_ANOTHER))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ShapeError, match="before"):
         replace(scene, before=without_objects(scene, [0]))
+
+
+def test_a_load_stands_on_its_car_and_nothing_else_changes(scene: SceneIR) -> None:
+    row = 1
+    box = load("crate", scene.meshes[row], scene.objects.size_lhw[row])
+    loaded = with_load(scene, row, box)
+    before, after = (Compositor(s).render(s) for s in (scene, loaded))
+    changed = (before.image - after.image).abs().amax(0) > 1e-3
+    assert int(changed.sum()) > 100
+    own = after.object_id == row + 1
+    near = torch.nn.functional.max_pool2d(own[None].float(), 3, 1, 1)[0]  # edges are no pixel's own
+    assert float(near[changed].mean()) > 0.98
+    # It is above the car, and on it: of its columns hardly one shows a gap.
+    columns = (changed & own).any(0).nonzero()[:, 0]
+    gaps = [int((~own[:, x])[own[:, x].nonzero().min() : own[:, x].nonzero().max()].sum()) for x in columns]
+    assert sum(gap > 2 for gap in gaps) < 0.3 * len(gaps)
+    top = int(own.any(1).nonzero().min())
+    assert top < int((before.object_id == row + 1).any(1).nonzero().min()) - 3
+    assert len(loaded.meshes) == len(scene.meshes) + 1
+
+
+def test_a_load_goes_where_its_car_goes(scene: SceneIR) -> None:
+    loaded = with_load(scene, 1, load("roof box", scene.meshes[1], scene.objects.size_lhw[1]))
+    step = torch.zeros(3, 3)
+    step[1, 0] = 0.5
+    tops = []
+    for state in (loaded, loaded.with_objects(translation=loaded.objects.translation + step)):
+        own = Compositor(state).render(state).object_id == 2
+        tops.append(own[: int(own.any(1).nonzero().min()) + 3].any(0).nonzero().float().mean())
+    assert 3 < float(tops[1] - tops[0]) < 8  # 0.5 m at 10.5 m and 110 px
+
+
+@pytest.mark.parametrize("kind", LOADS)
+def test_a_load_is_above_the_roof_and_within_the_car(kind: str) -> None:
+    made = load(kind, template("sedan"), (4.5, 1.45, 1.8))
+    low, high = made.vertices.amin(0), made.vertices.amax(0)
+    assert -1.5 < float(low[1]) < -1.15
+    assert -1 < float(high[1]) < -0.9
+    assert float(low[0]) > -0.5
+    assert float(high[0]) < 0.5
+    assert float(high[2]) == pytest.approx(-float(low[2]), abs=1e-4)
+    assert float(high[2]) < 0.45

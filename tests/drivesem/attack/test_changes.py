@@ -10,8 +10,9 @@ from drivesem.attack.changes import Change, Changes, affordable, parse_changes, 
 from drivesem.attack.feasibility_check import check_exchange, check_scene
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from scene_ir.errors import FormatError
-from scene_ir.exchange import CHANGE, Vehicle, with_other, with_vehicle, without
+from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
 from scene_ir.meshes.load import save_mesh
+from scene_ir.meshes.loads import load
 from scene_ir.meshes.templates import template
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR
@@ -37,16 +38,13 @@ def labels_of(changed: SceneIR):
 
 @pytest.fixture(scope="module")
 def proposed(scene: SceneIR) -> list[SceneIR]:
-    return proposals(scene, Changes(tuple(Change)), 3, 7)
+    return proposals(scene, Changes(tuple(Change)), 4, 7)
 
 
 def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR]) -> None:
     words = [made.provenance[CHANGE] for made in proposed]
-    assert [any(w in text for text in words) for w in ("is gone", "parks as", "in the place of")] == [
-        True,
-        True,
-        True,
-    ]
+    wanted = ("is gone", "parks as", "in the place of", "on the roof")
+    assert all(word in text for word, text in zip(wanted, words, strict=True))
     for made in proposed:
         assert made.origin.photograph is scene.photograph
         assert check_exchange(made) == []
@@ -54,7 +52,7 @@ def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR
 
 
 def test_the_same_seed_proposes_the_same(scene: SceneIR, proposed: list[SceneIR]) -> None:
-    again = proposals(scene, Changes(tuple(Change)), 3, 7)
+    again = proposals(scene, Changes(tuple(Change)), 4, 7)
     for one, other in zip(proposed, again, strict=True):
         assert one.provenance == other.provenance
         assert torch.equal(one.objects.translation, other.objects.translation)
@@ -72,6 +70,19 @@ def test_labels_follow(scene: SceneIR) -> None:
     assert not labels.ignore[row]
     rest = [i for i in range(len(scene.objects)) if i != row]
     assert torch.equal(labels.boxes_xyxy[rest], scene.objects.box2d[rest])
+
+
+def test_a_load_on_the_roof_is_part_of_its_cars_label(scene: SceneIR) -> None:
+    row = 5
+    car = scene.meshes[int(scene.objects.mesh_index[row])]
+    loaded = with_load(scene, row, load("crate", car, scene.objects.size_lhw[row]))
+    _, labels = labels_of(loaded)
+    grown = (labels.boxes_xyxy - scene.objects.box2d)[row]
+    assert grown[1] < -8
+    assert grown[[0, 2, 3]].abs().max() < 1
+    higher = to_kitti_labels(labels, loaded.origin, loaded).size_lhw[row, 1] - scene.objects.size_lhw[row, 1]
+    assert 0.3 < float(higher) < 0.6
+    assert check_exchange(loaded) == []
 
 
 def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
@@ -119,7 +130,7 @@ def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
 
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
 def test_what_is_no_change_is_named(text: str) -> None:
-    with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap"):
+    with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap, load"):
         parse_changes(text)
 
 
