@@ -41,7 +41,7 @@ from drivesem.run.manifest import manifest_of
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
-from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
+from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
 from drivesem.settings.blocks import FrameCommand
 from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
@@ -99,6 +99,8 @@ def _attacked(
     names, without_vehicles, failed = selected
     config = worker.config
     todo = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
+    if todo and config.backend == "warp" and config.device == "cpu":
+        make_ready(config)
     work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
     answers = ask(todo, work, build, config, Bar("attacking frames"))
     failed = failed | answers.failed
