@@ -17,6 +17,7 @@ from torch import Tensor
 
 from drivesem.attack.feasibility_check import check_exchange
 from drivesem.attack.labels import Labeller
+from drivesem.attack.methods.margin_search import LEAST_PASSES
 from drivesem.attack.space import ground_axes
 from scene_ir import exchange
 from scene_ir.errors import FormatError
@@ -97,10 +98,11 @@ def vehicle_mesh(path: str) -> Imported:
 
 
 def affordable(passes: int) -> int:
-    """How many proposals an attack of so many passes sees: a pass for each scene before the change, and its
-    draws.
+    """How many proposals an attack of so many passes sees, beside the scene as it is: each costs a pass for the
+    picture before it, and its draws.
     """
-    return min(int(_SHARE * passes) // (DRAWS + 1), _MOST)
+    spare = min(int(_SHARE * passes), passes - LEAST_PASSES)
+    return min(max(spare // (DRAWS + 1) - 1, 0), _MOST)
 
 
 @torch.no_grad()
