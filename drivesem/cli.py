@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import signal
 import sys
@@ -77,7 +78,12 @@ def _is_bad_input(error: Exception) -> bool:
 
 def _run(config: Command) -> int:
     name = next(name for name, kind in COMMANDS.items() if type(config) is kind)
-    run: Callable[[Command], int] = importlib.import_module(_MODULES.format(name.replace("-", "_"))).run
+    gc.disable()  # libraries make half a million objects as they load, and none of them is garbage
+    try:
+        run: Callable[[Command], int] = importlib.import_module(_MODULES.format(name.replace("-", "_"))).run
+    finally:
+        gc.enable()
+    gc.freeze()
     return run(config)
 
 

@@ -5,6 +5,7 @@
     background.png    likewise
     arrays.npz        depth, maps, and the crops of what the photograph saw of each object, and in front of them
     meshes/0.glb      see `scene_ir.meshes.load`: opens in any viewer, keeps every bit of float32
+    before/           `SceneIR.before`, where there is one, in the same form
 
 A folder that was written by another version of the schema is refused, not guessed at.
 """
@@ -42,10 +43,10 @@ from scene_ir.types import (
 )
 
 SCHEMA = "drivesem.scene"
-VERSION = 3
+VERSION = 4
 """Raise it with every change that an older reader would misread."""
-_READ = (2, VERSION)
-"""Versions that are read; before the third, no sun was moved."""
+_READ = (2, 3, VERSION)
+"""Versions that are read; before the third, no sun was moved, before the fourth, no vehicle was exchanged."""
 
 _T = TypeVar("_T")
 _DTYPES = {str(d).removeprefix("torch."): d for d in (torch.float32, torch.float64, torch.int64, torch.int32)}
@@ -111,6 +112,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.front)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
             "ignore": _numbers(scene.ignore),
+            "before": scene.before is not None,
         }
         files.write_json(temporary / "scene.json", record)
         files.write_npz(temporary / "arrays.npz", arrays)
@@ -118,6 +120,8 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
         for i, mesh in enumerate(scene.meshes):
             _check_mesh(i, mesh)
             save_mesh(mesh, temporary / "meshes" / f"{i}.glb")
+        if scene.before is not None:
+            save_scene(scene.before, temporary / "before")
 
 
 def load_scene(folder: Path) -> SceneIR:
@@ -166,6 +170,8 @@ def load_scene(folder: Path) -> SceneIR:
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))
     ignore = root["ignore"]
     provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
+    changed = root["version"].value > 3 and root["before"].flag()
+    before = load_scene(folder / "before") if changed else None
     return root.build(
         lambda: SceneIR(
             camera=camera,
@@ -178,6 +184,7 @@ def load_scene(folder: Path) -> SceneIR:
             ignore=ignore.tensor(ignore.rows(), 4),
             provenance=provenance,
             front=front,
+            before=before,
         )
     )
 
@@ -291,6 +298,11 @@ class _Node:
 
     def text(self) -> str:
         return self._require(str, "text")
+
+    def flag(self) -> bool:
+        if not isinstance(self.value, bool):
+            raise FormatError(self.where, "true or false", repr(self.value))
+        return self.value
 
     def integer(self) -> int:
         return self._require(int, "an integer")

@@ -24,7 +24,8 @@ def without_objects(scene: SceneIR, rows: Collection[int], settings: RenderSetti
     What a removed vehicle hid of a farther one was known to be unseen because the nearer one's matte said so. That
     matte goes, so the farther one's foreground takes up what is drawn there today: the mirrored side or the
     template. Sources that nothing removed stood before keep every bit, as do photograph, background and maps.
-    Raises RangeError for a row that the scene does not have.
+    Of a scene after an exchange (`scene_ir.exchange`), what was before it is left behind. Raises RangeError for a
+    row that the scene does not have.
     """
     count = len(scene.objects)
     for row in rows:
@@ -35,10 +36,9 @@ def without_objects(scene: SceneIR, rows: Collection[int], settings: RenderSetti
         return scene
     sources = scene.objects.source
     if sources:
-        with torch.no_grad():
-            sources = _uncovered(scene, set(rows), settings)
+        sources = uncovered(scene, rows, settings)
     objects = _rows(scene.objects, kept, tuple(sources[row] for row in kept) if sources else ())
-    return replace(scene, objects=objects, provenance=_renumbered(scene.provenance, kept))
+    return replace(scene, objects=objects, provenance=_renumbered(scene.provenance, kept), before=None)
 
 
 def _rows(objects: Objects, kept: Sequence[int], source: tuple[Source, ...]) -> Objects:
@@ -59,9 +59,12 @@ def _renumbered(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str,
     return found
 
 
-def _uncovered(scene: SceneIR, removed: set[int], settings: RenderSettings | None) -> tuple[Source, ...]:
+@torch.no_grad()
+def uncovered(
+    scene: SceneIR, removed: Collection[int], settings: RenderSettings | None = None
+) -> tuple[Source, ...]:
     """The sources of all objects, those behind a removed one completed where it stood."""
-    photographed = scene.as_photographed()
+    photographed = scene.at_rest()
     objects, sources = photographed.objects, scene.objects.source
     order = blend.paint_order(
         objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)

@@ -290,6 +290,8 @@ class SceneIR:
     their shadows, and equal to the photograph elsewhere; depth: (H, W) m of the background, inf in the sky.
     ignore: (K, 4) px, xyxy, regions no detection is judged in (DontCare). provenance: where it came from.
     front: what may stand in front of vehicles: drawn over those behind it, and part of the background too.
+    before: the scene of which this is what became when a vehicle was exchanged, added or taken away; None where
+    none was. It has the same objects, row by row; one that is not there stands behind the camera (`in_view`).
     """
 
     camera: Camera
@@ -302,6 +304,7 @@ class SceneIR:
     ignore: Tensor
     provenance: Mapping[str, str] = field(default_factory=dict)
     front: tuple[Front, ...] = ()
+    before: SceneIR | None = None
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width
@@ -316,6 +319,11 @@ class SceneIR:
                 self._check_inside(f"objects.source[{i}].{name}", getattr(source, name))
         for i, thing in enumerate(self.front):
             self._check_inside(f"scene.front[{i}].foreground", thing.foreground)
+        if self.before is not None:
+            if self.before.before is not None:
+                raise RangeError("scene.before", "a scene without one", "a scene with one")
+            if len(self.before.objects) != len(self.objects):
+                raise ShapeError("scene.before.objects", f"{len(self.objects)} objects", len(self.before.objects))
 
     def _check_inside(self, name: str, crop: Crop | None) -> None:
         if crop is None:
@@ -333,10 +341,21 @@ class SceneIR:
         """The same scene with some fields of `environment` replaced."""
         return replace(self, environment=replace(self.environment, **changes))
 
+    @property
+    def origin(self) -> SceneIR:
+        """The scene before vehicles were exchanged, added or taken away; this one where none was."""
+        return self if self.before is None else self.before
+
     def as_photographed(self) -> SceneIR:
-        """The scene at theta0: every object where the photograph saw it, every code at 0.
+        """The scene that the photograph shows: `origin`, at rest.
 
         A saved counterexample thus carries the scene that it was made from. Needs `objects.source`.
+        """
+        return self.origin.at_rest()
+
+    def at_rest(self) -> SceneIR:
+        """The scene at theta0: every object at the geometry of its source, every code at 0. Vehicles that were
+        exchanged, added or taken away stay so. Needs `objects.source`.
         """
         source = self.objects.source
         if len(source) != len(self.objects):

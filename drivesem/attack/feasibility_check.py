@@ -42,6 +42,8 @@ SYMMETRY_TOLERANCE = 1e-5
 """Unit boxes: float32's rounding of lattice offsets, and no more."""
 ROAD_LOSS = 0.1
 ROAD_TOLERANCE = 0.05
+PARKED_ON_ROAD = 0.6
+"""Share of the footprint of a car that was not there before."""
 HEIGHT_KEPT = 0.6
 IN_FRAME = 0.5
 VISIBLE_TOLERANCE = 0.05
@@ -145,7 +147,34 @@ def check_scene(
         found += [f"objects[{i}]: {line}" for line in lines + _frame(base, old, new)]
     found += _collisions(dict(enumerate(before)), dict(enumerate(after)), judge)
     found += _hidden(base, before, after, judge)
+    found += check_exchange(perturbed, by)
     return found + (_weather(base, perturbed) + _unseen(base, perturbed, after) if joint_weather else [])
+
+
+def check_exchange(scene: SceneIR, by: JudgeName | None = None) -> list[str]:
+    """What is wrong with the vehicles that were exchanged, added or taken away, before anything else changed;
+    lines as of `check_scene`, nothing where none was. What there is stands on the road, or as far on it as what
+    stood there before, in no other car and hides none that was seen.
+    """
+    if scene.before is None:
+        return []
+    judge = _Outlines() if by == "outlines" else _judge()
+    base, rest = scene.before.at_rest(), scene.at_rest()
+    rows = range(len(rest.objects))
+    before, after = ([_Car(state, i) for i in rows] for state in (base, rest))
+    road = base.environment.road.numpy().astype(np.float64)
+    there = [i for i in rows if after[i].near > 0]
+    found = []
+    for i in there:
+        lines = _road(base, road, before[i], after[i])
+        if before[i].near < 0:
+            share = _road_share(base, road, after[i]) or 0.0
+            lines = [] if share >= PARKED_ON_ROAD else [f"off the road, {share:.2f} of its footprint on it"]
+            lines += _height(base, after[i], after[i])
+        found += [f"objects[{i}]: {line}" for line in lines]
+    found += _collisions({i: before[i] for i in there}, {i: after[i] for i in there}, judge)
+    hidden = _hidden(base, before, [car if car.near > 0 else before[i] for i, car in enumerate(after)], judge)
+    return [f"exchange: {line}" for line in (*found, *hidden)]
 
 
 def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list[str]:

@@ -62,7 +62,8 @@ class MovedLabels:
     ignore (N,) bool: too hard in the benign scene, or now. became_ignored (N,) bool: only now.
     became_counted (N,) bool: too hard in the benign scene, no longer now (still ignored, so that benign and
     attacked figures are over the same objects). out_of_sight (N,) bool: showed in the benign scene, and is behind
-    others now. regions_xyxy (K, 4) px: no detection is judged there.
+    others now. regions_xyxy (K, 4) px: no detection is judged there. in_view (N,) bool: not behind the camera,
+    where those stand that are not in the scene.
     """
 
     mode: LabelMode
@@ -75,6 +76,7 @@ class MovedLabels:
     became_counted: Tensor
     out_of_sight: Tensor
     regions_xyxy: Tensor
+    in_view: Tensor
 
     @property
     def targets(self) -> Targets:
@@ -99,10 +101,7 @@ class Labeller:
     ) -> None:
         self.base = base
         self.difficulty = difficulty or Difficulty()
-        outlines = {
-            index: _Outline.of(base.meshes[index]) for index in sorted(set(base.objects.mesh_index.tolist()))
-        }
-        self._outlines = [outlines[index] for index in base.objects.mesh_index.tolist()]
+        self._outlines: dict[int, tuple[Mesh, _Outline]] = {}
         objects, camera = base.objects, base.camera
         self._limit = np.array([camera.width - 1.0, camera.height - 1.0] * 2)
         self._boxes = self._project(base)
@@ -128,6 +127,7 @@ class Labeller:
             became_counted=torch.zeros_like(ignore),
             out_of_sight=torch.zeros_like(ignore),
             regions_xyxy=base.ignore.detach(),
+            in_view=torch.from_numpy(_any_area(self._boxes)).to(objects.translation.device),
         )
 
     def paper(self) -> MovedLabels:
@@ -139,6 +139,7 @@ class Labeller:
         if len(perturbed.objects) != len(self.base.objects):
             raise ShapeError("perturbed.objects", f"{len(self.base.objects)} objects", len(perturbed.objects))
         whole = self._project(perturbed)
+        in_view = _any_area(whole)
         inside = self._clipped(whole)
         boxes = self._box2d + (inside - self._inside).astype(self._box2d.dtype)
         boxes = np.minimum(np.maximum(boxes, self._lowest), self._highest)
@@ -151,13 +152,13 @@ class Labeller:
             hidden = _hidden_shares(render)
             occlusion = _new_occlusion(self._occlusion, self._hidden, hidden)
             gone = (hidden >= 1) & (self._hidden < 1)
-            out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS)
-        hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render)
+            out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS) & in_view
+        hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render) | ~in_view
         device = self._paper.boxes_xyxy.device
         return MovedLabels(
             mode="moved",
             boxes_xyxy=torch.from_numpy(boxes).to(device),
-            category=self._paper.category,
+            category=perturbed.objects.category,
             truncation=torch.from_numpy(truncation).to(device),
             occlusion=torch.from_numpy(occlusion).to(device),
             ignore=torch.from_numpy(self._ignore | hard).to(device),
@@ -165,6 +166,7 @@ class Labeller:
             became_counted=torch.from_numpy(self._ignore & ~hard).to(device),
             out_of_sight=torch.from_numpy(out_of_sight).to(device),
             regions_xyxy=self._paper.regions_xyxy,
+            in_view=torch.from_numpy(in_view).to(device),
         )
 
     def labels(self, mode: LabelMode, perturbed: SceneIR, render: Render | None = None) -> MovedLabels:
@@ -193,6 +195,12 @@ class Labeller:
             return np.zeros(len(self._box2d), np.bool_)
         return contrasts(render) < self.difficulty.min_contrast
 
+    def _outline(self, mesh: Mesh) -> _Outline:
+        # Kept beside its mesh, whose number would else be given to another one.
+        if id(mesh) not in self._outlines:
+            self._outlines[id(mesh)] = (mesh, _Outline.of(mesh))
+        return self._outlines[id(mesh)][1]
+
     def _project(self, scene: SceneIR) -> Array:
         """Tight boxes (N, 4) px of the deformed meshes, cut at the near plane, not at the image border."""
         objects = scene.objects
@@ -201,7 +209,8 @@ class Labeller:
         # Placing and projecting are affine: done to the lattice, they are done to all that it carries.
         control = to_clip(place(_LATTICE_AT_REST + offsets, size, yaw, translation), matrix)
         nets = control.transpose(1, 2).contiguous().numpy()
-        boxes = [outline.image_box(net) for outline, net in zip(self._outlines, nets, strict=True)]
+        meshes = [scene.meshes[index] for index in objects.mesh_index.tolist()]
+        boxes = [self._outline(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)
 
 
@@ -254,12 +263,15 @@ def _hidden_shares(render: Render) -> Array:
 def to_kitti_labels(
     labels: MovedLabels, base: SceneIR, perturbed: SceneIR, kinds: Sequence[str] | None = None
 ) -> Labels:
-    """Labels of one mode as a KITTI file holds them: `paper` with the base's 3D boxes, `moved` with the new ones.
+    """Labels of one mode as a KITTI file holds them: `paper` with the base's 3D boxes, `moved` with the new ones,
+    of objects that are in view.
 
     A moved 3D box follows the pose and the change of the deformed mesh's extents; where nothing changed it is the
     base's to the bit. kinds: the types as labelled (a Van counts as a Car); else those of the categories.
     """
     names = tuple(kinds) if kinds is not None else tuple(_kind(c) for c in labels.category.tolist())
+    rows = labels.in_view
+    names = tuple(name for name, seen in zip(names, rows.tolist(), strict=True) if seen)
     translation, yaw, size_lhw = base.objects.translation, base.objects.yaw, base.objects.size_lhw
     if labels.mode == "moved":
         low0, high0 = _unit_extents(base)
@@ -273,12 +285,12 @@ def to_kitti_labels(
         yaw = torch.where(yaw.abs() > torch.pi, yaw - turns * 2 * torch.pi, yaw)
     return Labels(
         kind=names,
-        boxes_xyxy=labels.boxes_xyxy,
-        truncation=labels.truncation,
-        occlusion=labels.occlusion,
-        translation=translation.detach(),
-        yaw=yaw.detach(),
-        size_lhw=size_lhw.detach(),
+        boxes_xyxy=labels.boxes_xyxy[rows],
+        truncation=labels.truncation[rows],
+        occlusion=labels.occlusion[rows],
+        translation=translation.detach()[rows],
+        yaw=yaw.detach()[rows],
+        size_lhw=size_lhw.detach()[rows],
         ignore_xyxy=labels.regions_xyxy,
     )
 
@@ -352,6 +364,10 @@ class _Outline:
 def _outside(whole_xyxy: Array, inside_xyxy: Array) -> Array:
     """Share (N,) of each box that the image's border cuts off."""
     return 1 - _area(inside_xyxy) / np.maximum(_area(whole_xyxy), 1e-9)
+
+
+def _any_area(boxes_xyxy: Array) -> NDArray[np.bool_]:
+    return _area(boxes_xyxy) > 0
 
 
 def _area(boxes_xyxy: Array) -> Array:

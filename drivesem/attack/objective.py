@@ -87,11 +87,12 @@ class Objective:
         self.aim = aim
         self.difficulty = difficulty or Difficulty()
         with torch.no_grad():
-            base_render = compositor.render(space.apply(space.scene, space.theta0))
-        self._labeller = Labeller(space.scene, base_render, self.difficulty)
+            base_render = compositor.render(space.apply(space.scene, space.theta0).origin)
+        base = space.scene.origin
+        self._labeller = Labeller(base, base_render, self.difficulty)
         self._whole = True  # the reference comes first
         self._reference: Reference | None = None
-        self._benign = self._judged(space.scene, base_render)
+        self._benign = self._judged(base, base_render)
         self._whole = whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
@@ -105,7 +106,9 @@ class Objective:
 
     @property
     def benign(self) -> Rendered:
-        """The scene at theta = 0, re-rendered."""
+        """The scene at theta = 0, re-rendered; where vehicles were exchanged, added or taken away, the one
+        before.
+        """
         return self._benign
 
     def __call__(self, theta: Tensor) -> Tensor:
@@ -129,7 +132,7 @@ class Objective:
     @torch.no_grad()
     def evaluate(self, theta: Tensor) -> Rendered:
         """Render, detect and label at theta (D,), without gradients."""
-        if torch.equal(theta, self.space.theta0):
+        if self.space.scene.before is None and torch.equal(theta, self.space.theta0):
             return self._benign
         for known, rendered in self._recent:
             if torch.equal(theta, known):

@@ -15,6 +15,7 @@ from detectors.base import Detector, DetectorError, Predictor
 from detectors.registry import load_detector, load_predictor
 from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of, written
+from drivesem.attack.changes import Changes, parse_changes, vehicle_mesh
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import LOOKED_AT
@@ -40,7 +41,7 @@ from drivesem.run.manifest import manifest_of
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
-from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
+from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
 from drivesem.settings.blocks import FrameCommand
 from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
@@ -98,6 +99,8 @@ def _attacked(
     names, without_vehicles, failed = selected
     config = worker.config
     todo = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
+    if todo and config.backend == "warp" and config.device == "cpu":
+        make_ready(config)
     work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
     answers = ask(todo, work, build, config, Bar("attacking frames"))
     failed = failed | answers.failed
@@ -162,6 +165,7 @@ class Worker:
     source: SceneSource
     detector: Predictor
     grader: Grader
+    changes: Changes | None = None
 
     @classmethod
     def of(cls, config: Attack, detector: Predictor | None = None) -> Worker:
@@ -172,7 +176,8 @@ class Worker:
         params, source, method = params_of(config), open_source(config), attack_method(config)
         detector = _load(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
-        return cls(config, params, method, source, detector, grader_of(config, detector))
+        grader, changes = grader_of(config, detector), changes_of(config)
+        return cls(config, params, method, source, detector, grader, changes)
 
     def beside(self, config: Attack) -> Worker:
         """For another attack on the same source and detector, which are shared."""
@@ -213,12 +218,22 @@ class Worker:
             keep_last=config.keep == "last",
             only_bounds=config.project == "bounds",
             whole=config.whole,
+            changes=self.changes,
         )
         try:
             return attack_scene(identifier, scene, self.detector, settings)
         except (RangeError, ShapeError) as error:
             # A loss or gradient that is no number says where in the scene, and not in which.
             raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
+
+
+def changes_of(config: Attack) -> Changes | None:
+    """What the settings let a search propose; None for nothing. Raises FormatError for what is no change, or no
+    mesh of a vehicle.
+    """
+    if config.changes is None:
+        return None
+    return Changes(parse_changes(config.changes), None if config.mesh is None else vehicle_mesh(config.mesh))
 
 
 def aim_of(config: Attack) -> Aim:

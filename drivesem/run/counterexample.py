@@ -45,6 +45,8 @@ class AttackOptions(TypedDict, total=False):
     steps: int
     queries: int
     passes: int
+    changes: str
+    mesh: str
     step_form: Literal["raw", "l2"]
     rate: float
     momentum: float

@@ -12,7 +12,7 @@ from pathlib import Path
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.scenes.sheet import write_scene_sheet
-from drivesem.scenes.sources import SceneSource, open_source
+from drivesem.scenes.sources import SceneSource, make_ready, open_source
 from drivesem.settings.commands import Derender
 from scene_ir.io import count_objects, load_scene, save_scene
 
@@ -80,6 +80,8 @@ def derender_run(config: Derender, begin: Callable[[SceneSource], None]) -> Dere
             done[name] = Taken(count_objects(out / name), None)
     begin(worker.source)
     todo = [name for name in names if name not in done]
+    if todo:
+        make_ready(config)
     answers = ask(todo, worker, build, config, Bar("taking frames apart", remaining=True))
     done |= answers.results
     frames = {name: done[name] for name in names if name in done}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,12 +17,14 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.budgets import reach_of
+from drivesem.attack.changes import DRAWS, Changes, affordable, proposals
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode, MovedLabels, shown_boxes, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.base import AttackResult
+from drivesem.attack.methods.margin_search import OfMargins, value_of
 from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
@@ -38,6 +41,7 @@ from drivesem.truth.redraw.compositor import CompositorDraw
 from drivesem.truth.views import DrawnViews
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.exchange import CHANGE
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -53,7 +57,8 @@ class FrameSettings:
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
     how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`.
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`. changes:
+    what is proposed before a search on margins begins, None for nothing.
     """
 
     attack: AttackMethod
@@ -69,6 +74,7 @@ class FrameSettings:
     keep_last: bool = False
     only_bounds: bool = False
     whole: bool = False
+    changes: Changes | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,27 +104,27 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     detector knows no cars.
     """
     start = time.perf_counter()
-    space = ParameterSpace(scene, settings.params, settings.budget)
-    compositor = Compositor(scene, settings.render)
-    objective = Objective(
-        compositor,
-        space,
-        detector,
-        settings.label_mode,
-        settings.term,
-        t_star=settings.t_star,
-        aim=settings.aim,
-        whole=settings.whole,
-    )
+    views, attack = _posed(identifier, scene, detector, settings), settings.attack
+    before = 0
+    if settings.changes is not None and isinstance(attack, OfMargins):
+        count = affordable(attack.passes)
+        views, before = _best_change(
+            views,
+            (
+                _posed(identifier, changed, detector, settings)
+                for changed in proposals(scene, settings.changes, count, settings.seed, settings.render)
+            ),
+        )
+        attack = replace(attack, passes=attack.passes - before)
+        before -= views.passes
+    objective, space = views.objective, views.objective.space
     feasible = objective.feasible_set(only_bounds=settings.only_bounds)
-    nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
-    views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
     problem = objective.problem(feasible, settings.keep_last, views)
-    search = settings.attack(problem, space.theta0, settings.seed)
+    search = attack(problem, space.theta0, settings.seed)
     views.forget()
     rendered = objective.evaluate(search.theta)
     benign = objective.detect(scene.photograph)
-    passes = objective.passes + 1
+    passes = objective.passes + 1 + before
     searched = time.perf_counter()
     failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
     objective.forget()
@@ -136,6 +142,38 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
         seconds=end - start,
         grading_seconds=end - searched,
     )
+
+
+def _posed(identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> DrawnViews:
+    """A scene and what is asked of it, in draws of this frame's name."""
+    objective = Objective(
+        Compositor(scene, settings.render),
+        ParameterSpace(scene, settings.params, settings.budget),
+        detector,
+        settings.label_mode,
+        settings.term,
+        t_star=settings.t_star,
+        aim=settings.aim,
+        whole=settings.whole,
+    )
+    nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
+    return DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
+
+
+def _best_change(still: DrawnViews, changed: Iterable[DrawnViews]) -> tuple[DrawnViews, int]:
+    """Of a scene and what changes made of it, that with the lowest margins; and the passes that all of them
+    took.
+    """
+    best, least, passes = still, math.inf, 0
+    for views in chain([still], changed):
+        theta0 = views.objective.space.theta0
+        value = sum(value_of(views.margins(theta0, number), views.judged) for number in range(DRAWS))
+        passes += views.passes
+        if value < least:
+            best, least = views, value
+        else:
+            views.forget()
+    return best, passes
 
 
 def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:
@@ -167,9 +205,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
         active_constraints=search.active_constraints,
-        violations=tuple(
-            check_scene(perturbed.as_photographed(), perturbed, reach=reach_of(objective.space.budget))
-        ),
+        violations=tuple(check_scene(perturbed.at_rest(), perturbed, reach=reach_of(objective.space.budget))),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(attacked.benign, names),
@@ -179,7 +215,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
         success_paper=search.success_paper,
         success_moved=search.success_moved,
-        identity_psnr_db=psnr_in_boxes(scene, objective.benign.render.image),
+        identity_psnr_db=psnr_in_boxes(objective.benign.scene, objective.benign.render.image),
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
         checked_by=judge_at_hand(),
@@ -187,6 +223,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         grade_notes=attacked.grade_notes,
         min_contrast=objective.difficulty.min_contrast,
         joint_weather=True,
+        change=scene.provenance.get(CHANGE, "") if scene.before is not None else "",
     )
 
 
@@ -203,7 +240,7 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
     files.write_png(part / "overlay.png", marked)
     files.write_png(part / "difference.png", pictures.difference(before, after))
     for labels in (rendered.paper, rendered.moved):
-        as_kitti = to_kitti_labels(labels, scene, rendered.scene)
+        as_kitti = to_kitti_labels(labels, objective.benign.scene, rendered.scene)
         kitti.write_labels(part / f"labels_{labels.mode}.txt", as_kitti)
     files.write_json(
         part / "theta.json",
@@ -238,7 +275,9 @@ def _graded(
         identifier,
         CompositorDraw(objective.compositor, objective.labeller),
         objective.judged,
-        State(objective.space.scene, objective.benign.render, objective.benign.paper, objective.benign.detections),
+        State(
+            objective.benign.scene, objective.benign.render, objective.benign.paper, objective.benign.detections
+        ),
         State(rendered.scene, rendered.render, rendered.moved, rendered.detections),
         placebo,
     )

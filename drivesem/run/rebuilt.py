@@ -35,7 +35,7 @@ def rebuilt(
     The saved scene carries the one it was made from, so that neither the data set nor its de-rendering is needed.
     Raises FormatError.
     """
-    scene = load_scene(folder / "scene").as_photographed()
+    scene = load_scene(folder / "scene").at_rest()
     space = ParameterSpace(scene, params, budget_of(attack.budget))
     if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")

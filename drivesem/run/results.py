@@ -90,7 +90,7 @@ class FrameResult:
     (as before there was a choice) outlines. min_contrast: below it objects were ignored, 0 where that was no rule;
     joint_weather: whether that check bounded weather codes together, too; both as in earlier runs by default.
     passes: of the detector, a gradient counted as 3, without what grading took. grade_notes: why a grade could not
-    be reached.
+    be reached. change: which vehicle was exchanged, added or taken away, in words; empty where none was.
     """
 
     identifier: str
@@ -117,6 +117,7 @@ class FrameResult:
     joint_weather: bool = False
     passes: int | None = None
     grade_notes: tuple[str, ...] = ()
+    change: str = ""
 
     @property
     def feasible(self) -> bool:

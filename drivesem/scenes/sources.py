@@ -162,3 +162,11 @@ def open_source(config: Scenes) -> SceneSource:
     if config.dataset == DEMO:
         return DemoSource(config.seed, config.limit or DEMO_SCENES)
     return PhotographSource(config)
+
+
+def make_ready(config: Scenes) -> None:
+    """Compile or load, together, the kernels that draw the source's frames, before a frame asks for them."""
+    from drivesem.synth import kernels, mesh_kernels
+    from scene_ir.render.kernels import ready
+
+    ready.make_ready((kernels, mesh_kernels) if config.dataset == DEMO else ())

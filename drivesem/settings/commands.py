@@ -105,6 +105,14 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
     early_stop: Flag = False
     """Stop a frame at its first success instead of using all steps or queries."""
+    changes: Annotated[str, Of(("climb", "corners"))] | None = None
+    """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
+    (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried in the same
+    passes, the best is kept."""
+    mesh: str | None = None
+    """Of --changes: the vehicle that parks or comes in a car's place, a mesh (OBJ, GLB, PLY) in metres, y up; by
+    default templates.
+    """
     target_objects: str | None = None
     """Only these objects of each frame, such as 0,2: others may be lost, which is no success; nor are phantoms."""
     target_classes: str | None = None
@@ -128,6 +136,9 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         subsets = self.method == "subsets"
         whole = self.early_stop and self.method in ("subsets", "corners", "climb")
         refuse(whole, "--early-stop", "a method that may end at the first success", self.method)
+        street = self.budget.split(",")[0] == "street"
+        refuse(self.changes is not None and not street, "--changes", "--budget street beside it", self.budget)
+        refuse(self.mesh is not None and self.changes is None, "--mesh", "--changes beside it", self.mesh)
         unlike = self.method == "placebo" and self.like is None
         refuse(unlike, "--like", "a run of drivesem attack, for --method placebo", "nothing")
         refuse(subsets and self.queries == 1, "--queries", "at least 2 with subsets", self.queries)

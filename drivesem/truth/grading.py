@@ -122,8 +122,9 @@ class Grader:
         """The number-th look at the scene before the change. Kept as long as the frame stays: attacks on it differ
         in what comes after.
         """
-        if self._kept is None or self._kept[0] is not case.base.photograph:
-            self._kept = (case.base.photograph, {})
+        labels = case.base.objects.box2d  # no change touches them
+        if self._kept is None or self._kept[0] is not labels:
+            self._kept = (labels, {})
         kept, key = self._kept[1], (camera.stream, number)
         if key not in kept:
             kept[key] = _look(case.base, case.benign, camera, number)
@@ -139,7 +140,7 @@ class Grader:
         if not certain or self.second is None:
             return graded, ()
         try:
-            renderer = self.second(case.identifier, case.base)
+            renderer = self.second(case.identifier, case.changed)
             camera = self._camera(case, renderer, self.detector, self.t_star, "second")
             before = [self._before(case, camera, number) for number in _SECOND_DRAWS]
             second = _agreements(case, camera, [g.fault for g in certain], before, renderer.name)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from detectors.base import Predictor
@@ -67,6 +66,8 @@ class Neighbourhood:
         self._span = reach * (objective.space.upper - objective.space.lower)
         renderer = CompositorDraw(objective.compositor, objective.labeller)
         self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"hole:{name}")
+        from scipy.stats import qmc  # on use: it takes a third of a second to load
+
         self._sequence = qmc.Halton(
             len(self._own), scramble=True, rng=np.random.default_rng(zlib.crc32(name.encode()))
         )

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import torch
 
-from scene_ir.errors import ShapeError
+from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import Layout
 from scene_ir.render import blend, fast, reference
 from scene_ir.render.environment import apply_foliage, apply_weather, shadow_softening
@@ -31,6 +31,7 @@ class Compositor(Prepared):
     """Draws perturbations of one scene; keeps what no parameter touches."""
 
     _fixed: fast.Fixed | None = None
+    _before: Compositor | None = None
 
     @property
     def fixed(self) -> fast.Fixed | None:
@@ -48,7 +49,16 @@ class Compositor(Prepared):
         return _layers([self], self.pack, fixed, [objects], [sun])[0]
 
     def render(self, perturbed: SceneIR) -> Render:
-        """The picture of a perturbed scene; with nothing perturbed, the photograph."""
+        """The picture of a perturbed scene; with nothing perturbed, the photograph. Where vehicles were exchanged,
+        added or taken away, states of the scene before that are drawn too (`SceneIR.before`). Raises RangeError
+        for a state of which this scene is the one before.
+        """
+        if perturbed.before is None and self.scene.before is not None:
+            if self._before is None:
+                self._before = Compositor(self.scene.before, self.settings)
+            return self._before.render(perturbed)
+        if perturbed.before is not None and self.scene.before is None:
+            raise RangeError("scene", "a state of the compositor's own", "one with vehicles exchanged")
         objects = self.moved(perturbed)
         sun = self.sun_of(perturbed.environment)
         return self.compose(perturbed, objects, self.layers(objects, sun) if len(objects) else None)

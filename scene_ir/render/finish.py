@@ -42,6 +42,8 @@ _SIDES, _UNEVEN, _UNSURE = 10.0, 0.25, 0.3
 expected strength."""
 _SHADED, _NO_SHADOW = 0.3, 0.02
 """Sunlight to expect where nothing tells, between an overcast sky's and a clear one's; weight of that."""
+_PLENTY = 50
+"""Pixels that tell how a frame is exposed."""
 _SURE_PX, _DISAGREES = 200.0, 20.0
 """Samples of paint at which a vehicle counts half; how much one vehicle's disagreement may cost."""
 _DARKEST, _BRIGHTEST = 0.02, 0.97
@@ -103,7 +105,7 @@ def sunlight(seen: Sequence[tuple[Surface, Samples]], expected: Sequence[float |
         weight = samples.weight * clear
         own = np.zeros_like(cost)
         if weight.sum() >= _FEWEST:
-            level = np.log(_light(samples.photograph.mean(axis=1)))
+            level = np.log(light_of(samples.photograph.mean(axis=1)))
             rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
             mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
             apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
@@ -115,6 +117,19 @@ def sunlight(seen: Sequence[tuple[Surface, Samples]], expected: Sequence[float |
     return float(_STRENGTHS[int(cost.argmin())])
 
 
+def exposure(surface: Surface, samples: Samples) -> tuple[float, float] | None:
+    """Gain and lift of `texture.finished` for another vehicle in the same light: the median over what is not
+    paint, whose colour templates know; None where too little of it is seen.
+    """
+    known = (surface.part.cpu().numpy()[samples.vertex[:, 0]] != Part.PAINT) & (samples.weight > 0.5)
+    if np.count_nonzero(known) < _PLENTY:
+        return None
+    lift = _lift(surface, samples)
+    bright = light_of((samples.photograph[known].mean(axis=1) - lift).clip(0.0) / (1.0 - lift))
+    gain = np.median(bright / np.maximum(samples.template[known].mean(axis=1), _DARKEST))
+    return float(np.clip(gain, _LEAST_GAIN, _MOST_GAIN[1])), lift
+
+
 def fitted(surface: Surface, samples: Samples) -> Array:
     """For each vertex (V, 4) the gains (3) and the lift of `texture.finished`.
 
@@ -124,7 +139,7 @@ def fitted(surface: Surface, samples: Samples) -> Array:
     count = len(web.part)
     lift = np.where(web.part == Part.PAINT, 0.0, _lift(surface, samples))
     less = 1.0 - lift[web.node[samples.vertex[:, :1]]]
-    ratio = np.log(_light(1.0 - (1.0 - samples.photograph) / less) / np.maximum(samples.template, _DARKEST))
+    ratio = np.log(light_of(1.0 - (1.0 - samples.photograph) / less) / np.maximum(samples.template, _DARKEST))
     node = web.node[samples.vertex].reshape(-1)
     share = (samples.weight[:, None] * samples.share).reshape(-1)
     total = _summed(node, share, count)
@@ -148,7 +163,7 @@ def _summed(node: NDArray[np.int64], values: Array, count: int) -> Array:
     return np.bincount(node, values, count).astype(np.float64)
 
 
-def _light(display: Array) -> Array:
+def light_of(display: Array) -> Array:
     """The light that `texture.finished` shows as these display values."""
     return -np.log(1.0 - np.clip(display, _DARKEST / 2, _BRIGHTEST))
 

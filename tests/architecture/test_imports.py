@@ -306,6 +306,12 @@ def test_importing_loads_nothing_heavy(module: str) -> None:
     assert found.stdout.split() == []
 
 
+def test_an_attack_starts_without_statistics() -> None:
+    code = "import sys, drivesem.commands.attack; print('scipy.stats' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["False"]
+
+
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys, atexit\n"

@@ -331,3 +331,14 @@ def test_bad_photographs(small_kitti: Path) -> None:
         ds.derender("nowhere.png")
     with pytest.raises(RangeError, match="focal"):
         ds.derender(pixels, focal=-1.0)
+
+
+def test_the_collector_looks_again_once_a_command_is_loaded() -> None:
+    code = (
+        "import gc\n"
+        "from drivesem.cli import main\n"
+        "assert main(['attack', '--dataset', 'kitti', '--root', '/nowhere']) == 2\n"
+        "assert gc.isenabled() and gc.get_freeze_count() > 0\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

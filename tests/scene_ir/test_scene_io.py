@@ -248,7 +248,7 @@ BAD = [
     ("damaged", damaged, r"arrays\.npz: expected an NPZ"),
     ("list", lambda f: (f / "scene.json").write_text("[]"), r"scene\.json: expected an object, found list"),
     ("schema", edit("schema", value="other"), r"scene\.json: schema: expected 'drivesem\.scene', found 'other'"),
-    ("version", edit("version", value=99), r"scene\.json: version: expected one of 2, 3, found 99"),
+    ("version", edit("version", value=99), r"scene\.json: version: expected one of 2, 3, 4, found 99"),
     (
         "missing",
         edit("camera", "intrinsics"),

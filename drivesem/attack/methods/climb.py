@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from drivesem.attack.methods.corners import corners
@@ -54,6 +53,8 @@ def _look_around(search: MarginSearch, count: int) -> Tensor:
 
 def _scouts(search: MarginSearch, count: int) -> Tensor:
     """Places (count, K): balanced corners and a scrambled Halton sequence in turn."""
+    from scipy.stats import qmc  # on use: it takes a third of a second to load
+
     at = search.at
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
     places = torch.from_numpy(qmc.Halton(len(at.owner), scramble=True, rng=rng).random(count))

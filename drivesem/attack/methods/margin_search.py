@@ -32,6 +32,12 @@ _POOL = 8
 """Draws that the search goes round in."""
 
 
+def value_of(margins: Tensor, judged: Tensor) -> float:
+    """What a search lowers, of margins (N,) of objects of which judged (N,) count."""
+    known = margins[judged.to(margins.device)].clamp(SURE, FAR)
+    return float(torch.tanh(2 * known).sum() + 0.1 * known.sum())
+
+
 @dataclass
 class MarginSearch:
     """A search of the unit box within a number of passes. limit: passes in all."""
@@ -86,8 +92,7 @@ class MarginSearch:
 
     def value(self, margins: Tensor) -> float:
         """What is to be low: a step a lost object, and beyond that the margins themselves."""
-        known = margins[self.views.judged.to(margins.device)].clamp(SURE, FAR)
-        return float(torch.tanh(2 * known).sum() + 0.1 * known.sum())
+        return value_of(margins, self.views.judged)
 
     def candidates(self, places: Tensor) -> list[Tensor]:
         """Of places (C, K), each seen in another draw: the best, and what the best of each object make together,

@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from drivesem.attack.methods.base import Problem, Proposals
@@ -38,6 +37,8 @@ class Sampling(Search):
         """Where in the unit box to look: (queries, dimensions) float64."""
         if self.kind == "random":
             return torch.rand(self.queries, dimensions, generator=generator, dtype=torch.float64)
+        from scipy.stats import qmc  # on use: it takes a third of a second to load
+
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         if self.kind == "halton":
             return torch.from_numpy(qmc.Halton(dimensions, scramble=True, rng=rng).random(self.queries))

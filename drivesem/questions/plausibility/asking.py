@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from drivesem.data.kitti import read_labels
 from drivesem.questions.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
@@ -18,6 +19,8 @@ from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Plausibility as Config
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import ShapeError
+from scene_ir.io import load_scene
+from scene_ir.types import Labels, SceneIR
 
 LOWEST = "lowest"
 _BEFORE, _AFTER = "labels_paper.txt", "labels_moved.txt"
@@ -74,9 +77,26 @@ def _pair(run: Run, frame: Frame) -> FramePair:
     identifier = frame.result.identifier
     folder = run.folder / "frames" / identifier
     before, after = (read_labels(folder / name) for name in (_BEFORE, _AFTER))
+    if frame.result.change:
+        before, after = _in_both(load_scene(folder / "scene"), before, after)
     if before.kind != after.kind:
         raise ShapeError(str(folder / _AFTER), f"the {len(before.kind)} vehicles of {_BEFORE}", len(after.kind))
     return FramePair(identifier, before.kind, plausibility(before), plausibility(after), weather_of(frame.result))
+
+
+def _in_both(scene: SceneIR, before: Labels, after: Labels) -> tuple[Labels, Labels]:
+    """The labels of vehicles that are there before and after another one left or came."""
+    first, then = (state.objects.translation[:, 2] > 0 for state in (scene.origin, scene))
+    return _chosen(before, then[first]), _chosen(after, first[then])
+
+
+def _chosen(labels: Labels, rows: Tensor) -> Labels:
+    """Some rows (M,) bool of labels; regions stay."""
+    if len(rows) != len(labels.kind):
+        raise ShapeError("labels", f"those of the scene's {len(rows)} vehicles", len(labels.kind))
+    names = [field.name for field in fields(Labels) if field.name not in ("kind", "ignore_xyxy")]
+    kinds = tuple(kind for kind, chosen in zip(labels.kind, rows.tolist(), strict=True) if chosen)
+    return replace(labels, kind=kinds, **{name: getattr(labels, name)[rows] for name in names})
 
 
 def _figures(found: Plausibility) -> dict[str, np.ndarray]:

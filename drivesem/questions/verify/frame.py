@@ -118,13 +118,13 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     """
     result = load_frame(folder / RESULT)
     perturbed = load_scene(folder / "scene")
-    base = perturbed.as_photographed()
+    base, rest = perturbed.as_photographed(), perturbed.at_rest()
     log = CheckLog()
     known, found = given.hashes.get(identifier, {}), frame_hashes(folder)
     for name in sorted(known.keys() | found.keys()) if given.sealed else known:
         log.same("files", name, known.get(name, _NO_FILE), found.get(name, _NO_FILE))
-    check_change(log, folder, result, base, perturbed, given.params, given.budget)
-    check_feasibility(log, result, base, perturbed, given.budget)
+    check_change(log, folder, result, rest, perturbed, given.params, given.budget)
+    check_feasibility(log, result, rest, perturbed, given.budget)
     size = (base.camera.height, base.camera.width)
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
@@ -167,7 +167,7 @@ def _render(
     log: CheckLog, pictures: Mapping[str, np.ndarray], scenes: _Scenes, difficulty: Difficulty, backend: str
 ) -> _Drawn:
     """The three pictures against the scene; labels of the scene by mode, and contrasts by the pictures."""
-    compositor = Compositor(scenes.base, RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
+    compositor = Compositor(scenes.perturbed.at_rest(), RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
     before, after = compositor.render(scenes.base), compositor.render(scenes.perturbed)
     drawn = {BENIGN: scenes.base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
     levels: dict[str, Level] = {}
@@ -371,5 +371,7 @@ def _compare_rows(log: CheckLog, name: str, written: Tensor, own: Tensor) -> Non
 
 def _targets_of(written: Labels, own: MovedLabels, ignore: Tensor) -> Targets:
     """What a label file holds as targets, with the recorded flags (M,) of what is ignored."""
-    boxes = replace(own, boxes_xyxy=written.boxes_xyxy, regions_xyxy=written.ignore_xyxy).targets
+    placed = own.boxes_xyxy.clone()
+    placed[own.in_view] = written.boxes_xyxy
+    boxes = replace(own, boxes_xyxy=placed, regions_xyxy=written.ignore_xyxy).targets
     return Targets(boxes.boxes_xyxy, boxes.labels, ignore if len(ignore) == len(boxes) else boxes.ignore)

@@ -8,13 +8,36 @@ from torch import Tensor
 
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.errors import UsageError
-from drivesem.truth.redraw.base import SecondRenderer
+from drivesem.truth.redraw.base import Redrawn, SecondRenderer
 from drivesem.truth.redraw.generator import GeneratorRedraw
 from drivesem.truth.redraw.photograph import PhotographRedraw
 from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
 from drivesem.truth.redraw.screen import shared_screen
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR
+
+
+class Exchanged:
+    """Of a scene whose vehicles were exchanged, added or taken away: the scenes before and after it, each drawn
+    from its own textures. The generator's plan has no vehicle for a new one, so that pyrender draws it. scene:
+    any state after it. Raises SceneError where a second renderer cannot be had.
+    """
+
+    def __init__(self, identifier: str, scene: SceneIR) -> None:
+        self._before = PhotographRedraw(identifier, scene.origin)
+        self._after = PhotographRedraw(identifier, scene, before=self._before)
+
+    @property
+    def name(self) -> str:
+        return self._after.name
+
+    def redraw(self, changed: SceneIR) -> Redrawn:
+        """A state of the scene, before or after."""
+        return (self._before if changed.before is None else self._after).redraw(changed)
+
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """See `PhotographRedraw`."""
+        return self._after.not_carried(changed)
 
 
 class SecondRenderers:
@@ -26,15 +49,16 @@ class SecondRenderers:
     def __init__(self, dataset: str, root: str | None) -> None:
         self._dataset = dataset
         self._folder = _folder_plans(dataset, root)
-        self._last: tuple[Tensor, SecondRenderer] | None = None
+        self._last: tuple[Tensor, Tensor, SecondRenderer] | None = None
 
     def of(self, identifier: str, scene: SceneIR) -> SecondRenderer:
         """What draws a frame again. scene: any state of it; attacks on the same scene, one after the other, share
         the renderer. Raises SceneError where nothing can.
         """
-        if self._last is None or self._last[0] is not scene.photograph:
-            self._last = (scene.photograph, self._made(identifier, scene))
-        return self._last[1]
+        same = (scene.photograph, scene.objects.mesh_index)  # the same state of affairs: no theta touches them
+        if self._last is None or any(a is not b for a, b in zip(self._last, same, strict=False)):
+            self._last = (*same, self._made(identifier, scene))
+        return self._last[2]
 
     def check(self) -> None:
         """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
@@ -42,6 +66,8 @@ class SecondRenderers:
             shared_screen()
 
     def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+        if scene.before is not None:
+            return Exchanged(identifier, scene)
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
         if plans is not None:
             return GeneratorRedraw(identifier, scene, plans)

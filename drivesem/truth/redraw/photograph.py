@@ -64,8 +64,15 @@ class PhotographRedraw:
 
     name = "pyrender"
 
-    def __init__(self, identifier: str, scene: SceneIR, difficulty: Difficulty | None = None) -> None:
-        still = scene.as_photographed()
+    def __init__(
+        self,
+        identifier: str,
+        scene: SceneIR,
+        difficulty: Difficulty | None = None,
+        before: PhotographRedraw | None = None,
+    ) -> None:
+        """before: of the scene before vehicles were exchanged, which says how much of each is to show."""
+        still = scene.at_rest()
         self._identifier, self._still, self._difficulty = identifier, still, difficulty or Difficulty()
         self._lens, self._screen = Lens.of(still.camera), shared_screen()
         self._photograph, self._background = (_picture(p) for p in (still.photograph, still.background))
@@ -73,9 +80,9 @@ class PhotographRedraw:
         self._air = weathering.air_of(self._photograph, numbers(still.environment.sky))
         self._leaves = numbers(still.environment.foliage_map)
         self._vehicles = [self._vehicle(source, i) for i, source in enumerate(still.objects.source)]
-        before = self._state(still)
-        self._shares = before.shares
-        self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), before)
+        rest = self._state(still)
+        self._shares = rest.shares if before is None else before._shares
+        self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), rest)
 
     def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
         """The sun: textures that are baked from the photograph keep its light."""

@@ -1,0 +1,314 @@
+"""Vehicles exchanged, added and taken away, as they are in streets from one day to the next.
+
+The scene before goes along (`SceneIR.before`) with the same objects, row by row. A vehicle that is in one of the
+two only stands behind the camera in the other, where no picture, label or constraint meets it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir.errors import RangeError
+from scene_ir.geometry import to_clip
+from scene_ir.removal import uncovered
+from scene_ir.render import finish, model, texture
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.sources import analytic_shadows
+from scene_ir.types import (
+    LATTICE_POINTS,
+    TEXTURE_DIM,
+    Category,
+    Crop,
+    Mesh,
+    Objects,
+    Part,
+    SceneIR,
+    Source,
+)
+
+AWAY_M = 60.0
+"""How far behind the camera vehicles stand that are not in a scene."""
+CHANGE = "change"
+"""Where a scene's provenance says what was done to it."""
+_NEUTRAL = 0.8
+"""Of the templates' paint."""
+_INFLATION_M = 0.05
+_STREET_SHADOW = 0.7
+_MOST_GAIN = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """One that the photograph does not show. translation (3,) m, the bottom-face centre; yaw () rad; size_lhw
+    (3,) m; paint: (3,) RGB in [0, 1] in place of the mesh's own, None to keep it.
+    """
+
+    mesh: Mesh
+    category: Category
+    translation: Tensor
+    yaw: Tensor
+    size_lhw: Tensor
+    paint: tuple[float, float, float] | None = None
+
+
+def without(scene: SceneIR, row: int) -> SceneIR:
+    """The scene with the vehicle in `row` and its shadow gone: background shows, and what it hid of others is
+    completed (`scene_ir.removal`). Raises RangeError for a row that the scene does not have, or sources that it
+    lacks.
+    """
+    _check(scene, row)
+    objects = scene.objects
+    sources = list(uncovered(scene, {row}))
+    place = _away(scene, objects.translation)
+    sources[row] = _unseen(sources[row], place)
+    translation = objects.translation.clone()
+    translation[row] = place
+    return changed(
+        scene, scene, replace(objects, translation=translation, source=tuple(sources)), f"objects[{row}] is gone"
+    )
+
+
+@torch.no_grad()
+def with_vehicle(scene: SceneIR, vehicle: Vehicle) -> SceneIR:
+    """The scene with one vehicle more, in a last row, in the scene's light and with a shadow. In the scene before
+    it, that row stands behind the camera. Raises RangeError for sources that the scene lacks.
+    """
+    _check(scene, None)
+    here, mesh = _drawn(scene, vehicle), len(scene.meshes)
+    place = _away(scene, scene.objects.translation)
+    padded = replace(scene, meshes=(*scene.meshes, here.mesh))
+    there = replace(_row(here, mesh, padded), translation=place[None], source=(_unseen(here.source, place),))
+    before = replace(padded, objects=_joined(scene.objects, there))
+    objects = _joined(scene.objects, _row(here, mesh, padded))
+    return changed(padded, before, objects, f"{vehicle.mesh.name} parks as objects[{len(scene.objects)}]")
+
+
+@torch.no_grad()
+def with_other(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
+    """The scene with another vehicle in the place of the one in `row`, which it keeps. Raises as `without`."""
+    _check(scene, row)
+    here = _drawn(scene, vehicle)
+    new = _row(here, len(scene.meshes), scene)
+    sources = list(uncovered(scene, {row}))
+    sources[row] = here.source
+    own = {}
+    for name in _TENSORS:
+        own[name] = getattr(scene.objects, name).clone()
+        own[name][row] = getattr(new, name)[0]
+    objects = replace(scene.objects, source=tuple(sources), **own)
+    wider = replace(scene, meshes=(*scene.meshes, here.mesh))
+    return changed(wider, scene, objects, f"{vehicle.mesh.name} in the place of objects[{row}]")
+
+
+@torch.no_grad()
+def with_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
+    """The scene with a load on the roof of the vehicle in `row`, of which the photograph shows all else. load: a
+    mesh in the unit box of that vehicle, and above it; it moves and bends with the vehicle. Raises as `without`.
+    """
+    _check(scene, row)
+    objects, source = scene.objects, scene.objects.source[row]
+    own = scene.meshes[int(objects.mesh_index[row])]
+    bare = replace(objects, source=(), **{n: getattr(objects, n)[row : row + 1] for n in _TENSORS})
+    bare = replace(bare, mesh_index=torch.zeros_like(bare.mesh_index))
+    top, body = (_alone(scene, bare, mesh) for mesh in (load, own))
+    size = (scene.camera.height, scene.camera.width)
+    frame = (0, 0, size[1], size[0])
+    nearer = texture.crop_of(top.nearness, frame, size) >= texture.crop_of(body.nearness, frame, size)
+    rgba = texture.crop_of(top.rgba, frame, size) * nearer
+    whole = rgba + (1.0 - rgba[3:]) * texture.crop_of(source.foreground, frame, size)
+    rows, columns = ((whole[3] > 0).any(dim=side).nonzero()[:, 0] for side in (1, 0))
+    y0, x0 = int(rows[0]), int(columns[0])
+    values = whole[:, y0 : int(rows[-1]) + 1, x0 : int(columns[-1]) + 1]
+    sources = list(objects.source)
+    sources[row] = replace(source, foreground=Crop(values.to(scene.background).contiguous(), x0, y0))
+    index = objects.mesh_index.clone()
+    index[row] = len(scene.meshes)
+    loaded = replace(scene, meshes=(*scene.meshes, _together(own, load)))
+    words = f"{load.name} on the roof of objects[{row}]"
+    return changed(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), words)
+
+
+def changed(scene: SceneIR, before: SceneIR, objects: Objects, words: str) -> SceneIR:
+    """`scene` with other objects, after `before`. words: what was done, for people."""
+    said = {**scene.provenance, CHANGE: words}
+    return replace(scene, objects=objects, before=before, provenance=said)
+
+
+_TENSORS = tuple(entry.name for entry in fields(Objects) if entry.name != "source")
+
+
+@dataclass(frozen=True, slots=True)
+class _Here:
+    """A vehicle as the scene shows it. mesh: in its own paint."""
+
+    vehicle: Vehicle
+    mesh: Mesh
+    source: Source
+
+
+def _row(here: _Here, mesh: int, scene: SceneIR) -> Objects:
+    """The one row of a vehicle. Its label is made where labels are (`drivesem.attack.labels`): nothing yet."""
+    vehicle, like = here.vehicle, scene.objects.translation
+    return Objects(
+        mesh_index=torch.tensor([mesh]),
+        translation=vehicle.translation.to(like)[None],
+        yaw=vehicle.yaw.to(like)[None],
+        size_lhw=vehicle.size_lhw.to(like)[None],
+        ffd=like.new_zeros(1, LATTICE_POINTS, 3),
+        texture_code=like.new_zeros(1, TEXTURE_DIM),
+        category=torch.tensor([int(vehicle.category)]),
+        box2d=scene.objects.box2d.new_zeros(1, 4),
+        truncation=scene.objects.truncation.new_zeros(1),
+        occlusion=scene.objects.occlusion.new_zeros(1),
+        source=(here.source,),
+    )
+
+
+def _joined(first: Objects, then: Objects) -> Objects:
+    rows = {name: torch.cat([getattr(first, name), getattr(then, name)]) for name in _TENSORS}
+    return Objects(**rows, source=(*first.source, *then.source))
+
+
+def _drawn(scene: SceneIR, vehicle: Vehicle) -> _Here:
+    """A vehicle in the scene's light, as if it had been photographed: in the finish and the sunlight of the
+    others, with a shadow as dark as theirs.
+    """
+    mesh, sources = _painted(vehicle.mesh, vehicle.paint), scene.objects.source
+    here = _Here(vehicle, mesh, _blank(vehicle, mesh, _sunlight(scene)))
+    row = replace(_row(here, 0, scene), source=())
+    alone = _alone(scene, row, mesh)
+    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))[0]
+    nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
+    dark = (1.0 - shadow.values) * _darkness([sources[i] for i in nearest])
+    source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark))
+    return replace(here, source=source)
+
+
+@dataclass(frozen=True, slots=True)
+class _Alone:
+    """One object drawn by itself. rgba: Crop (4, h, w), premultiplied; nearness: Crop (1, h, w), 1 / m, 0 beside
+    it.
+    """
+
+    rgba: Crop
+    nearness: Crop
+
+
+def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
+    """`row`, one object of `mesh` that no photograph shows, in the scene's light."""
+    compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))
+    compositor.sunlight.fill_(_sunlight(scene))
+    layers = compositor.layers(compositor.scene.objects)
+    (packed, size), (x0, y0) = layers.layout.spans()[0], layers.layout.rects[0, :2].tolist()
+    opacity = layers.opacity[packed, None].clamp(0.0, 1.0)
+    light = layers.colour[packed, :3] / opacity.clamp(min=model.LEAST_ALPHA)
+    gain, lift = _exposure(scene, row.translation[0], row.size_lhw[0])
+    colour = texture.finished(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
+    values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
+    values = values.to(scene.background).contiguous()
+    return _Alone(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
+
+
+def _sunlight(scene: SceneIR) -> float:
+    return scene.objects.source[0].sunlight if scene.objects.source else model.SUNLIGHT
+
+
+def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, float]:
+    """Gain and lift as of `finish.exposure`: the medians of the others, of the gain as large a multiple of what
+    the road shows where each stands, which differs along a street, in the shade of a house.
+    """
+    objects, whole = scene.objects, Compositor(scene.at_rest())
+    gains, lifts = [], []
+    for i, (surface, samples) in enumerate(zip(whole.fleet.surfaces, whole.samples(), strict=True)):
+        found = finish.exposure(surface, samples)
+        if found is not None:
+            gains.append(found[0] / _road_light(scene, objects.translation[i], objects.size_lhw[i]))
+            lifts.append(found[1])
+    if not gains:
+        return 1.0, 0.0
+    gain = float(np.median(gains)) * _road_light(scene, place, size_lhw)
+    return min(gain, _MOST_GAIN), float(np.median(lifts))
+
+
+def _road_light(scene: SceneIR, translation: Tensor, size_lhw: Tensor) -> float:
+    """The light that the ground shows without vehicles, at a place (3,) and around it as far as a vehicle is
+    wide.
+    """
+    steps = torch.linspace(-0.5, 0.5, 9) * size_lhw[2]
+    x, z = torch.meshgrid(steps, steps, indexing="ij")
+    points = translation + torch.stack([x, torch.zeros_like(x), z], dim=-1).reshape(-1, 3)
+    clip = to_clip(points.to(scene.camera.matrix), scene.camera.matrix)
+    pixels = (clip[:, :2] / clip[:, 2:].clamp(min=1.0)).round().long()
+    column, row = pixels[:, 0].clamp(0, scene.camera.width - 1), pixels[:, 1].clamp(0, scene.camera.height - 1)
+    shown = scene.background[:, row, column].mean(dim=0).double().numpy()
+    return float(finish.light_of(shown).mean())
+
+
+def _blank(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:
+    translation = vehicle.translation
+    nothing, ffd = Crop(translation.new_zeros(4, 1, 1), 0, 0), translation.new_zeros(LATTICE_POINTS, 3)
+    paint = translation.new_tensor(vehicle.paint or (_NEUTRAL,) * 3)
+    return Source(translation, vehicle.yaw, vehicle.size_lhw, ffd, nothing, None, _INFLATION_M, paint, sunlight)
+
+
+def _darkness(sources: Sequence[Source]) -> float:
+    """How dark the shadow of the first that has one is where it is darkest, as a share; a plain street's where
+    none has.
+    """
+    shadows = (source.shadow.values for source in sources if source.shadow is not None)
+    return next((float((1.0 - s).mean(dim=0).max()) for s in shadows if s.numel()), _STREET_SHADOW)
+
+
+def _together(body: Mesh, load: Mesh) -> Mesh:
+    """Two meshes in one unit box as one."""
+    both = (body, load)
+    grey = (
+        mesh.vertices.new_full(mesh.vertices.shape, 0.7) if mesh.colours is None else mesh.colours for mesh in both
+    )
+    return Mesh(
+        vertices=torch.cat([mesh.vertices for mesh in both]),
+        faces=torch.cat([body.faces, load.faces + len(body.vertices)]),
+        part=torch.cat([mesh.part for mesh in both]),
+        name=f"{body.name} with {load.name}",
+        colours=torch.cat(list(grey)),
+    )
+
+
+def _painted(mesh: Mesh, paint: tuple[float, float, float] | None) -> Mesh:
+    if paint is None or mesh.colours is None:
+        return mesh
+    rows = mesh.faces[mesh.part == Part.PAINT].unique()
+    colours = mesh.colours.clone()
+    colours[rows] = colours[rows] * colours.new_tensor(paint) / _NEUTRAL
+    return replace(mesh, colours=colours.clamp(0.0, 1.0))
+
+
+def _check(scene: SceneIR, row: int | None) -> None:
+    count = len(scene.objects)
+    if scene.before is not None:
+        raise RangeError(
+            "scene", "one in which no vehicle was exchanged yet", scene.provenance.get(CHANGE, "another")
+        )
+    if len(scene.objects.source) != count:
+        raise RangeError("objects.source", "one entry an object", len(scene.objects.source))
+    if row is not None and not 0 <= row < count:
+        raise RangeError("objects", f"a row from 0 to {count - 1}" if count else "no row of none", row)
+
+
+def _away(scene: SceneIR, like: Tensor) -> Tensor:
+    """Where (3,) vehicles stand that are not in a scene: on its ground, behind the camera."""
+    ground = scene.environment.ground.to(like)
+    return torch.stack(
+        [ground.new_zeros(()), (ground[2] * AWAY_M - ground[3]) / ground[1], ground.new_tensor(-AWAY_M)]
+    )
+
+
+def _unseen(source: Source, place: Tensor) -> Source:
+    """The source of a vehicle that the picture does not show, since it stands at `place` (3,)."""
+    nothing = Crop(source.foreground.values.new_zeros(4, 1, 1), 0, 0)
+    return replace(source, translation=place, foreground=nothing, shadow=None, region=None)

@@ -1,0 +1,154 @@
+"""Vehicles that leave, park or come in others' places: what is proposed, what labels say, what is refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import drivesem as ds
+from drivesem.attack.changes import Change, Changes, affordable, parse_changes, proposals, vehicle_mesh
+from drivesem.attack.feasibility_check import check_exchange, check_scene
+from drivesem.attack.labels import Labeller, to_kitti_labels
+from scene_ir.errors import FormatError
+from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
+from scene_ir.meshes.load import save_mesh
+from scene_ir.meshes.loads import load
+from scene_ir.meshes.templates import template
+from scene_ir.render.compositor import Compositor
+from scene_ir.types import Category, SceneIR
+
+SIZE = torch.tensor([4.0, 1.5, 1.75])
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneIR:
+    return ds.demo_scene(1).ir
+
+
+def beside(scene: SceneIR, place: torch.Tensor) -> SceneIR:
+    vehicle = Vehicle(template("suv"), Category.CAR, place, scene.objects.yaw[0], SIZE)
+    return with_vehicle(scene, vehicle)
+
+
+def labels_of(changed: SceneIR):
+    compositor = Compositor(changed)
+    labeller = Labeller(changed.origin, compositor.render(changed.origin))
+    return labeller, labeller.moved(changed, compositor.render(changed))
+
+
+@pytest.fixture(scope="module")
+def proposed(scene: SceneIR) -> list[SceneIR]:
+    return proposals(scene, Changes(tuple(Change)), 4, 7)
+
+
+def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR]) -> None:
+    words = [made.provenance[CHANGE] for made in proposed]
+    wanted = ("is gone", "parks as", "in the place of", "on the roof")
+    assert all(word in text for word, text in zip(wanted, words, strict=True))
+    for made in proposed:
+        assert made.origin.photograph is scene.photograph
+        assert check_exchange(made) == []
+        assert check_scene(made.at_rest(), made) == []
+
+
+def test_the_same_seed_proposes_the_same(scene: SceneIR, proposed: list[SceneIR]) -> None:
+    again = proposals(scene, Changes(tuple(Change)), 4, 7)
+    for one, other in zip(proposed, again, strict=True):
+        assert one.provenance == other.provenance
+        assert torch.equal(one.objects.translation, other.objects.translation)
+
+
+def test_labels_follow(scene: SceneIR) -> None:
+    row = 6
+    van = Vehicle(
+        template("van"), Category.TRUCK, scene.objects.translation[row], scene.objects.yaw[row], 1.3 * SIZE
+    )
+    _, labels = labels_of(with_other(scene, row, van))
+    assert int(labels.category[row]) == int(Category.TRUCK)
+    higher = (labels.boxes_xyxy - scene.objects.box2d)[row]
+    assert higher[1] < -5  # its roof is
+    assert not labels.ignore[row]
+    rest = [i for i in range(len(scene.objects)) if i != row]
+    assert torch.equal(labels.boxes_xyxy[rest], scene.objects.box2d[rest])
+
+
+def test_a_load_on_the_roof_is_part_of_its_cars_label(scene: SceneIR) -> None:
+    row = 5
+    car = scene.meshes[int(scene.objects.mesh_index[row])]
+    loaded = with_load(scene, row, load("crate", car, scene.objects.size_lhw[row]))
+    _, labels = labels_of(loaded)
+    grown = (labels.boxes_xyxy - scene.objects.box2d)[row]
+    assert grown[1] < -8
+    assert grown[[0, 2, 3]].abs().max() < 1
+    higher = to_kitti_labels(labels, loaded.origin, loaded).size_lhw[row, 1] - scene.objects.size_lhw[row, 1]
+    assert 0.3 < float(higher) < 0.6
+    assert check_exchange(loaded) == []
+
+
+def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
+    left = without(scene, 6)
+    labeller, labels = labels_of(left)
+    assert labels.ignore[6]
+    assert not labels.out_of_sight.any()
+    assert labels.in_view.tolist() == [True] * 6 + [False]
+    assert len(to_kitti_labels(labels, left.origin, left).kind) == 6
+    assert len(to_kitti_labels(labeller.paper(), left.origin, left).kind) == 7
+
+
+def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
+    more = beside(scene, scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0]))
+    labeller, labels = labels_of(more)
+    assert labels.ignore[-1]
+    assert labels.in_view.all()
+    written = to_kitti_labels(labels, more.origin, more)
+    assert len(written.kind) == len(scene.objects) + 1
+    x0, y0, x1, y1 = written.boxes_xyxy[-1].tolist()
+    assert x1 - x0 > 40
+    assert y1 - y0 > 20
+    assert len(to_kitti_labels(labeller.paper(), more.origin, more).kind) == len(scene.objects)
+
+
+def test_a_car_that_another_hides_is_not_counted(scene: SceneIR) -> None:
+    target = scene.objects.translation[0]
+    _, labels = labels_of(beside(scene, 0.5 * target + torch.tensor([0.0, 0.5 * float(target[1]), 0.0])))
+    assert labels.became_ignored[0]
+
+
+@pytest.mark.parametrize(("shift", "said"), [((0.5, 0.0, 0.5), "collision"), ((16.0, 0.0, -4.0), "off the road")])
+def test_what_cannot_be_is_said(scene: SceneIR, shift: tuple[float, float, float], said: str) -> None:
+    place = scene.objects.translation[3] + torch.tensor(shift)
+    found = check_exchange(beside(scene, place))
+    assert any(said in line for line in found)
+    assert all(line.startswith("exchange: objects[") for line in found)
+    changed = beside(scene, place)
+    assert set(found) <= set(check_scene(changed.at_rest(), changed))
+
+
+def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
+    assert [affordable(passes) for passes in (24, 29, 36, 90, 1000)] == [0, 0, 2, 6, 6]
+
+
+@pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
+def test_what_is_no_change_is_named(text: str) -> None:
+    with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap, load"):
+        parse_changes(text)
+
+
+def test_changes_by_name() -> None:
+    assert parse_changes("swap, leave") == (Change.LEAVE, Change.SWAP)
+
+
+def test_a_mesh_of_ones_own_parks_and_must_be_as_large_as_a_vehicle(scene: SceneIR, tmp_path: Path) -> None:
+    small = template("sedan")
+    save_mesh(small, tmp_path / "unit.glb")
+    with pytest.raises(FormatError, match=r"unit.glb: length: expected a vehicle's in metres, 1.5 to 20, found 1"):
+        vehicle_mesh(str(tmp_path / "unit.glb"))
+    obj = tmp_path / "block.obj"
+    corners = [(x, y, z) for x in (0, 4) for y in (0, 1.5) for z in (0, 1.8)]
+    quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {' '.join(map(str, q))}" for q in quads]
+    obj.write_text("\n".join(lines))
+    own = vehicle_mesh(str(obj))
+    made = proposals(scene, Changes((Change.PARK,), own), 1, 0)
+    assert made[0].meshes[-1].name == "block"
+    assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.0, 1.5, 1.8])

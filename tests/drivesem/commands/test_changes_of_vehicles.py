@@ -1,0 +1,81 @@
+"""`drivesem attack --changes`: what is tried within the passes, written, checked again and asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+import drivesem as ds
+from drivesem.cli import main
+from drivesem.run import frame as run_frame
+from drivesem.run.results import FrameResult, load_frame
+from scene_ir.exchange import CHANGE
+from scene_ir.io import load_scene
+
+Runs = dict[str, tuple[Path, FrameResult]]
+PASSES = 36
+WORDS = ("--method", "climb", "--budget", "street", "--params", "translate", "--passes", str(PASSES))
+
+
+def attacked(out: Path, kind: str) -> FrameResult:
+    words = ("attack", *WORDS, "--changes", kind, "--limit", "1", "--workers", "1", "--no-confirm")
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    return load_frame(out / "frames" / "demo-000" / "result.json")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    folders = {kind: tmp_path_factory.mktemp(kind) / "run" for kind in ("leave", "park")}
+    worse = count(0, -1)
+    with pytest.MonkeyPatch.context() as patch:  # the last one tried is kept, whatever it is worth
+        patch.setattr(run_frame, "value_of", lambda *_: next(worse))
+        return {kind: (folder, attacked(folder, kind)) for kind, folder in folders.items()}
+
+
+@pytest.mark.parametrize(("kind", "words"), [("leave", "is gone"), ("park", "parks as objects[6]")])
+def test_a_run_holds_what_was_done_and_agrees_with_its_files(runs: Runs, kind: str, words: str) -> None:
+    folder, result = runs[kind]
+    assert words in result.change
+    assert result.violations == ()
+    assert result.passes is not None
+    assert result.passes <= PASSES
+    scene = load_scene(folder / "frames" / "demo-000" / "scene")
+    assert scene.provenance[CHANGE] == result.change
+    assert scene.before is not None
+    assert words in (folder / "report.html").read_text()
+    assert main(["verify", "--run", str(folder)]) == 0
+
+
+@pytest.mark.parametrize("kind", ["leave", "park"])
+def test_a_run_can_be_asked(runs: Runs, kind: str, tmp_path: Path) -> None:
+    folder, _ = runs[kind]
+    assert main(["plausibility", "--run", str(folder), "--out", str(tmp_path / "out")]) == 0
+
+
+def test_the_same_from_python() -> None:
+    found = ds.attack(
+        ds.demo_scene(0), method="climb", budget="street", params="translate", passes=PASSES, changes="park",
+        confirm=False,
+    )  # fmt: skip
+    assert "parks as" in found.result.change
+    assert found.feasible
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--changes", "fly", *WORDS), "--changes: expected each at most once of leave, park, swap, load"),
+        (
+            ("--changes", "leave", "--method", "climb"),
+            "--changes: expected --budget street beside it, found paper",
+        ),
+        (("--changes", "leave", "--budget", "street"), "--changes: expected --method climb, corners beside it"),
+        (("--mesh", "car.obj", *WORDS), "--mesh: expected --changes beside it"),
+        (("--changes", "park", "--mesh", "no.obj", *WORDS), "no.obj: expected"),
+    ],
+)
+def test_what_cannot_be_is_one_line(refused: Callable[..., str], words: tuple[str, ...], message: str) -> None:
+    assert refused("attack", "--limit", "1", *words).startswith(f"drivesem: {message}")
