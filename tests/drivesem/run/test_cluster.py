@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,6 +20,7 @@ from drivesem.run.workers import outcomes
 from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, SceneError
+from tests.drivesem.commands.test_attack_command import contents
 
 ray = pytest.importorskip("ray")
 
@@ -95,3 +99,26 @@ def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[s
     assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
     with pytest.raises(UsageError, match="--address"):
         Sharing(address="auto").check()
+
+
+@pytest.mark.slow
+def test_an_attack_on_a_cluster_that_loses_a_machine_is_what_one_machine_makes(
+    tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["attack", "--limit", "6", "--steps", "2", "--out"]
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    alone = [sys.executable, "-m", "drivesem.cli", *words, str(tmp_path / "local"), "--workers", "2"]
+    subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
+    shared = tmp_path / "shared"
+
+    def lose_a_machine() -> None:
+        while len(list(shared.glob("frames/*/result.json"))) < 2:
+            time.sleep(0.1)
+        here = ray.get_runtime_context().get_node_id()
+        cluster.remove_node(next(n for n in cluster.worker_nodes if n.node_id != here), allow_graceful=False)
+
+    loss = threading.Thread(target=lose_a_machine)
+    loss.start()
+    assert main([*words, str(shared), "--engine", "ray", "--address", cluster.address]) == 0
+    loss.join()
+    assert contents(shared / "frames") == contents(tmp_path / "local" / "frames")
