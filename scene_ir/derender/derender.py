@@ -15,6 +15,7 @@ from scene_ir.derender import cutout as cutouts
 from scene_ir.derender import depth as depths
 from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand, street, upright
 from scene_ir.derender import widen as wide
+from scene_ir.derender.colours import largest
 from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.matte import opacity_of
 from scene_ir.derender.silhouette import Placement
@@ -273,7 +274,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     if cuts:
         # What stands behind the vehicles no classes tell.
         behind = segment.segment(background, ground, camera, settings.segmenter)
-        seen = segment.of_frame(frame, behind).within((background != image).any(-1), behind)
+        seen = segment.of_frame(frame, behind).within((largest(np.abs(background - image)) > 0), behind)
     stood = maps.footprints(labels, _posed_rows(labels), ground, camera)
     ties = depths.Ties(seen.sky, seen.ground, stood, _behind_m(cuts, camera))
     depth = torch.from_numpy(depths.surroundings(background, ground, camera, ties))
@@ -538,14 +539,15 @@ def _layers(
         return image, [], [], maps.sun_direction()
     near = np.stack([view.distance for view in views]).min(0)
     in_front = surroundings.front > 0
+    plane = street.plane_view(surroundings.ground, surroundings.camera)
     lighting = shadow.light(
-        image, road, vehicles, views, behind=lambda zone: _continued(image, zone, near, surroundings).image
+        image, road, vehicles, views, behind=lambda zone: _continued(image, zone, near, surroundings, plane).image
     )
     sun, shaded = _shaded(lighting, cuts, views, vehicles, in_front)
     hole = vehicles.copy()
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4) | (view.distance < 0.2)
-    filled = _filled(image, hole, near, surroundings, seed)
+    filled = _filled(image, hole, near, surroundings, plane, seed)
     mattes = [opacity_of(cut.seen, cut.mask, cut.unknown) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
@@ -591,9 +593,11 @@ def _shaded(
     return best[1], best[2]
 
 
-def _filled(image: Array, hole: Mask, near: Array, surroundings: _Surroundings, seed: int) -> Array:
+def _filled(
+    image: Array, hole: Mask, near: Array, surroundings: _Surroundings, plane: street.Plane, seed: int
+) -> Array:
     """The image (H, W, 3) without what is in the hole. near (H, W) m: distance from the cars' footprints."""
-    guide = _continued(image, silhouette.grow(hole, 2), near, surroundings)
+    guide = _continued(image, silhouette.grow(hole, 2), near, surroundings, plane)
     forbidden = silhouette.grow(hole, _BORDER_PX) | _not_copied(surroundings, hole)
     seen = surroundings.seen
     like = np.where(forbidden, 0, np.where(guide.ground, _ground_share(seen), seen.ground)).astype(np.float32)
@@ -605,11 +609,12 @@ def _filled(image: Array, hole: Mask, near: Array, surroundings: _Surroundings, 
     return fills.fill(standing.image, rest, forbidden, surroundings.horizon, ground, seed, settings, guide.image)
 
 
-def _continued(image: Array, unknown: Mask, near: Array, surroundings: _Surroundings) -> street.Continued:
+def _continued(
+    image: Array, unknown: Mask, near: Array, surroundings: _Surroundings, plane: street.Plane
+) -> street.Continued:
     """The street behind unknown pixels. near (H, W) m: distance from the cars' footprints."""
     seen = surroundings.seen
     unknown = unknown | _not_copied(surroundings, unknown)
-    plane = street.plane_view(surroundings.ground, surroundings.camera)
     shares = street.Shares(seen.ground, seen.sky, unknown & (near < _STOOD_M), _ground_share(seen))
     return street.continued(image, unknown, shares, plane, surroundings.horizon)
 

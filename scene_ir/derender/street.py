@@ -10,6 +10,7 @@ smooth but has the street's structure: `upright.copied` and `background.fill` ad
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scene_ir.derender.background import push_pull
+from scene_ir.derender.colours import grey, largest
 from scene_ir.types import Camera
 
 Image = NDArray[np.float32]
@@ -161,7 +163,7 @@ def continued(
     profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
     rest = (image - profile).astype(np.float32)
     # What differs from the ground around it is a line, a dash or a crossing's bar: continued, it would be a smear.
-    odd = np.abs(image - local).max(-1) / settings.marking
+    odd = largest(np.abs(image - local)) / settings.marking
     weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
     guess = _sideways(rest, weight) + profile
     # Paint at the borders of removed cars must not tint what stands behind them.
@@ -277,8 +279,8 @@ def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float
 def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
     """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow; 0, 0
     where there are too few."""
-    grey = cv2.GaussianBlur(image.mean(-1), (0, 0), 1.0)
-    gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3)
+    smooth: Any = cv2.GaussianBlur(grey(image), (0, 0), 1.0)
+    gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
     strength = np.hypot(gx, gy)
     kernel = np.ones((5, 5), np.uint8)
     inside = cv2.erode(known.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
@@ -326,13 +328,13 @@ def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) 
     street, _ = mean(colour, filled, (1.5, 40.0))
     difference = colour - street
     # Paint has colours that no ground has: a car that nobody labelled must not run on along the road.
-    tint = np.abs(difference - difference.mean(-1, keepdims=True)).max(-1)
-    filled = filled / (1 + (tint / _TINT) ** 4)
+    tint = largest(np.abs(difference - grey(difference)[..., None]))
+    filled = np.asarray(filled / (1 + (tint / _TINT) ** 4), np.float32)
     weight = filled
     line, total = mean(difference, weight, (10.0, 0.5))
     for _ in range(3):
         # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
-        weight = filled / (1 + (np.abs(difference - line).max(-1) / robust) ** 2)
+        weight = np.asarray(filled / (1 + (largest(np.abs(difference - line)) / robust) ** 2), np.float32)
         line, total = mean(difference, weight, (10.0, 0.5))
     local, _ = mean(colour, known_cells, (1.5, _AROUND))
     return local, line * np.clip(total * 10, 0, 1)[..., None]

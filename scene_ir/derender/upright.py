@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from scene_ir.derender.background import mean_inside
+from scene_ir.derender.colours import square_length
 from scene_ir.derender.street import Continued
 
 Image = NDArray[np.float32]
@@ -181,6 +182,8 @@ class _Search:
         part = np.ix_(rows, columns)
         hole, ring, image, guide = self.hole[part], self.ring[part], self.image[part], self.guide[part]
         height, width = self.hole.shape
+        # By one index: two take twice as long.
+        colours, smooth, forbidden = self.image.reshape(-1, 3), self.smooth.reshape(-1, 3), self.forbidden.ravel()
         top, last = hole.argmax(0), len(rows) - 1 - hole[::-1].argmax(0)
         sample = np.rint(top + (last - top) * np.linspace(0, 1, _SAMPLES)[:, None]).astype(np.int64)
         costs = np.empty((columns.size, self.shifts.size), np.float32)
@@ -191,11 +194,11 @@ class _Search:
             v = np.rint(self.horizon + (rows[:, None] - self.horizon) * ratio).astype(np.int64)
             u = np.broadcast_to(where, v.shape)
             outside = (v < 0) | (v >= height) | (u < 0) | (u >= width)
-            v, u = v.clip(0, height - 1), u.clip(0, width - 1)
-            found, bad = self.image[v, u], self.forbidden[v, u] | outside
-            apart = np.minimum(((found - image) ** 2).sum(-1), settings.most_ring)
+            at = v.clip(0, height - 1) * width + u.clip(0, width - 1)
+            found, bad = colours.take(at, axis=0), forbidden.take(at) | outside
+            apart = np.minimum(square_length(found - image), settings.most_ring)
             cost = settings.ring_weight * np.where(bad, settings.most, apart) * ring
-            guess = np.minimum(((self.smooth[v, u] - guide) ** 2).sum(-1), settings.most)
+            guess = np.minimum(square_length(smooth.take(at, axis=0) - guide), settings.most)
             far = settings.far * abs(shift) / 100 * settings.most
             cost = cost + (settings.guess_weight * guess + _BAD * settings.most * bad + far) * hole
             costs[:, k] = cost.sum(0)
