@@ -44,9 +44,18 @@ _ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
 
+_LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+
+
 def _sibling(path: Path) -> Path:
     """A free hidden name beside `path`, on the same file system, so that a rename is atomic."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """Files and folders below `folder` that a process was writing when it was killed, the outermost of them."""
+    found = sorted(path for path in folder.rglob(".*.tmp") if _LEFT.fullmatch(path.name))
+    return [path for path in found if not any(parent in found for parent in path.parents)]
 
 
 def write_bytes(path: Path, data: bytes) -> None:

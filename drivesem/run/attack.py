@@ -35,6 +35,7 @@ from drivesem.attack.methods.subsets import Subsets
 from drivesem.attack.objective import GRADIENT_PASSES, OF_DETECTIONS
 from drivesem.attack.space import SIX, Parameter, combo, parse_params
 from drivesem.run.ask import Bar, ask
+from drivesem.run.finished import MANIFEST, METRICS
 from drivesem.run.folder import FRAMES, claim
 from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
 from drivesem.run.manifest import manifest_of
@@ -46,6 +47,7 @@ from drivesem.settings.blocks import FrameCommand
 from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
+from drivesem.settings.values import part_of
 from drivesem.truth.certificate import Rule
 from drivesem.truth.grading import Grader, witness_of
 from drivesem.truth.nuisances import Nuisances
@@ -59,7 +61,7 @@ PEERS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures: what is confirmed of one is shown to another."""
 _AROUND = 3
 """Passes of a frame in which no method has a say."""
-WRITTEN = ("metrics.json", "manifest.json", "report.html", FRAMES)
+WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
 
 
 def attack_run(config: Attack) -> RunSummary:
@@ -73,7 +75,8 @@ def attack_run(config: Attack) -> RunSummary:
     worker = Worker.of(config)
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, WRITTEN)
-    return _attacked(worker, select_frames(worker.source, config), out, start, must_find=True)
+    names, without, failed = select_frames(worker.source, config)
+    return _attacked(worker, (_of_part(names, config.part), without, failed), out, start, must_find=True)
 
 
 def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary:
@@ -111,14 +114,20 @@ def _attacked(
         _check_sight(worker, results)
     summary = replace(
         summary_of(config, worker.params, worker.detector, results),
-        out=str(out),
         frames_without_vehicles=without_vehicles + len(empty),
         frames_failed=dict(sorted(failed.items())),
         seconds=round(time.perf_counter() - start, 3),
     )
+    return conclude(out, config, summary, results)
+
+
+def conclude(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
+    """Write into the folder of a run what is said of all of its frames."""
+    summary = replace(summary, out=str(out))
     metrics = summary.to_json()
-    files.write_json(out / "metrics.json", metrics)
-    files.write_json(out / "manifest.json", manifest_of(config, out, done, metrics))
+    files.write_json(out / METRICS, metrics)
+    names = [result.identifier for result in results]
+    files.write_json(out / MANIFEST, manifest_of(config, out, names, metrics))
     write_run(out, config, summary, results)
     return summary
 
@@ -389,6 +398,14 @@ def select_frames(source: SceneSource, config: FrameCommand) -> tuple[list[str],
         else:
             without += 1
     return names, without, failed
+
+
+def _of_part(names: list[str], part: str | None) -> list[str]:
+    """Every N-th of the frames, from the K-th on, so that all parts take about as long."""
+    if part is None:
+        return names
+    number, count = part_of("--part", part)
+    return names[number - 1 :: count]
 
 
 def _name(config: Attack, params: tuple[Parameter, ...]) -> str:

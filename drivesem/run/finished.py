@@ -27,8 +27,9 @@ as the source was judged on them."""
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame of a run: what came of it, and its pictures by name (PICTURES)."""
+    """One frame of a run: its folder, what came of it, and its pictures by name (PICTURES)."""
 
+    folder: Path
     result: FrameResult
     pictures: dict[str, Path]
 
@@ -156,4 +157,4 @@ def _frame(folder: Path) -> Frame:
     for path in pictures.values():
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")
-    return Frame(load_frame(folder / RESULT), pictures)
+    return Frame(folder, load_frame(folder / RESULT), pictures)

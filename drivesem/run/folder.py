@@ -26,6 +26,7 @@ FRAMES = "frames"
 PRESENTATION = (
     "out",
     "limit",
+    "part",
     "workers",
     "engine",
     "address",

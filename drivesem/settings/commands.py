@@ -40,7 +40,7 @@ from drivesem.settings.blocks import (
 )
 from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within, at_least
 from drivesem.settings.errors import refuse
-from drivesem.settings.values import class_map, numbers
+from drivesem.settings.values import class_map, numbers, part_of
 
 COMBO_NUMBERS = (1, 2, 3, 4)
 DEFAULT_COMBO = 2
@@ -61,7 +61,7 @@ Search = Literal[
 """Attacks that look for failures; the placebo looks for none."""
 
 _RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
-Runs = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
+RunFolders = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
 Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
 
 
@@ -119,6 +119,9 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Only objects and phantoms of these classes, such as Car,Pedestrian."""
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
+
+    part: Annotated[str | None, Parsed(part_of)] = None
+    """K/N, such as 2/4: the 2nd, 6th, 10th frame and so on, for one of four machines (drivesem runs merge)."""
 
     def check(self) -> None:
         super().check()
@@ -294,7 +297,7 @@ class Confirm(Trust, FinishedRun, FrameCommand):
 class Holes(Trust, FrameCommand):
     """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
 
-    runs: Runs = ()
+    runs: RunFolders = ()
     """Folders of drivesem attack."""
     samples: Annotated[int, at_least(24, "of which a rule can be made")] = 96
     """States around each failure, within what the run could change; each is seen once, with nuisances."""
@@ -310,7 +313,7 @@ class Holes(Trust, FrameCommand):
 class Gate(Bootstrap, Tiles, FrameCommand):
     """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
 
-    runs: Runs = ()
+    runs: RunFolders = ()
     """Folders of drivesem attack."""
     before: str = "squeezedet"
     """The detector that stands: shipped, a file, or another project's."""
@@ -326,12 +329,36 @@ class Gate(Bootstrap, Tiles, FrameCommand):
 class Report(Command):
     """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
 
-    runs: Runs = ()
+    runs: RunFolders = ()
     """Folders of drivesem attack; a folder of drivesem study stands for its arms."""
     out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
     """HTML file to write; by default report.html in the one folder given, else where the command is called."""
     frames: Count | None = None
     """Frames whose pictures are shown, worst first; by default as many as hold 200 pictures: 100 of one run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Runs(Trust, Command):
+    """Tell what runs there are, make one of several parts, and remove what was never finished."""
+
+    what: tyro.conf.Positional[Literal["list", "show", "merge", "prune"]] = "list"
+    """list: the runs in folders, by default in runs; show: what was asked for and found; merge: one run, --out, of
+    parts that were made with the same settings, on several machines for instance; prune: remove what commands left
+    that were killed."""
+    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER...")] = ()
+    """Runs of drivesem attack; to list, folders that hold some."""
+    out: str | None = None
+    """Merge: the folder of the run that is made."""
+    dry: Flag = False
+    """Prune: only say what would be removed."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.what != "list" and not self.folders, "FOLDER", f"runs to {self.what}", "none")
+        refuse(
+            (self.what == "merge") != (self.out is not None), "--out", "a folder, of runs merge alone", self.out
+        )
+        refuse(self.dry and self.what != "prune", "--dry", "runs prune", f"runs {self.what}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -348,7 +375,7 @@ class Plausibility(FinishedRun, Command):
 class Realism(Draws, Command):
     """How far re-renders and counterexamples are from their photographs: PSNR, SSIM, LPIPS, FID and their kin."""
 
-    runs: Runs = ()
+    runs: RunFolders = ()
     """Folders of runs of drivesem attack; a table each."""
     metrics: str = "available"
     """With commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
@@ -407,7 +434,7 @@ class Worth(Draws, Command):
 class Survey(Command):
     """A page that asks people what they see and how real it looks, as the paper did; it needs no network."""
 
-    runs: Runs = ()
+    runs: RunFolders = ()
     """Folders of runs of drivesem attack."""
     items: Count = 15
     """Counterexamples that are shown, as in the paper; successes before others, drawn at random."""
@@ -849,6 +876,7 @@ _ALL: tuple[type[Command], ...] = (
         Holes,
         Gate,
         Report,
+        Runs,
         Plausibility,
         Realism,
         Worth,

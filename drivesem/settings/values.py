@@ -46,3 +46,11 @@ def numbers(setting: str, text: str, least: int = 1) -> list[int]:
     if not found or found[0] < least:
         raise UsageError(setting, f"numbers of at least {least}, with commas", repr(text))
     return found
+
+
+def part_of(setting: str, text: str) -> tuple[int, int]:
+    """K and N of "K/N", the K-th of N parts. Raises UsageError naming the setting."""
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise UsageError(setting, "K/N, the K-th of N parts, such as 2/4", repr(text))
+    return int(number), int(count)

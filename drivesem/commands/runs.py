@@ -1,0 +1,126 @@
+"""`drivesem runs`: what runs there are, one of several parts, and nothing that was never finished."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from drivesem.commands.attack import told_grades
+from drivesem.report.answer import print_json
+from drivesem.run.finished import METRICS
+from drivesem.run.folder import CONFIG, FRAMES, attack_of, settings_of
+from drivesem.run.frame import RESULT
+from drivesem.run.lock import hold
+from drivesem.run.parts import merge
+from drivesem.settings.commands import Attack, Runs
+from drivesem.settings.errors import UsageError
+from drivesem.truth.grades import Grade
+from scene_ir import files
+
+_HOME = "runs"
+"""Where `drivesem attack` puts runs without --out."""
+
+
+def run(config: Runs) -> int:
+    """Tell, merge or prune; exit code 0. Raises UsageError or SceneError for bad input."""
+    console = Console()
+    does = {"list": _list, "show": _show, "merge": _merge, "prune": _prune}
+    data = does[config.what](config, Console(quiet=True) if config.json else console)
+    if config.json:
+        print_json(data)
+    return 0
+
+
+def _list(config: Runs, console: Console) -> dict[str, Any]:
+    found = [run for folder in config.folders or (_HOME,) for run in _runs_in(Path(folder))]
+    rows = [_row(folder) for folder in found]
+    table = Table()
+    for name in ("run", "detector", "params", "method", "frames", "threshold", "certain", "confirmed", "MB"):
+        table.add_column(name, justify="left" if name in ("run", "detector", "params", "method") else "right")
+    for row in rows:
+        grades = row["grades"] or {}
+        counts = [str(grades.get(grade, "-")) for grade in (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)]
+        frames = f"{row['frames']}" if row["finished"] else f"{row['frames']}, unfinished"
+        table.add_row(
+            *map(str, (row["run"], row["detector"], row["params"], row["method"])),
+            frames,
+            *counts,
+            f"{row['mb']:.0f}",
+        )
+    console.print(table)
+    return {"runs": rows}
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise UsageError("FOLDER", "a folder with runs of drivesem attack", folder)
+    if (folder / CONFIG).is_file():
+        return [folder]
+    return sorted(path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
+
+
+def _row(folder: Path) -> dict[str, Any]:
+    attack, figures = attack_of(folder), _figures(folder)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return {
+        "run": str(folder),
+        "finished": bool(figures),
+        "detector": attack.detector,
+        "dataset": attack.dataset,
+        "params": ",".join(figures.get("params", ())) or attack.params or f"combo {attack.combo}",
+        "method": attack.method,
+        "frames": len(list(folder.glob(f"{FRAMES}/*/{RESULT}"))),
+        "grades": figures.get("grades"),
+        "mb": round(size / 1e6, 1),
+    }
+
+
+def _figures(folder: Path) -> dict[str, Any]:
+    """Of metrics.json; empty for a run that is not finished."""
+    found = files.read_json(folder / METRICS) if (folder / METRICS).is_file() else {}
+    return found if isinstance(found, dict) else {}
+
+
+def _show(config: Runs, console: Console) -> dict[str, Any]:
+    told = []
+    for folder in map(Path, config.folders):
+        usual = {field.name: field.default for field in fields(Attack)}
+        asked = {key: value for key, value in settings_of(attack_of(folder)).items() if value != usual[key]}
+        told.append({**_row(folder), "settings": asked, "left": len(files.leftovers(folder))})
+        console.print(
+            f"{folder}: {told[-1]['frames']} frames, {told[-1]['mb']:.0f} MB", soft_wrap=True, markup=False
+        )
+        for key, value in asked.items():
+            console.print(f"  {key}: {value}", soft_wrap=True, markup=False)
+        console.print(f"  {'finished' if told[-1]['finished'] else 'not finished: the same command goes on'}")
+    return {"runs": told}
+
+
+def _merge(config: Runs, console: Console) -> dict[str, Any]:
+    summary = merge(config.folders, Path(config.out or ""), config.trust)
+    console.print(told_grades(summary), soft_wrap=True)
+    console.print(f"{summary.frames} frames of {len(config.folders)} runs in {summary.out}", soft_wrap=True)
+    return summary.to_json()
+
+
+def _prune(config: Runs, console: Console) -> dict[str, Any]:
+    removed: list[str] = []
+    for folder in map(Path, config.folders):
+        attack_of(folder)
+        hold(folder)  # what another command is writing now is none of this
+        for path in files.leftovers(folder):
+            removed.append(str(path))
+            if config.dry:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    verb = "would be removed" if config.dry else "removed"
+    console.print("\n".join([*removed, f"{len(removed)} leftovers {verb}"]), soft_wrap=True, markup=False)
+    return {"removed": removed}

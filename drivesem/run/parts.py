@@ -1,0 +1,79 @@
+"""Parts of one attack, made on several machines, as one run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from drivesem.attack.space import parse_params
+from drivesem.run.attack import WRITTEN, conclude, summary_of
+from drivesem.run.finished import METRICS, Run, load_runs
+from drivesem.run.folder import FRAMES, claim, detector_of, settings_of, trusted_attack
+from drivesem.run.frame import RESULT
+from drivesem.run.manifest import digest_of
+from drivesem.run.results import RunSummary
+from drivesem.settings.commands import Attack
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+
+def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
+    """Make one run in the folder `out` of the frames of several finished ones with the same settings, or go on
+    with it. Frames that are the same in two of them count once. trust: see `trusted_attack`.
+
+    Raises UsageError for runs that are no parts of one, FormatError naming a file that is damaged.
+    """
+    parts = load_runs(folders, setting="FOLDER")
+    attacks = [trusted_attack(part.folder, trust) for part in parts]
+    for part, attack in zip(parts, attacks, strict=True):
+        _check_alike(parts[0], attacks[0], part, attack)
+    config = replace(attacks[0], out=str(out), part=None, limit=None)
+    claim(out, config, WRITTEN)
+    results = {}
+    for part in parts:
+        for frame in part.frames:
+            name = frame.result.identifier
+            if name in results and _told(frame.folder) != _told(out / FRAMES / name):
+                raise UsageError("FOLDER", "runs in which a frame is the same", f"two results of frame {name}")
+            if name not in results and not (out / FRAMES / name / RESULT).is_file():
+                with files.whole_folder(out / FRAMES / name) as whole:
+                    shutil.copytree(frame.folder, whole, dirs_exist_ok=True, copy_function=_link_or_copy)
+            results[name] = frame.result
+    ordered = [results[name] for name in sorted(results)]
+    metrics = [files.read_json(part.folder / METRICS) for part in parts]
+    try:
+        failed = {name: str(why) for figures in metrics for name, why in figures["frames_failed"].items()}
+        # Each part passed over all frames without vehicles.
+        without = max(int(figures["frames_without_vehicles"]) for figures in metrics)
+        seconds = round(sum(float(figures["seconds"]) for figures in metrics), 3)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise FormatError(METRICS, "frames_failed, frames_without_vehicles and seconds", error) from error
+    failed = {name: why for name, why in sorted(failed.items()) if name not in results}
+    summary = summary_of(config, parse_params(parts[0].params), detector_of(config, config.device), ordered)
+    summary = replace(summary, frames_failed=failed, frames_without_vehicles=without, seconds=seconds)
+    return conclude(out, config, summary, ordered)
+
+
+def _check_alike(first: Run, wanted: Attack, part: Run, attack: Attack) -> None:
+    one, other = settings_of(wanted), settings_of(attack)
+    if one != other:
+        changed = ", ".join(key for key, value in one.items() if other[key] != value)
+        raise UsageError(
+            "FOLDER", f"runs with the settings of {first.folder}", f"{part.folder}: another {changed}"
+        )
+
+
+def _told(frame: Path) -> str:
+    return digest_of(files.read_json(frame / RESULT))
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    """Files of runs are replaced and never written into: a second name for one is as good as a copy."""
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without links
+        shutil.copy2(source, target)
