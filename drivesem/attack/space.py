@@ -234,6 +234,9 @@ class ParameterSpace:
             self.lower[where] = low
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
+            if SPECS[parameter].per_object:
+                for bound in (self.lower, self.upper):
+                    bound[where].view(self.count, SPECS[parameter].size)[behind_camera(scene)] = 0
 
     @property
     def blocks(self) -> Mapping[Parameter, slice]:
@@ -400,6 +403,11 @@ class ParameterSpace:
             return -limit, limit
         start = start.detach()
         return (low - start).clamp(max=0), (limit - start).clamp(min=0)
+
+
+def behind_camera(scene: SceneIR) -> Tensor:
+    """(N,) bool: the vehicles that are not in the scene (`scene_ir.exchange`), which nothing moves."""
+    return scene.objects.translation[:, 2] < 0
 
 
 def shown_whole(scene: SceneIR) -> Tensor:

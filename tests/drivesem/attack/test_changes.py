@@ -6,9 +6,12 @@ import pytest
 import torch
 
 import drivesem as ds
+from drivesem.attack.budgets import PRESETS
 from drivesem.attack.changes import Change, Changes, affordable, parse_changes, proposals, vehicle_mesh
 from drivesem.attack.feasibility_check import check_exchange, check_scene
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
+from drivesem.attack.space import Parameter, ParameterSpace
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
 from scene_ir.meshes.load import save_mesh
@@ -93,6 +96,16 @@ def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
     assert labels.in_view.tolist() == [True] * 6 + [False]
     assert len(to_kitti_labels(labels, left.origin, left).kind) == 6
     assert len(to_kitti_labels(labeller.paper(), left.origin, left).kind) == 7
+
+
+def test_what_is_not_there_is_not_moved_and_violates_nothing(scene: SceneIR) -> None:
+    space = ParameterSpace(without(scene, 6), ("translate", "rotate"), PRESETS["street"])
+    for name in ("translate", "rotate"):
+        upper = space.upper[space.blocks[Parameter(name)]].view(7, -1)
+        assert (upper[6] == 0).all()
+        assert (upper[:6] > 0).all()
+    whole = ParameterSpace(scene, ("translate", "rotate"), PRESETS["street"])
+    assert FeasibleSet(space).violated_at_start == FeasibleSet(whole).violated_at_start
 
 
 def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
