@@ -331,6 +331,17 @@ class ParameterSpace:
             codes["light"] = _within(light, part.sun, -self.budget.sun, self.budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
+    def carried(self, other: ParameterSpace, theta: Tensor) -> Tensor:
+        """theta (D',) of another space of the same parameters, as one (D,) of this one, whose scene has the same
+        vehicles, and perhaps more after them.
+        """
+        other.unflatten(theta)
+        here = self.theta0.clone()
+        for parameter, where in other.blocks.items():
+            start = self.blocks[parameter].start
+            here[start : start + where.stop - where.start] = theta[where]
+        return here
+
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
         """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a bare code."""
         parameter, owner, k = self._locate(i)
