@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
+import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -39,6 +40,10 @@ _NEUTRAL = 0.8
 """Of the templates' paint."""
 _INFLATION_M = 0.05
 _STREET_SHADOW = 0.7
+_DARKEST = 0.3
+"""Least that a box's shadow is taken to be dark where it is darkest; of many that are cut, only a rim is seen."""
+_LENS_PX = 0.5
+"""Standard deviation of what a camera makes of an edge."""
 _MOST_GAIN = 2.0
 
 
@@ -184,8 +189,10 @@ def _drawn(scene: SceneIR, vehicle: Vehicle) -> _Here:
     alone = _alone(scene, row, mesh)
     shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))[0]
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
-    dark = (1.0 - shadow.values) * _darkness([sources[i] for i in nearest])
-    source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark))
+    dark = 1.0 - shadow.values
+    if dark.numel():
+        dark = dark * (_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_DARKEST))
+    source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark.clamp(0.0, 1.0)))
     return replace(here, source=source)
 
 
@@ -211,6 +218,7 @@ def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
     colour = texture.finished(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
     values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
     values = values.to(scene.background).contiguous()
+    values[:4] = kornia.filters.gaussian_blur2d(values[None, :4], (5, 5), (_LENS_PX, _LENS_PX), "replicate")[0]
     return _Alone(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
 
 

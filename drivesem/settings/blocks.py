@@ -125,6 +125,14 @@ class Sharing(Options):
     """Processes that share the frames; by default one a core, at most 4."""
     keep_going: Flag = False
     """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
+    engine: Literal["local", "ray"] = "local"
+    """What shares the frames: processes of this machine, or of a Ray cluster (docs/scale.md)."""
+    address: str | None = None
+    """Address of the Ray cluster, such as auto or ray://HOST:10001; by default one on this machine alone."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.address is not None and self.engine == "local", "--address", "--engine ray beside it", "local")
 
     @property
     def processes(self) -> int:
