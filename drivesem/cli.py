@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import gc
 import importlib
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
 
 from drivesem.run.lock import let_go
 from drivesem.settings.blocks import Command
@@ -16,22 +21,46 @@ from drivesem.settings.parsing import parse
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
+_EXIT_ENDED = 143
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
+    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 143 ended by
+    SIGTERM.
+    """
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
-        with let_go():
+        with _sigterm_interrupts(), let_go():
             return _run(config)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
-        return _EXIT_INTERRUPTED
+        return _EXIT_ENDED if isinstance(error, _EndedError) else _EXIT_INTERRUPTED
     except (ValueError, OSError) as error:
         if not _is_bad_input(error):
             raise
         sys.stderr.write(f"drivesem: {' '.join(str(error).split())}\n")
         return _EXIT_BAD_INPUT
+
+
+class _EndedError(KeyboardInterrupt):
+    """SIGTERM: to be cleaned up after as after Ctrl-C."""
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """What systems that share machines send before they kill ends a command as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():  # a signal's handler can't be set elsewhere
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> NoReturn:
+        raise _EndedError
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _is_bad_input(error: Exception) -> bool:

@@ -11,10 +11,11 @@ from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
 from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
+from drivesem.run.workers import mapping
 from drivesem.settings.commands import Synth
 from drivesem.settings.errors import UsageError
 from drivesem.synth.variations import MIXED, parse_variations
-from drivesem.synth.write import Order, in_processes, synthesise
+from drivesem.synth.write import Order, synthesise
 
 _DRIVE_FRAMES = 10
 """Frames of one drive in the layouts of Virtual KITTI, unless --sequence says otherwise."""
@@ -54,7 +55,7 @@ def run(config: Synth) -> int:
     total = len(order.places())
     hold(order.out)
     with progress_bar(Console(stderr=True), remaining=True) as progress:
-        done = synthesise(order, in_processes(min(config.processes, total)))
+        done = synthesise(order, mapping(config))
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}

@@ -27,6 +27,8 @@ PRESENTATION = (
     "out",
     "limit",
     "workers",
+    "engine",
+    "address",
     "keep_going",
     "resume",
     "json",

@@ -32,6 +32,7 @@ from drivesem.data import kitti
 from drivesem.evaluation.failures import Failures
 from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.settings.blocks import KEEP_MB
 from drivesem.truth.certificate import with_regions
 from drivesem.truth.grades import Grade
 from drivesem.truth.grading import Case, Graded, Grader, Grades
@@ -57,8 +58,8 @@ class FrameSettings:
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
     how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`. changes:
-    what is proposed after a search on margins, None for nothing.
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole, keep_mb: see `Objective`.
+    changes: what is proposed after a search on margins, None for nothing.
     """
 
     attack: AttackMethod
@@ -74,6 +75,7 @@ class FrameSettings:
     keep_last: bool = False
     only_bounds: bool = False
     whole: bool = False
+    keep_mb: float = KEEP_MB
     changes: Changes | None = None
 
 
@@ -159,6 +161,7 @@ class _Posed:
             t_star=settings.t_star,
             aim=settings.aim,
             whole=settings.whole,
+            keep_mb=settings.keep_mb,
         )
         nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
         views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")

@@ -1,108 +1,132 @@
-"""Independent pieces of work, such as frames, shared by processes of one machine."""
+"""Independent pieces of work, such as frames, shared by processes of one machine, or of a cluster."""
 
 from __future__ import annotations
 
 import os
+import signal
 import threading
-import traceback
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, wait
 from functools import partial
-from multiprocessing import get_context, parent_process
-from pathlib import Path
+from itertools import islice
 from typing import Any, TypeVar
 
+import cv2
 import torch
 
-from detectors.base import DetectorError
+from drivesem.run.cluster import on_ray
+from drivesem.run.jobs import Start, begin, do, ended, forgiving
 from drivesem.settings.blocks import Sharing
-from drivesem.settings.errors import UsageError
-from scene_ir.errors import SceneError
 
 J = TypeVar("J")
 R = TypeVar("R")
 
-_work: Callable[[Any], Any] | None = None
-
-
-class UnforeseenError(SceneError):
-    """A defect of drivesem that one job brought to light, and with which a night's work need not end."""
-
 
 def outcomes(
-    work: Callable[[J], R], build: Callable[[], Callable[[J], R]], jobs: Sequence[J], config: Sharing
+    work: Callable[[J], R],
+    build: Callable[[], Callable[[J], R]],
+    jobs: Sequence[J],
+    config: Sharing,
+    apart: bool = False,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     """Each job with a call that gives its result or raises what went wrong, as they are done.
 
     work: does a job in this process, where one process is enough. build: makes the like of it in another process,
     once for each, and can be pickled, as jobs and results can. With `keep_going` an error for which no input is to
-    blame is raised as UnforeseenError, which says where it arose.
+    blame is raised as UnforeseenError, which says where it arose. So is, always, a job at which its process ended,
+    and ended again when the job was tried alone. apart: in no case in this process. UsageError for a cluster that
+    is not there.
     """
+    if config.engine == "ray":
+        yield from on_ray(Start(build, 1, config.keep_going), jobs, config)
+        return
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.
     before = torch.get_num_threads()
     threads = max(min((os.cpu_count() or 1) // config.processes, before), 1)
     torch.set_num_threads(threads)
     try:
-        yield from _outcomes(work, build, jobs, config, threads)
+        count = min(config.processes, len(jobs))
+        if count > 1 or apart:
+            yield from _shared(Start(build, threads, config.keep_going), jobs, count)
+            return
+        here = partial(forgiving, work) if config.keep_going else work
+        for job in jobs:
+            yield job, partial(here, job)
     finally:
         torch.set_num_threads(before)  # what follows, such as training, is alone again
 
 
-def _outcomes(
-    work: Callable[[J], R],
-    build: Callable[[], Callable[[J], R]],
-    jobs: Sequence[J],
-    config: Sharing,
-    threads: int,
-) -> Iterator[tuple[J, Callable[[], R]]]:
-    count = min(config.processes, len(jobs))
-    if count <= 1:
-        here = partial(_forgiving, work) if config.keep_going else work
-        for job in jobs:
-            yield job, partial(here, job)
-        return
-    start = (build, threads, config.keep_going)
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_start, initargs=start)
-    with pool:
-        pending = {pool.submit(_do, job): job for job in jobs}
-        try:
-            for future in as_completed(pending):
-                yield pending[future], future.result
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+def mapping(config: Sharing, apart: bool = False) -> Callable[[Callable[[J], R], Sequence[J]], Iterator[R]]:
+    """What does jobs that nothing has to be made for, and gives their results as they are done; see `outcomes`."""
+
+    def over(work: Callable[[J], R], jobs: Sequence[J]) -> Iterator[R]:
+        for _, outcome in outcomes(work, partial(_as_it_is, work), jobs, config, apart):
+            yield outcome()
+
+    return over
 
 
-def _start(build: Callable[[], Callable[[Any], Any]], threads: int, keep_going: bool) -> None:
-    global _work
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    torch.set_num_threads(threads)
-    work = build()
-    _work = partial(_forgiving, work) if keep_going else work
+def _as_it_is(work: Callable[[J], R]) -> Callable[[J], R]:
+    cv2.setNumThreads(1)  # the work is parallel over jobs already
+    return work
 
 
-def _forgiving(work: Callable[[J], R], job: J) -> R:
+def _shared(start: Start, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Callable[[], Any]]]:
+    left = list(jobs)
+    while left:
+        lost: list[J] = []
+        for job, outcome in _pooled(start, left, count, lost):
+            left.remove(job)
+            yield job, outcome
+        # A process is gone, for want of memory say, and nobody knows at which of these: each has one try alone.
+        for job in lost:
+            left.remove(job)
+            again: list[J] = []
+            yield from _pooled(start, [job], 1, again)
+            if again:
+                yield job, ended
+
+
+def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Iterator[tuple[J, Callable[[], Any]]]:
+    """Jobs by so many processes, as they are done. Where a process ends by itself all end, and those that were at
+    work are `lost`.
+    """
+    from loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
+
+    pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(), start))
+    waiting, pending = iter(jobs), {}
     try:
-        return work(job)
-    except (SceneError, UsageError, DetectorError):
-        raise
-    except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
-        raise UnforeseenError("drivesem", "no defect of its own", found) from error
+        # No more jobs at a time than processes: what is pending is what is at work.
+        pending |= {pool.submit(do, job): job for job in islice(waiting, count)}
+        while pending:
+            done, _ = wait(pending, return_when=FIRST_COMPLETED)
+            gone = {future for future in done if isinstance(future.exception(), TerminatedWorkerError)}
+            if not gone:
+                pending |= {pool.submit(do, job): job for job in islice(waiting, len(done))}
+            for future in done - gone:
+                yield pending.pop(future), future.result
+            if gone:
+                lost += pending.values()
+                return
+    finally:
+        # Done with, interrupted, or broken: nobody waits for what is still at work, which is whole or not there.
+        pool.shutdown(kill_workers=True)
 
 
-def _leave_with_parent() -> None:
+def _begin(parent: int, start: Start) -> None:
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches all processes of a terminal; the first one ends it
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    begin(start)
+
+
+def _leave_with(parent: int) -> None:
     """End this process when the one that started it is gone: killed, it can no longer say so itself, and its
     workers would wait for ever, each with a detector in memory.
     """
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _do(job: Any) -> Any:
-    assert _work is not None
-    return _work(job)
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)

@@ -37,6 +37,8 @@ SOURCES = (DEMO, *DATASETS)
 
 CERTIFYING_DRAWS = 16
 """What the rule of certificates needs at least (`truth.certificate`)."""
+KEEP_MB = 800.0
+"""Of a detector's layers that a process keeps: SqueezeDet's are 24 MB for each picture of 1242 x 375 px."""
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
 
@@ -123,6 +125,14 @@ class Sharing(Options):
     """Processes that share the frames; by default one a core, at most 4."""
     keep_going: Flag = False
     """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
+    engine: Literal["local", "ray"] = "local"
+    """What shares the frames: processes of this machine, or of a Ray cluster (docs/scale.md)."""
+    address: str | None = None
+    """Address of the Ray cluster, such as auto or ray://HOST:10001; by default one on this machine alone."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.address is not None and self.engine == "local", "--address", "--engine ray beside it", "local")
 
     @property
     def processes(self) -> int:
@@ -255,6 +265,8 @@ class Regions(Options):
     where its layers are known (docs/detectors.md)."""
     incremental: Flag = False
     """The default by its name: only what changed, also of a run with --whole."""
+    keep_mb: Annotated[float, at_least(1)] = KEEP_MB
+    """MB of layers that a process keeps of a frame's pictures, at most 120 of one; the rest is computed again."""
 
     def check(self) -> None:
         super().check()

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -48,8 +46,8 @@ _FEWEST_IN_A_DRIVE, _MOST_ATTEMPTS = 3, 10
 TRACKS_A_STREET = 25
 """Track numbers set apart for each of those."""
 Engine = Callable[["Callable[[Job], int]", "Sequence[Job]"], Iterator[int]]
-"""Runs a function over independent jobs and yields the numbers of those done, in any order: processes here, and
-room for a cluster's scheduler."""
+"""Runs a function over independent jobs and yields the numbers of those done, in any order: processes, or a
+cluster's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,32 +225,6 @@ def make_frame(job: Job) -> int:
     return place.number
 
 
-def _one_thread() -> None:
-    """Each worker keeps to one core: the work is parallel over frames already."""
-    import cv2
-    import torch
-
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-
-
-def in_processes(workers: int, apart: bool = False) -> Engine:
-    """An engine of so many processes; a single one is this process, unless `apart`. RangeError for none."""
-    if workers < 1:
-        raise RangeError("synth workers", "at least 1", workers)
-
-    def run(work: Callable[[Job], int], jobs: Sequence[Job]) -> Iterator[int]:
-        if workers == 1 and not apart:
-            yield from map(work, jobs)
-            return
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        context = multiprocessing.get_context("spawn")
-        with context.Pool(workers, initializer=_one_thread) as pool:
-            yield from pool.imap(work, jobs)
-
-    return run
-
-
 def jobs_of(order: Order) -> list[Job]:
     """All frames of the data set, in order."""
     variations = order.variations
@@ -269,7 +241,6 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
     objects. A frame's bytes depend on its seed, index and settings alone, not on order, engine or number of
     frames. Raises FormatError where the folder holds frames of another recipe.
     """
-    engine = engine or in_processes(1)
     stamp = order.out / _STATE / "recipe.json"
     recipe = order.recipe()
     if order.resume and stamp.exists() and (found := files.read_json(stamp)) != recipe:
@@ -279,7 +250,7 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
     if not order.resume or not stamp.exists():
         files.write_json(stamp, recipe)
     jobs = jobs_of(order)
-    yield from engine(make_frame, jobs)
+    yield from (engine or map)(make_frame, jobs)
     _finish(order, jobs)
 
 

@@ -39,7 +39,21 @@ FRESH, CACHE = "fresh", "cache"
 _FRESH_OF = "fresh_of.txt"
 """Digest of the weights that the new attack was against."""
 _WRITTEN = (WEIGHTS, FIGURES, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES, FRESH, CACHE)
-_FREE = ("out", "workers", "keep_going", "resume", "json", "minutes", "checkpoint_every", "fresh", "trust")
+_FREE = (
+    *(
+        "out",
+        "workers",
+        "engine",
+        "address",
+        "keep_going",
+        "resume",
+        "json",
+        "minutes",
+        "checkpoint_every",
+        "fresh",
+    ),
+    "trust",
+)
 """Settings that a run may change on the way."""
 
 

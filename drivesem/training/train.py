@@ -23,6 +23,7 @@ from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
 from drivesem.report.progress import training_bar
 from drivesem.run.folder import claim
+from drivesem.run.workers import mapping
 from drivesem.settings.commands import SYNTH, Train
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
@@ -45,7 +46,7 @@ _WRITTEN = (
     *(CACHES, SEMANTIC, "tensorboard"),
 )
 _FREE = (
-    *("out", "workers", "keep_going", "resume", "json", "device", "loaders"),
+    *("out", "workers", "engine", "address", "keep_going", "resume", "json", "device", "loaders"),
     *("minutes", "checkpoint_every", "evaluate_every", "thin", "note", "also", "weights"),
 )
 """Settings that a run may change on the way."""
@@ -201,7 +202,7 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
     """Layout, folder to train on, folder to judge by."""
     if config.dataset != SYNTH:
         return config.dataset, Path(config.root or ""), Path(config.held_out) if config.held_out else None
-    from drivesem.synth.write import Order, in_processes, synthesise
+    from drivesem.synth.write import Order, synthesise
 
     root, held_out = out / "frames" / "train", out / "frames" / "held_out"
     orders = [Order(root, config.frames, config.seed)]
@@ -209,7 +210,7 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
         orders.append(Order(held_out, config.held_out_frames, config.seed, split="heldout"))
     if rank == 0:
         for order in orders:
-            done = synthesise(order, in_processes(min(config.processes, order.frames)))
+            done = synthesise(order, mapping(config))
             with training_bar(console) as bar:
                 for _ in bar.track(done, total=order.frames, description="making frames"):
                     pass

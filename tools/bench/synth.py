@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import tempfile
 import threading
 import time
@@ -11,10 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from drivesem.bench.tables import Columns
+from drivesem.run.workers import mapping
+from drivesem.settings.blocks import Sharing
 from drivesem.synth.variations import MIXED
-from drivesem.synth.write import Order, in_processes, synthesise
+from drivesem.synth.write import Order, synthesise
 
 TITLE = "The scene generator"
 COLUMNS: Columns = {
@@ -68,7 +70,10 @@ def _row(layout: str, workers: int, frames: int, seed: int) -> SynthRow:
         with _Watch() as watch:
             start = time.perf_counter()
             # A single process is a child too, so that what this one has loaded does not count.
-            done = [time.perf_counter() - start for _ in synthesise(order, in_processes(workers, apart=True))]
+            done = [
+                time.perf_counter() - start
+                for _ in synthesise(order, mapping(Sharing(workers=workers), apart=True))
+            ]
     warm = min(2 * workers, frames - 1)
     return SynthRow(
         layout=layout,
@@ -112,14 +117,12 @@ class _Watch:
 
     def _run(self) -> None:
         while not self._stop.wait(_SAMPLE_S):
-            self._samples.append(sum(_resident_kb(child.pid) for child in multiprocessing.active_children()))
+            self._samples.append(sum(map(_resident_kb, psutil.Process().children(recursive=True))))
 
 
-def _resident_kb(pid: int | None) -> int:
+def _resident_kb(process: psutil.Process) -> int:
     """Resident memory of a process now, KB; 0 where it has ended."""
     try:
-        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
-    except OSError:
+        return process.memory_info().rss // 1024
+    except psutil.NoSuchProcess:
         return 0
-    line = next((line for line in status.splitlines() if line.startswith("VmRSS:")), "VmRSS: 0 kB")
-    return int(line.split()[1])

@@ -18,6 +18,7 @@ from drivesem.questions.study.arms import Arm, attack_of
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.run.attack import Worker
 from drivesem.run.protocol import follows_paper
+from drivesem.run.workers import mapping
 from drivesem.scenes.sources import SceneSource
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
@@ -233,10 +234,10 @@ def held_out_frames(study: Study, parts: Parts, classes: Sequence[str], out: Pat
     if parts.held_out is not None:
         dataset, names = parts.held_out
         return FrameStore(dataset, names, out / CACHE / "held_out", classes)
-    from drivesem.synth.write import Order, in_processes, synthesise
+    from drivesem.synth.write import Order, synthesise
 
     order = Order(out / FRAMES, benign_count(study), study.seed + 1, split="heldout")
-    done = synthesise(order, in_processes(min(study.processes, order.frames)))
+    done = synthesise(order, mapping(study))
     for _ in track(done, "making frames", order.frames, console=console, transient=True):
         pass
     made = open_dataset("kitti", order.out)

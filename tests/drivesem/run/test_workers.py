@@ -131,6 +131,29 @@ def test_bad_settings_end_it_in_any_case(keep_going: bool) -> None:
         outcome()
 
 
+def die(job: int, folder: str) -> int:
+    """End the process at job 2 always, at job 4 once."""
+    if job == 2 or (job == 4 and not Path(folder, "once").exists()):
+        Path(folder, "once").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return job
+
+
+def dying(folder: str) -> Callable[[int], int]:
+    return partial(die, folder=folder)
+
+
+def test_a_job_whose_process_is_killed_is_tried_alone_and_then_listed(tmp_path: Path) -> None:
+    found: dict[int, int | str] = {}
+    for job, outcome in outcomes(die, partial(dying, str(tmp_path)), [1, 2, 3, 4, 5], Sharing(workers=2)):
+        try:
+            found[job] = outcome()
+        except SceneError as error:
+            found[job] = str(error)
+    assert {job: value for job, value in found.items() if job != 2} == {1: 1, 3: 3, 4: 4, 5: 5}
+    assert "expected a process that lasts, found one that was ended twice" in str(found[2])
+
+
 def linger(job: int, folder: str) -> None:
     """Say who works, and never end."""
     Path(folder, f"{job}-{os.getpid()}").touch()
@@ -141,27 +164,38 @@ def lingering(folder: str) -> Callable[[int], None]:
     return partial(linger, folder=folder)
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
-def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
-    script = (
+_NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
+
+
+@_NO_PROC
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_path: Path) -> None:
+    """Soon, and without a word of their own; also where the script guards nothing by its name."""
+    (tmp_path / "stopped.py").write_text(
         "from drivesem.settings.blocks import Sharing\n"
         "from drivesem.run.workers import outcomes\n"
         "from tests.drivesem.run.test_workers import lingering\n"
         "from functools import partial\n"
-        "if __name__ == '__main__':\n"
-        f"    list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Sharing(workers=2)))\n"
+        f"list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Sharing(workers=2)))\n"
     )
-    file = tmp_path / "killed.py"
-    file.write_text(script)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    parent = subprocess.Popen([sys.executable, str(file)], env=environment, stderr=subprocess.DEVNULL)
-    _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
-    found = list(tmp_path.glob("[12]-*"))
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    assert len(found) == 2
-    workers = [int(path.name.partition("-")[2]) for path in found]
-    assert _soon(lambda: not any(_lives(pid) for pid in workers))
+    command = [sys.executable, str(tmp_path / "stopped.py")]
+    with subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as parent:
+        assert parent.stderr is not None
+        assert _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
+        workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("[12]-*")]
+        start = time.monotonic()
+        if number == signal.SIGINT:  # as a terminal sends it: to all of them
+            os.killpg(parent.pid, number)
+        else:
+            parent.send_signal(number)
+        parent.wait()
+        assert _soon(lambda: not any(_lives(pid) for pid in workers), 10)
+        took, said = time.monotonic() - start, parent.stderr.read()
+    assert took < 5
+    assert said.count("Traceback") == (number == signal.SIGINT), "of the script itself, which catches nothing"
 
 
 def _soon(what: Callable[[], bool], seconds: float = 60) -> bool:

@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from drivesem.data.registry import WRITERS, open_dataset
+from drivesem.run.workers import mapping
+from drivesem.settings.blocks import Sharing
 from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
 from drivesem.synth.frames import VARIANTS, SynthSettings, boxes_alone, plan_frame, render_frame, variation_of
 from drivesem.synth.layout import LayoutSettings
-from drivesem.synth.write import Order, in_processes, synthesise
+from drivesem.synth.write import Order, synthesise
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
@@ -168,11 +170,6 @@ def test_bad_requests_are_errors(tmp_path, changes, message):
         Order(**{"out": tmp_path / "out", "frames": 1, **changes})
 
 
-def test_no_processes_is_an_error():
-    with pytest.raises(RangeError, match="synth workers: expected at least 1, found 0"):
-        in_processes(0)
-
-
 def test_places_fill_the_scenes_of_virtual_kitti_with_tracks_that_eight_bits_hold(tmp_path):
     single = Order(tmp_path, 65, layout="vkitti2", people=False, variations=("clone", "fog")).places()
     assert [p.number for p in single] == list(range(130))
@@ -229,5 +226,5 @@ def test_the_right_camera_is_written_beside_the_left(tmp_path):
 def test_workers_change_nothing(tmp_path, layout):
     one, two = (order_for(tmp_path / str(n), layout, frames=4) for n in (1, 2))
     list(synthesise(one))
-    list(synthesise(two, in_processes(2)))
+    list(synthesise(two, mapping(Sharing(workers=2))))
     assert tree(two.out) == tree(one.out)

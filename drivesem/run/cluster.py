@@ -1,0 +1,135 @@
+"""Independent pieces of work shared by the machines of a Ray cluster: https://docs.ray.io.
+
+One actor of Ray is one process, and has one job at a time, so that what a machine takes with it is what was in its
+hands. It is begun anew elsewhere, and the job is tried again.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from drivesem.run.jobs import Start, begin, do, ended
+from drivesem.settings.blocks import Sharing
+from drivesem.settings.errors import UsageError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+J = TypeVar("J")
+_PATIENCE_S = 10.0
+_TRIES = 3
+"""How often a job may be in hand when a process ends, before it is listed."""
+
+
+class _Process:
+    """What an actor is. Made on another machine: paths of settings are relative to the folder of the command."""
+
+    def __init__(self, folder: str, start: Start) -> None:
+        os.chdir(folder)
+        begin(start)
+
+    def ready(self) -> None:
+        """Returns once everything that jobs need has been made."""
+
+    def do(self, job: Any) -> tuple[Any, Exception | None]:
+        """A job's result, or what went wrong with it."""
+        try:
+            return do(job), None
+        except Exception as error:
+            return None, error
+
+
+@dataclass(frozen=True, slots=True)
+class _InHand:
+    """An actor and the job that it does, None while it is getting ready. tries: of the job, before this one."""
+
+    actor: Any
+    job: Any = None
+    tries: int = 0
+
+
+def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J, Callable[[], Any]]]:
+    """Each job with a call that gives its result or raises what went wrong, as they are done.
+
+    By `--workers` processes on the machines of the cluster, by default one for each CPU. Raises UsageError where
+    there is no Ray, or no cluster.
+    """
+    if not jobs:
+        return
+    ray = _loaded()
+    if not ray.is_initialized():  # it stays until this process ends: commands ask more than once
+        _connect(ray, config.address)
+    count = min(config.workers or max(int(ray.cluster_resources().get("CPU", 1)), 1), len(jobs))
+    kind = ray.remote(num_cpus=1, max_restarts=-1, scheduling_strategy="SPREAD")(_Process)
+    actors = [kind.remote(os.getcwd(), start) for _ in range(count)]
+    try:
+        yield from _shared(ray, actors, deque((job, 0) for job in jobs))
+    finally:
+        for actor in actors:
+            ray.kill(actor)
+
+
+def _connect(ray: ModuleType, address: str | None) -> None:
+    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        if host and port.isdecimal():  # Ray itself would go on asking for minutes
+            socket.create_connection((host, int(port)), _PATIENCE_S).close()
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except OSError as error:
+        raise UsageError("--address", "a Ray cluster", f"{address}: {error}") from error
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
+
+
+def _shared(
+    ray: ModuleType, actors: Sequence[Any], left: deque[tuple[Any, int]]
+) -> Iterator[tuple[Any, Callable[[], Any]]]:
+    pending: dict[Any, _InHand] = {actor.ready.remote(): _InHand(actor) for actor in actors}
+    while pending:
+        (reference,), _ = ray.wait(list(pending), num_returns=1)
+        hand = pending.pop(reference)
+        outcome: Callable[[], Any] | None = None
+        try:
+            result, error = ray.get(reference) or (None, None)
+            outcome = partial(_hand_over, result, error)
+            ready = True
+        except ray.exceptions.RayActorError as error:
+            if getattr(error, "actor_init_failed", False):
+                raise
+            # Begun anew by Ray where there is room: only then it gets a job again.
+            pending[hand.actor.ready.remote()] = _InHand(hand.actor)
+            ready = False
+            if hand.job is not None and hand.tries + 1 < _TRIES:
+                left.appendleft((hand.job, hand.tries + 1))
+            elif hand.job is not None:
+                outcome = ended
+        if ready and left:
+            job, tries = left.popleft()
+            pending[hand.actor.do.remote(job)] = _InHand(hand.actor, job, tries)
+        if hand.job is not None and outcome is not None:
+            yield hand.job, outcome
+        if not left and not any(one.job is not None for one in pending.values()):
+            return
+
+
+def _hand_over(result: Any, error: Exception | None) -> Any:
+    if error is not None:
+        raise error
+    return result
+
+
+def _loaded() -> ModuleType:
+    try:
+        import ray
+    except ImportError as error:
+        raise UsageError("--engine", "local, or Ray installed (pip install 'drivesem[ray]')", "ray") from error
+    return ray

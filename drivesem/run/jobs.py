@@ -1,0 +1,67 @@
+"""What a process does that shares jobs with others, on this machine or on another one."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import torch
+
+from detectors.base import DetectorError
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import SceneError
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+_work: Callable[[Any], Any] | None = None
+
+
+class UnforeseenError(SceneError):
+    """A defect of drivesem that one job brought to light, and with which a night's work need not end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `forgiving`."""
+
+    build: Callable[[], Callable[[Any], Any]]
+    threads: int
+    keep_going: bool
+
+
+def begin(start: Start) -> None:
+    """Once in a process, before its first job."""
+    global _work
+    torch.set_num_threads(start.threads)
+    work = start.build()
+    _work = partial(forgiving, work) if start.keep_going else work
+
+
+def do(job: Any) -> Any:
+    """A job, in a process that has begun."""
+    assert _work is not None
+    return _work(job)
+
+
+def forgiving(work: Callable[[J], R], job: J) -> R:
+    """A job's result; an error for which no input is to blame as UnforeseenError, which says where it arose."""
+    try:
+        return work(job)
+    except (SceneError, UsageError, DetectorError):
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
+        raise UnforeseenError("drivesem", "no defect of its own", found) from error
+
+
+def ended() -> NoReturn:
+    """The outcome of a job at which processes ended."""
+    raise UnforeseenError(
+        "drivesem", "a process that lasts", "one that was ended twice, for want of memory perhaps"
+    )

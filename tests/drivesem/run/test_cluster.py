@@ -1,0 +1,124 @@
+"""Work shared by a cluster of Ray: three nodes on this machine, of one process each."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivesem.cli import main
+from drivesem.run.workers import outcomes
+from drivesem.settings.blocks import Sharing
+from drivesem.settings.errors import UsageError
+from scene_ir.errors import FormatError, SceneError
+from tests.drivesem.commands.test_attack_command import contents
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))  # where nodes find this module
+    found = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    for _ in range(2):
+        found.add_node(num_cpus=1)
+    found.wait_for_nodes()
+    yield found
+    ray.shutdown()
+    found.shutdown()
+
+
+def look(job: int, folder: str) -> tuple[int, str]:
+    """A job's square and the node that found it. FormatError for 3; job 5 ends its process once, job 7 always."""
+    with Path(folder, str(job)).open("a") as tries:
+        tries.write("x")
+    if job == 3:
+        raise FormatError("three", "another number", job)
+    if job == 7 or (job == 5 and len(Path(folder, "5").read_text()) == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.2)
+    return job * job, ray.get_runtime_context().get_node_id()
+
+
+def looking(folder: str) -> Callable[[int], tuple[int, str]]:
+    return partial(look, folder=folder)
+
+
+def found_by(jobs: list[int], folder: Path, address: str) -> Iterator[tuple[int, Any]]:
+    config = Sharing(engine="ray", address=address)
+    for job, outcome in outcomes(look, partial(looking, str(folder)), jobs, config):
+        try:
+            yield job, outcome()
+        except SceneError as error:
+            yield job, str(error)
+
+
+def test_nodes_share_jobs_and_a_process_that_ends_costs_what_it_had_in_hand(tmp_path: Path, cluster: Any) -> None:
+    found = dict(found_by(list(range(12)), tmp_path, cluster.address))
+    assert found[3] == "three: expected another number, found 3"
+    assert "expected a process that lasts" in found[7]
+    rest = {job: value for job, value in found.items() if job not in (3, 7)}
+    assert {job: value[0] for job, value in rest.items()} == {
+        job: job * job for job in range(12) if job not in (3, 7)
+    }
+    assert len({node for _, node in rest.values()}) >= 2
+    tries = {job: len((tmp_path / str(job)).read_text()) for job in range(12)}
+    assert tries == dict.fromkeys(range(12), 1) | {5: 2, 7: 3}, "nothing is done twice"
+
+
+def test_a_node_that_is_gone_costs_what_it_had_in_hand(tmp_path: Path, cluster: Any) -> None:
+    found: dict[int, Any] = {}
+    jobs, gone = list(range(10, 60)), False
+    for job, outcome in found_by(jobs, tmp_path, cluster.address):
+        found[job] = outcome
+        if not gone and len({node for _, node in found.values()}) == 3:
+            # Not the one through which this process speaks to the others: all share this machine.
+            here = ray.get_runtime_context().get_node_id()
+            other = next(node for node in cluster.worker_nodes if node.node_id != here)
+            cluster.remove_node(other, allow_graceful=False)
+            gone = True
+    assert gone
+    assert {job: value[0] for job, value in found.items()} == {job: job * job for job in jobs}
+    assert sum(len((tmp_path / str(job)).read_text()) for job in jobs) <= len(jobs) + 1
+
+
+def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1"]
+    assert main(words) == 2
+    assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
+    with pytest.raises(UsageError, match="--address"):
+        Sharing(address="auto").check()
+
+
+@pytest.mark.slow
+def test_an_attack_on_a_cluster_that_loses_a_machine_is_what_one_machine_makes(
+    tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["attack", "--limit", "6", "--steps", "2", "--out"]
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    alone = [sys.executable, "-m", "drivesem.cli", *words, str(tmp_path / "local"), "--workers", "2"]
+    subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
+    shared = tmp_path / "shared"
+
+    def lose_a_machine() -> None:
+        while len(list(shared.glob("frames/*/result.json"))) < 2:
+            time.sleep(0.1)
+        here = ray.get_runtime_context().get_node_id()
+        cluster.remove_node(next(n for n in cluster.worker_nodes if n.node_id != here), allow_graceful=False)
+
+    loss = threading.Thread(target=lose_a_machine)
+    loss.start()
+    assert main([*words, str(shared), "--engine", "ray", "--address", cluster.address]) == 0
+    loss.join()
+    assert contents(shared / "frames") == contents(tmp_path / "local" / "frames")
