@@ -1,8 +1,8 @@
 """Changes that people see in streets from one day to the next, as an attack's scouts propose them: another
 vehicle in a car's place, a parked car more or less, a load on a roof.
 
-Each is a scene of its own, on which theta goes on (`scene_ir.exchange`). A few are seen in draws, and the one with
-the lowest margins is kept, or the scene as it is.
+Each is a scene of its own, which theta changes as it does the first (`scene_ir.exchange`). A few are seen in
+draws at the theta that a search found, and the one with the lowest margins is kept, or the scene as it is.
 """
 
 from __future__ import annotations
@@ -98,11 +98,16 @@ def vehicle_mesh(path: str) -> Imported:
 
 
 def affordable(passes: int) -> int:
-    """How many proposals an attack of so many passes sees, beside the scene as it is: each costs a pass for the
-    picture before it, and its draws.
-    """
+    """How many proposals an attack of so many passes sees, beside the scene as it is."""
     spare = min(int(_SHARE * passes), passes - LEAST_PASSES)
-    return min(max(spare // (DRAWS + 1) - 1, 0), _MOST)
+    return min(max((spare - DRAWS - 1) // (DRAWS + 1), 0), _MOST)
+
+
+def passes_of(count: int) -> int:
+    """What so many proposals take: each a pass for the picture before it, and its draws; with those of the scene
+    as it is, and the judging of the one that is kept.
+    """
+    return count * (DRAWS + 1) + DRAWS + 1 if count else 0
 
 
 @torch.no_grad()

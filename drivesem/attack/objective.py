@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import Detector, Predictor, RawPredictions, predict
-from detectors.incremental.reference import Reference
+from detectors.incremental.reference import LIMIT_MB, Reference
 from detectors.incremental.regions import Rect
 from detectors.types import Detections, Targets
 from drivesem.attack import detection_loss, goals
@@ -23,6 +23,7 @@ from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.attack.methods.base import Group, Problem, Score, Views
 from drivesem.attack.space import SPECS, Parameter, ParameterSpace
 from drivesem.evaluation import failures
+from drivesem.settings.blocks import KEEP_MB
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor, render_batch
@@ -58,7 +59,8 @@ class Objective:
     `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. difficulty: what is judged. t_star:
     score from which a detection counts; by default the detector's own. aim: what counts as a failure, and is
     raised; by default everything. whole: the detector always sees whole pictures; else only what vehicles change
-    of the benign one is computed again, where the detector's layers are known (`detectors.incremental`).
+    of the benign one is computed again, where the detector's layers are known (`detectors.incremental`). keep_mb:
+    of layers of pictures that are kept for that, those of `truth.views` included.
     Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
     RangeError where it has no such term.
 
@@ -76,6 +78,7 @@ class Objective:
         t_star: float | None = None,
         aim: Aim = EVERYTHING,
         whole: bool = False,
+        keep_mb: float = KEEP_MB,
     ) -> None:
         self.compositor = compositor
         self.space = space
@@ -90,6 +93,7 @@ class Objective:
             base_render = compositor.render(space.apply(space.scene, space.theta0).origin)
         base = space.scene.origin
         self._labeller = Labeller(base, base_render, self.difficulty)
+        self.keep_mb = keep_mb
         self._whole = True  # the reference comes first
         self._reference: Reference | None = None
         self._benign = self._judged(base, base_render)
@@ -237,6 +241,16 @@ class Objective:
         """Whether the detector always sees whole pictures."""
         return self._whole
 
+    @property
+    def picture_mb(self) -> float:
+        """Of layers, the most that is kept of one picture."""
+        return min(LIMIT_MB, self.keep_mb)
+
+    @property
+    def kept_mb(self) -> float:
+        """Of the benign picture's layers."""
+        return 0.0 if self._reference is None else self._reference.bytes / 1e6
+
     def forget(self) -> None:
         """Let go of the benign picture's layers, which are made anew when they are asked for."""
         self._reference = None
@@ -244,7 +258,7 @@ class Objective:
     def _kept(self) -> Reference | None:
         """The benign picture's layers, or nothing where pictures are seen whole."""
         if self._reference is None and not self._whole:
-            self._reference = Reference.of(self.differentiable, self._benign.render.image[None])
+            self._reference = Reference.of(self.differentiable, self._benign.render.image[None], self.picture_mb)
             self._whole = self._reference is None
         return self._reference
 

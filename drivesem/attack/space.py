@@ -234,6 +234,9 @@ class ParameterSpace:
             self.lower[where] = low
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
+            if SPECS[parameter].per_object:
+                for bound in (self.lower, self.upper):
+                    bound[where].view(self.count, SPECS[parameter].size)[behind_camera(scene)] = 0
 
     @property
     def blocks(self) -> Mapping[Parameter, slice]:
@@ -328,6 +331,17 @@ class ParameterSpace:
             codes["light"] = _within(light, part.sun, -self.budget.sun, self.budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
+    def carried(self, other: ParameterSpace, theta: Tensor) -> Tensor:
+        """theta (D',) of another space of the same parameters, as one (D,) of this one, whose scene has the same
+        vehicles, and perhaps more after them.
+        """
+        other.unflatten(theta)
+        here = self.theta0.clone()
+        for parameter, where in other.blocks.items():
+            start = self.blocks[parameter].start
+            here[start : start + where.stop - where.start] = theta[where]
+        return here
+
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
         """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a bare code."""
         parameter, owner, k = self._locate(i)
@@ -400,6 +414,11 @@ class ParameterSpace:
             return -limit, limit
         start = start.detach()
         return (low - start).clamp(max=0), (limit - start).clamp(min=0)
+
+
+def behind_camera(scene: SceneIR) -> Tensor:
+    """(N,) bool: the vehicles that are not in the scene (`scene_ir.exchange`), which nothing moves."""
+    return scene.objects.translation[:, 2] < 0
 
 
 def shown_whole(scene: SceneIR) -> Tensor:

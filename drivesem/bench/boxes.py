@@ -24,6 +24,7 @@ from drivesem.bench.step import Stepping
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Clock, Spread
 from drivesem.data.kitti import read_calib, read_labels
+from drivesem.settings.blocks import KEEP_MB
 from scene_ir.derender.derender import VEHICLES, DerenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.geometry import clip_boxes, project_boxes
@@ -162,13 +163,18 @@ def scene_of(frame: Labelled, seed: int) -> SceneIR:
 
 
 def measure(
-    frames: Sequence[Labelled], detector: Detector, seed: int, device: str, whole: bool = False
+    frames: Sequence[Labelled],
+    detector: Detector,
+    seed: int,
+    device: str,
+    whole: bool = False,
+    keep_mb: float = KEEP_MB,
 ) -> Iterator[FrameCost]:
-    """One row a frame. whole: as of `Objective`."""
+    """One row a frame. whole, keep_mb: as of `Objective`."""
     clock, params = Clock(device), combo(2)
     layout: torch.memory_format | None = None
     for number, frame in enumerate(frames):
-        stepping = Stepping(scene_of(frame, seed), params, detector, seed, device, whole=whole)
+        stepping = Stepping(scene_of(frame, seed), params, detector, seed, device, whole=whole, keep_mb=keep_mb)
         layout = layout or stepping.faster_layout(clock)
         alone = stepping.detector_alone(layout)
         if number == 0:  # what is made once for all frames is nobody's

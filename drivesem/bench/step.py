@@ -18,6 +18,7 @@ from drivesem.attack.space import Parameter, ParameterSpace, combo
 from drivesem.bench.scenes import BenchScene, bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock, Spread, rounds
+from drivesem.settings.blocks import KEEP_MB
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR, scene_to
@@ -103,10 +104,16 @@ def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[StepCase]
 
 
 def measure(
-    case_list: Sequence[StepCase], detector: Detector, seconds: float, seed: int, device: str, whole: bool = False
+    case_list: Sequence[StepCase],
+    detector: Detector,
+    seconds: float,
+    seed: int,
+    device: str,
+    whole: bool = False,
+    keep_mb: float = KEEP_MB,
 ) -> Iterator[StepRow]:
-    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow. whole: as of
-    `Objective`.
+    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow. whole,
+    keep_mb: as of `Objective`.
     """
     budget = Budget(seconds, len(case_list))
     clock = Clock(device)
@@ -114,7 +121,7 @@ def measure(
     for case in case_list:
         start = time.perf_counter()
         bench = bench_scene(case.cars, case.triangles, seed)
-        step = Stepping(bench.scene, case.params, detector, seed, device, case.lod, whole)
+        step = Stepping(bench.scene, case.params, detector, seed, device, case.lod, whole, keep_mb)
         layout = layout or step.faster_layout(clock)
         alone = step.detector_alone(layout)
         for _ in range(_WARM_UP):
@@ -163,7 +170,7 @@ def _row(
 
 
 class Stepping:
-    """An attack on one scene, step by step. lod: level of detail on; whole: as of `Objective`."""
+    """An attack on one scene, step by step. lod: level of detail on; whole, keep_mb: as of `Objective`."""
 
     def __init__(
         self,
@@ -174,11 +181,12 @@ class Stepping:
         device: str,
         lod: bool = True,
         whole: bool = False,
+        keep_mb: float = KEEP_MB,
     ) -> None:
         scene = scene_to(scene, torch.float32, device)
         self.space = ParameterSpace(scene, params)
         self.compositor = Compositor(scene, RenderSettings(lod=lod))
-        self.objective = Objective(self.compositor, self.space, detector, term=_TERM, whole=whole)
+        self.objective = Objective(self.compositor, self.space, detector, term=_TERM, whole=whole, keep_mb=keep_mb)
         self.feasible = FeasibleSet(self.space)
         self.detector = detector
         with torch.no_grad():

@@ -61,7 +61,9 @@ def _step(config: Bench, console: Console) -> Measured:
         return _boxes(config, Path(config.boxes), detector, console)
     sizes, beside = step.cases(*_sizes(config))
     seconds = _seconds("step", config)
-    measured = step.measure(sizes + beside, detector, seconds, config.seed, config.device, config.whole)
+    measured = step.measure(
+        sizes + beside, detector, seconds, config.seed, config.device, config.whole, config.keep_mb
+    )
     rows = _dicts(watched(measured, len(sizes) + len(beside), console))
     rows, beside_rows = rows[: len(sizes)], rows[len(sizes) :]
     return Measured(
@@ -75,7 +77,7 @@ def _boxes(config: Bench, path: Path, detector: Detector, console: Console) -> M
         frames = boxes.frames_of(path, -(-config.frames // 4) if config.quick else config.frames)
     except FormatError as error:
         raise UsageError("--boxes", error.expected, f"{error.field}: {error.actual}") from error
-    measured = boxes.measure(frames, detector, config.seed, config.device, config.whole)
+    measured = boxes.measure(frames, detector, config.seed, config.device, config.whole, config.keep_mb)
     costs = list(watched(measured, len(frames), console))
     row = asdict(boxes.BoxesRow.of(costs))
     return Measured(

@@ -227,6 +227,7 @@ class Worker:
             keep_last=config.keep == "last",
             only_bounds=config.project == "bounds",
             whole=config.whole,
+            keep_mb=config.keep_mb,
             changes=self.changes,
         )
         try:

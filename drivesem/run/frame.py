@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,14 +16,15 @@ from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.budgets import reach_of
-from drivesem.attack.changes import DRAWS, Changes, affordable, proposals
+from drivesem.attack.changes import DRAWS, Changes, affordable, passes_of, proposals
 from drivesem.attack.feasibility_check import check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode, MovedLabels, shown_boxes, to_kitti_labels
 from drivesem.attack.methods.base import Attack as AttackMethod
-from drivesem.attack.methods.base import AttackResult
-from drivesem.attack.methods.margin_search import OfMargins, value_of
+from drivesem.attack.methods.base import AttackResult, Problem
+from drivesem.attack.methods.given import Given
+from drivesem.attack.methods.margin_search import FRESH, OfMargins, value_of
 from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
@@ -32,6 +32,7 @@ from drivesem.data import kitti
 from drivesem.evaluation.failures import Failures
 from drivesem.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.settings.blocks import KEEP_MB
 from drivesem.truth.certificate import with_regions
 from drivesem.truth.grades import Grade
 from drivesem.truth.grading import Case, Graded, Grader, Grades
@@ -57,8 +58,8 @@ class FrameSettings:
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
     how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole: see `Objective`. changes:
-    what is proposed before a search on margins begins, None for nothing.
+    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole, keep_mb: see `Objective`.
+    changes: what is proposed after a search on margins, None for nothing.
     """
 
     attack: AttackMethod
@@ -74,6 +75,7 @@ class FrameSettings:
     keep_last: bool = False
     only_bounds: bool = False
     whole: bool = False
+    keep_mb: float = KEEP_MB
     changes: Changes | None = None
 
 
@@ -104,27 +106,22 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     detector knows no cars.
     """
     start = time.perf_counter()
-    views, attack = _posed(identifier, scene, detector, settings), settings.attack
-    before = 0
+    posed, attack = _Posed.of(identifier, scene, detector, settings), settings.attack
+    aside = 0
     if settings.changes is not None and isinstance(attack, OfMargins):
         count = affordable(attack.passes)
-        views, before = _best_change(
-            views,
-            (
-                _posed(identifier, changed, detector, settings)
-                for changed in proposals(scene, settings.changes, count, settings.seed, settings.render)
-            ),
-        )
-        attack = replace(attack, passes=attack.passes - before)
-        before -= views.passes
-    objective, space = views.objective, views.objective.space
-    feasible = objective.feasible_set(only_bounds=settings.only_bounds)
-    problem = objective.problem(feasible, settings.keep_last, views)
-    search = attack(problem, space.theta0, settings.seed)
-    views.forget()
+        attack = replace(attack, passes=attack.passes - passes_of(count))
+        search = posed.searched(attack)
+        offered = proposals(scene, settings.changes, count, settings.seed, settings.render)
+        others = (_Posed.of(identifier, changed, detector, settings) for changed in offered)
+        posed, search, aside = _best_change(posed, search, others)
+    else:
+        search = posed.searched(attack)
+    posed.views.forget()
+    objective, feasible = posed.views.objective, posed.feasible
     rendered = objective.evaluate(search.theta)
     benign = objective.detect(scene.photograph)
-    passes = objective.passes + 1 + before
+    passes = objective.passes + 1 + aside
     searched = time.perf_counter()
     failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
     objective.forget()
@@ -144,36 +141,69 @@ def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings:
     )
 
 
-def _posed(identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> DrawnViews:
-    """A scene and what is asked of it, in draws of this frame's name."""
-    objective = Objective(
-        Compositor(scene, settings.render),
-        ParameterSpace(scene, settings.params, settings.budget),
-        detector,
-        settings.label_mode,
-        settings.term,
-        t_star=settings.t_star,
-        aim=settings.aim,
-        whole=settings.whole,
-    )
-    nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
-    return DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
+@dataclass(frozen=True, slots=True)
+class _Posed:
+    """A scene and what is asked of it, in draws of its frame's name."""
+
+    views: DrawnViews
+    feasible: FeasibleSet
+    problem: Problem
+    seed: int
+
+    @classmethod
+    def of(cls, identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> _Posed:
+        objective = Objective(
+            Compositor(scene, settings.render),
+            ParameterSpace(scene, settings.params, settings.budget),
+            detector,
+            settings.label_mode,
+            settings.term,
+            t_star=settings.t_star,
+            aim=settings.aim,
+            whole=settings.whole,
+            keep_mb=settings.keep_mb,
+        )
+        nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
+        views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
+        feasible = objective.feasible_set(only_bounds=settings.only_bounds)
+        return cls(views, feasible, objective.problem(feasible, settings.keep_last, views), settings.seed)
+
+    @property
+    def space(self) -> ParameterSpace:
+        """Of theta."""
+        return self.views.objective.space
+
+    def searched(self, attack: AttackMethod) -> AttackResult:
+        """What an attack finds."""
+        return attack(self.problem, self.space.theta0, self.seed)
+
+    def value(self, theta: Tensor) -> float:
+        """What a search on margins lowers, at theta (D,), in draws that no search looks at."""
+        seen = (self.views.margins(theta, FRESH + number) for number in range(DRAWS))
+        return sum(value_of(margins, self.views.judged) for margins in seen)
 
 
-def _best_change(still: DrawnViews, changed: Iterable[DrawnViews]) -> tuple[DrawnViews, int]:
-    """Of a scene and what changes made of it, that with the lowest margins; and the passes that all of them
-    took.
+def _best_change(
+    still: _Posed, search: AttackResult, changed: Iterable[_Posed]
+) -> tuple[_Posed, AttackResult, int]:
+    """Of a scene at the theta that was found, and what changes made of it at the same theta, that with the lowest
+    margins; and the passes that the others took.
     """
-    best, least, passes = still, math.inf, 0
-    for views in chain([still], changed):
-        theta0 = views.objective.space.theta0
-        value = sum(value_of(views.margins(theta0, number), views.judged) for number in range(DRAWS))
-        passes += views.passes
+    best, least, theta = still, still.value(search.theta), search.theta
+    all_passes = kept_passes = still.views.passes
+    for posed in changed:
+        here = posed.problem.project(posed.space.carried(still.space, search.theta)).theta
+        value = posed.value(here)
+        posed.views.forget()
+        all_passes += posed.views.passes
         if value < least:
-            best, least = views, value
-        else:
-            views.forget()
-    return best, passes
+            best, least, theta, kept_passes = posed, value, here, posed.views.passes
+    if best is not still:
+        found = best.searched(Given(theta))
+        if torch.equal(found.theta, theta):  # else its render showed that it cannot be
+            trace = (*search.loss_trace, *found.loss_trace)
+            return best, replace(found, queries=search.queries, loss_trace=trace), all_passes - kept_passes
+    return still, search, all_passes - still.views.passes
 
 
 def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:

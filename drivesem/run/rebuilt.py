@@ -45,5 +45,5 @@ def rebuilt(
     aim = Aim.of(attack.target_objects, attack.target_classes)
     difficulty = Difficulty(min_contrast=result.min_contrast)
     return Objective(
-        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole
+        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole, attack.keep_mb
     ), theta

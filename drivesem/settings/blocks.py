@@ -37,6 +37,8 @@ SOURCES = (DEMO, *DATASETS)
 
 CERTIFYING_DRAWS = 16
 """What the rule of certificates needs at least (`truth.certificate`)."""
+KEEP_MB = 800.0
+"""Of a detector's layers that a process keeps: SqueezeDet's are 24 MB for each picture of 1242 x 375 px."""
 _MOST_PROCESSES = 4
 """Each process takes about 1 GB."""
 
@@ -263,6 +265,8 @@ class Regions(Options):
     where its layers are known (docs/detectors.md)."""
     incremental: Flag = False
     """The default by its name: only what changed, also of a run with --whole."""
+    keep_mb: Annotated[float, at_least(1)] = KEEP_MB
+    """MB of layers that a process keeps of a frame's pictures, at most 120 of one; the rest is computed again."""
 
     def check(self) -> None:
         super().check()

@@ -107,8 +107,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Stop a frame at its first success instead of using all steps or queries."""
     changes: Annotated[str, Of(("climb", "corners"))] | None = None
     """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
-    (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried in the same
-    passes, the best is kept."""
+    (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried on what was
+    found, within the same passes; the best is kept."""
     mesh: str | None = None
     """Of --changes: the vehicle that parks or comes in a car's place, a mesh (OBJ, GLB, PLY) in metres, y up; by
     default templates.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import Candidates, Detector, predict
-from detectors.incremental.reference import LIMIT_MB, Reference
+from detectors.incremental.reference import Reference
 from drivesem.attack import goals
 from drivesem.attack.labels import shown_boxes
 from drivesem.attack.objective import GRADIENT_PASSES, Objective
@@ -22,8 +22,6 @@ from scene_ir.types import Render, SceneIR
 
 SHARPNESS = 4.0
 """Of the soft maximum over candidates in gradients, 1 / logits."""
-_MOST_KEPT_MB = 800.0
-"""Of the layers that are kept of pictures: SqueezeDet's are 24 MB a draw at 1242 x 375 px."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +123,9 @@ class DrawnViews:
 
     def _kept(self, detector: Detector, image: Tensor, number: int) -> Reference | None:
         """A draw's first picture; None where its layers are not known, or there is no room for them."""
-        if number not in self._first and self.kept_mb + LIMIT_MB <= _MOST_KEPT_MB:
-            first = Reference.of(detector, image[None])
+        limit = self.objective.picture_mb
+        if number not in self._first and self.objective.kept_mb + self.kept_mb + limit <= self.objective.keep_mb:
+            first = Reference.of(detector, image[None], limit)
             if first is not None:
                 self._first[number] = first
         return self._first.get(number)

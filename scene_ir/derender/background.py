@@ -345,8 +345,7 @@ class _Level:
         """Each hole pixel becomes the trust-weighted mean of what the patches around it say."""
         flat = self.padded.reshape(-1, 3)
         weight = self.confidence / (self.best + 0.002)
-        size = self.padded.shape[0] * self.stride
-        total, mass = np.zeros((3, size)), np.zeros(size)
+        total = np.zeros((len(flat), 4))
         target = self._flat(self.rows, self.columns)
         source = self._flat(self.source[:, 0], self.source[:, 1])
         for dy in (-1, 0, 1):
@@ -354,11 +353,11 @@ class _Level:
                 offset = dy * self.stride + dx
                 share = weight * (1.0 if dy == dx == 0 else 0.5)
                 colour = flat[source + offset] * share[:, None]
-                mass += np.bincount(target + offset, share, size)
-                for channel in range(3):
-                    total[channel] += np.bincount(target + offset, colour[:, channel], size)
+                # No target twice: each pixel is added to once.
+                total[target + offset] += np.concatenate([colour, share[:, None]], axis=1)
         inner = self._flat(*np.nonzero(self.hole))
-        flat[inner] = (total[:, inner] / np.maximum(mass[inner], 1e-12)).T.astype(np.float32)
+        mean = total[inner, :3] / np.maximum(total[inner, 3:], 1e-12)
+        flat[inner] = mean.astype(np.float32)
 
     def run(
         self, coarse: NDArray[np.int64] | None, rounds: int, rng: np.random.Generator

@@ -288,35 +288,36 @@ def estimate_sun(
     car = torch.arange(len(points)).repeat_interleave(torch.tensor([len(part) for part in points]))
     sized = size[car]
 
-    def explained(sun: torch.Tensor, every: int = 1) -> float:
-        offset = sun_offset(sun, yaw, size[:, 1])[car[::every]]
+    def explained(suns: Sequence[torch.Tensor], every: int = 1) -> list[float]:
+        offset = torch.stack([sun_offset(sun, yaw, size[:, 1]) for sun in suns])[:, car[::every]]
         model, dark = shadow_density(local[::every], sized[::every], offset), observed[::every]
-        strength = (model * dark).sum() / model.square().sum().clamp(min=1e-6)
-        rest = (dark - strength.clamp(0.0, 1.2) * model).square().sum()
-        return 1 - float(rest / dark.square().sum().clamp(min=1e-6))
+        strength = (model * dark).sum(-1) / model.square().sum(-1).clamp(min=1e-6)
+        rest = (dark - strength.clamp(0.0, 1.2)[:, None] * model).square().sum(-1)
+        return (1 - rest.double() / dark.square().sum().clamp(min=1e-6)).tolist()
 
-    def worth(length: float, angle: float, every: int = 1) -> float:
-        return explained(_sun(length, angle), every) - _LOW * max(length - 1.2, 0.0)
+    def worth(places: Sequence[tuple[float, float]], every: int = 1) -> list[float]:
+        lengths = [length for length, _ in places]
+        shares = explained([_sun(*place) for place in places], every)
+        return [share - _LOW * max(length - 1.2, 0.0) for share, length in zip(shares, lengths, strict=True)]
 
-    score, best = explained(assumed) + settings.gain, None
+    score, best = explained([assumed])[0] + settings.gain, None
     tried = [(length, 2 * math.pi * step / _AZIMUTHS) for length in _LENGTHS for step in range(_AZIMUTHS)]
-    rough = [worth(*each, _EVERY) for each in tried]
-    for place in np.argsort(rough)[: -_LIKELY - 1 : -1]:
-        value = worth(*tried[place])
+    likely = [tried[place] for place in np.argsort(worth(tried, _EVERY))[: -_LIKELY - 1 : -1]]
+    for place, value in zip(likely, worth(likely), strict=True):
         if value > score:
-            score, best = value, tried[place]
+            score, best = value, place
     if best is None:
         return assumed
     turn, stretch = math.pi / _AZIMUTHS, 1.2
     for _ in range(_FINER):
         length, angle = best
-        for near in (
+        around = [
             (length * stretch, angle),
             (length / stretch, angle),
             (length, angle + turn),
             (length, angle - turn),
-        ):
-            value = worth(*near)
+        ]
+        for near, value in zip(around, worth(around), strict=True):
             if value > score:
                 score, best = value, near
         turn, stretch = turn / 2, math.sqrt(stretch)

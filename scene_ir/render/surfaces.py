@@ -383,9 +383,9 @@ def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: T
 def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
     """How dark (T,) in [0, 1] a box-like vehicle makes the ground at (x, z) (T, 2) m of its frame; smooth.
 
-    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point. The contact shadow under the body fades
-    over some tens of centimetres; the cast one is that of a box tapering to the roof, moved along the sun's
-    offset.
+    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point; for S suns offset (S, T, 2) -> (S, T).
+    The contact shadow under the body fades over some tens of centimetres; the cast one is that of a box tapering
+    to the roof, moved along the sun's offset.
     """
     half = size_lhw[:, [0, 2]] / 2
 

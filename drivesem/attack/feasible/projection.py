@@ -22,7 +22,7 @@ from drivesem.attack.feasible.cars import TOLERANCE, Array, Cars, Flags, Indices
 from drivesem.attack.feasible.strain import StrainBound
 from drivesem.attack.feasible.surfaces import CarSurfaces, extents, lowest
 from drivesem.attack.feasible.weather import Fading, WeatherSet
-from drivesem.attack.space import Parameter, ParameterSpace, ground_axes
+from drivesem.attack.space import Parameter, ParameterSpace, behind_camera, ground_axes
 from scene_ir.errors import RangeError
 
 
@@ -84,7 +84,9 @@ class FeasibleSet:
             return ()
         strained = [f"objects[{i}]: strain" for i in np.flatnonzero(self._strain.violated_at_start)]
         asked = Bounds.alike(self.space.count, self.limits)
-        return (*strained, *self._examine(self._at_rest(), asked).names())
+        names = (*strained, *self._examine(self._at_rest(), asked).names())
+        away = tuple(f"objects[{i}]:" for i in behind_camera(self.space.scene).nonzero()[:, 0].tolist())
+        return tuple(name for name in names if not name.startswith(away))
 
     def project(self, theta: Tensor) -> Projected:
         """The nearest feasible theta (D,) we can find; `theta` itself where it is feasible.

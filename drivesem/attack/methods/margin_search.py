@@ -30,6 +30,8 @@ _OTHERWISE = 4
 """Passes that the benign pictures and the judging of what is found take."""
 _POOL = 8
 """Draws that the search goes round in."""
+FRESH = _POOL + _FINAL_DRAWS
+"""The first draw that no search looks at."""
 
 
 def value_of(margins: Tensor, judged: Tensor) -> float:

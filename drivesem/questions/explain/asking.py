@@ -58,7 +58,8 @@ class ExplainWorker:
 
     def __init__(self, config: Explain, attack: Attack, params: tuple[Parameter, ...], out: Path) -> None:
         self.config, self.params, self.out = config, params, out
-        self.attack = replace(attack, whole=config.whole_beside(attack.whole), incremental=False)
+        whole = config.whole_beside(attack.whole)
+        self.attack = replace(attack, whole=whole, incremental=False, keep_mb=config.keep_mb)
         self.detector = detector_of(attack, config.device)
 
     def __call__(self, name: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from drivesem.attack.space import behind_camera
 from drivesem.data.kitti import read_labels
 from drivesem.questions.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
 from drivesem.questions.plausibility.weather import CODES, Weather, weather_of
@@ -86,7 +87,7 @@ def _pair(run: Run, frame: Frame) -> FramePair:
 
 def _in_both(scene: SceneIR, before: Labels, after: Labels) -> tuple[Labels, Labels]:
     """The labels of vehicles that are there before and after another one left or came."""
-    first, then = (state.objects.translation[:, 2] > 0 for state in (scene.origin, scene))
+    first, then = (~behind_camera(state) for state in (scene.origin, scene))
     return _chosen(before, then[first]), _chosen(after, first[then])
 
 

@@ -6,9 +6,12 @@ import pytest
 import torch
 
 import drivesem as ds
-from drivesem.attack.changes import Change, Changes, affordable, parse_changes, proposals, vehicle_mesh
+from drivesem.attack.budgets import PRESETS
+from drivesem.attack.changes import Change, Changes, affordable, parse_changes, passes_of, proposals, vehicle_mesh
 from drivesem.attack.feasibility_check import check_exchange, check_scene
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
+from drivesem.attack.space import Parameter, ParameterSpace
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
 from scene_ir.meshes.load import save_mesh
@@ -95,6 +98,29 @@ def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
     assert len(to_kitti_labels(labeller.paper(), left.origin, left).kind) == 7
 
 
+def test_what_is_not_there_is_not_moved_and_violates_nothing(scene: SceneIR) -> None:
+    space = ParameterSpace(without(scene, 6), ("translate", "rotate"), PRESETS["street"])
+    for name in ("translate", "rotate"):
+        upper = space.upper[space.blocks[Parameter(name)]].view(7, -1)
+        assert (upper[6] == 0).all()
+        assert (upper[:6] > 0).all()
+    whole = ParameterSpace(scene, ("translate", "rotate"), PRESETS["street"])
+    assert FeasibleSet(space).violated_at_start == FeasibleSet(whole).violated_at_start
+
+
+def test_theta_is_carried_over_to_a_scene_with_one_more(scene: SceneIR) -> None:
+    params = ("color", "weather", "translate", "rotate")
+    place = scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0])
+    less, more = (ParameterSpace(s, params, PRESETS["street"]) for s in (scene, beside(scene, place)))
+    theta = torch.linspace(-0.1, 0.1, less.dim)
+    here = more.carried(less, theta)
+    for parameter in map(Parameter, params):
+        block = here[more.blocks[parameter]]
+        kept = theta[less.blocks[parameter]]
+        assert torch.equal(block[: len(kept)], kept)
+        assert (block[len(kept) :] == 0).all()
+
+
 def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
     more = beside(scene, scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0]))
     labeller, labels = labels_of(more)
@@ -125,7 +151,11 @@ def test_what_cannot_be_is_said(scene: SceneIR, shift: tuple[float, float, float
 
 
 def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
-    assert [affordable(passes) for passes in (24, 29, 36, 90, 1000)] == [0, 0, 2, 6, 6]
+    assert [affordable(passes) for passes in (24, 29, 30, 36, 90, 1000)] == [0, 0, 1, 2, 6, 6]
+    for passes in range(24, 200):
+        count = affordable(passes)
+        assert passes - passes_of(count) >= 24
+        assert passes_of(count) <= 0.25 * passes
 
 
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])

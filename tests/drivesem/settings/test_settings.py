@@ -18,7 +18,7 @@ import yaml
 import drivesem
 from drivesem.cli import main
 from drivesem.run.folder import attack_of
-from drivesem.settings.blocks import Command, constraints, option
+from drivesem.settings.blocks import Command, Regions, constraints, option
 from drivesem.settings.commands import COMMANDS, Attack, Explain, Study, Synth
 from drivesem.settings.constraints import Constraint, Folder, Of, OneOf, Required, Within
 from drivesem.settings.errors import UsageError
@@ -305,3 +305,11 @@ def test_incremental_and_whole_exclude_each_other(command: tuple[str, ...]) -> N
     parse([*command, "--incremental"])
     with pytest.raises(UsageError, match="--incremental: expected it or --whole, found both"):
         parse([*command, "--incremental", "--whole"])
+
+
+@pytest.mark.parametrize("command", [("attack",), ("study", "single"), ("bench",), ("explain", "--run", "run")])
+def test_how_much_is_kept_of_layers(command: tuple[str, ...]) -> None:
+    kept = [parse([*command, *words]) for words in ((), ("--keep-mb", "50"))]
+    assert [config.keep_mb for config in kept if isinstance(config, Regions)] == [800, 50]
+    with pytest.raises(UsageError, match="--keep-mb: expected at least 1, found 0"):
+        parse([*command, "--keep-mb", "0"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-import drivesem.truth.views as module
 from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
 from drivesem.attack.aims import Aim
@@ -122,13 +121,31 @@ def test_weather_has_no_regions(objective: Objective) -> None:
     assert kept == 0
 
 
-def test_no_more_layers_are_kept_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MOST_KEPT_MB", LIMIT_MB + 1.0)
+def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
     scene = demo_scene(0, 0)
     space = ParameterSpace(scene, ("translate",))
-    views = DrawnViews.of(Objective(Compositor(scene), space, load_detector("squeezedet")), Nuisances(), "search")
+    objective = Objective(Compositor(scene), space, load_detector("squeezedet"), keep_mb=LIMIT_MB + 1.0)
+    views = DrawnViews.of(objective, Nuisances(), "search")
     kept = []
     for number in range(2):
         views.margins(space.theta0, number)
         kept.append(views.kept_mb)
     assert kept[0] == kept[1] > 0
+
+
+def test_the_benign_picture_counts_and_one_picture_keeps_no_more_than_the_process() -> None:
+    scene, detector = demo_scene(0, 0), load_detector("squeezedet")
+    space = ParameterSpace(scene, ("translate",))
+    whole = Objective(Compositor(scene), space, detector, whole=True)
+    tight = Objective(Compositor(scene), space, detector, keep_mb=10.0)
+    views = DrawnViews.of(tight, Nuisances(), "search")
+    theta = 0.1 * space.upper
+    loss, gradient = tight.loss_and_grad(theta)
+    expected, slope = whole.loss_and_grad(theta)
+    assert loss == pytest.approx(expected, abs=1e-4)
+    torch.testing.assert_close(gradient, slope, atol=1e-3 * float(slope.abs().max()), rtol=1e-3)
+    assert 0 < tight.kept_mb <= 10.0
+    views.margins(space.theta0, 0)
+    assert views.kept_mb == 0
+    tight.forget()
+    assert tight.kept_mb == 0

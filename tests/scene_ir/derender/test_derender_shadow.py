@@ -183,3 +183,13 @@ def test_what_is_known_to_be_behind_a_car_tells_a_dark_strip_from_its_shadow():
     assert np.count_nonzero(dark) > 50
     wrong, right = (found_in(light, toward(0.6, 0.0)) for light in (plain, told))
     assert right[dark].mean() < 0.1 < wrong[dark].mean()
+
+
+def test_several_suns_together_shade_as_one_by_one() -> None:
+    generator = torch.Generator().manual_seed(3)
+    local = 4 * torch.randn(50, 2, generator=generator)
+    size = 1.5 + torch.rand(50, 3, generator=generator)
+    offsets = torch.randn(5, 50, 2, generator=generator)
+    together = shadow_density(local, size, offsets)
+    assert together.shape == (5, 50)
+    assert torch.equal(together, torch.stack([shadow_density(local, size, offset) for offset in offsets]))
