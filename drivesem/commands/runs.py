@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from drivesem.commands.attack import told_grades
 from drivesem.report.answer import print_json
@@ -39,21 +39,21 @@ def run(config: Runs) -> int:
 def _list(config: Runs, console: Console) -> dict[str, Any]:
     found = [run for folder in config.folders or (_HOME,) for run in _runs_in(Path(folder))]
     rows = [_row(folder) for folder in found]
-    table = Table()
-    for name in ("run", "detector", "params", "method", "frames", "threshold", "certain", "confirmed", "MB"):
-        table.add_column(name, justify="left" if name in ("run", "detector", "params", "method") else "right")
     for row in rows:
-        grades = row["grades"] or {}
-        counts = [str(grades.get(grade, "-")) for grade in (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)]
-        frames = f"{row['frames']}" if row["finished"] else f"{row['frames']}, unfinished"
-        table.add_row(
-            *map(str, (row["run"], row["detector"], row["params"], row["method"])),
-            frames,
-            *counts,
-            f"{row['mb']:.0f}",
-        )
-    console.print(table)
+        console.print(_line(row), soft_wrap=True, markup=False)
+    console.print(f"{len(rows)} in all", soft_wrap=True)
     return {"runs": rows}
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    """A run in words."""
+    grades, frames = row["grades"], f"{row['frames']} frame{'' if row['frames'] == 1 else 's'}"
+    what = f"{row['params']} by {row['method']} on {row['detector']}, {row['mb']:.0f} MB"
+    if grades is None:
+        return f"{row['run']}: {frames}, not finished (the same command goes on); {what}"
+    held = [f"{grades[grade]} {grade}" for grade in (Grade.CERTAIN, Grade.CONFIRMED) if grade in grades]
+    found = f"{', '.join(held)} of {grades.get(Grade.THRESHOLD, 0)} failures by threshold"
+    return f"{row['run']}: {frames}, {found}; {what}"
 
 
 def _runs_in(folder: Path) -> list[Path]:
@@ -97,7 +97,6 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
         )
         for key, value in asked.items():
             console.print(f"  {key}: {value}", soft_wrap=True, markup=False)
-        console.print(f"  {'finished' if told[-1]['finished'] else 'not finished: the same command goes on'}")
     return {"runs": told}
 
 

@@ -118,7 +118,7 @@ def test_commands_are_read_by_the_parser(where: str, words: list[str], monkeypat
     elif program.startswith("python") and words[1] != "-m":
         assert (ROOT / words[1]).is_file()
     else:
-        assert program in ("python", "python3", "pip"), where
+        assert program in ("python", "python3", "pip", "ray"), where
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in ("yaml", "json")], ids=str)

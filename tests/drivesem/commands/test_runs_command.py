@@ -1,0 +1,133 @@
+"""`drivesem runs` as a user types it, and parts of an attack that become one run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivesem.cli import main
+from scene_ir.files import leftovers
+from tests.drivesem.commands.test_attack_command import without_times
+
+WORDS = [
+    "attack",
+    "--params",
+    "color",
+    "--method",
+    "fgsm",
+    "--peer",
+    "off",
+    "--limit",
+    "3",
+    "--workers",
+    "1",
+]
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three frames, and the same in two parts."""
+    home = tmp_path_factory.mktemp("runs")
+    assert main([*WORDS, "--out", str(home / "whole")]) == 0
+    for number in (1, 2):
+        assert main([*WORDS, "--part", f"{number}/2", "--out", str(home / f"part{number}")]) == 0
+    return home
+
+
+def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(["runs", *words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_parts_are_every_nth_frame_and_merge_into_the_whole(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {folder: {p.name for p in (parts / folder / "frames").iterdir()} for folder in ("part1", "part2")}
+    assert names == {"part1": {"demo-000", "demo-002"}, "part2": {"demo-001"}}
+    out = tmp_path / "merged"
+    both = [str(parts / "part1"), str(parts / "part2")]
+    merged = told(["merge", *both, str(parts / "whole"), "--out", str(out)], capsys)
+    whole = json.loads((parts / "whole" / "metrics.json").read_text())
+    assert without_times(merged) == without_times(whole)
+    hashes = [json.loads((folder / "manifest.json").read_text()) for folder in (out, parts / "whole")]
+    assert hashes[0] == hashes[1]
+    assert main(["verify", "--run", str(out)]) == 0
+    assert told(["merge", *both, "--out", str(out)], capsys)["frames"] == 3, "it goes on"
+
+
+def test_frames_that_differ_and_other_settings_are_refused(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(parts / "part2", other)
+    result = other / "frames" / "demo-001" / "result.json"
+    result.write_text(json.dumps(json.loads(result.read_text()) | {"objects": 99}))
+    merge = ["runs", "merge", str(parts / "part2"), str(other), "--out", str(tmp_path / "merged")]
+    assert main(merge) == 2
+    assert "FOLDER: expected runs in which a frame is the same, found two results of frame demo-001" in (
+        capsys.readouterr().err
+    )
+    config = other / "config.yaml"
+    config.write_text(config.read_text().replace("seed: 0", "seed: 7"))
+    assert main(merge) == 2
+    assert f"found {other}: another seed" in capsys.readouterr().err
+
+
+def test_list_and_show(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = {Path(row["run"]).name: row for row in told(["list", str(parts)], capsys)["runs"]}
+    assert {name: row["frames"] for name, row in rows.items()} == {"part1": 2, "part2": 1, "whole": 3}
+    assert rows["whole"]["params"] == "color"
+    assert rows["whole"]["finished"]
+    (shown,) = told(["show", str(parts / "whole")], capsys)["runs"]
+    assert shown["settings"] == {"params": "color", "method": "fgsm", "peer": "off"}
+    assert main(["runs", "list", str(parts)]) == 0
+    said = capsys.readouterr().out
+    assert "whole: 3 frames, " in said
+    assert "color by fgsm on squeezedet" in said
+    assert main(["runs", "show", str(parts / "whole")]) == 0
+    assert "  method: fgsm\n" in capsys.readouterr().out
+
+
+def test_a_run_that_stopped_early_is_listed(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(parts / "part2", tmp_path / "run")
+    (tmp_path / "run" / "metrics.json").unlink()
+    assert main(["runs", "list", str(tmp_path)]) == 0
+    assert "run: 1 frame, not finished (the same command goes on)" in capsys.readouterr().out
+
+
+def test_prune_removes_what_a_killed_command_left(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(parts / "part2", run)
+    half = run / "frames" / ".demo-002.0123abcd.tmp"
+    half.mkdir()
+    (half / ".benign.png.89abcdef.tmp").write_bytes(b"half")
+    before = {p for p in run.rglob("*") if half not in (p, *p.parents) and p.name != ".lock"}
+    assert leftovers(run) == [half]
+    assert told(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
+    assert half.is_dir()
+    assert told(["prune", str(run)], capsys) == {"removed": [str(half)]}
+    assert {p for p in run.rglob("*") if p.name != ".lock"} == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["runs", "merge", "a"], "--out: expected a folder, of runs merge alone, found None"),
+        (["runs", "show"], "FOLDER: expected runs to show, found none"),
+        (["runs", "list", "nowhere"], "FOLDER: expected a folder with runs of drivesem attack, found nowhere"),
+        (["runs", "list", "--dry"], "--dry: expected runs prune, found runs list"),
+        (["attack", "--part", "3/2"], "--part: expected K/N, the K-th of N parts, such as 2/4, found '3/2'"),
+    ],
+)
+def test_bad_input(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert capsys.readouterr().err == f"drivesem: {message}\n"
