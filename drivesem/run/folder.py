@@ -23,14 +23,13 @@ CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
 FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
+SHARING = ("workers", "engine", "address", "keep_going")
+"""Settings of who shares the frames."""
 PRESENTATION = (
+    *SHARING,
     "out",
     "limit",
     "part",
-    "workers",
-    "engine",
-    "address",
-    "keep_going",
     "resume",
     "json",
     "cache",

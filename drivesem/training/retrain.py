@@ -20,7 +20,7 @@ from drivesem.data.registry import open_dataset
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
 from drivesem.report.tables import Sheet, csv_text, percent
 from drivesem.run.attack import Worker, attack_frames
-from drivesem.run.folder import claim, trusted_attack
+from drivesem.run.folder import SHARING, claim, trusted_attack
 from drivesem.run.frame import as_targets
 from drivesem.settings.commands import Attack, Retrain
 from drivesem.settings.errors import UsageError
@@ -39,21 +39,7 @@ FRESH, CACHE = "fresh", "cache"
 _FRESH_OF = "fresh_of.txt"
 """Digest of the weights that the new attack was against."""
 _WRITTEN = (WEIGHTS, FIGURES, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES, FRESH, CACHE)
-_FREE = (
-    *(
-        "out",
-        "workers",
-        "engine",
-        "address",
-        "keep_going",
-        "resume",
-        "json",
-        "minutes",
-        "checkpoint_every",
-        "fresh",
-    ),
-    "trust",
-)
+_FREE = (*SHARING, "out", "resume", "json", "minutes", "checkpoint_every", "fresh", "trust")
 """Settings that a run may change on the way."""
 
 

@@ -22,7 +22,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
 from drivesem.report.progress import training_bar
-from drivesem.run.folder import claim
+from drivesem.run.folder import SHARING, claim
 from drivesem.run.workers import mapping
 from drivesem.settings.commands import SYNTH, Train
 from drivesem.settings.devices import check_device
@@ -46,7 +46,7 @@ _WRITTEN = (
     *(CACHES, SEMANTIC, "tensorboard"),
 )
 _FREE = (
-    *("out", "workers", "engine", "address", "keep_going", "resume", "json", "device", "loaders"),
+    *(*SHARING, "out", "resume", "json", "device", "loaders"),
     *("minutes", "checkpoint_every", "evaluate_every", "thin", "note", "also", "weights"),
 )
 """Settings that a run may change on the way."""
