@@ -50,6 +50,7 @@ def result(name: str) -> FrameResult:
         "min_contrast": 0.0,
         "joint_weather": False,
         "passes": None,
+        "change": "",
     }
     return FrameResult(**nothing | facts)  # pyright: ignore[reportArgumentType]
 

@@ -197,7 +197,7 @@ def test_a_scene_of_another_version_is_refused(
     record = out / "demo-001" / "scene.json"
     record.write_text(record.read_text().replace(f'"version": {VERSION}', '"version": 99'))
     said = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
-    assert f"scene.json: version: expected one of 2, {VERSION}, found 99" in said
+    assert f"scene.json: version: expected one of 2, 3, {VERSION}, found 99" in said
 
 
 def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
