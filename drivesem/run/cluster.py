@@ -83,7 +83,8 @@ def _connect(ray: ModuleType, address: str | None) -> None:
     try:
         if host and port.isdecimal():  # Ray itself would go on asking for minutes
             socket.create_connection((host, int(port)), _PATIENCE_S).close()
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        # Not whatever cluster ran here last, which is what Ray takes without an address.
+        ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR")
     except OSError as error:
         raise UsageError("--address", "a Ray cluster", f"{address}: {error}") from error
     if threading.current_thread() is threading.main_thread():

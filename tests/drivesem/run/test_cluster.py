@@ -93,6 +93,18 @@ def test_a_node_that_is_gone_costs_what_it_had_in_hand(tmp_path: Path, cluster: 
     assert sum(len((tmp_path / str(job)).read_text()) for job in jobs) <= len(jobs) + 1
 
 
+def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not what RAY_ADDRESS or the last cluster's file speak of."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
+    ray.shutdown()
+    config = Sharing(engine="ray", workers=1)
+    try:
+        found = dict(outcomes(look, partial(looking, str(tmp_path)), [1, 2], config))
+        assert {job: outcome()[0] for job, outcome in found.items()} == {1: 1, 2: 4}
+    finally:
+        ray.shutdown()
+
+
 def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1"]
     assert main(words) == 2
