@@ -96,6 +96,7 @@ def test_a_node_that_is_gone_costs_what_it_had_in_hand(tmp_path: Path, cluster: 
 def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And not what RAY_ADDRESS or the last cluster's file speak of."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     ray.shutdown()
     config = Sharing(engine="ray", workers=1)
     try:

@@ -172,10 +172,13 @@ _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="nee
 def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_path: Path) -> None:
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
     (tmp_path / "stopped.py").write_text(
+        "import signal\n"
         "from drivesem.settings.blocks import Sharing\n"
         "from drivesem.run.workers import outcomes\n"
         "from tests.drivesem.run.test_workers import lingering\n"
         "from functools import partial\n"
+        # As in a terminal: what a shell starts in the background ignores Ctrl-C.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Sharing(workers=2)))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
