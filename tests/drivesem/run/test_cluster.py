@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import ray
 
 from drivesem.cli import main
 from drivesem.run.workers import outcomes
@@ -21,8 +22,6 @@ from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents
-
-ray = pytest.importorskip("ray")
 
 
 @pytest.fixture
