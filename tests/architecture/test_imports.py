@@ -23,7 +23,17 @@ TOP_LEVEL_NAMES = {
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
-LOADED_WHERE_USED = ("open3d", "pyrender", "onnxruntime", "torchvision", "ultralytics", "cma", "ray", "loky")
+LOADED_WHERE_USED = (
+    "open3d",
+    "pyrender",
+    "onnxruntime",
+    "torchvision",
+    "ultralytics",
+    "cma",
+    "ray",
+    "loky",
+    "fsspec",
+)
 
 
 @dataclass(frozen=True)
