@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TypeVar
 import torch
 
 from detectors.base import DetectorError
+from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError
 
@@ -37,6 +38,7 @@ class Start:
 def begin(start: Start) -> None:
     """Once in a process, before its first job."""
     global _work
+    keep_freed()
     torch.set_num_threads(start.threads)
     work = start.build()
     _work = partial(forgiving, work) if start.keep_going else work
