@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TypeVar
 import torch
 
 from detectors.base import DetectorError
+from drivesem import store
 from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError
@@ -28,11 +29,14 @@ class UnforeseenError(SceneError):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `forgiving`."""
+    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `forgiving`; url: of
+    the store to which it brings what it makes, None where another process does.
+    """
 
     build: Callable[[], Callable[[Any], Any]]
     threads: int
     keep_going: bool
+    url: str | None = None
 
 
 def begin(start: Start) -> None:
@@ -40,6 +44,8 @@ def begin(start: Start) -> None:
     global _work
     keep_freed()
     torch.set_num_threads(start.threads)
+    if start.url is not None:
+        store.opened(start.url)
     work = start.build()
     _work = partial(forgiving, work) if start.keep_going else work
 
@@ -47,7 +53,10 @@ def begin(start: Start) -> None:
 def do(job: Any) -> Any:
     """A job, in a process that has begun."""
     assert _work is not None
-    return _work(job)
+    result = _work(job)
+    if (elsewhere := store.current()) is not None:
+        elsewhere.keep(now=True)
+    return result
 
 
 def forgiving(work: Callable[[J], R], job: J) -> R:
