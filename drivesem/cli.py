@@ -17,6 +17,7 @@ from drivesem.settings.blocks import Command
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse
+from drivesem.store import stored
 
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
@@ -30,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
-        with _sigterm_interrupts(), let_go():
+        with _sigterm_interrupts(), let_go(), stored(config) as config:
             return _run(config)
     except KeyboardInterrupt as error:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from drivesem.run.lock import hold
 from drivesem.run.parts import merge
 from drivesem.settings.commands import Attack, Runs
 from drivesem.settings.errors import UsageError
+from drivesem.store import place
 from drivesem.truth.grades import Grade
 from scene_ir import files
 
@@ -36,8 +38,11 @@ def run(config: Runs) -> int:
     return 0
 
 
+_place = partial(place, setting="FOLDER")
+
+
 def _list(config: Runs, console: Console) -> dict[str, Any]:
-    found = [run for folder in config.folders or (_HOME,) for run in _runs_in(Path(folder))]
+    found = [run for folder in config.folders or (_HOME,) for run in _runs_in(_place(folder))]
     rows = [_row(folder) for folder in found]
     for row in rows:
         console.print(_line(row), soft_wrap=True, markup=False)
@@ -88,7 +93,7 @@ def _figures(folder: Path) -> dict[str, Any]:
 
 def _show(config: Runs, console: Console) -> dict[str, Any]:
     told = []
-    for folder in map(Path, config.folders):
+    for folder in map(_place, config.folders):
         usual = {field.name: field.default for field in fields(Attack)}
         asked = {key: value for key, value in settings_of(attack_of(folder)).items() if value != usual[key]}
         told.append({**_row(folder), "settings": asked, "left": len(files.leftovers(folder))})
@@ -101,7 +106,7 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
 
 
 def _merge(config: Runs, console: Console) -> dict[str, Any]:
-    summary = merge(config.folders, Path(config.out or ""), config.trust)
+    summary = merge([str(_place(folder)) for folder in config.folders], Path(config.out or ""), config.trust)
     console.print(told_grades(summary), soft_wrap=True)
     console.print(f"{summary.frames} frames of {len(config.folders)} runs in {summary.out}", soft_wrap=True)
     return summary.to_json()

@@ -10,6 +10,7 @@ from drivesem.data import coco, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.virtual import VirtualDataset
+from drivesem.store import place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
@@ -77,17 +78,19 @@ LAYOUTS = tuple(_TABLE_WRITERS)
 
 
 def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
-    """The data set `name` under `root`. with_points: read laser points too, which only KITTI has.
+    """The data set `name` under `root`, a folder or its URL. with_points: read laser points too, which only KITTI
+    has.
 
-    RangeError for an unknown name, or one without points; FormatError for a bad folder.
+    RangeError for an unknown name, or one without points; FormatError for a bad folder; UsageError for a URL that
+    cannot be read.
     """
     if name not in DATASETS:
         raise RangeError("dataset", f"one of {', '.join(sorted(DATASETS))}", name)
     if with_points:
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
-        return kitti.KittiDataset(Path(root), with_points=True)
-    return DATASETS[name](Path(root))
+        return kitti.KittiDataset(place(root), with_points=True)
+    return DATASETS[name](place(root))
 
 
 def layout_of(path: Path) -> str | None:

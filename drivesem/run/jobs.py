@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TypeVar
 import torch
 
 from detectors.base import DetectorError
+from drivesem import store
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError, WriteError
 
@@ -27,24 +28,32 @@ class UnforeseenError(SceneError):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`."""
+    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`; url: of the
+    store to which it brings what it makes, None where another process does.
+    """
 
     build: Callable[[], Callable[[Any], Any]]
     threads: int
     keep_going: bool
+    url: str | None = None
 
 
 def begin(start: Start) -> None:
     """Once in a process, before its first job."""
     global _work
     torch.set_num_threads(start.threads)
+    if start.url is not None:
+        store.opened(start.url)
     _work = partial(attempt, start.build(), start.keep_going)
 
 
 def do(job: Any) -> Any:
     """A job, in a process that has begun."""
     assert _work is not None
-    return _work(job)
+    result = _work(job)
+    if (elsewhere := store.current()) is not None:
+        elsewhere.keep(now=True)
+    return result
 
 
 def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:

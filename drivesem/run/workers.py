@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import cv2
 import torch
 
+from drivesem import store
 from drivesem.run.cluster import on_ray
 from drivesem.run.jobs import Start, attempt, begin, do, ended
 from drivesem.settings.blocks import Sharing
@@ -38,8 +39,26 @@ def outcomes(
     and ended again when the job was tried alone. apart: in no case in this process. UsageError for a cluster that
     is not there.
     """
+    elsewhere = store.current()
+    for job, outcome in _outcomes(work, build, jobs, config, apart):
+        yield job, outcome
+        if elsewhere is not None:
+            elsewhere.keep()
+    if elsewhere is not None and config.engine == "ray":
+        elsewhere.fetch()  # what other machines made
+
+
+def _outcomes(
+    work: Callable[[J], R],
+    build: Callable[[], Callable[[J], R]],
+    jobs: Sequence[J],
+    config: Sharing,
+    apart: bool,
+) -> Iterator[tuple[J, Callable[[], R]]]:
     if config.engine == "ray":
-        yield from on_ray(Start(build, 1, config.keep_going), jobs, config)
+        elsewhere = store.current()
+        url = None if elsewhere is None else elsewhere.url
+        yield from on_ray(Start(build, 1, config.keep_going, url), jobs, config)
         return
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.

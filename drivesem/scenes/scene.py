@@ -164,15 +164,15 @@ class Frames:
 
 
 def open_dataset(name: str, root: str | Path, *, velodyne: bool = False) -> Frames:
-    """A data set: kitti, vkitti1, vkitti2, coco or yolo, under the folder `root`.
+    """A data set: kitti, vkitti1, vkitti2, coco or yolo, under `root`, a folder or its URL.
 
         for frame in ds.open_dataset("kitti", "PATH_TO_KITTI"):
             scene = ds.derender(frame)
 
     velodyne: read the laser's points too, which only KITTI has. RangeError for an unknown name, FormatError for a
-    folder that is none of the kind.
+    folder that is none of the kind, UsageError for a URL that cannot be read.
     """
-    return Frames(registry.open_dataset(name, Path(root), with_points=velodyne))
+    return Frames(registry.open_dataset(name, root, with_points=velodyne))
 
 
 def derender(

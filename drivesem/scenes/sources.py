@@ -68,7 +68,7 @@ class PhotographSource:
         from drivesem.data.registry import open_dataset
 
         points = isinstance(config, Derender) and config.velodyne
-        self._dataset = open_dataset(config.dataset, Path(config.root or ""), with_points=points)
+        self._dataset = open_dataset(config.dataset, config.root or "", with_points=points)
         self._settings = _settings(config)
         self._kept = _kept_scenes(config)
 

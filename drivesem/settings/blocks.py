@@ -17,15 +17,27 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
-from drivesem.settings.constraints import POSITIVE, Constraint, Of, OneOf, Parsed, Required, Within, at_least
+from drivesem.settings.constraints import (
+    POSITIVE,
+    Anywhere,
+    Constraint,
+    Of,
+    OneOf,
+    Parsed,
+    Required,
+    Within,
+    at_least,
+)
 from drivesem.settings.errors import refuse
-from drivesem.settings.values import interval, size_hw
+from drivesem.settings.values import interval, is_url, size_hw
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 Count = Annotated[int, at_least(1)]
 NotNegative = Annotated[int, at_least(0)]
 Run = Annotated[str | None, Required("a folder of drivesem attack")]
+Place = Annotated[str | None, Anywhere()]
+"""A folder, or its URL."""
 Score = Annotated[float, Within(0, 1, "(]", "a score in (0, 1]")]
 LabelMode = Literal["moved", "paper"]
 
@@ -54,6 +66,10 @@ class Options:
         markers = constraints(type(self))
         for field in fields(self):
             value = getattr(self, field.name)
+            if not any(isinstance(marker, Anywhere) for marker in markers[field.name]):
+                for text in value if isinstance(value, tuple) else (value,):
+                    here = not (isinstance(text, str) and is_url(text))
+                    refuse(not here, option(field.name), "what is on this machine (docs/scale.md)", text)
             for marker in markers[field.name]:
                 if isinstance(marker, Of):
                     if value != field.default:
@@ -127,7 +143,7 @@ class Sharing(Options):
     """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
     engine: Literal["local", "ray"] = "local"
     """What shares the frames: processes of this machine, or of a Ray cluster (docs/scale.md)."""
-    address: str | None = None
+    address: Annotated[str | None, Anywhere()] = None
     """Address of the Ray cluster, such as auto or ray://HOST:10001; by default one on this machine alone."""
 
     def check(self) -> None:
@@ -159,8 +175,8 @@ class DataSource(Seed, Limit):
 
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
-    root: str | None = None
-    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib."""
+    root: Place = None
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib, or its URL."""
 
     def check(self) -> None:
         super().check()

@@ -7,7 +7,7 @@ This module is loaded by `drivesem --help`: it imports nothing heavy.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Annotated, Literal
 
@@ -29,6 +29,7 @@ from drivesem.settings.blocks import (
     Grading,
     LabelMode,
     NotNegative,
+    Place,
     Regions,
     Repeated,
     Run,
@@ -37,10 +38,11 @@ from drivesem.settings.blocks import (
     Tiles,
     Training,
     Trust,
+    option,
 )
-from drivesem.settings.constraints import POSITIVE, Folder, Of, OneOf, Parsed, Required, Within, at_least
+from drivesem.settings.constraints import POSITIVE, Anywhere, Folder, Of, OneOf, Parsed, Required, Within, at_least
 from drivesem.settings.errors import refuse
-from drivesem.settings.values import class_map, numbers, part_of
+from drivesem.settings.values import class_map, is_url, numbers, part_of
 
 COMBO_NUMBERS = (1, 2, 3, 4)
 DEFAULT_COMBO = 2
@@ -120,6 +122,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
 
+    out: Place = None
+    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     part: Annotated[str | None, Parsed(part_of)] = None
     """K/N, such as 2/4: the 2nd, 6th, 10th frame and so on, for one of four machines (drivesem runs merge)."""
 
@@ -163,6 +167,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     what labels that stay behind make of an attack; transfer: counterexamples of combination 2 before other
     detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
     counterexamples."""
+    out: Place = None
+    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
@@ -221,6 +227,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
 class Derender(Scenes, FrameCommand):
     """Take photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
 
+    out: Place = None
+    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
     """A photograph without labels: vehicles are found by the shipped detector and placed by a small network."""
     focal: Annotated[float, Within(0, ends="()", expected="positive px")] | None = None
@@ -289,8 +297,8 @@ class Confirm(Trust, FinishedRun, FrameCommand):
 
     run: Run = None
     """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
-    root: str | None = None
-    """Folder of the run's data set, where it is no longer where the run found it."""
+    root: Place = None
+    """Folder of the run's data set, or its URL, where it is no longer where the run found it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,8 +353,8 @@ class Runs(Trust, Command):
     """list: the runs in folders, by default in runs; show: what was asked for and found; merge: one run, --out, of
     parts that were made with the same settings, on several machines for instance; prune: remove what commands left
     that were killed."""
-    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER...")] = ()
-    """Runs of drivesem attack; to list, folders that hold some."""
+    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER..."), Anywhere()] = ()
+    """Runs of drivesem attack, or their URLs; to list, folders that hold some."""
     out: str | None = None
     """Merge: the folder of the run that is made."""
     dry: Flag = False
@@ -359,6 +367,9 @@ class Runs(Trust, Command):
             (self.what == "merge") != (self.out is not None), "--out", "a folder, of runs merge alone", self.out
         )
         refuse(self.dry and self.what != "prune", "--dry", "runs prune", f"runs {self.what}")
+        elsewhere = next((folder for folder in self.folders if is_url(folder)), None)
+        here = elsewhere is None or self.what != "prune"
+        refuse(not here, "FOLDER", "a folder of this machine, to prune", elsewhere)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -510,6 +521,8 @@ class Edit(Command):
 class Synth(FrameCommand):
     """Make driving frames with exact ground truth by code."""
 
+    out: Place = None
+    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     frames: Count = 10
     """How many frames; each is made in every one of --variations."""
     layout: Literal["kitti", "vkitti2", "vkitti1", "coco", "yolo"] = "kitti"
@@ -633,15 +646,15 @@ class Gradcheck(Scenes, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eval(Tiles, Command):
+class Eval(Tiles, Sharing, Command):
     """Figures of detections against labels, as COCO, KITTI or VOC define them; or of a detector on a data set."""
 
-    gt: str | None = None
+    gt: Place = None
     """Labels: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of
     drivesem attack."""
-    pred: str | None = None
+    pred: Place = None
     """Detections: a folder of KITTI result files (with scores), COCO results, YOLO text files, or a run."""
-    pred_b: str | None = None
+    pred_b: Place = None
     """A second set of detections of the same frames, compared with the first by a paired test."""
     protocol: Literal["coco", "kitti", "voc"] = "coco"
     """Which benchmark's rules."""
@@ -676,8 +689,8 @@ class Eval(Tiles, Command):
     docs/detectors.md)."""
     dataset: Annotated[str, OneOf(DATASETS)] = "kitti"
     """Of --detector: kitti, vkitti1, vkitti2, coco or yolo."""
-    root: str | None = None
-    """Of --detector: folder of the data set."""
+    root: Place = None
+    """Of --detector: folder of the data set, or its URL."""
     limit: Count | None = None
     """Of --detector: the first N frames."""
     device: str = "cpu"
@@ -697,6 +710,9 @@ class Eval(Tiles, Command):
         which = "both" if self.gt else "neither"
         refuse(given == asked, "--gt and --pred, or --detector", "one or the other", which)
         refuse(asked and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
+        sharing = next((f.name for f in fields(Sharing) if getattr(self, f.name) != f.default), None)
+        alone = sharing is not None and not asked
+        refuse(alone, option(sharing or ""), "--detector beside it", "none")
         nowhere = self.pictures > 0 and (not asked or self.out is None)
         refuse(nowhere, "--pictures", "--detector and --out", "one of them missing")
 
@@ -819,7 +835,7 @@ class Train(Training, FrameCommand):
     and foliage changed, by the project's own renderer; data sets with 3D boxes."""
     loaders: NotNegative = 0
     """Threads that make views ready ahead (where a GPU trains); 0 makes them between the steps."""
-    note: str = ""
+    note: Annotated[str, Anywhere()] = ""
     """A remark on this run for the model card."""
 
     def check(self) -> None:

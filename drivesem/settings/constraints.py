@@ -91,4 +91,12 @@ class Of:
         refuse(method not in self.methods, setting, f"--method {', '.join(self.methods)} beside it", method)
 
 
-Constraint = Within | OneOf | Folder | Parsed | Required | Of
+@dataclass(frozen=True)
+class Anywhere:
+    """A text that may be a URL; others name what is on this machine."""
+
+    def check(self, setting: str, value: Any) -> None:
+        """Any will do."""
+
+
+Constraint = Within | OneOf | Folder | Parsed | Required | Of | Anywhere

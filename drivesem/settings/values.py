@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from drivesem.settings.errors import UsageError
 
@@ -54,3 +55,8 @@ def part_of(setting: str, text: str) -> tuple[int, int]:
     if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise UsageError(setting, "K/N, the K-th of N parts, such as 2/4", repr(text))
     return int(number), int(count)
+
+
+def is_url(text: str) -> bool:
+    """Whether a text names something by a URL, such as s3://BUCKET/FOLDER, and not a path of this machine."""
+    return re.match(r"[a-z][a-z0-9+.-]*(://|::)", text) is not None

@@ -23,7 +23,17 @@ TOP_LEVEL_NAMES = {
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
-LOADED_WHERE_USED = ("open3d", "pyrender", "onnxruntime", "torchvision", "ultralytics", "cma", "ray", "loky")
+LOADED_WHERE_USED = (
+    "open3d",
+    "pyrender",
+    "onnxruntime",
+    "torchvision",
+    "ultralytics",
+    "cma",
+    "ray",
+    "loky",
+    "fsspec",
+)
 
 
 @dataclass(frozen=True)
@@ -44,8 +54,8 @@ class Rule:
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
 _JOINED = ("drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
-_BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "synth")
-_BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings")
+_BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "store", "synth")
+_BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings", "store")
 MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
 """Questions that are made of others."""
 RULES = (

@@ -16,6 +16,7 @@ from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, truste
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import Confirm
 from drivesem.settings.errors import UsageError
+from drivesem.settings.values import is_url
 from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 
@@ -59,6 +60,8 @@ class ConfirmWorker:
         self.frames = {frame.result.identifier: frame for frame in run.frames}
         if attack.dataset == DEMO and config.root is not None:
             raise UsageError("--root", "none for the embedded scenes", config.root)
+        if config.root is None and is_url(attack.root or ""):  # a run does not say where this machine looks
+            raise UsageError("--root", "the run's data set, named again as it lies elsewhere", attack.root)
         self.second = SecondRenderers(attack.dataset, config.root or attack.root)
         self.second.check()
         self.detector = detector_of(attack, config.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.table import Table
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
-from detectors.types import Detections, Targets
+from detectors.types import Detections
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty
 from drivesem.data.registry import Dataset, open_dataset
@@ -21,8 +22,8 @@ from drivesem.evaluation import coco
 from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.mistakes import marked
-from drivesem.report.progress import progress_bar
 from drivesem.report.tables import percent
+from drivesem.run.ask import Bar, ask
 from drivesem.run.looking import detections_in
 from drivesem.settings.commands import Eval
 from drivesem.settings.errors import UsageError
@@ -46,12 +47,19 @@ def evaluate_detector(config: Eval) -> DetectorFigures:
     """Run the detector over the frames, count, and write what is asked for. UsageError or SceneError for bad
     input.
     """
-    dataset = open_dataset(config.dataset, Path(config.root or ""))
+    dataset = open_dataset(config.dataset, config.root or "")
     detector = _detector(config)
     names = dataset.identifiers[: config.limit]
-    found, targets = _look(config, dataset, detector, names)
+    looker, build = _Looker(config, dataset, detector), partial(_Looker, config)
+    looked = ask(names, looker, build, config, Bar("frames", stays=False))
+    names = [name for name in names if name in looked.results]
+    if not names:
+        raise UsageError("--root", "frames that can be used", "none")
+    found, labels = [looked.results[name][0] for name in names], [looked.results[name][1] for name in names]
     t_star = t_star_of(detector)
     judged = JudgedClasses.of(detector).names
+    limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
+    targets = [judged_targets(one, limits, judged) for one in labels]
     scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
     outcome = Outcome.of(targets, found, judged.index(HEADLINE))
     draws = DRAWS if config.bootstrap is None else config.bootstrap
@@ -60,6 +68,7 @@ def evaluate_detector(config: Eval) -> DetectorFigures:
         "detector": config.detector,
         "dataset": config.dataset,
         "frames": len(names),
+        "failed": dict(sorted(looked.failed.items())),
         "headline": HEADLINE,
         "t_star": t_star,
         "min_height": config.min_height,
@@ -95,21 +104,20 @@ def _detector(config: Eval) -> Predictor:
     return detector
 
 
-def _look(
-    config: Eval, dataset: Dataset, detector: Predictor, names: Sequence[str]
-) -> tuple[list[Detections], list[Targets]]:
-    judged = JudgedClasses.of(detector)
-    found: list[Detections] = []
-    labels: list[Labels] = []
-    with progress_bar(Console(stderr=True), stays=False) as progress:
-        for name in progress.track(names, description="frames"):
-            frame = dataset.frame(name)
-            if frame.labels is None:
-                raise FormatError(f"frame {name}", "labels", "none")
-            found.append(detections_in(detector, frame.photograph.to(config.device)))
-            labels.append(frame.labels)
-    limits = suited(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
-    return found, [judged_targets(one, limits, judged.names) for one in labels]
+class _Looker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, config: Eval, dataset: Dataset | None = None, detector: Predictor | None = None) -> None:
+        self._dataset = dataset or open_dataset(config.dataset, config.root or "")
+        self._detector = detector or _detector(config)
+        self._device = config.device
+
+    def __call__(self, name: str) -> tuple[Detections, Labels]:
+        """What is found in a frame, and its labels. Raises FormatError for a frame without."""
+        frame = self._dataset.frame(name)
+        if frame.labels is None:
+            raise FormatError(f"frame {name}", "labels", "none")
+        return detections_in(self._detector, frame.photograph.to(self._device)), frame.labels
 
 
 def _write(
@@ -141,6 +149,8 @@ def _write(
 def print_figures(figures: DetectorFigures, console: Console) -> None:
     """The table, the intervals, and who was judged."""
     data = figures.data
+    for name, reason in data["failed"].items():
+        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True, markup=False)
     table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
     table.add_column("class")
     for title in (*coco.SCORE_TITLES, "objects"):

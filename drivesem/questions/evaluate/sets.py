@@ -17,6 +17,7 @@ from drivesem.run.labels import layout_of, read
 from drivesem.settings.commands import Eval
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import class_map
+from drivesem.store import place
 from scene_ir import files
 
 _SHOWN = 3
@@ -44,7 +45,8 @@ def open_sets(config: Eval) -> EvalSet:
     UsageError or FormatError, one line: ids that do not match, a class that nobody mapped, a score that is no
     number, no detections at all.
     """
-    gt_path, paths = Path(config.gt or ""), [Path(p) for p in (config.pred, config.pred_b) if p is not None]
+    gt_path = place(config.gt or "", "--gt")
+    paths = [place(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
     gt_layout = layout_of(gt_path) if config.gt_format == "auto" else config.gt_format
     truth = read(gt_path, gt_layout, stage=config.stage)
     wanted = _wanted(config, truth)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from torch import Tensor
 
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.errors import UsageError
+from drivesem.store import place
 from drivesem.truth.redraw.base import Redrawn, SecondRenderer
 from drivesem.truth.redraw.generator import GeneratorRedraw
 from drivesem.truth.redraw.photograph import PhotographRedraw
@@ -79,6 +78,6 @@ def _folder_plans(dataset: str, root: str | None) -> Plans | None:
     if dataset != "kitti":
         return None
     try:
-        return FolderPlans(Path(root or ""))
+        return FolderPlans(place(root or ""))
     except (UsageError, FormatError):
         return None

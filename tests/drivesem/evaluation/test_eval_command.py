@@ -409,6 +409,28 @@ def kitti_with_images(tmp_path: Path) -> Path:
     return tmp_path / "kitti"
 
 
+def test_a_detectors_frames_are_shared_and_one_that_cannot_be_used_is_listed(
+    run: Run, tmp_path: Path, kitti_with_images: Path
+):
+    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
+    alone, shared = run(*words, "--workers", 1)[1], run(*words, "--workers", 2)[1]
+    assert alone == shared
+    assert alone["frames"] == 2
+    (kitti_with_images / "training/image_2/000000.png").write_bytes(b"no picture")
+    words = (*words, "--workers", 1)
+    assert run(*words)[0] == 2
+    code, data, text = run(*words, "--keep-going")
+    assert (code, data["frames"], list(data["failed"])) == (0, 1, ["000000"])
+    assert "frame 000000 could not be used: " in text
+    (kitti_with_images / "training/image_2/000001.png").write_bytes(b"no picture")
+    code, _, text = run(*words, "--keep-going")
+    assert code == 2
+    assert "--root: expected frames that can be used, found none" in text
+    code, _, text = run("--gt", "a", "--pred", "b", "--engine", "ray")
+    assert code == 2
+    assert "--engine: expected --detector beside it, found none" in text
+
+
 def test_a_detectors_mistakes_are_drawn_worst_first(run: Run, tmp_path: Path, kitti_with_images: Path):
     words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
     code, data, _ = run(*words, "--out", tmp_path / "out", "--pictures", 1)

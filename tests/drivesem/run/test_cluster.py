@@ -20,6 +20,7 @@ from drivesem.cli import main
 from drivesem.run.workers import outcomes
 from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
+from drivesem.store import place
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents
 
@@ -111,6 +112,42 @@ def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[s
     assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
     with pytest.raises(UsageError, match="--address"):
         Sharing(address="auto").check()
+
+
+@pytest.mark.slow
+def test_each_command_that_works_through_frames_makes_on_a_cluster_what_it_makes_here(
+    tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    data, ray_words = tmp_path / "kitti", ("--engine", "ray", "--address", cluster.address)
+
+    def alike(words: list[str], out: str, *figures: str) -> None:
+        told = []
+        for folder, sharing in ((out, ("--workers", "2")), (f"{out}-ray", ray_words)):
+            capsys.readouterr()
+            if sharing == ray_words:
+                assert main([*words, *sharing, "--out", str(tmp_path / folder), "--json"]) == 0
+            else:
+                alone = [sys.executable, "-m", "drivesem.cli", *words, *sharing, "--out", str(tmp_path / folder)]
+                subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
+            told.append({n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(figures or "-")})
+        assert told[0] == told[1]
+        assert told[0]
+
+    alike(["synth", "--frames", "3", "--seed", "5"], "kitti")
+    read = ["--dataset", "kitti", "--root", str(data)]
+    alike(["derender", "--no-fit", *read], "scenes")
+    alike(["eval", "--detector", "squeezedet", *read], "figures")
+    study = ["study", "labels", "--quick", "--limit", "2", "--steps", "1", "--peer", "off", "--bootstrap", "0"]
+    alike(study, "study", "study.", "largest", "config.yaml", "label_sets")
+    run = tmp_path / "study" / "arms" / "translate"
+    alike(["confirm", "--run", str(run)], "confirm")
+    alike(["holes", str(run), "--samples", "24", "--fresh", "8"], "holes")
+    # Each machine brings what it made to the store; this one fetches it.
+    url = f"file://{tmp_path}/elsewhere/kitti"
+    assert main(["synth", "--frames", "3", "--seed", "5", *ray_words, "--out", url]) == 0
+    assert contents(place(url)) == contents(data)
 
 
 @pytest.mark.slow

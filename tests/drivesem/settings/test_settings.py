@@ -20,7 +20,7 @@ from drivesem.cli import main
 from drivesem.run.folder import attack_of
 from drivesem.settings.blocks import Command, Regions, constraints, option
 from drivesem.settings.commands import COMMANDS, Attack, Explain, Study, Synth
-from drivesem.settings.constraints import Constraint, Folder, Of, OneOf, Required, Within
+from drivesem.settings.constraints import Anywhere, Constraint, Folder, Of, OneOf, Required, Within
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse, preset_words
 from drivesem.settings.text import to_yaml
@@ -166,7 +166,7 @@ def outside(constraint: Constraint, number: type) -> list[Any]:
             return [number(value) for value in (*low_values, *high_values)] + [math.nan] * (number is float)
         case Required():
             return []
-        case Of():
+        case Of() | Anywhere():
             return []
         case Folder() | OneOf():
             return ["nowhere"]

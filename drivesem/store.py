@@ -1,0 +1,349 @@
+"""Folders in a store elsewhere, named by a URL that fsspec opens (s3://, gs://, memory://), and their copies here.
+
+A command works in the copy, as in any folder. What is new in it goes to the store, each time in the order in which
+it was written, and a commit comes last: an object that names the files, with their sizes, times and hashes. Only
+what a commit names is read back, so that no store has to rename anything, and what was cut off in the middle is
+not there. A file that changes lies beside its place until its commit is written. A folder without commits, such as
+somebody's data set, is read as it stands.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from drivesem.settings.blocks import Command, Output
+from drivesem.settings.errors import UsageError
+from drivesem.settings.values import is_url
+from scene_ir import files
+from scene_ir.errors import FormatError
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+_COMMITS = ".store"
+"""Folder of the commits: NUMBER-HASH.json, and of changed files by their hash, until they are in their places."""
+_COMMIT = re.compile(r"(\d{6})-([0-9a-f]{16})\.json")
+_SHARE = 0.1
+"""Of a command's time, for copies to the store while it works."""
+
+C = TypeVar("C", bound=Command)
+
+
+@dataclass(frozen=True, slots=True)
+class _Version:
+    """One state of a file: bytes, nanoseconds, SHA-256."""
+
+    size: int
+    time_ns: int
+    digest: str
+
+
+class Store:
+    """A folder of a store. setting: what named it on the command line."""
+
+    def __init__(self, url: str, setting: str) -> None:
+        self.url, self._setting = url.rstrip("/"), setting
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drivesem" / "stores"
+        self._home = home / hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        # A run is called as its folder is.
+        self.folder = (
+            self._home / "copy" / (re.sub(r"[^\w.-]", "_", self.url.rsplit("/", 1)[-1]).strip(".") or "_")
+        )
+        self._known: dict[str, _Version | None] = {}
+        self._read: set[str] = set()
+        self._not_before = 0.0
+
+    def fetch(self) -> None:
+        """Bring here what the store has and the copy lacks. Raises UsageError for a store that cannot be read."""
+        with self._held():
+            commits = self._listed(_COMMITS)
+            if commits:
+                self._fetch_commits([name for name in commits if _COMMIT.fullmatch(name)])
+            else:
+                self._mirror()
+
+    def keep(self, now: bool = False) -> None:
+        """Copy to the store what is new here. now: whatever was copied last, else in a tenth of the time. Raises
+        UsageError for a store that cannot be written.
+        """
+        begun = time.monotonic()
+        if not now and begun < self._not_before:
+            return
+        with self._held():
+            self._push()
+        self._not_before = time.monotonic() + (time.monotonic() - begun) / _SHARE
+
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """One process of this machine at a time looks after the copy."""
+        from filelock import FileLock
+
+        (self._home / "commits").mkdir(parents=True, exist_ok=True)
+        with FileLock(self._home / "lock"):
+            self._read_commits()
+            yield
+
+    @functools.cached_property
+    def _opened(self) -> tuple[AbstractFileSystem, str]:
+        try:
+            from fsspec.core import url_to_fs
+
+            return url_to_fs(self.url)
+        except (ImportError, ValueError) as error:
+            expected = "a folder, or a URL whose library is here (pip install 'drivesem[remote]')"
+            raise UsageError(self._setting, expected, f"{self.url}: {error}") from error
+
+    @contextmanager
+    def _asking(self, expected: str) -> Iterator[tuple[AbstractFileSystem, str]]:
+        """The store and the folder in it. What its library raises is in one line: each has errors of its own."""
+        opened = self._opened
+        try:
+            yield opened
+        except Exception as error:
+            found = f"{self.url}: {type(error).__name__}: {error} (what was made is kept in {self.folder})"
+            raise UsageError(self._setting, expected, found) from error
+
+    def _get(self, name: str) -> bytes | None:
+        """What an object of the folder holds; None where it is not there."""
+        with self._asking("a store that can be read") as (store, root):
+            try:
+                data: Any = store.cat_file(f"{root}/{name}")
+            except FileNotFoundError:
+                return None
+        return data
+
+    def _put(self, name: str, data: bytes) -> None:
+        with self._asking("a store that can be written") as (store, root):
+            path = f"{root}/{name}"
+            try:
+                store.pipe_file(path, data)
+            except FileNotFoundError:  # a store with folders
+                store.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+                store.pipe_file(path, data)
+
+    def _remove(self, name: str) -> None:
+        with self._asking("a store that can be written") as (store, root):
+            try:
+                store.rm_file(f"{root}/{name}")
+            except FileNotFoundError:
+                return
+
+    def _listed(self, folder: str = "") -> dict[str, str]:
+        """What lies in a folder of this one, below it too: a mark of its state, by name."""
+        with self._asking("a store that can be read") as (store, root):
+            store.invalidate_cache()
+            path = f"{root}/{folder}".rstrip("/")
+            try:
+                found: Any = store.find(path, detail=True)
+            except FileNotFoundError:
+                return {}
+        marks = ((name[len(path) + 1 :], str(info).encode()) for name, info in found.items())
+        return {name: hashlib.sha256(info).hexdigest() for name, info in marks}
+
+    # --- folders with commits
+
+    def _read_commits(self) -> None:
+        for path in sorted((self._home / "commits").glob("*.json")):
+            if path.name not in self._read:
+                self._known |= _versions(path)
+                self._read.add(path.name)
+
+    def _fetch_commits(self, names: Iterable[str]) -> None:
+        fresh: dict[str, dict[str, _Version | None]] = {}
+        for name in sorted(set(names) - self._read):
+            data, path = self._get(f"{_COMMITS}/{name}") or b"", self._home / "commit"
+            if hashlib.sha256(data).hexdigest()[:16] == name[7:23]:  # else it is half written
+                files.write_bytes(path, data)
+                fresh[name] = _versions(path)
+        wanted = dict(self._known)
+        for versions in fresh.values():
+            wanted |= versions
+        # Also what was here and is gone: it is not to be taken for something that a command removed.
+        lost = {name for name in _shown(wanted) if not self._bring(name, wanted[name])}
+        for name, versions in fresh.items():
+            self._note(name, {file: None if file in lost else v for file, v in versions.items()})
+        self._known |= dict.fromkeys(lost)
+
+    def _bring(self, name: str, version: _Version | None) -> bool:
+        """Make a file here as a commit names it. False where the store has other bytes in its place."""
+        path = files.below(self.folder, name)
+        if version is None:
+            path.unlink(missing_ok=True)
+            return True
+        if _state(path) == (version.size, version.time_ns):
+            return True
+        # Beside its place while it changes; in its place again where that ended in between.
+        for place in (name, f"{_COMMITS}/{version.digest}", name):
+            data = self._get(place)
+            if data is not None and hashlib.sha256(data).hexdigest() == version.digest:
+                files.write_bytes(path, data)
+                os.utime(path, ns=(version.time_ns, version.time_ns))
+                return True
+        path.unlink(missing_ok=True)
+        return False
+
+    def _push(self) -> None:
+        here = {path.relative_to(self.folder).as_posix(): state for path, state in _files(self.folder)}
+        known = self._known
+        changed = [
+            name for name, state in here.items() if (v := known.get(name)) is None or state != (v.size, v.time_ns)
+        ]
+        removed = [name for name, version in known.items() if version is not None and name not in here]
+        if not changed and not removed:
+            return
+        if not self._read:
+            self._commit({})  # from now on, what no commit names is not there
+        written: dict[str, _Version | None] = dict.fromkeys(removed)
+        beside: dict[str, str] = {}
+        for name in sorted(changed, key=lambda name: here[name][1]):
+            data = files.read_bytes(self.folder / name)
+            digest = hashlib.sha256(data).hexdigest()
+            if known.get(name) is not None:
+                beside[name] = f"{_COMMITS}/{digest}"
+            self._put(beside.get(name, name), data)
+            written[name] = _Version(len(data), here[name][1], digest)
+        self._commit(written)
+        for name, place in beside.items():
+            data = files.read_bytes(self.folder / name)
+            if place.endswith(hashlib.sha256(data).hexdigest()):  # else it has changed again
+                self._put(name, data)
+                self._remove(place)
+        for name in removed:
+            self._remove(name)
+
+    def _commit(self, versions: Mapping[str, _Version | None]) -> None:
+        told = {name: v and [v.size, v.time_ns, v.digest] for name, v in versions.items()}
+        data = json.dumps(told, ensure_ascii=False).encode()
+        number = max((int(name[:6]) for name in self._read), default=-1) + 1
+        name = f"{number:06d}-{hashlib.sha256(data).hexdigest()[:16]}.json"
+        self._put(f"{_COMMITS}/{name}", data)
+        self._note(name, versions)
+
+    def _note(self, name: str, versions: Mapping[str, _Version | None]) -> None:
+        told = {file: v and [v.size, v.time_ns, v.digest] for file, v in versions.items()}
+        files.write_json(self._home / "commits" / name, told)
+        self._known |= versions
+        self._read.add(name)
+
+    # --- folders of others
+
+    def _mirror(self) -> None:
+        record = self._home / "mirror.txt"
+        lines = files.read_text(record).splitlines() if record.is_file() else []
+        before = {name: mark for mark, _, name in (line.partition(" ") for line in lines)}
+        found = self._listed()
+        with record.open("a", encoding="utf-8") as told:
+            for name in _shown(name for name, mark in found.items() if before.get(name) != mark):
+                path, data = files.below(self.folder, name), self._get(name)
+                if data is not None:
+                    files.write_bytes(path, data)
+                    told.write(f"{found[name]} {name}\n")
+                    told.flush()
+        for name in before.keys() - found:
+            files.below(self.folder, name).unlink(missing_ok=True)
+        files.write_text(record, "".join(f"{mark} {name}\n" for name, mark in found.items()))
+
+
+def _shown(names: Iterable[str]) -> Iterable[str]:
+    from rich.console import Console
+    from rich.progress import track
+
+    names = list(names)
+    bar = Console(stderr=True)
+    return track(names, "copying from the store", console=bar, transient=True, disable=not names)
+
+
+def _versions(path: Path) -> dict[str, _Version | None]:
+    """What a commit names. FormatError where it is none."""
+    told = files.read_json(path)
+    try:
+        found = {name: v and _Version(int(v[0]), int(v[1]), str(v[2])) for name, v in told.items()}
+    except (AttributeError, TypeError, ValueError, LookupError) as error:
+        raise FormatError(str(path), "size, time and hash of each file, or null", error) from error
+    return found
+
+
+def _files(folder: Path) -> Iterator[tuple[Path, tuple[int, int]]]:
+    """Files that are whole, with their states. Hidden ones at the top, such as a lock, are this machine's own."""
+    left = set(files.leftovers(folder))
+    for root, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if Path(root, name) not in left]
+        for path in (Path(root, name) for name in names):
+            own = path in left or (path.parent == folder and path.name.startswith("."))
+            state = None if own else _state(path)
+            if state is not None:
+                yield path, state
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_size, found.st_mtime_ns
+
+
+def place(path: str | Path, setting: str = "--root") -> Path:
+    """A folder: the one of this name, or the copy of the one at this URL, compared with the store once in a
+    process. Raises UsageError for a URL where nothing is.
+    """
+    return _copy_of(path, setting) if isinstance(path, str) and is_url(path) else Path(path)
+
+
+@functools.cache
+def _copy_of(url: str, setting: str) -> Path:
+    store = Store(url, setting)
+    store.fetch()
+    if not store.folder.is_dir():
+        raise UsageError(setting, "a folder with files", f"{url}, where there are none")
+    return store.folder
+
+
+_open: Store | None = None
+"""Where this process' command writes, if that is elsewhere."""
+
+
+@contextmanager
+def stored(config: C) -> Iterator[C]:
+    """The settings with a folder here in place of a URL in --out: what the store has is brought there first, and
+    what the command makes is copied back, as it goes (`keep`) and at the end.
+    """
+    _copy_of.cache_clear()
+    if not isinstance(config, Output) or config.out is None or not is_url(config.out):
+        yield config
+        return
+    store = opened(config.out)
+    try:
+        store.fetch()
+        yield replace(config, out=str(store.folder))
+        store.keep(now=True)
+    finally:
+        closed()
+
+
+def opened(url: str) -> Store:
+    """From now on `keep` is about this store."""
+    global _open
+    _open = Store(url, "--out")
+    return _open
+
+
+def closed() -> None:
+    """From now on `keep` is about nothing."""
+    global _open
+    _open = None
+
+
+def current() -> Store | None:
+    """Where this process' command writes, if that is elsewhere."""
+    return _open
