@@ -28,8 +28,8 @@ class UnforeseenError(SceneError):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`; url: of the
-    store to which it brings what it makes, None where another process does.
+    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`; url: of
+    the store to which it brings what it makes, None where another process does.
     """
 
     build: Callable[[], Callable[[Any], Any]]
