@@ -162,7 +162,10 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert not list(tmp_path.iterdir()), "bad settings leave nothing behind"
 
 
-@pytest.mark.parametrize("command", ["verify", "explain", "confirm", "plausibility", "transfer --detectors squeezedet"])
+_TAKE_RUNS = ["verify", "explain", "confirm", "plausibility", "transfer --detectors squeezedet"]
+
+
+@pytest.mark.parametrize("command", _TAKE_RUNS)
 def test_the_run_may_stand_first(command: str) -> None:
     name, *rest = command.split()
     assert parse([name, "runs/a", *rest]) == parse([name, "--run", "runs/a", *rest])
