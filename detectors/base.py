@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from detectors.memory import in_halves
 from detectors.types import Detections, Targets
 
 
@@ -200,8 +201,10 @@ class Predictor(Protocol):
 
 @torch.no_grad()
 def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
-    """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each."""
-    return predictor.decode(predictor.forward(images))
+    """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each. Images that are too many
+    for the device's memory are looked at in halves.
+    """
+    return in_halves(lambda part: predictor.decode(predictor.forward(part)), images, "images")
 
 
 class Detector(nn.Module, ABC):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from detectors.adapters import choose
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
+from detectors.whole import write_whole
 from detectors.yolov3 import cfg
 from detectors.yolov3.yolov3 import YoloV3, YoloV3Slim, YoloV3Tiny
 
@@ -167,14 +167,8 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 
 
 def write_weights(path: Path, metadata: dict[str, str], tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file, so that a reader sees the old or the new one, never a part. Makes the folder.
-
-    The same content gives the same bytes.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(_in_order(save(tensors, metadata)))
-    os.replace(temporary, path)
+    """Write a safetensors file, as `write_whole` does. The same content gives the same bytes."""
+    write_whole(path, _in_order(save(tensors, metadata)))
 
 
 def _in_order(data: bytes) -> bytes:

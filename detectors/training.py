@@ -8,6 +8,7 @@ threads, and a batch can be shared by the processes of torch.distributed, where 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import time
@@ -25,9 +26,11 @@ from torch import Tensor, distributed
 
 from detectors.augment import AugmentSettings, view
 from detectors.base import Detector, DetectorError, RawPredictions
+from detectors.memory import make_room
 from detectors.registry import read_weights, write_weights
 from detectors.squeezedet import SeededDropout
 from detectors.types import Targets
+from detectors.whole import write_whole
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.csv"
@@ -134,7 +137,6 @@ def train(
     rank, ranks = _place()
     if settings.batch % ranks:
         raise ValueError(f"batch: expected a multiple of the {ranks} processes, found {settings.batch}")
-    folder.mkdir(parents=True, exist_ok=True)
     run = _Run(detector, settings)
     step = run.load(folder / CHECKPOINT) if (folder / CHECKPOINT).is_file() else 0
     _wait_for_all()
@@ -151,16 +153,18 @@ def train(
             log.add(step, run.seconds, row)
             if progress is not None and rank == 0:
                 progress(step, settings.steps, row)
-            if step % settings.checkpoint_every == 0 and rank == 0:
-                run.save(folder / CHECKPOINT, step)
-                log.flush()
+            # A run that is killed goes on from the checkpoint: what belongs to its step is written before it.
             if evaluate is not None and settings.evaluate_every and step % settings.evaluate_every == 0:
-                log.flush()
+                log.write()
                 if rank == 0:
                     with run.averaged() as averaged:
                         evaluate(averaged, step)
                 _wait_for_all()
+            if step % settings.checkpoint_every == 0 and rank == 0:
+                log.write()
+                run.save(folder / CHECKPOINT, step)
         if stop_after is None and rank == 0:
+            log.write()
             run.save(folder / CHECKPOINT, step)
     run.use_average()
     if evaluate is not None and stop_after is None and rank == 0:
@@ -251,6 +255,7 @@ class _Run:
             if isinstance(module, SeededDropout):
                 module.generator = self.generator
         self.device = next(detector.parameters()).device
+        self.part = settings.batch  # views at once
         self.average = {name: value.detach().clone() for name, value in detector.state_dict().items()}
         fresh, started = [], []
         for name, parameter in detector.named_parameters():
@@ -280,14 +285,9 @@ class _Run:
         self.generator.manual_seed(self.settings.seed * 1_000_003 + step + (_place()[0] << 40))
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
-        with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
-            raw = self.forward(images.to(self.device, non_blocking=True))
-        terms = self.detector.loss(raw, targets)
-        self.optimiser.zero_grad(set_to_none=True)
-        self.scaler.scale(terms["total"]).backward()
+        values = self._backward(images, targets, dtype)
         self.scaler.unscale_(self.optimiser)
         norm = torch.nn.utils.clip_grad_norm_(self.detector.parameters(), self.settings.clip_norm)
-        values = {name: float(value.detach()) for name, value in terms.items() if name != NO_LOSS}
         overflown = self.scaler.is_enabled() and math.isfinite(values["total"])
         if not (math.isfinite(values["total"]) and (overflown or bool(torch.isfinite(norm)))):
             raise FloatingPointError(f"step {step}: expected a finite loss and gradient, found {values}, {norm}")
@@ -302,6 +302,37 @@ class _Run:
                 else:
                     self.average[name].copy_(value)
         return {"rate": rate, **values, "norm": float(norm)}
+
+    def _backward(self, images: Tensor, targets: Sequence[Targets], dtype: torch.dtype) -> dict[str, float]:
+        """Gradients of the mean loss of a batch, and the loss terms. Where the device's memory does not hold the
+        whole batch, parts of it follow one another, as if so many processes shared it; then so in all later steps.
+        """
+        while True:
+            try:
+                return self._in_parts(images, targets, dtype)
+            except torch.OutOfMemoryError:
+                if self.part < 2 or _place()[1] > 1:
+                    raise
+            self.part = -(-min(self.part, len(images)) // 2)
+            self.optimiser.zero_grad(set_to_none=True)
+            make_room(
+                f"a batch of {len(images)} does not fit into the device's memory: {self.part} at once from now on"
+            )
+
+    def _in_parts(self, images: Tensor, targets: Sequence[Targets], dtype: torch.dtype) -> dict[str, float]:
+        values: dict[str, float] = {}
+        self.optimiser.zero_grad(set_to_none=True)
+        for start in range(0, len(images), self.part):
+            part = images[start : start + self.part]
+            share = len(part) / len(images)
+            with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
+                raw = self.forward(part.to(self.device, non_blocking=True))
+            terms = self.detector.loss(raw, targets[start : start + self.part])
+            self.scaler.scale(terms["total"] * share).backward()
+            for name, value in terms.items():
+                if name != NO_LOSS:
+                    values[name] = values.get(name, 0.0) + share * float(value.detach())
+        return values
 
     @contextmanager
     def averaged(self) -> Iterator[Detector]:
@@ -367,43 +398,35 @@ class _Run:
 class _Log:
     """CSV of the run, a line a step; a run that goes on drops the lines after its checkpoint.
 
-    Columns: step, seconds, rate, the detector's own loss terms, norm of the gradient.
+    Columns: step, seconds, rate, the detector's own loss terms, norm of the gradient. The file is whole at all
+    times: a killed run must neither leave half a line, nor a checkpoint with steps that the log lacks.
     """
 
     def __init__(self, path: Path, step: int, writes: bool) -> None:
-        self._kept: list[dict[str, str]] = []
-        if step and writes and path.is_file():
+        self._path, self._writes = path, writes
+        self._rows: list[dict[str, str]] = []
+        if step and path.is_file():
             with path.open(newline="") as file:
-                self._kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-        self._file = path.open("w", newline="") if writes else None
-        self._writer: csv.DictWriter[str] | None = None
-        if self._kept:
-            self._begin(list(self._kept[0]))
+                self._rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
 
     def __enter__(self) -> _Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def _begin(self, columns: list[str]) -> None:
-        if self._file is not None:
-            self._writer = csv.DictWriter(self._file, columns)
-            self._writer.writeheader()
-            self._writer.writerows(self._kept)
+        self.write()
 
     def add(self, step: int, seconds: float, values: Mapping[str, float]) -> None:
         numbers = {name: f"{value:.6g}" for name, value in values.items()}
-        row = {"step": str(step), "seconds": f"{seconds:.1f}", **numbers}
-        if self._writer is None:
-            self._begin(list(row))
-        if self._writer is not None:
-            self._writer.writerow(row)
+        self._rows.append({"step": str(step), "seconds": f"{seconds:.1f}", **numbers})
 
-    def flush(self) -> None:
-        if self._file is not None:
-            self._file.flush()
+    def write(self) -> None:
+        """All lines so far. DetectorError where they cannot be written."""
+        if self._rows and self._writes:
+            table = io.StringIO(newline="")
+            writer = csv.DictWriter(table, list(self._rows[0]))
+            writer.writeheader()
+            writer.writerows(self._rows)
+            write_whole(self._path, table.getvalue().encode())
 
 
 def _place() -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Errors raised at the borders of the scene representation.
 
-All are `ValueError`s whose message is one line: what was looked at, what was expected, what was found.
+Their message is one line: what was looked at, what was expected, what was found. All but `WriteError` are
+`ValueError`s.
 """
 
 from __future__ import annotations
@@ -18,6 +19,21 @@ class SceneError(ValueError):
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
         """As processes hand errors to one another: `actual` as text, which always can be."""
         return type(self), (self.field, self.expected, str(self.actual))
+
+
+class WriteError(OSError):
+    """A file that cannot be written: a full disk, a folder that may only be read. No input is to blame, and with
+    the next it would be the same, so this is no SceneError.
+    """
+
+    def __init__(self, path: str, reason: str) -> None:
+        self.path = path
+        self.reason = reason
+        super().__init__(f"{path}: expected a place that can be written, found {reason}")
+
+    def __reduce__(self) -> tuple[type[WriteError], tuple[str, str]]:
+        """As processes hand errors to one another."""
+        return type(self), (self.path, self.reason)
 
 
 class ShapeError(SceneError):

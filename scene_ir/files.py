@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from scene_ir.errors import FormatError, ShapeError
+from scene_ir.errors import FormatError, ShapeError, WriteError
 
 _NPZ_LEVEL = 1
 """zlib level: float maps shrink hardly further at higher ones, and take several times as long."""
@@ -44,7 +44,7 @@ _ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
 
-_LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+_LEFT = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
 
 
 def _sibling(path: Path) -> Path:
@@ -58,15 +58,32 @@ def leftovers(folder: Path) -> list[Path]:
     return [path for path in found if not any(parent in found for parent in path.parents)]
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that a reader sees the old file or the new one, never a part. Makes the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _sibling(path)
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Inside, what the system says against writing `path` becomes a WriteError that names it, as it would be
+    called in the end.
+    """
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except WriteError:
+        raise
+    except OSError as error:
+        names = (found[1] if (found := _LEFT.fullmatch(part)) else part for part in path.parts)
+        raise WriteError(str(Path(*names)), (error.strerror or str(error)).lower()) from error
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` to `path` so that a reader sees the old file or the new one, never a part. Makes the folder.
+    Raises WriteError; so do all that write here.
+    """
+    temporary = _sibling(path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            temporary.write_bytes(data)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def share_alike(folder: Path, other: Path) -> None:
@@ -128,18 +145,20 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder beside `folder` that takes its name and place when the block ends without error."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = _sibling(folder)
-    temporary.mkdir()
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
     try:
         yield temporary
-        if folder.exists():
-            old = _sibling(folder)
-            os.replace(folder, old)
-            os.replace(temporary, folder)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, folder)
+        with writing(folder):
+            if folder.exists():
+                old = _sibling(folder)
+                os.replace(folder, old)
+                os.replace(temporary, folder)
+                shutil.rmtree(old)
+            else:
+                os.replace(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

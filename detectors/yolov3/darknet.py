@@ -6,6 +6,7 @@ from pathlib import Path
 
 from detectors.adapters import coco
 from detectors.base import DetectorError
+from detectors.whole import write_whole
 from detectors.yolov3 import cfg, weights
 from detectors.yolov3.yolov3 import YoloV3
 
@@ -30,8 +31,8 @@ def load(cfg_path: Path, weights_path: Path | None = None) -> YoloV3:
 def save(detector: YoloV3, cfg_path: Path, seen: int = 0) -> None:
     """Write the three files that `load` reads. seen: images that the detector was trained on."""
     weights.write(detector.network, cfg_path.with_suffix(".weights"), seen)
-    cfg_path.with_suffix(".names").write_text("".join(f"{name}\n" for name in detector.classes), encoding="utf-8")
-    cfg_path.write_text(cfg.write(detector.cfg), encoding="utf-8")
+    write_whole(cfg_path.with_suffix(".names"), "".join(f"{name}\n" for name in detector.classes).encode())
+    write_whole(cfg_path, cfg.write(detector.cfg).encode())
 
 
 def _classes(path: Path, count: int) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ and variances, then the kernel (out, in, height, width).
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import DetectorError
+from detectors.whole import write_whole
 from detectors.yolov3.network import Block, Network
 
 VERSION = (0, 2, 0)
@@ -54,10 +54,7 @@ def write(network: Network, path: Path, seen: int = 0) -> None:
     """Write a file that Darknet reads; atomic. seen: images that the network was trained on."""
     parts = [np.array(VERSION, "<i4").tobytes(), np.array([seen], "<i8").tobytes()]
     parts += [tensor.detach().cpu().contiguous().numpy().astype("<f4").tobytes() for tensor in _tensors(network)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(b"".join(parts))
-    os.replace(temporary, path)
+    write_whole(path, b"".join(parts))
 
 
 def _tensors(network: Network) -> list[Tensor]:

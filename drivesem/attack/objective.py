@@ -12,6 +12,7 @@ from torch import Tensor
 from detectors.base import Detector, Predictor, RawPredictions, predict
 from detectors.incremental.reference import LIMIT_MB, Reference
 from detectors.incremental.regions import Rect
+from detectors.memory import in_halves
 from detectors.types import Detections, Targets
 from drivesem.attack import detection_loss, goals
 from drivesem.attack.aims import EVERYTHING, Aim
@@ -358,6 +359,12 @@ def _key(theta: Tensor) -> bytes:
 def _losses_and_gradients(
     objectives: Sequence[Objective], thetas: Sequence[Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
+    """In halves, where the device's memory does not hold all renders and their layers."""
+    return in_halves(_together, list(zip(objectives, thetas, strict=True)), "thetas")
+
+
+def _together(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
+    objectives, thetas = zip(*pairs, strict=True)
     leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
     losses = _losses(objectives, leaves)
     gradients = torch.autograd.grad(losses, leaves)

@@ -13,8 +13,9 @@ import torch
 
 from detectors.base import DetectorError
 from drivesem import store
+from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
-from scene_ir.errors import SceneError
+from scene_ir.errors import SceneError, WriteError
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -28,7 +29,7 @@ class UnforeseenError(SceneError):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `forgiving`; url: of
+    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`; url: of
     the store to which it brings what it makes, None where another process does.
     """
 
@@ -41,11 +42,11 @@ class Start:
 def begin(start: Start) -> None:
     """Once in a process, before its first job."""
     global _work
+    keep_freed()
     torch.set_num_threads(start.threads)
     if start.url is not None:
         store.opened(start.url)
-    work = start.build()
-    _work = partial(forgiving, work) if start.keep_going else work
+    _work = partial(attempt, start.build(), start.keep_going)
 
 
 def do(job: Any) -> Any:
@@ -57,16 +58,26 @@ def do(job: Any) -> Any:
     return result
 
 
-def forgiving(work: Callable[[J], R], job: J) -> R:
-    """A job's result; an error for which no input is to blame as UnforeseenError, which says where it arose."""
+def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
+    """A job's result. SceneError where the device has no room for it. keep_going: an error for which no input is
+    to blame becomes UnforeseenError, which says where it arose.
+    """
     try:
         return work(job)
-    except (SceneError, UsageError, DetectorError):
+    except torch.OutOfMemoryError as error:
+        found = str(error).splitlines()[0]
+    except (SceneError, UsageError, DetectorError, WriteError):
         raise
     except Exception as error:
+        if not keep_going:
+            raise
         last = traceback.extract_tb(error.__traceback__)[-1]
         found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
         raise UnforeseenError("drivesem", "no defect of its own", found) from error
+    # Not before the error is gone, which holds what the device has no room for.
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    raise SceneError("--device", "one with memory for this", found)
 
 
 def ended() -> NoReturn:

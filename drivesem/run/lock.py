@@ -21,19 +21,23 @@ _held: dict[Path, BaseFileLock] = {}
 def hold(folder: Path) -> None:
     """Make `folder`, and keep other processes that ask from writing into it, until `let_go` or this process' end.
 
-    This process may ask again. Raises UsageError where another one holds the folder.
+    This process may ask again. Raises UsageError where another one holds the folder,
+    WriteError where it cannot be made.
     """
     from filelock import FileLock, Timeout  # when needed: `drivesem --help` starts without
 
-    folder.mkdir(parents=True, exist_ok=True)
+    from scene_ir.files import writing
+
     path = folder.resolve() / LOCK
     if path in _held:
         return
     lock = FileLock(path)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise UsageError("--out", "a folder that no other command writes into now", folder) from None
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            raise UsageError("--out", "a folder that no other command writes into now", folder) from None
     _held[path] = lock
 
 

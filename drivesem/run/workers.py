@@ -17,7 +17,7 @@ import torch
 
 from drivesem import store
 from drivesem.run.cluster import on_ray
-from drivesem.run.jobs import Start, begin, do, ended, forgiving
+from drivesem.run.jobs import Start, attempt, begin, do, ended
 from drivesem.settings.blocks import Sharing
 
 J = TypeVar("J")
@@ -70,9 +70,8 @@ def _outcomes(
         if count > 1 or apart:
             yield from _shared(Start(build, threads, config.keep_going), jobs, count)
             return
-        here = partial(forgiving, work) if config.keep_going else work
         for job in jobs:
-            yield job, partial(here, job)
+            yield job, partial(attempt, work, config.keep_going, job)
     finally:
         torch.set_num_threads(before)  # what follows, such as training, is alone again
 

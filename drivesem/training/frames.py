@@ -38,24 +38,26 @@ class FrameStore(Sequence[Sample]):
         done: Callable[[], object] | None = None,
     ) -> None:
         """names: the frames to take; done: called after each. Raises FormatError for a frame that cannot be read,
-        and for one without labels."""
-        cache.mkdir(parents=True, exist_ok=True)
+        and for one without labels; WriteError for a cache that cannot be written.
+        """
         index: dict[str, tuple[int, int, int]] = {}
         if (cache / INDEX).is_file():
             index = {name: (start, height, width) for name, start, height, width in files.read_json(cache / INDEX)}
         end = sum(height * width * 3 for _, height, width in index.values())
         chosen = list(names)
-        with (cache / PIXELS).open("r+b" if (cache / PIXELS).is_file() else "w+b") as file:
-            file.truncate(end)
-            file.seek(end)
-            for name in chosen:
-                if name not in index:
-                    image = to_uint8(dataset.frame(name).photograph)
-                    file.write(image.tobytes())
-                    index[name] = (end, image.shape[0], image.shape[1])
-                    end += image.size
-                if done is not None:
-                    done()
+        with files.writing(cache / PIXELS):
+            cache.mkdir(parents=True, exist_ok=True)
+            with (cache / PIXELS).open("r+b" if (cache / PIXELS).is_file() else "w+b") as file:
+                file.truncate(end)
+                file.seek(end)
+                for name in chosen:
+                    if name not in index:
+                        image = to_uint8(dataset.frame(name).photograph)
+                        file.write(image.tobytes())
+                        index[name] = (end, image.shape[0], image.shape[1])
+                        end += image.size
+                    if done is not None:
+                        done()
         rows = [(name, *place) for name, place in index.items()]
         files.write_text(cache / INDEX, json.dumps(rows))
         self.dataset, self.classes = dataset, tuple(classes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -108,12 +109,13 @@ class Keeper:
         if path.is_file():
             with path.open(newline="") as file:
                 kept = [row for row in csv.DictReader(file) if int(row["step"]) < step]
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, _COLUMNS)
-            writer.writeheader()
-            writer.writerows(kept)
-            row = {k: "" if v is None else f"{v:.6g}" for k, v in _row(step, marks).items()}
-            writer.writerow(row | {"step": str(step)})
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, _COLUMNS)
+        writer.writeheader()
+        writer.writerows(kept)
+        row = {k: "" if v is None else f"{v:.6g}" for k, v in _row(step, marks).items()}
+        writer.writerow(row | {"step": str(step)})
+        files.write_text(path, table.getvalue())
 
 
 def _row(step: int, marks: Marks) -> dict[str, float | None]:

@@ -128,6 +128,9 @@ def train_run(config: Train) -> Trained | None:
                 train(detector, shown, settings, out, evaluate, progress=progress, loaders=config.loaders)
             except FloatingPointError as error:
                 raise UsageError("--rate", "one at which the loss stays finite", error) from error
+            except torch.OutOfMemoryError as error:
+                found = str(error).splitlines()[0]
+                raise UsageError("--window", "views that the device's memory holds one by one", found) from error
         return _trained(config, out, weights, len(frames), pace) if rank == 0 else None
 
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from detectors import training
 from detectors.augment import AugmentSettings
 from detectors.base import DetectorError, RawPredictions
 from detectors.boxes import iou_matrix
@@ -75,6 +77,75 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, optimiser: str, precision:
     assert [row["step"] for row in log[0]] == ["1", "2", "3", "4", "5", "6"]
     for first, second in zip(*log, strict=True):
         assert {**first, "seconds": ""} == {**second, "seconds": ""}
+
+
+class KilledError(Exception):
+    """SIGKILL, at a place of choice."""
+
+
+def die(*_: object) -> None:
+    raise KilledError
+
+
+def test_an_evaluation_at_which_a_run_is_killed_is_made_again(tmp_path: Path) -> None:
+    settings = replace(SMALL, evaluate_every=2)
+    with pytest.raises(KilledError):
+        train(fresh(), painted(3), settings, tmp_path, evaluate=die)
+    judged: list[int] = []
+    train(fresh(), painted(3), settings, tmp_path, evaluate=lambda _, step: judged.append(step))
+    assert judged[0] == 2, "its checkpoint comes after it"
+
+
+def test_no_checkpoint_has_steps_that_the_log_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = training.write_weights
+
+    def and_die(path: Path, *content: Any) -> None:
+        write(path, *content)
+        log = (tmp_path / LOG).read_text().splitlines()  # as it lies there now
+        assert [row["step"] for row in csv.DictReader(log)] == ["1", "2"]
+        die()
+
+    monkeypatch.setattr(training, "write_weights", and_die)
+    with pytest.raises(KilledError):
+        train(fresh(), painted(3), SMALL, tmp_path)
+
+
+class Small(SqueezeDet):
+    """On a device that holds no more than so many views at once. Its loss is a mean over views."""
+
+    most = 2
+
+    def forward(self, images: torch.Tensor) -> RawPredictions:
+        if len(images) > self.most:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return super().forward(images)
+
+    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
+        alone = [super(Small, self).loss(raw.one(i), [target]) for i, target in enumerate(targets)]
+        return {name: torch.stack([terms[name] for terms in alone]).mean() for name in alone[0]}
+
+
+def test_a_batch_for_which_there_is_no_memory_is_seen_in_parts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = fresh().state_dict()
+
+    def moved(most: int) -> torch.Tensor:
+        detector = Small(classes=("Car", "Truck"), dropout=0)
+        detector.load_state_dict(start)
+        detector.most = most
+        settings = replace(SMALL, steps=2, batch=4, optimiser="sgd", warmup_steps=0)
+        end = train(detector, painted(4), settings, tmp_path / str(most)).state_dict()
+        return torch.cat([(end[name] - start[name]).flatten() for name in start])
+
+    whole, halves, singles = (moved(most) for most in (4, 2, 1))
+    told = capsys.readouterr().err.splitlines()
+    line = "drivesem: a batch of 4 does not fit into the device's memory: {} at once from now on"
+    assert told == [line.format(2), line.format(2), line.format(1)], "once, not at every step"
+    assert (halves - whole).norm() < 1e-3 * whole.norm()
+    assert (singles - whole).norm() < 1e-3 * whole.norm()
+    with pytest.raises(torch.OutOfMemoryError):
+        moved(0)
 
 
 class Pooled(SqueezeDet):

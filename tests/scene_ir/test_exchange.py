@@ -123,6 +123,16 @@ def test_another_takes_a_cars_place_and_its_row(scene: SceneIR) -> None:
     assert float(brighter.mean()) < 0.005  # edges apart
 
 
+def test_a_smaller_one_shows_what_the_old_car_hid(scene: SceneIR) -> None:
+    row = 1
+    small = replace(vehicle(scene.objects.translation[row]), size_lhw=torch.tensor([1.5, 0.8, 0.8]))
+    other, bare = with_other(scene, row, small), without(scene, row)
+    shown, before = (Compositor(s).render(s) for s in (other, scene))
+    behind = (before.object_id == row + 1) & (shown.object_id != row + 1) & (shown.object_id > 0)
+    assert int(behind.sum()) > 20
+    assert float((shown.image - picture(bare))[:, behind].abs().mean()) < 0.005  # edges of the small one
+
+
 def test_both_renderers_draw_the_same(scene: SceneIR) -> None:
     for changed in (without(scene, 0), with_vehicle(scene, vehicle(BEFORE_ANOTHER))):
         fast, slow = (Compositor(changed, RenderSettings(b)).render(changed).image for b in ("warp", "reference"))

@@ -1,11 +1,16 @@
-"""Files that take no room twice."""
+"""Files that take no room twice, and files for which there is none."""
 
+import errno
 import os
+import resource
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from scene_ir import files
+from scene_ir.errors import WriteError
 
 
 @pytest.fixture
@@ -49,3 +54,58 @@ def test_where_there_are_no_links_two_copies_stay(
     assert (second / "scene" / "same.txt").read_text() == "the same"
     assert not (second / "scene" / "same.txt").samefile(first / "scene" / "same.txt")
     assert not [p for p in second.rglob("*") if p.name.endswith(".tmp")]
+
+
+@pytest.fixture
+def full_disk() -> Iterator[Callable[[int], None]]:
+    """Lets no file grow beyond so many bytes, as the system itself says it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_where_there_is_no_room_the_old_file_stays(tmp_path: Path, full_disk: Callable[[int], None]) -> None:
+    path = tmp_path / "a.txt"
+    files.write_text(path, "old")
+    full_disk(1000)
+    with pytest.raises(WriteError, match=r"a\.txt: expected a place that can be written, found file too large"):
+        files.write_text(path, 2000 * "x")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path], "no half of the new one"
+
+
+def test_a_folder_for_which_there_is_no_room_is_not_there(
+    tmp_path: Path, full_disk: Callable[[int], None]
+) -> None:
+    def write() -> None:
+        with files.whole_folder(tmp_path / "frame") as part:
+            files.write_text(part / "small.txt", "x")
+            files.write_text(part / "large.txt", 2000 * "x")
+
+    full_disk(1000)
+    with pytest.raises(WriteError, match=f"^{tmp_path}/frame/large.txt: expected"):
+        write()
+    assert not list(tmp_path.iterdir())
+
+
+def _reads_only(*_: object, **__: object) -> NoReturn:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+@pytest.mark.parametrize("call", ["mkdir", "write_bytes"])
+def test_what_may_only_be_read_is_named(tmp_path: Path, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, call, _reads_only)
+    with pytest.raises(WriteError, match=r"a\.txt: expected a place that can be written, found read-only file"):
+        files.write_text(tmp_path / "a.txt", "x")
+
+
+def test_a_folder_in_what_may_only_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "mkdir", _reads_only)
+    with pytest.raises(WriteError, match="frame: expected"), files.whole_folder(tmp_path / "frame"):
+        raise AssertionError
+
+
+def test_errors_of_reading_inside_stay_what_they_are(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), files.whole_folder(tmp_path / "frame"):
+        (tmp_path / "gone").read_bytes()
+    assert not list(tmp_path.iterdir())

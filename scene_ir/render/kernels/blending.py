@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, field, launch, start_warp
+from scene_ir.raster.launch import array, between, filled, launch, start_warp
 from scene_ir.render import model
 
 start_warp()
@@ -219,7 +219,7 @@ class Blend(torch.autograd.Function):
         over = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
         under_shadow, under_layer = torch.empty_like(factor), torch.empty_like(colour)
         inputs = [
-            *(_stack(*shadows), _stack(*layers), array(factor, wp.vec3f), array(colour, wp.vec4f)),
+            *(filled(Stack, *shadows), filled(Stack, *layers), array(factor, wp.vec3f), array(colour, wp.vec4f)),
             *(array(opacity), array(depth), clamped, array(image), array(nearest), array(number)),
             *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over)),
         ]
@@ -243,7 +243,7 @@ class Blend(torch.autograd.Function):
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)
         inputs = [
-            *(_stack(*shadows), _stack(*layers), array(factor, wp.vec3f), array(opacity)),
+            *(filled(Stack, *shadows), filled(Stack, *layers), array(factor, wp.vec3f), array(opacity)),
             *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over), array(grad_image)),
             *(array(grad), array(grad_factor, wp.vec3f), array(grad_colour, wp.vec4f), array(grad_opacity)),
         ]
@@ -262,9 +262,3 @@ def row_edges(height: int, rects: np.ndarray) -> list[int]:
     np.add.at(change, rects[:, 3], -width)
     first, last = int(rects[:, 1].min()), int(rects[:, 3].max())
     return between(list(range(first, last + 1)), change.cumsum()[first:last].tolist())
-
-
-def _stack(order: Tensor, rects: Tensor, offsets: Tensor) -> Any:
-    stack = Stack()
-    stack.order, stack.rects, stack.offsets = field(order), field(rects), field(offsets)
-    return stack

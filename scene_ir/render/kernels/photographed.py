@@ -17,7 +17,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, field, halves, launch, load, share
+from scene_ir.raster.launch import array, between, filled, halves, launch, load, share
 from scene_ir.raster.layout import Fragments, Layout
 from scene_ir.render import channels, surfaces
 from scene_ir.render.kernels import ground, shading
@@ -104,14 +104,14 @@ class Photographed(torch.autograd.Function):
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
-        pixels = _struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
-        vertices = _struct(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
-        photograph = _struct(
+        pixels = filled(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
+        vertices = filled(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
+        photograph = filled(
             shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
         )
-        looks = _struct(shading.Looks, found, look, mesh, halo, fill)
-        layers = _struct(shading.Layers, colour, opacity, depth)
-        patches = _struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
+        looks = filled(shading.Looks, found, look, mesh, halo, fill)
+        layers = filled(shading.Layers, colour, opacity, depth)
+        patches = filled(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
         shadows = [array(ground_table, wp.vec4i), patches]
         tables = [
             [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
@@ -148,7 +148,8 @@ class Photographed(torch.autograd.Function):
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
                 kept.painted = leaves, s.painter(*leaves, table, nearest)
-            looks.mesh, looks.halo = (field(t.detach().contiguous(), wp.vec4f) for t in kept.painted[1])
+            for name, painted in zip(("mesh", "halo"), kept.painted[1], strict=True):
+                looks.put(name, painted.detach().contiguous())
             launch(shading.combine_kernel, halves(size), [pixels, looks, layers], (), device)
         ctx.setting, ctx.kept = s, kept
         ctx.mark_non_differentiable(depth)
@@ -173,9 +174,8 @@ class Photographed(torch.autograd.Function):
         grad_then = torch.zeros_like(s.inside)
         grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
         grad_sun = torch.zeros(len(kept.turn), 4, dtype=torch.float64, device=device)
-        to_layers = shading.Layers()
-        to_layers.colour, to_layers.opacity = field(grad_colour, wp.vec4f), field(grad_opacity)
-        grads = _struct(
+        to_layers = filled(shading.Layers, grad_colour, grad_opacity, grad_opacity)  # depth has no gradient
+        grads = filled(
             *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
             *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
@@ -215,18 +215,11 @@ class Photographed(torch.autograd.Function):
             )
             grad_fill.copy_(torch.zeros_like(grad_fill) if to_fill is None else to_fill)
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
-            grads.mesh, grads.halo = field(grad_mesh, wp.vec4f), field(grad_halo, wp.vec4f)
+            grads.put("mesh", grad_mesh)
+            grads.put("halo", grad_halo)
             grad_look += more
         share(work, parts.edges)
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
-
-
-def _struct(kind: Any, *tensors: Tensor) -> Any:
-    """A struct of arrays, one a tensor, in the order of its fields."""
-    out = kind()
-    for (name, variable), values in zip(kind.vars.items(), tensors, strict=True):
-        setattr(out, name, field(values, variable.type.dtype))
-    return out

@@ -52,6 +52,15 @@ def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR
         assert made.origin.photograph is scene.photograph
         assert check_exchange(made) == []
         assert check_scene(made.at_rest(), made) == []
+        labels = labels_of(made)[1]
+        assert torch.equal(made.objects.box2d, labels.boxes_xyxy)
+        assert torch.equal(made.objects.occlusion, labels.occlusion)
+
+
+def test_what_cannot_be_is_not_proposed(scene: SceneIR) -> None:
+    found = proposals(scene, Changes((Change.PARK,)), 6, 3)
+    assert found
+    assert not [line for made in found for line in check_exchange(made)]
 
 
 def test_the_same_seed_proposes_the_same(scene: SceneIR, proposed: list[SceneIR]) -> None:
