@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import DRAWS, intervals, rate
@@ -51,19 +52,22 @@ METHOD = (
     "frame's folder and the independent check. Frames without vehicles are passed over by their labels. Hours: "
     "the mean of all parts for each frame, shared by the processes; intervals 95 %, by bootstrap over frames. "
     "Start-up, some seconds a process, is left out. Measured: the same frames in another way; reckoned: from "
-    "the parts."
+    "the parts, or, for no other work, from the processor's seconds, where a process has one thread."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Seconds of one frame. unfitted: of taking it apart with --no-fit, None where that was done anyway."""
+    """Seconds of one frame. unfitted: of taking it apart with --no-fit, None where that was done anyway.
+    processor: of the processor, for all parts, None where several threads shared them.
+    """
 
     derender: float
     search: float
     certify: float
     write: float
     unfitted: float | None
+    processor: float | None = None
 
     @property
     def total(self) -> float:
@@ -96,7 +100,7 @@ def timer_of(settings: Attack) -> Callable[[str], Spent | None]:
     unfitted = open_source(replace(settings, fit=False)) if settings.fit else None
 
     def spent(name: str) -> Spent | None:
-        start = time.perf_counter()
+        start, begun = time.perf_counter(), time.process_time()
         try:
             scene = worker.source.scene(name)
             derender = time.perf_counter() - start
@@ -107,12 +111,13 @@ def timer_of(settings: Attack) -> Callable[[str], Spent | None]:
             start = time.perf_counter()
             write_frame(attacked, Path(folder) / "frame")
             write = time.perf_counter() - start
+        processor = time.process_time() - begun if torch.get_num_threads() == 1 else None
         certify, quick = attacked.grading_seconds, None
         if unfitted is not None:
             start = time.perf_counter()
             unfitted.scene(name)
             quick = time.perf_counter() - start
-        return Spent(derender, attacked.seconds - certify, certify, write, quick)
+        return Spent(derender, attacked.seconds - certify, certify, write, quick, processor)
 
     return spent
 
@@ -138,6 +143,9 @@ def night_rows(spent: Sequence[Spent], frames: int, processes: int, seed: int) -
     if len(fits) == len(spent):
         quick = [one.total - one.derender + fit for one, fit in zip(spent, fits, strict=True)]
         others.append(row("--no-fit", "measured", quick, processes))
+    alone = [one.processor for one in spent if one.processor is not None]
+    if len(alone) == len(spent):
+        others.append(row("no other work on the machine", "reckoned", alone, processes))
     others.append(row("half the steps", "reckoned", [one.total - one.search / 2 for one in spent], processes))
     without = [one.total - one.derender for one in spent]
     others.append(row("frames taken apart before", "reckoned", without, processes))

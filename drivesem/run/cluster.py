@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from drivesem.run.jobs import Start, begin, do, ended
@@ -64,7 +65,7 @@ def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J
     """
     if not jobs:
         return
-    ray = _loaded()
+    ray = _loaded(config.address)
     if not ray.is_initialized():  # it stays until this process ends: commands ask more than once
         _connect(ray, config.address)
     count = min(config.workers or max(int(ray.cluster_resources().get("CPU", 1)), 1), len(jobs))
@@ -128,7 +129,10 @@ def _hand_over(result: Any, error: Exception | None) -> Any:
     return result
 
 
-def _loaded() -> ModuleType:
+def _loaded(address: str | None) -> ModuleType:
+    if address is not None and (Path.home() / ".ray" / "auth_token").is_file():
+        # `ray start` asks for this token where it finds it; `ray.init` shows it, but only when told so.
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         import ray
     except ImportError as error:

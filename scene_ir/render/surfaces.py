@@ -419,7 +419,8 @@ def on_ground(
     """
     normal = ground[:3].to(pixels)
     ray = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1) @ unproject.T
-    along, down = ray @ normal, (translation - centre) @ normal
+    # No product of matrices: shared among threads, it rounds by their number.
+    along, down = (ray * normal).sum(dim=1), (translation - centre) @ normal
     distance = down / torch.where(along.abs() > 1e-6, along, torch.full_like(along, 1e-6))
     if not bool(((distance > 0) & (along.abs() > 1e-6)).all()):
         return None

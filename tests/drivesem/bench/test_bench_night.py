@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,15 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
 def test_frames_that_were_not_fitted_have_no_faster_way() -> None:
     rows = night.night_rows([Spent(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
     assert [row["how"] for row in rows] == ["as asked", "half the steps", "frames taken apart before"]
+
+
+def test_beside_other_work_the_processors_seconds_tell() -> None:
+    frames = [replace(frame, processor=2.5) for frame in FRAMES]
+    rows = {row["how"]: row for row in night.night_rows(frames, 600, 2, 0)}
+    alone = rows["no other work on the machine"]
+    assert (alone["hours"], alone["by"]) == (pytest.approx(2.5 * 600 / 2 / 3600), "reckoned")
+    some = [frames[0], FRAMES[1]]
+    assert "no other work on the machine" not in {row["how"] for row in night.night_rows(some, 600, 2, 0)}
 
 
 def test_frames_lie_evenly() -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.render.sources import _continue_shadow
-from scene_ir.render.surfaces import _sigmoid
+from scene_ir.render.surfaces import _sigmoid, on_ground
 
 RANDOM = torch.Generator()
 
@@ -42,6 +42,16 @@ def test_continued_shadow() -> None:
     expected = torch.rand(171, 498, generator=RANDOM)
     covered = torch.rand(171, 498, generator=RANDOM) > 0.6
     one, *others = by_threads(lambda: _continue_shadow(dark, expected, covered))
+    assert all(torch.equal(one, other) for other in others)
+
+
+def test_points_on_the_ground() -> None:
+    down, across = torch.rand(2, 39988, generator=RANDOM.manual_seed(0)) * 300
+    pixels = torch.stack([down * 3, across + 400], dim=1)
+    camera = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]])
+    ground = torch.tensor([0.01, -0.9998, 0.02, 1.65])
+    placed = (torch.zeros(3), torch.tensor([1.0, 1.65, 9.0]), torch.tensor(0.3), ground)
+    one, *others = by_threads(lambda: on_ground(pixels, camera.inverse(), *placed) + 0.0)  # type: ignore[operator]
     assert all(torch.equal(one, other) for other in others)
 
 
