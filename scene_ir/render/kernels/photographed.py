@@ -68,7 +68,8 @@ class _Parts:
 @dataclass(slots=True)
 class _Kept:
     """What the forward pass leaves to the backward one. turn (N, 2): cosine and sine of the yaws; painted: leaves and
-    results of the painter; needs: of each part, the pixels that were completed."""
+    results of the painter; needs, leaning: of each part, the pixels that were completed, and those that
+    `shading.leans`."""
 
     parts: _Parts
     pixels: Any
@@ -78,6 +79,7 @@ class _Kept:
     shadows: list[Any]
     turn: Tensor
     needs: dict[int, Tensor]
+    leaning: dict[int, Tensor]
     painted: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
 
@@ -119,6 +121,7 @@ class Photographed(torch.autograd.Function):
         ]
         darkened = array(shadow, wp.vec3f)
         needs: dict[int, Tensor] = {}
+        leaning: dict[int, Tensor] = {}
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -131,7 +134,9 @@ class Photographed(torch.autograd.Function):
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
             launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
-            launch(shading.fill_kernel, [first, last], [pixels, looks], (), device)
+            leaning[start] = lean = _leaning(s.fragments.face[first:last], coverage[first:last]) + first
+            launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
+            launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
             launch(shading.shade_kernel, [first, last], [pixels, photograph, looks], (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
@@ -143,7 +148,7 @@ class Photographed(torch.autograd.Function):
         for kernel in (shading.look_kernel, ground.shadow_kernel):
             load(kernel)
         share(work, parts.edges)
-        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs)
+        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs, leaning)
         if s.painter is not None:
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
@@ -202,8 +207,11 @@ class Photographed(torch.autograd.Function):
                 launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
             inputs = [pixels, photograph, looks, grads]
             launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
-            launch(shading.keep_kernel, [first, last], [pixels, grads], (), device)
-            launch(shading.fill_backward_kernel, [first, last], [pixels, looks, grads], (), device)
+            lean = kept.leaning[start]
+            launch(shading.keep_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
+            launch(
+                shading.fill_backward_kernel, [0, lean.shape[0]], [array(lean), pixels, looks, grads], (), device
+            )
             launch(shading.look_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
 
         grad_code = None
@@ -223,3 +231,8 @@ class Photographed(torch.autograd.Function):
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
+
+
+def _leaning(face: Tensor, coverage: Tensor) -> Tensor:
+    """Which pixels `shading.leans`."""
+    return ((coverage < 1) & ((face >= 0) | (coverage > 0))).nonzero()[:, 0]

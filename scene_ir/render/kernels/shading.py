@@ -95,8 +95,8 @@ class Photograph:
 
 @wp.struct
 class Looks:
-    """What packed pixels show, stage by stage: where they look, at hits, and continued over the outline; premultiplied
-    RGB and opacity of mesh and halo; how much of the mesh is left to be completed."""
+    """What packed pixels show, stage by stage: where they look, continued over the outline, and of leaning pixels also
+    as found there; premultiplied RGB and opacity of mesh and halo; how much of the mesh is left to be completed."""
 
     found: wp.array(dtype=look_type)
     look: wp.array(dtype=look_type)
@@ -206,6 +206,21 @@ def own_dot(a: own_type, b: own_type):
     return total
 
 
+@wp.func
+def leans(pixels: Pixels, i: int):
+    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
+    return pixels.coverage[i] < 1.0 and (pixels.face[i] >= 0 or pixels.coverage[i] > 0.0)
+
+
+@wp.func
+def found_at(pixels: Pixels, looks: Looks, i: int):
+    """Where a pixel looks, as found, not continued over the outline."""
+    found = looks.look[i]
+    if leans(pixels, i):
+        found = looks.found[i]
+    return found
+
+
 @wp.kernel(enable_backward=False)
 def look_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: Looks):
     i = start + wp.tid()
@@ -226,7 +241,7 @@ def look_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: Looks):
         if then > NEAR_M:
             value[ch.MOVE] = (a[0] - wp.float32(at[1]) * change) / then
             value[ch.MOVE + 1] = (a[1] - wp.float32(at[2]) * change) / then
-    looks.found[i] = value
+    looks.look[i] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -237,7 +252,7 @@ def look_backward_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: 
         x = wp.float32(at[1])
         y = wp.float32(at[2])
         hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
-        v = looks.found[i]
+        v = found_at(pixels, looks, i)
         go = grads.look[i]
         # Back through the division, to the interpolated values.
         g = go
@@ -317,31 +332,28 @@ def fringe_of(pixels: Pixels, i: int):
     return out
 
 
-@wp.func
-def leans(pixels: Pixels, i: int):
-    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
-    return pixels.coverage[i] < 1.0 and (pixels.face[i] >= 0 or pixels.coverage[i] > 0.0)
+@wp.kernel(enable_backward=False)
+def find_kernel(start: int, leaning: wp.array(dtype=wp.int64), looks: Looks):
+    """Keeps what leaning pixels found, before `fill_kernel` continues what is beside them."""
+    i = wp.int32(leaning[start + wp.tid()])
+    looks.found[i] = looks.look[i]
 
 
 @wp.kernel(enable_backward=False)
-def fill_kernel(start: int, pixels: Pixels, looks: Looks):
-    i = start + wp.tid()
-    if leans(pixels, i):
-        f = fringe_of(pixels, i)
-        mean = looks.found[f.pixel[0]] * f.weight[0] + looks.found[f.pixel[1]] * f.weight[1]
-        mean += looks.found[f.pixel[2]] * f.weight[2] + looks.found[f.pixel[3]] * f.weight[3]
-        looks.look[i] = looks.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
-    else:
-        looks.look[i] = looks.found[i]
+def fill_kernel(start: int, leaning: wp.array(dtype=wp.int64), pixels: Pixels, looks: Looks):
+    i = wp.int32(leaning[start + wp.tid()])
+    f = fringe_of(pixels, i)
+    mean = found_at(pixels, looks, f.pixel[0]) * f.weight[0] + found_at(pixels, looks, f.pixel[1]) * f.weight[1]
+    mean += found_at(pixels, looks, f.pixel[2]) * f.weight[2] + found_at(pixels, looks, f.pixel[3]) * f.weight[3]
+    looks.look[i] = looks.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
 
 
 @wp.kernel(enable_backward=False)
-def keep_kernel(start: int, pixels: Pixels, grads: Gradients):
+def keep_kernel(start: int, leaning: wp.array(dtype=wp.int64), grads: Gradients):
     """Moves gradients of leaning pixels from `grad` to `kept`, so that `fill_backward_kernel` can spread them."""
-    i = start + wp.tid()
-    if leans(pixels, i):
-        grads.kept[i] = grads.look[i]
-        grads.look[i] = look_type()
+    i = wp.int32(leaning[start + wp.tid()])
+    grads.kept[i] = grads.look[i]
+    grads.look[i] = look_type()
 
 
 @wp.func
@@ -357,22 +369,23 @@ def fringe_to_coverage(pixels: Pixels, i: int, f: Fringe, to_own: float, to_weig
 
 
 @wp.kernel(enable_backward=False)
-def fill_backward_kernel(start: int, pixels: Pixels, looks: Looks, grads: Gradients):
-    i = start + wp.tid()
-    if leans(pixels, i):
-        f = fringe_of(pixels, i)
-        g = grads.kept[i]
-        rest = 1.0 - f.own
-        wp.atomic_add(grads.look, i, g * (f.own * f.hit))
-        to_own = f.hit * wp.dot(g, looks.found[i])
-        to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-        for n in range(4):
-            if f.known[n] > 0.0:
-                wp.atomic_add(grads.look, f.pixel[n], g * (rest * f.weight[n]))
-                along = wp.dot(g, looks.found[f.pixel[n]])
-                to_own -= f.weight[n] * along
-                to_weight[n] = rest * along
-        fringe_to_coverage(pixels, i, f, to_own, to_weight, grads)
+def fill_backward_kernel(
+    start: int, leaning: wp.array(dtype=wp.int64), pixels: Pixels, looks: Looks, grads: Gradients
+):
+    i = wp.int32(leaning[start + wp.tid()])
+    f = fringe_of(pixels, i)
+    g = grads.kept[i]
+    rest = 1.0 - f.own
+    wp.atomic_add(grads.look, i, g * (f.own * f.hit))
+    to_own = f.hit * wp.dot(g, looks.found[i])
+    to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    for n in range(4):
+        if f.known[n] > 0.0:
+            wp.atomic_add(grads.look, f.pixel[n], g * (rest * f.weight[n]))
+            along = wp.dot(g, found_at(pixels, looks, f.pixel[n]))
+            to_own -= f.weight[n] * along
+            to_weight[n] = rest * along
+    fringe_to_coverage(pixels, i, f, to_own, to_weight, grads)
 
 
 # --------------------------------------------------------------------------------------- looking up the photograph
