@@ -122,6 +122,7 @@ class Photographed(torch.autograd.Function):
         darkened = array(shadow, wp.vec3f)
         needs: dict[int, Tensor] = {}
         leaning: dict[int, Tensor] = {}
+        final = s.painter is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -137,13 +138,11 @@ class Photographed(torch.autograd.Function):
             leaning[start] = lean = _leaning(s.fragments.face[first:last], coverage[first:last]) + first
             launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
             launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
-            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks], (), device)
+            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks, final, layers], (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, layers]
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
-            if s.painter is None:
-                launch(shading.combine_kernel, [first, last], [pixels, looks, layers], (), device)
 
         for kernel in (shading.look_kernel, ground.shadow_kernel):
             load(kernel)
@@ -186,11 +185,7 @@ class Photographed(torch.autograd.Function):
         )
         shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
 
-        def combine(start: int, end: int) -> None:
-            first, last = parts.pixels[start], parts.pixels[end]
-            grad_look[first:last].zero_()
-            inputs = [pixels, looks, to_layers, grads]
-            launch(shading.combine_backward_kernel, [first, last], inputs, (), device)
+        final = kept.painted is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -198,14 +193,15 @@ class Photographed(torch.autograd.Function):
             launch(ground.shadow_backward_kernel, ranges, shadowed, (), device)
             if last == first:
                 return
-            if kept.painted is None:
-                combine(start, end)
+            grad_coverage[first:last].zero_()
+            if final:
+                grad_look[first:last].zero_()
                 grad_fill[first:last].zero_()
             need = kept.needs[start]
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks, grads]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, to_layers, grads]
                 launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
-            inputs = [pixels, photograph, looks, grads]
+            inputs = [pixels, photograph, looks, final, to_layers, grads]
             launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
             lean = kept.leaning[start]
             launch(shading.keep_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
@@ -216,7 +212,7 @@ class Photographed(torch.autograd.Function):
 
         grad_code = None
         if kept.painted is not None:
-            combine(0, len(parts.pixels) - 1)
+            launch(shading.combine_backward_kernel, halves(size), [pixels, looks, to_layers, grads], (), device)
             leaves, painted = kept.painted
             grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
@@ -225,7 +221,7 @@ class Photographed(torch.autograd.Function):
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
             grads.put("mesh", grad_mesh)
             grads.put("halo", grad_halo)
-            grad_look += more
+            grad_look.copy_(more)
         share(work, parts.edges)
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
