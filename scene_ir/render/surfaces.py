@@ -28,6 +28,8 @@ CREASE_RAD = 0.7
 tools."""
 SHADOW_MARGIN_M = 0.8
 """How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
+_UNSHARED = 1 << 15
+"""So many values torch computes in one thread (ATen's GRAIN_SIZE)."""
 _WELD = 1e-5
 """Vertices of the unit box nearer than this are one point."""
 
@@ -451,13 +453,18 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
         apart = (q.clamp(min=0.0).square().sum(-1) + 1e-6).sqrt()
         return apart + q.amax(dim=-1).clamp(max=0.0)
 
-    contact = torch.sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
+    contact = _sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
     shares = ((0.25, 0.97), (0.55, 0.92), (0.9, 0.72))
-    cast = torch.stack(
-        [torch.sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares]
-    )
+    cast = torch.stack([_sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares])
     lit = 1.0 - (1.0 - cast).prod(dim=0)
     return 1.0 - (1.0 - 0.72 * contact) * (1.0 - 0.55 * lit)
+
+
+def _sigmoid(values: Tensor) -> Tensor:
+    """Of any shape, alike for any number of threads: where torch shares values out, the last ones of each share
+    are rounded otherwise.
+    """
+    return torch.cat([part.sigmoid() for part in values.flatten().split(_UNSHARED)]).view_as(values)
 
 
 def crop_rects(
