@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+from drivesem.run.allocation import keep_freed
 from drivesem.run.lock import let_go
 from drivesem.settings.blocks import Command
 from drivesem.settings.commands import COMMANDS
@@ -85,6 +86,7 @@ def _run(config: Command) -> int:
     finally:
         gc.enable()
     gc.freeze()
+    keep_freed()
     return run(config)
 
 

@@ -157,8 +157,10 @@ def _peak_kb() -> int:
 
 def main(words: list[str]) -> None:
     """Run what the words ask for and leave the result in the file."""
+    from drivesem.run.allocation import keep_freed
     from scene_ir.files import write_json
 
+    keep_freed()
     what, order, path = words
     run: dict[str, Callable[[ProbeOrder], Any]] = {"detector": _detector_alone, "attack": _attack}
     write_json(Path(path), asdict(run[what](ProbeOrder(**json.loads(order)))))

@@ -14,7 +14,7 @@ from rich.console import Console
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.attack.space import parse_params
-from drivesem.bench import boxes, climb, detector, memory, night, render, step
+from drivesem.bench import boxes, climb, detector, memory, night, render, scale, step
 from drivesem.bench.planted import summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
@@ -48,6 +48,7 @@ def run(config: Bench) -> int:
         "climb": _climb,
         "planted": _planted,
         "night": _night,
+        "scale": _scale,
     }
     return conduct(config, "drivesem bench", measure[config.what])
 
@@ -181,6 +182,11 @@ def _night(config: Bench, console: Console) -> Measured:
             Section(night.NIGHTS_TITLE, night.NIGHTS_COLUMNS, nights),
         ],
     )
+
+
+def _scale(config: Bench, console: Console) -> Measured:
+    rows = _dicts(watched(scale.measure(config), 2, console))
+    return Measured({"rows": rows, "method": scale.METHOD}, [Section(scale.TITLE, scale.COLUMNS, rows)])
 
 
 def _minutes(passes: int) -> str:

@@ -15,6 +15,7 @@ import torch
 
 from detectors.base import DetectorError
 from drivesem import store
+from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError, WriteError
 
@@ -43,6 +44,7 @@ class Start:
 def begin(start: Start) -> None:
     """Once in a process, before its first job."""
     global _work
+    keep_freed()
     torch.set_num_threads(start.threads)
     if start.url is not None:
         store.opened(start.url)

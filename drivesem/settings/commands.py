@@ -563,16 +563,16 @@ class Synth(FrameCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Regions, Scenes, FrameCommand):
-    """Measure: an attack step, the renderer, memory, detectors, what attacks find of known faults, a night."""
+    """Measure: an attack step, the renderer, memory, detectors, attacks on known faults, a night, a cluster."""
 
-    what: tyro.conf.Positional[Literal["step", "render", "memory", "detector", "climb", "planted", "night"]] = (
-        "step"
-    )
+    what: tyro.conf.Positional[
+        Literal["step", "render", "memory", "detector", "climb", "planted", "night", "scale"]
+    ] = "step"
     """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
     memory above the detector's own; detector: forward, backward and decoding of each detector; climb: a search by
     climb, and the parts of its passes; planted: how many faults that were planted into the detector each attack
     finds (docs/planted.md), minutes a frame; night: how long an attack on all frames of --root takes, told by
-    some."""
+    some; scale: frames shared by Ray beside frames shared by processes of this machine."""
     quick: Flag = False
     """Fewer repetitions: some 50 s; planted: two faults a frame."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -601,7 +601,8 @@ class Bench(Regions, Scenes, FrameCommand):
     """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
     whether that is the fault; the same of the detector without a fault."""
     limit: Count | None = None
-    """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all."""
+    """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all. Scale:
+    so many frames for each, by default 200."""
     count: Count | None = None
     """Night: how many frames to foretell; by default all that have vehicles."""
     attack: str | None = None

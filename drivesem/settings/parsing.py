@@ -37,7 +37,7 @@ def parse(argv: Sequence[str]) -> Command:
         sys.stdout.write(f"drivesem {__version__}\n")
         raise SystemExit(0)
     if words[0] in COMMANDS:
-        words = [words[0], *_with_presets(words[0], words[1:])]
+        words = [words[0], *_with_presets(words[0], _with_run(words[0], words[1:]))]
     elif not words[0].startswith("-"):
         raise UsageError("command", _ANY, _meant(words[0], COMMANDS))
     captured = io.StringIO()
@@ -50,9 +50,7 @@ def parse(argv: Sequence[str]) -> Command:
         if stop.code in (0, None):
             raise
         _refuse_unknown(words)
-        raise UsageError(
-            "command line", "known options (see drivesem --help)", _unboxed(captured.getvalue())
-        ) from None
+        raise _refused(words[0], _unboxed(captured.getvalue())) from None
     config.check()
     return config
 
@@ -71,10 +69,30 @@ def _refuse_unknown(words: Sequence[str]) -> None:
             raise UsageError("command line", expected, _meant(name, known))
 
 
+def _refused(command: str, text: str) -> UsageError:
+    """The parser's own sentence, as field, expected and found where it is one of the usual ones."""
+    choice = re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?),?\)", text)
+    if choice is not None:
+        known = [name.strip(" '") for name in choice[3].split(",")]
+        return UsageError(choice[2], f"one of {', '.join(known)}", _meant(choice[1], known))
+    stray = re.search(r"Unrecognized options: (.*)", text)
+    if stray is not None:
+        return UsageError("command line", f"options of drivesem {command} (its --help lists them)", stray[1])
+    return UsageError("command line", "known options (see drivesem --help)", text)
+
+
 def _meant(word: str, known: Iterable[str]) -> str:
     """A word, and what it may have been meant to be."""
     near = difflib.get_close_matches(word, list(known), n=1)
     return f"{word}; did you mean {near[0]}?" if near else word
+
+
+def _with_run(command: str, words: list[str]) -> list[str]:
+    """The run that a question is asked of may stand first, without its option's name."""
+    takes_runs = any(field.name == "run" for field in fields(COMMANDS[command]))
+    if takes_runs and words and not words[0].startswith("-"):
+        return [f"{option('run')}={words[0]}", *words[1:]]
+    return words
 
 
 def _with_presets(command: str, words: list[str]) -> list[str]:

@@ -132,16 +132,30 @@ def _run(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any
     wp.launch(kernel, dim=count, inputs=[start, *inputs], device=device, stream=stream)
 
 
-def field(values: Tensor, dtype: Any = None) -> Any:
-    """A tensor as an array for a struct."""
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False)
-
-
 def array(values: Tensor, dtype: Any = None) -> Any:
     """A tensor as an array for a kernel, in the form that is made fastest."""
     return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
-def vec3(values: Tensor) -> Any:
-    """Rows (R, 3) as an array for a kernel."""
-    return array(values, wp.vec3f)
+class Filled:
+    """A struct of arrays for a kernel, in the form that is made fastest; it keeps their tensors."""
+
+    def __init__(self, kind: Any) -> None:
+        self._kind, self._ctype = kind, kind.ctype()
+        self._held: dict[str, Tensor] = {}
+
+    def __ctype__(self) -> Any:
+        return self._ctype
+
+    def put(self, name: str, values: Tensor) -> None:
+        """The array of that name."""
+        self._held[name] = values
+        setattr(self._ctype, name, array(values, self._kind.vars[name].type.dtype))
+
+
+def filled(kind: Any, *tensors: Tensor) -> Filled:
+    """A struct of arrays, one a tensor, in the order of its fields."""
+    out = Filled(kind)
+    for name, values in zip(kind.vars, tensors, strict=True):
+        out.put(name, values)
+    return out

@@ -139,9 +139,6 @@ def _layers(
 ) -> list[Layers]:
     """The layers of each member by the fast kernels, all of them in one go."""
     drawn = pack.draw(objects, suns, with_ground=False)
-    sun = fixed.sun
-    if any(one is not None for one in suns):
-        sun = joined([m.lights(one) for m, one in zip(members, suns, strict=True)])
     code = None
     if any(active(o.texture_code) for o in objects):
         regions = [m.regions for m in members]
@@ -151,7 +148,7 @@ def _layers(
             Regions.joined([r for r in regions if r is not None]),
         )
     yaw = joined([o.yaw for o in objects])
-    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, sun, code)
+    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, code)
     if len(members) == 1:
         return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
     layouts, grounds = (

@@ -14,6 +14,7 @@ from torch import Tensor
 from scene_ir.raster import verbs
 from scene_ir.render import channels, texture
 from scene_ir.render.prepare import Drawn, Prepared
+from scene_ir.render.prepare import photographed as photographed_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +23,7 @@ class Fixed:
     camera then, paint, height; own (V, channels.OWN), with local normals, without depth; texels, dark: values (S,
     channels.TEXEL) and (S, 4), the fourth 0, rects (N, 4), offsets (N + 1,); patches
     (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
-    frame_wh (N, 2) px; sun (N, 4): direction, strength; unproject (N, 3, 3).
+    frame_wh (N, 2) px; unproject (N, 3, 3).
     """
 
     faces: Tensor
@@ -33,7 +34,6 @@ class Fixed:
     patches: Tensor
     dark: tuple[Tensor, Tensor, Tensor]
     frame_wh: Tensor
-    sun: Tensor
     unproject: Tensor
 
     @classmethod
@@ -53,14 +53,13 @@ class Fixed:
                 prepared.texels.rects[:count],
                 prepared.texels.offsets[: count + 1],
             ),
-            patches=patches(base.ground_clip),
+            patches=prepared.pack.patches([photographed_at(prepared.scene.objects)]),
             dark=(
                 torch.nn.functional.pad(prepared.shadows.values, (0, 1)),
                 prepared.shadows.rects,
                 prepared.shadows.offsets,
             ),
             frame_wh=prepared.like.new_tensor([width, height]).expand(count, 2).contiguous(),
-            sun=prepared.lights(),
             unproject=prepared.unproject.expand(count, 3, 3).contiguous(),
         )
 
@@ -69,7 +68,7 @@ class Fixed:
         """Several scenes' objects, one after the other."""
         if len(parts) == 1:
             return parts[0]
-        plain = ("base_clip", "base", "own", "patches", "frame_wh", "sun", "unproject")
+        plain = ("base_clip", "base", "own", "patches", "frame_wh", "unproject")
         return cls(
             faces=_shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts]),
             texels=_packed([p.texels for p in parts]),
@@ -105,13 +104,12 @@ def photographed(
     drawn: Drawn,
     reach_px: Sequence[float],
     yaw: Tensor,
-    sun: Tensor,
     code: Code | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors
     (Ts, 3) by which their shadows darken the ground.
 
-    reach_px: of each halo; sun (N, 4): as in `Fixed`, or another; code: texture codes, if there are any.
+    reach_px: of each halo; code: texture codes, if there are any.
     """
     from scene_ir.render.kernels.photographed import Photographed, Setting
 
@@ -139,24 +137,19 @@ def photographed(
 
         return painted(mesh, look, fill), painted(halo, anchor, torch.zeros_like(fill))
 
-    inside = torch.linalg.inv_ex(patches(drawn.geometry.ground_clip)).inverse
-    then = fixed.patches @ inside
+    geometry = drawn.geometry
+    assert geometry.inside is not None
+    assert geometry.lights is not None
+    then = fixed.patches @ geometry.inside
     setting = Setting(
         fragments=drawn.mesh,
         ground=drawn.ground_layout,
-        inside=inside.detach().contiguous(),
+        inside=geometry.inside.detach(),
         reach_px=reach_px,
         painter=paint if code is not None else None,
-        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name not in ("patches", "sun")},
+        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
     )
-    geometry = drawn.geometry
     codes = code.values if code is not None else yaw.new_zeros(0)
     return Photographed.apply(
-        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, sun, setting
+        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, geometry.lights, setting
     )
-
-
-def patches(clip: Tensor) -> Tensor:
-    """(N, 3, 3) float64: from a patch's (s, t, 1) to clip coordinates, of corners (4N, 3) one after the other."""
-    first, second, _, last = clip.reshape(-1, 4, 3).double().unbind(dim=1)
-    return torch.stack([second - first, last - first, first], dim=2)

@@ -97,6 +97,10 @@ RELIT = (0.3, 0.6)
 show less of it, and the sun that the shading knows may be behind a tree. Held against generated truth."""
 SUN_TURN_RAD, SUN_RISE_RAD, SUN_STRENGTH = math.radians(15.0), math.radians(7.5), 0.2
 """Of light code 1: turn of the sun about the vertical, rise above the horizon, share of its light that it adds."""
+SUN_OFFSET_MAX_M = 4.0
+"""Longest cast shadow that is kept: beyond it the penumbra of a low sun is too faint to be worth its pixels."""
+LEAST_SINE = 0.3
+"""Of the sun's height: lower suns cast shadows as this one does."""
 SHRUNK = 0.02
 """Share of a vehicle's size, within which its shadow softly ceases to follow as the vehicle becomes smaller."""
 OWN_SHADOW = 0.9

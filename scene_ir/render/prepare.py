@@ -118,12 +118,15 @@ class Standing:
 class Geometry:
     """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
     camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.brightened`, by what the
-    objects turned since the photograph."""
+    objects turned since the photograph. lights (N, 4) and inside (N, 3, 3) float64, of the fast kernels alone: the
+    sun on each object, and from a pixel (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways."""
 
     clip: Tensor
     cos: Tensor
     ground_clip: Tensor
     brighter: Tensor
+    lights: Tensor | None = None
+    inside: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +192,6 @@ class Prepared:
         self.fleet = Fleet.of(picked, self.like)
         local = self.fleet.local(base.ffd, base.size_lhw)
         self.sharp, self.smooth = self.fleet.normals(local)
-        self.rig = Rig.of(self.fleet, self.smooth, self.scene.camera.matrix, self.centre)
         inflation = self.like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
         self.halo = inflation * self.scene.camera.matrix[0, 0].to(self.like)
         self.sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
@@ -201,6 +203,11 @@ class Prepared:
         self._casts: Tensor | None = None
         self.base_yaw = base.yaw
         self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
+        self.rig: Rig | None = None
+        if self.settings.backend == "warp" and len(base):
+            follows = self.sunlight if objects.source else torch.zeros_like(self.sunlight)
+            environment = self.scene.environment
+            self.rig = Rig.of(self.fleet, base, self.smooth, self.scene.camera, environment.sun, follows)
         self.size = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
         # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
@@ -320,7 +327,7 @@ class Prepared:
         return paint
 
     def _place(self, objects: Objects) -> Geometry:
-        return self.pack.place([objects], [None])
+        return self.pack.place([objects], [None], with_ground=True)
 
     def draw(self, objects: Objects, sun: Sun | None = None) -> Drawn:
         """Find which surfaces the pixels see. sun: as of `sun_of`."""
@@ -382,6 +389,17 @@ class Prepared:
         corners = corners + more * corners
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
+
+    def patched(self, sun: Sun | None) -> tuple[Tensor, ...]:
+        """What the kernels take of the patches besides poses: the tensors of `kernels.patches.Photographed`."""
+        count, environment = len(self.size), self.scene.environment
+        direction, ground = (t.to(self.like) for t in (environment.sun, environment.ground))
+        casts = self.like.new_zeros(count) if sun is None else self.casts[:, 0].contiguous()
+        return (
+            *(self.corners.contiguous(), self.outwards.contiguous(), self.sun_offset.contiguous(), self.size),
+            *(direction.expand(count, 3).contiguous(), ground.expand(count, 4).contiguous()),
+            *(self.scene.camera.matrix.to(self.like).expand(count, 3, 4).contiguous(), casts),
+        )
 
     @property
     def casts(self) -> Tensor:
@@ -541,7 +559,8 @@ class Pack:
     def __init__(self, members: Sequence[Prepared]) -> None:
         self._members = tuple(members)
         self._backend: verbs.Backend = members[0].settings.backend
-        self._rig = Rig.pack([m.rig for m in members])
+        rigs = [m.rig for m in members if m.rig is not None]
+        self._rig = Rig.pack(rigs) if rigs else None
         self._faces, self._vertex_ranges, self._face_ranges = Fleet.joined([m.fleet for m in members])
         self._ranges = torch.tensor(self._face_ranges, dtype=torch.int64, device=self._faces.device).reshape(-1, 2)
         closed = [s.closed for m in members for s in m.fleet.surfaces]
@@ -554,17 +573,44 @@ class Pack:
         self._patches = patch_faces(sum(self.counts), self._faces.device)
         self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self.counts))]
         self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self.counts))]
-        self._shadowless = [s for m in members for s in m.shadowless()]
+        self._shadowless = torch.tensor([s for m in members for s in m.shadowless()], dtype=torch.bool)
+        self._ground: tuple[Tensor, ...] | None = None
 
-    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None]) -> Geometry:
-        """Where the vertices of perturbed objects, of each member, come to lie, and the light on them."""
-        local = joined([m.local(o) for m, o in zip(self._members, objects, strict=True)])
-        yaw, translation = joined([o.yaw for o in objects]), joined([o.translation for o in objects])
+    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool) -> Geometry:
+        """Where the vertices of perturbed objects, of each member, come to lie, and the light on them.
+        with_ground: the patches by plain torch."""
+        if self._rig is None:
+            ((m,), (o,), (sun,)) = self._members, objects, suns
+            matrix = m.scene.camera.matrix.to(m.like)
+            clip, cos = surfaces.place(m.local(o), m.smooth, m.fleet.owner, o, matrix, m.centre)
+            return Geometry(clip, cos, m.ground(o, sun), m.brighter(o, sun))
         lit = list(zip(self._members, objects, suns, strict=True))
-        ground = joined([m.ground(o, sun) for m, o, sun in lit])
-        clip, cos = surfaces.place(self._rig, local, yaw, translation, self._backend if len(yaw) else "reference")
-        brighter = joined([m.brighter(o, sun) for m, o, sun in lit])
-        return Geometry(clip, cos, ground, brighter)
+        lights = joined([m.lights(sun) for m, _, sun in lit])
+        ffd, size, yaw, translation = (
+            joined([getattr(o, name) for o in objects]) for name in ("ffd", "size_lhw", "yaw", "translation")
+        )
+        clip, cos, brighter, _ = surfaces.placed(self._rig, ffd, size, yaw, translation, lights)
+        if with_ground:
+            return Geometry(clip, cos, joined([m.ground(o, sun) for m, o, sun in lit]), brighter, lights)
+        inside, _, ground = surfaces.patches(yaw, translation, size, lights, self._grounds(suns))
+        return Geometry(clip, cos, ground, brighter, lights, inside)
+
+    def patches(self, objects: Sequence[Objects]) -> Tensor:
+        """(N, 3, 3) float64: from a patch's (s, t, 1), 0 to 1 both ways, to its clip coordinates, under the
+        photographed sun."""
+        lights, fixed = joined([m.lights() for m in self._members]), self._grounds([None] * len(objects))
+        yaw, place, size = (joined([getattr(o, n) for o in objects]) for n in ("yaw", "translation", "size_lhw"))
+        return surfaces.patches(yaw, place, size, lights, fixed)[1]
+
+    def _grounds(self, suns: Sequence[Sun | None]) -> tuple[Tensor, ...]:
+        """What of the shadows' patches poses do not touch; kept where no sun moves."""
+        if self._ground is None or any(sun is not None for sun in suns):
+            parts = [m.patched(sun) for m, sun in zip(self._members, suns, strict=True)]
+            found = tuple(joined(rows) for rows in zip(*parts, strict=True))
+            if any(sun is not None for sun in suns):
+                return found
+            self._ground = found
+        return self._ground
 
     def reach_px(self, objects: Sequence[Objects]) -> list[float]:
         """How far the halo of each object reaches beyond its mesh."""
@@ -572,7 +618,8 @@ class Pack:
 
     def draw(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool = True) -> Drawn:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
-        geometry, backend, reach = self.place(objects, suns), self._backend, self.reach_px(objects)
+        backend, reach = self._backend, self.reach_px(objects)
+        geometry = self.place(objects, suns, with_ground)
         rects = surfaces.crop_rects(
             geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
             [2.0 + r for r in reach],
@@ -584,7 +631,7 @@ class Pack:
         patch_rects = surfaces.crop_rects(
             geometry.ground_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
         )
-        patch_rects[torch.tensor(self._shadowless, dtype=torch.bool)] = 0
+        patch_rects[self._shadowless] = 0
         ground_layout = verbs.Layout.of(patch_rects)
         ground = None
         if with_ground:

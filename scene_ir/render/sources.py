@@ -286,7 +286,9 @@ def _continue_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
     the seen ones in strength and, near them, in value."""
     seen = (~covered).to(dark)
     sure = seen * (expected > 0.05)
-    strength = (dark * expected * sure).sum(dim=(1, 2)) / (expected.square() * sure).sum().clamp(min=1e-6)
+    # Row by row: a sum that threads share depends on their number.
+    total = (expected.square() * sure).sum(dim=1).sum()
+    strength = (dark * expected * sure).sum(dim=2).sum(dim=1) / total.clamp(min=1e-6)
     strength = strength.clamp(0.3, 1.2) if float(sure.sum()) > 20.0 else torch.ones_like(strength)
     model = (strength[:, None, None] * expected).clamp(0.0, 0.95)
 

@@ -5,8 +5,9 @@ Shapes: N objects; V vertices and F triangles of all objects together, object af
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,15 +20,16 @@ from torch import Tensor
 from scene_ir.ffd import lattice_weights
 from scene_ir.geometry import to_clip, vertex_normals
 from scene_ir.raster import verbs
-from scene_ir.types import Camera, Mesh, Part
+from scene_ir.render import model
+from scene_ir.types import Camera, Mesh, Objects, Part
 
 CREASE_RAD = 0.7
 """Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling
 tools."""
 SHADOW_MARGIN_M = 0.8
 """How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
-SUN_OFFSET_MAX_M = 4.0
-"""Longest cast shadow that is kept: beyond it the penumbra of a low sun is too faint to be worth its pixels."""
+_UNSHARED = 1 << 15
+"""So many values torch computes in one thread (ATen's GRAIN_SIZE)."""
 _WELD = 1e-5
 """Vertices of the unit box nearer than this are one point."""
 
@@ -226,11 +228,22 @@ class Fleet:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What placing vertices takes besides the pose: normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4)
-    and centre (N, 3) m of the objects' cameras; edges: the objects' first vertices, and V."""
+    """What placing vertices by kernels takes besides poses. unit (V, 3); weights: of each object, (v, P); normal
+    (V, 3) unit, local; owner (V,) int32; paint (V,); ffd (N, P, 3) and bent (V, 3): the photograph's offsets, and
+    what they are at the vertices; lit (V,): how squarely its sun meets them; sunlight (N,): how strong that is, 0
+    where nothing was photographed; matrix (N, 3, 4) and centre (N, 3) m of the objects' cameras; edges: the
+    objects' first vertices, and V.
+    """
 
+    unit: Tensor
+    weights: tuple[Tensor, ...]
     normal: Tensor
     owner: Tensor
+    paint: Tensor
+    ffd: Tensor
+    bent: Tensor
+    lit: Tensor
+    sunlight: Tensor
     matrix: Tensor
     centre: Tensor
     edges: list[int]
@@ -245,45 +258,91 @@ class Rig:
         edges = [0]
         for rig in rigs:
             edges += [edges[-1] + e for e in rig.edges[1:]]
+        plain = ("unit", "normal", "paint", "ffd", "bent", "lit", "sunlight", "matrix", "centre")
         return cls(
-            torch.cat([r.normal for r in rigs]),
-            torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
-            torch.cat([r.matrix for r in rigs]),
-            torch.cat([r.centre for r in rigs]),
-            edges,
+            weights=tuple(w for r in rigs for w in r.weights),
+            owner=torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
+            edges=edges,
+            **{name: torch.cat([getattr(r, name) for r in rigs]) for name in plain},
         )
 
     @classmethod
-    def of(cls, fleet: Fleet, normal: Tensor, matrix: Tensor, centre: Tensor) -> Rig:
-        """Of one scene's objects. matrix (3, 4), centre (3,)."""
-        count = fleet.vertex_ranges.shape[0]
-        return cls(
-            normal.contiguous(),
-            fleet.owner.to(torch.int32),
-            matrix.to(normal).expand(count, 3, 4).contiguous(),
-            centre.to(normal).expand(count, 3).contiguous(),
-            [0, *fleet.vertex_ranges[:, 1].tolist()],
+    def of(cls, fleet: Fleet, base: Objects, normal: Tensor, camera: Camera, sun: Tensor, sunlight: Tensor) -> Rig:
+        """Of one scene's objects, as photographed. normal (V, 3), welded; sun (3,) and sunlight (N,): the
+        photograph's."""
+        count, like = len(base), normal
+        rig = cls(
+            unit=torch.cat([s.unit for s in fleet.surfaces]) if count else like,
+            weights=tuple(s.weights for s in fleet.surfaces),
+            normal=normal.contiguous(),
+            owner=fleet.owner.to(torch.int32),
+            paint=fleet.paint,
+            ffd=base.ffd.new_full((), torch.nan),
+            bent=torch.zeros_like(like),
+            lit=like.new_zeros(len(like)),
+            sunlight=sunlight,
+            matrix=camera.matrix.to(like).expand(count, 3, 4).contiguous(),
+            centre=camera_centre(camera.matrix).to(like).expand(count, 3).contiguous(),
+            edges=[0, *fleet.vertex_ranges[:, 1].tolist()],
         )
+        rig = replace(rig, bent=rig.bend(base.ffd), ffd=base.ffd)
+        lights = torch.cat([sun.to(like).expand(count, 3), sunlight[:, None]], dim=1)
+        poses = base.ffd, base.size_lhw, base.yaw, base.translation
+        return replace(rig, lit=placed(rig, *poses, lights)[3]) if count else rig
+
+    def bend(self, ffd: Tensor) -> Tensor:
+        """What offsets (N, P, 3) are at the vertices (V, 3), as fractions of the unit box."""
+        if torch.equal(ffd, self.ffd):
+            return self.bent
+        return torch.cat([weights @ own for own, weights in zip(ffd, self.weights, strict=True)])
+
+    def unbend(self, to_bent: Tensor) -> Tensor:
+        """A gradient to that, its rows as columns (3, V), as one to offsets (N, P, 3)."""
+        parts = [
+            (to_bent[:, a:b].contiguous() @ w).T
+            for (a, b), w in zip(itertools.pairwise(self.edges), self.weights, strict=True)
+        ]
+        return torch.stack(parts)
+
+
+def placed(
+    rig: Rig, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """By the kernels, in float32: clip coordinates (V, 3) of objects' vertices, the cosines (V,) of their normals
+    to the camera, how much brighter they are (V,), see `texture.brightened`, and how squarely the sun meets them
+    (V,). lights (N, 4): direction and strength of the sun on each object.
+    """
+    from scene_ir.render.kernels.placement import Place
+
+    found = Place.apply(ffd, size_lhw, yaw, translation, lights, rig)
+    assert isinstance(found, tuple)
+    return found
+
+
+def patches(
+    yaw: Tensor, translation: Tensor, size_lhw: Tensor, lights: Tensor, fixed: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """By the kernels: from a pixel (x, y, 1) to its place (s, t, 1) / w on an object's patch of ground (N, 3, 3)
+    float64, 0 to 1 both ways; and without gradient the same back, and clip coordinates (4N, 3) of the corners.
+    lights as of `placed`; fixed: as of `Prepared.patched`.
+    """
+    from scene_ir.render.kernels.patches import Patch
+
+    found = Patch.apply(yaw, translation, size_lhw, lights, fixed)
+    assert isinstance(found, tuple)
+    return found
 
 
 def place(
-    rig: Rig, local: Tensor, yaw: Tensor, translation: Tensor, backend: verbs.Backend
+    local: Tensor, normal: Tensor, owner: Tensor, objects: Objects, matrix: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals to the camera.
-
-    yaw (N,) rad; translation (N, 3) m; backend `reference` takes any dtype.
+    """In plain torch: clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals
+    (V, 3) to the camera. owner (V,) int64; matrix (3, 4), centre (3,) m of the camera.
     """
-    if backend == "warp":
-        from scene_ir.render.kernels.placement import Place
-
-        clip, cos = Place.apply(local, yaw, translation, rig.normal, rig.owner, rig.matrix, rig.centre, rig.edges)
-        return clip, cos
-    owner = rig.owner.long()
-    turn = yaw.index_select(0, owner)
-    points = rotate(local, turn) + translation.index_select(0, owner)
-    matrix = rig.matrix.index_select(0, owner)
-    clip = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
-    return clip, facing(points, rotate(rig.normal, turn), rig.centre.index_select(0, owner))
+    turn = objects.yaw.index_select(0, owner)
+    points = rotate(local, turn) + objects.translation.index_select(0, owner)
+    clip = points @ matrix[:, :3].T + matrix[:, 3]
+    return clip, facing(points, rotate(normal, turn), centre)
 
 
 class _Bend(torch.autograd.Function):
@@ -321,11 +380,11 @@ def camera_centre(matrix: Tensor) -> Tensor:
 def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
     """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun
     (3,)."""
-    away = -sun / (-sun[1]).clamp(min=0.3)
+    away = -sun / (-sun[1]).clamp(min=model.LEAST_SINE)
     world = torch.stack([away[0].expand_as(yaw), torch.zeros_like(yaw), away[2].expand_as(yaw)], dim=-1)
     offset = rotate(world, -yaw)[:, [0, 2]] * height_m[:, None]
     length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    return offset * (length.clamp(max=SUN_OFFSET_MAX_M) / length)
+    return offset * (length.clamp(max=model.SUN_OFFSET_MAX_M) / length)
 
 
 def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
@@ -394,13 +453,18 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
         apart = (q.clamp(min=0.0).square().sum(-1) + 1e-6).sqrt()
         return apart + q.amax(dim=-1).clamp(max=0.0)
 
-    contact = torch.sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
+    contact = _sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
     shares = ((0.25, 0.97), (0.55, 0.92), (0.9, 0.72))
-    cast = torch.stack(
-        [torch.sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares]
-    )
+    cast = torch.stack([_sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares])
     lit = 1.0 - (1.0 - cast).prod(dim=0)
     return 1.0 - (1.0 - 0.72 * contact) * (1.0 - 0.55 * lit)
+
+
+def _sigmoid(values: Tensor) -> Tensor:
+    """Of any shape, alike for any number of threads: where torch shares values out, the last ones of each share
+    are rounded otherwise.
+    """
+    return torch.cat([part.sigmoid() for part in values.flatten().split(_UNSHARED)]).view_as(values)
 
 
 def crop_rects(

@@ -20,6 +20,7 @@ from drivesem.bench import memory, render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
 from drivesem.bench.tables import Section
+from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.errors import SceneError
@@ -35,6 +36,7 @@ _EXIT_BAD_INPUT = 2
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 done, 2 bad input, which one line tells."""
     config = tyro.cli(BenchTool, prog=_PROGRAM, args=argv)
+    keep_freed()
     try:
         return run(config)
     except (UsageError, SceneError, DetectorError, OSError) as error:

@@ -17,7 +17,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, field, halves, launch, load, share
+from scene_ir.raster.launch import array, between, filled, halves, launch, load, share
 from scene_ir.raster.layout import Fragments, Layout
 from scene_ir.render import channels, surfaces
 from scene_ir.render.kernels import ground, shading
@@ -68,7 +68,8 @@ class _Parts:
 @dataclass(slots=True)
 class _Kept:
     """What the forward pass leaves to the backward one. turn (N, 2): cosine and sine of the yaws; painted: leaves and
-    results of the painter; needs: of each part, the pixels that were completed."""
+    results of the painter; needs, leaning: of each part, the pixels that were completed, and those that
+    `shading.leans`."""
 
     parts: _Parts
     pixels: Any
@@ -78,6 +79,7 @@ class _Kept:
     shadows: list[Any]
     turn: Tensor
     needs: dict[int, Tensor]
+    leaning: dict[int, Tensor]
     painted: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
 
@@ -104,14 +106,14 @@ class Photographed(torch.autograd.Function):
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
-        pixels = _struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
-        vertices = _struct(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
-        photograph = _struct(
+        pixels = filled(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
+        vertices = filled(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
+        photograph = filled(
             shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
         )
-        looks = _struct(shading.Looks, found, look, mesh, halo, fill)
-        layers = _struct(shading.Layers, colour, opacity, depth)
-        patches = _struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
+        looks = filled(shading.Looks, found, look, mesh, halo, fill)
+        layers = filled(shading.Layers, colour, opacity, depth)
+        patches = filled(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
         shadows = [array(ground_table, wp.vec4i), patches]
         tables = [
             [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
@@ -119,6 +121,8 @@ class Photographed(torch.autograd.Function):
         ]
         darkened = array(shadow, wp.vec3f)
         needs: dict[int, Tensor] = {}
+        leaning: dict[int, Tensor] = {}
+        final = s.painter is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -131,24 +135,25 @@ class Photographed(torch.autograd.Function):
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
             launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
-            launch(shading.fill_kernel, [first, last], [pixels, looks], (), device)
-            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks], (), device)
+            leaning[start] = lean = _leaning(s.fragments.face[first:last], coverage[first:last]) + first
+            launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
+            launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
+            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks, final, layers], (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, layers]
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
-            if s.painter is None:
-                launch(shading.combine_kernel, [first, last], [pixels, looks, layers], (), device)
 
         for kernel in (shading.look_kernel, ground.shadow_kernel):
             load(kernel)
         share(work, parts.edges)
-        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs)
+        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs, leaning)
         if s.painter is not None:
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
                 kept.painted = leaves, s.painter(*leaves, table, nearest)
-            looks.mesh, looks.halo = (field(t.detach().contiguous(), wp.vec4f) for t in kept.painted[1])
+            for name, painted in zip(("mesh", "halo"), kept.painted[1], strict=True):
+                looks.put(name, painted.detach().contiguous())
             launch(shading.combine_kernel, halves(size), [pixels, looks, layers], (), device)
         ctx.setting, ctx.kept = s, kept
         ctx.mark_non_differentiable(depth)
@@ -173,19 +178,14 @@ class Photographed(torch.autograd.Function):
         grad_then = torch.zeros_like(s.inside)
         grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
         grad_sun = torch.zeros(len(kept.turn), 4, dtype=torch.float64, device=device)
-        to_layers = shading.Layers()
-        to_layers.colour, to_layers.opacity = field(grad_colour, wp.vec4f), field(grad_opacity)
-        grads = _struct(
+        to_layers = filled(shading.Layers, grad_colour, grad_opacity, grad_opacity)  # depth has no gradient
+        grads = filled(
             *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
             *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
         shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
 
-        def combine(start: int, end: int) -> None:
-            first, last = parts.pixels[start], parts.pixels[end]
-            grad_look[first:last].zero_()
-            inputs = [pixels, looks, to_layers, grads]
-            launch(shading.combine_backward_kernel, [first, last], inputs, (), device)
+        final = kept.painted is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -193,30 +193,35 @@ class Photographed(torch.autograd.Function):
             launch(ground.shadow_backward_kernel, ranges, shadowed, (), device)
             if last == first:
                 return
-            if kept.painted is None:
-                combine(start, end)
+            grad_coverage[first:last].zero_()
+            if final:
+                grad_look[first:last].zero_()
                 grad_fill[first:last].zero_()
             need = kept.needs[start]
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks, grads]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, to_layers, grads]
                 launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
-            inputs = [pixels, photograph, looks, grads]
+            inputs = [pixels, photograph, looks, final, to_layers, grads]
             launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
-            launch(shading.keep_kernel, [first, last], [pixels, grads], (), device)
-            launch(shading.fill_backward_kernel, [first, last], [pixels, looks, grads], (), device)
+            lean = kept.leaning[start]
+            launch(shading.keep_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
+            launch(
+                shading.fill_backward_kernel, [0, lean.shape[0]], [array(lean), pixels, looks, grads], (), device
+            )
             launch(shading.look_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
 
         grad_code = None
         if kept.painted is not None:
-            combine(0, len(parts.pixels) - 1)
+            launch(shading.combine_backward_kernel, halves(size), [pixels, looks, to_layers, grads], (), device)
             leaves, painted = kept.painted
             grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
             )
             grad_fill.copy_(torch.zeros_like(grad_fill) if to_fill is None else to_fill)
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
-            grads.mesh, grads.halo = field(grad_mesh, wp.vec4f), field(grad_halo, wp.vec4f)
-            grad_look += more
+            grads.put("mesh", grad_mesh)
+            grads.put("halo", grad_halo)
+            grad_look.copy_(more)
         share(work, parts.edges)
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
@@ -224,9 +229,6 @@ class Photographed(torch.autograd.Function):
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
 
 
-def _struct(kind: Any, *tensors: Tensor) -> Any:
-    """A struct of arrays, one a tensor, in the order of its fields."""
-    out = kind()
-    for (name, variable), values in zip(kind.vars.items(), tensors, strict=True):
-        setattr(out, name, field(values, variable.type.dtype))
-    return out
+def _leaning(face: Tensor, coverage: Tensor) -> Tensor:
+    """Which pixels `shading.leans`."""
+    return ((coverage < 1) & ((face >= 0) | (coverage > 0))).nonzero()[:, 0]

@@ -1,5 +1,6 @@
-# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-"""Placing vertices, as Warp kernels: what `surfaces.place` does in plain torch; float32.
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
+# ruff: noqa: UP018 - Warp needs float(1.0) to declare what a branch changes.
+"""Placing vertices, as Warp kernels: what `surfaces.place` and `Prepared.brighter` do in plain torch; float32.
 
 Gradients are written by hand. Shapes: N objects, V vertices.
 """
@@ -13,132 +14,230 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, halves, launch, start_warp, vec3
+from scene_ir.raster.launch import between, filled, halves, launch, start_warp
+from scene_ir.render import model
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
 
+AROUND, ABOVE = model.AMBIENT
+RELIT, RELIT_MORE = model.RELIT[0], model.RELIT[1] - model.RELIT[0]
+
+
+@wp.struct
+class Templates:
+    """Of vertices: where they are in the unit box, by how much they are bent there, their unit normals, their
+    objects, how much of them is paint, and how squarely the photograph's sun meets them.
+    """
+
+    unit: wp.array(dtype=wp.vec3f)
+    bend: wp.array(dtype=wp.vec3f)
+    normal: wp.array(dtype=wp.vec3f)
+    owner: wp.array(dtype=wp.int32)
+    paint: wp.array(dtype=wp.float32)
+    lit: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Poses:
+    """Of objects: cosine and sine of the yaws; translation, size; cameras; how strong the photograph's sun is;
+    direction and strength of theirs.
+    """
+
+    turn: wp.array(dtype=wp.vec2f)
+    translation: wp.array(dtype=wp.vec3f)
+    size: wp.array(dtype=wp.vec3f)
+    matrix: wp.array2d(dtype=wp.vec4f)
+    centre: wp.array(dtype=wp.vec3f)
+    sunlight: wp.array(dtype=wp.float32)
+    lights: wp.array(dtype=wp.vec4f)
+
+
+@wp.struct
+class Places:
+    """Of vertices: clip coordinates, cosines towards the camera, how squarely the sun meets them, and how much
+    brighter they are; or gradients to these, of which the third is not asked for.
+    """
+
+    clip: wp.array(dtype=wp.vec3f)
+    facing: wp.array(dtype=wp.float32)
+    lit: wp.array(dtype=wp.float32)
+    brighter: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class ToPoses:
+    """Gradients: to bends (3, V); to translations and yaws, to sizes, and to lights."""
+
+    bend: wp.array2d(dtype=wp.float32)
+    pose: wp.array(dtype=wp.vec4d)
+    size: wp.array(dtype=wp.vec3d)
+    lights: wp.array(dtype=wp.vec4d)
+
+
+@wp.func
+def turned(v: wp.vec3f, turn: wp.vec2f):
+    """A vector turned about the y axis."""
+    return wp.vec3f(turn[0] * v[0] + turn[1] * v[2], v[1], turn[0] * v[2] - turn[1] * v[0])
+
+
+@wp.func
+def bent(templates: Templates, i: int):
+    """A vertex in its unit box."""
+    return templates.unit[i] + templates.bend[i]
+
+
+@wp.func
+def sun_of(poses: Poses, o: int):
+    light = poses.lights[o]
+    return wp.vec3f(light[0], light[1], light[2])
+
+
+@wp.func
+def light_then(templates: Templates, poses: Poses, i: int, o: int):
+    """The light on a vertex in the photograph."""
+    dome = 0.5 - 0.5 * templates.normal[i][1]
+    return AROUND + ABOVE * dome + poses.sunlight[o] * templates.lit[i]
+
+
+@wp.func
+def strength_of(poses: Poses, o: int):
+    """How strong the sun is, as a factor on the photograph's; 1 where there it is none."""
+    strength = float(1.0)
+    if poses.sunlight[o] != 0.0:
+        strength = poses.lights[o][3] / poses.sunlight[o]
+    return strength
+
 
 @wp.kernel(enable_backward=False)
-def place_kernel(
-    start: int,
-    local: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    owner: wp.array(dtype=wp.int32),
-    turn: wp.array(dtype=wp.vec2f),
-    translation: wp.array(dtype=wp.vec3f),
-    matrix: wp.array2d(dtype=wp.vec4f),
-    centre: wp.array(dtype=wp.vec3f),
-    clip: wp.array(dtype=wp.vec3f),
-    facing: wp.array(dtype=wp.float32),
-):
+def place_kernel(start: int, templates: Templates, poses: Poses, places: Places):
     i = start + wp.tid()
-    o = owner[i]
-    c = turn[o][0]
-    s = turn[o][1]
-    v = local[i]
-    p = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0]) + translation[o]
-    n = normal[i]
-    n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
+    o = templates.owner[i]
+    turn = poses.turn[o]
+    p = turned(wp.cw_mul(bent(templates, i), poses.size[o]), turn) + poses.translation[o]
+    n = turned(templates.normal[i], turn)
     q = wp.vec4f(p[0], p[1], p[2], 1.0)
-    clip[i] = wp.vec3f(wp.dot(matrix[o, 0], q), wp.dot(matrix[o, 1], q), wp.dot(matrix[o, 2], q))
-    way = centre[o] - p
-    facing[i] = wp.dot(way, n) / wp.max(wp.length(way), 1e-6)
+    places.clip[i] = wp.vec3f(
+        wp.dot(poses.matrix[o, 0], q), wp.dot(poses.matrix[o, 1], q), wp.dot(poses.matrix[o, 2], q)
+    )
+    way = poses.centre[o] - p
+    places.facing[i] = wp.dot(way, n) / wp.max(wp.length(way), 1e-6)
+    soft = wp.dot(n, sun_of(poses, o))
+    lit = 0.5 * (soft + wp.sqrt(soft * soft + model.TERMINATOR))
+    more = strength_of(poses, o) * lit - templates.lit[i]
+    ratio = poses.sunlight[o] * more / light_then(templates, poses, i, o)
+    share = RELIT + RELIT_MORE * templates.paint[i]
+    bound = ratio * (1.0 / model.RELIT_MOST)
+    places.lit[i] = lit
+    places.brighter[i] = share * ratio / wp.sqrt(1.0 + bound * bound)
 
 
 @wp.kernel(enable_backward=False)
-def place_backward_kernel(
-    start: int,
-    local: wp.array(dtype=wp.vec3f),
-    normal: wp.array(dtype=wp.vec3f),
-    owner: wp.array(dtype=wp.int32),
-    turn: wp.array(dtype=wp.vec2f),
-    translation: wp.array(dtype=wp.vec3f),
-    matrix: wp.array2d(dtype=wp.vec4f),
-    centre: wp.array(dtype=wp.vec3f),
-    grad_clip: wp.array(dtype=wp.vec3f),
-    grad_facing: wp.array(dtype=wp.float32),
-    grad_local: wp.array(dtype=wp.vec3f),
-    grad_pose: wp.array(dtype=wp.vec4d),
-):
+def place_backward_kernel(start: int, templates: Templates, poses: Poses, grads: Places, to: ToPoses):
     i = start + wp.tid()
-    g = grad_clip[i]
-    gf = grad_facing[i]
-    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or gf != 0.0:
-        o = owner[i]
-        c = turn[o][0]
-        s = turn[o][1]
-        v = local[i]
-        r = wp.vec3f(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
-        p = r + translation[o]
-        n = normal[i]
-        n = wp.vec3f(c * n[0] + s * n[2], n[1], c * n[2] - s * n[0])
-        way = centre[o] - p
+    g = grads.clip[i]
+    gf = grads.facing[i]
+    gb = grads.brighter[i]
+    to_bend = wp.vec3f(0.0, 0.0, 0.0)
+    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or gf != 0.0 or gb != 0.0:
+        o = templates.owner[i]
+        turn = poses.turn[o]
+        size = poses.size[o]
+        v = bent(templates, i)
+        r = turned(wp.cw_mul(v, size), turn)
+        n = turned(templates.normal[i], turn)
+        way = poses.centre[o] - (r + poses.translation[o])
         length = wp.max(wp.length(way), 1e-6)
-        m = matrix[o, 0] * g[0] + matrix[o, 1] * g[1] + matrix[o, 2] * g[2]
+        m = poses.matrix[o, 0] * g[0] + poses.matrix[o, 1] * g[1] + poses.matrix[o, 2] * g[2]
         to_way = (n - way * (wp.dot(way, n) / (length * length))) * (gf / length)
         to_p = wp.vec3f(m[0], m[1], m[2]) - to_way
         to_n = way * (gf / length)
-        grad_local[i] = wp.vec3f(c * to_p[0] - s * to_p[2], to_p[1], s * to_p[0] + c * to_p[2])
+        if gb != 0.0:
+            sun = sun_of(poses, o)
+            soft = wp.dot(n, sun)
+            root = wp.sqrt(soft * soft + model.TERMINATOR)
+            lit = 0.5 * (soft + root)
+            then = light_then(templates, poses, i, o)
+            strength = strength_of(poses, o)
+            ratio = poses.sunlight[o] * (strength * lit - templates.lit[i]) / then
+            bound = ratio * (1.0 / model.RELIT_MOST)
+            squared = 1.0 + bound * bound
+            share = RELIT + RELIT_MORE * templates.paint[i]
+            to_more = gb * share / (squared * wp.sqrt(squared)) / then  # of the light, not of its share
+            to_soft = to_more * poses.sunlight[o] * strength * (0.5 + 0.5 * soft / root)
+            to_n += sun * to_soft
+            d = n * to_soft
+            to_light = wp.vec4d(wp.float64(d[0]), wp.float64(d[1]), wp.float64(d[2]), wp.float64(to_more * lit))
+            wp.atomic_add(to.lights, o, to_light)
+        to_local = wp.vec3f(turn[0] * to_p[0] - turn[1] * to_p[2], to_p[1], turn[1] * to_p[0] + turn[0] * to_p[2])
+        to_bend = wp.cw_mul(to_local, size)
         # d (turned vector) / d yaw is (z, 0, -x) of the turned vector
         angle = to_p[0] * r[2] - to_p[2] * r[0] + to_n[0] * n[2] - to_n[2] * n[0]
         wp.atomic_add(
-            grad_pose,
+            to.pose,
             o,
             wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle)),
         )
+        wp.atomic_add(to.size, o, wp.vec3d(wp.cw_mul(to_local, v)))
+    to.bend[0, i] = to_bend[0]
+    to.bend[1, i] = to_bend[1]
+    to.bend[2, i] = to_bend[2]
 
 
 class Place(torch.autograd.Function):
-    """Local vertices (V, 3) m, yaw (N,), translation (N, 3) -> clip (V, 3), cosine towards the camera (V,).
-
-    normal (V, 3) unit, local; owner (V,) int32; matrix (N, 3, 4), centre (N, 3) of the objects' cameras; edges:
-    the objects' first vertices, and V.
+    """Offsets ffd (N, P, 3), size (N, 3) m, yaw (N,), translation (N, 3) m, lights (N, 4) -> clip (V, 3), cosine
+    towards the camera (V,), how much brighter (V,); and how squarely the sun meets each vertex (V,), without
+    gradient. rig: `surfaces.Rig`.
     """
 
     @staticmethod
-    def forward(ctx: Any, local, yaw, translation, normal, owner, matrix, centre, edges) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, ffd, size, yaw, translation, lights, rig):
+        bend = rig.bend(ffd.detach())
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
-        clip, facing = torch.empty_like(local), local.new_empty(local.shape[0])
-        fixed = (
-            local.detach().contiguous(),
-            normal,
-            owner,
-            turn,
-            translation.detach().contiguous(),
-            matrix,
-            centre,
-        )
+        count, like = rig.unit.shape[0], rig.unit
+        clip, facing, lit, brighter = like.new_empty(count, 3), *like.new_empty(3, count)
+        kept = [t.detach().contiguous() for t in (turn, translation, size, lights)]
+        templates, poses = _inputs(rig, bend, *kept)
         launch(
             place_kernel,
-            halves(local.shape[0]),
-            [*_place_inputs(fixed), vec3(clip), array(facing)],
-            device=local.device,
+            halves(count),
+            [templates, poses, filled(Places, clip, facing, lit, brighter)],
+            (),
+            like.device,
         )
-        ctx.save_for_backward(*fixed)
-        ctx.edges = edges
-        return clip, facing
+        ctx.kept, ctx.rig, ctx.bend = kept, rig, bend
+        ctx.mark_non_differentiable(lit)
+        ctx.set_materialize_grads(False)
+        return clip, facing, brighter, lit
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_clip: Tensor, grad_facing: Tensor):
-        fixed = ctx.saved_tensors
-        local, turn = fixed[0], fixed[3]
-        grad_clip, grad_facing = grad_clip.contiguous(), grad_facing.contiguous()
-        grad_local = torch.zeros_like(local)
-        grad_pose = torch.zeros(turn.shape[0], 4, dtype=torch.float64, device=local.device)
-        inputs = [
-            *(*_place_inputs(fixed), vec3(grad_clip), array(grad_facing)),
-            *(vec3(grad_local), array(grad_pose, wp.vec4d)),
+    def backward(ctx: Any, grad_clip: Tensor | None, grad_facing: Tensor | None, grad_brighter: Tensor | None, _):
+        rig, like = ctx.rig, ctx.rig.unit
+        count, objects = like.shape[0], len(rig.edges) - 1
+        grads = [
+            like.new_zeros(shape) if gradient is None else gradient.contiguous()
+            for gradient, shape in ((grad_clip, (count, 3)), (grad_facing, count), (grad_brighter, count))
         ]
-        launch(place_backward_kernel, between(ctx.edges), inputs, device=local.device)
-        pose = grad_pose.to(local.dtype)
-        return grad_local, pose[:, 3], pose[:, :3], None, None, None, None, None
+        to_bend = like.new_empty(3, count)
+        pose, to_size, to_lights = like.new_zeros(objects, 11, dtype=torch.float64).split([4, 3, 4], 1)
+        pose, to_size, to_lights = pose.contiguous(), to_size.contiguous(), to_lights.contiguous()
+        to = filled(ToPoses, to_bend, pose, to_size, to_lights)
+        places = filled(Places, grads[0], grads[1], grads[1], grads[2])
+        launch(
+            place_backward_kernel,
+            between(rig.edges),
+            [*_inputs(rig, ctx.bend, *ctx.kept), places, to],
+            (),
+            like.device,
+        )
+        small = [t.to(like.dtype) for t in (to_size, pose, to_lights)]
+        to_ffd = rig.unbend(to_bend) if ctx.needs_input_grad[0] else None
+        return to_ffd, small[0], small[1][:, 3], small[1][:, :3], small[2], None
 
 
-def _place_inputs(fixed) -> list:
-    local, normal, owner, turn, translation, matrix, centre = fixed
-    return [
-        *(vec3(local), vec3(normal), array(owner), array(turn, wp.vec2f)),
-        *(vec3(translation), array(matrix, wp.vec4f), vec3(centre)),
-    ]
+def _inputs(
+    rig: Any, bend: Tensor, turn: Tensor, translation: Tensor, size: Tensor, lights: Tensor
+) -> tuple[Any, Any]:
+    templates = filled(Templates, rig.unit, bend, rig.normal, rig.owner, rig.paint, rig.lit)
+    return templates, filled(Poses, turn, translation, size, rig.matrix, rig.centre, rig.sunlight, lights)

@@ -12,9 +12,9 @@ import warp as wp
 
 from scene_ir.meshes import collapse
 from scene_ir.raster import kernels
-from scene_ir.render.kernels import blending, ground, placement, shading
+from scene_ir.render.kernels import blending, ground, patches, placement, shading
 
-PICTURES: tuple[ModuleType, ...] = (shading, collapse, kernels, ground, blending, placement)
+PICTURES: tuple[ModuleType, ...] = (shading, collapse, kernels, ground, blending, placement, patches)
 """Modules whose kernels draw a scene in which no weather changes; the one that takes longest first."""
 _LONG_S = 2.0
 """Loading takes less: what takes longer is compiled."""

@@ -137,6 +137,11 @@ def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
         (["attack", "--limt", "3"], "found --limt; did you mean --limit?"),
         (["attack", "--limt=3"], "found --limt; did you mean --limit?"),
         (["study", "multi", "--no-confirm"], "an option of drivesem study"),
+        (["attack", "--method", "climbs"], "--method: expected one of si-fgsm, apgd"),
+        (["attack", "--method", "climbs"], "found climbs; did you mean climb?"),
+        (["attack", "stray"], "expected options of drivesem attack (its --help lists them), found stray"),
+        (["verify", "--limit", "2"], "--run: expected a folder of drivesem attack, found nothing"),
+        (["verify", "nowhere"], "nowhere"),
         ([], "command: expected one of attack, "),
     ],
 )
@@ -155,6 +160,15 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert captured.err.startswith("drivesem: ")
     assert message in captured.err
     assert not list(tmp_path.iterdir()), "bad settings leave nothing behind"
+
+
+_TAKE_RUNS = ["verify", "explain", "confirm", "plausibility", "transfer --detectors squeezedet"]
+
+
+@pytest.mark.parametrize("command", _TAKE_RUNS)
+def test_the_run_may_stand_first(command: str) -> None:
+    name, *rest = command.split()
+    assert parse([name, "runs/a", *rest]) == parse([name, "--run", "runs/a", *rest])
 
 
 def outside(constraint: Constraint, number: type) -> list[Any]:

@@ -1,0 +1,63 @@
+"""Taking a picture apart gives the same bits for any number of torch's threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from scene_ir.render.sources import _continue_shadow
+from scene_ir.render.surfaces import _sigmoid
+
+RANDOM = torch.Generator()
+
+
+@pytest.fixture(autouse=True)
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def by_threads(work: Callable[[], Tensor]) -> list[Tensor]:
+    found = []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        found.append(work())
+    return found
+
+
+@pytest.mark.parametrize("shape", [(94451,), (3, 41001), (0, 5), (2, 3, 4)])
+def test_sigmoid(shape: tuple[int, ...]) -> None:
+    values = 4 * torch.randn(shape, generator=RANDOM.manual_seed(0))
+    one, *others = by_threads(lambda: _sigmoid(values))
+    assert all(torch.equal(one, other) for other in others)
+    torch.testing.assert_close(one, torch.sigmoid(values), rtol=1e-6, atol=0)
+
+
+def test_continued_shadow() -> None:
+    dark = torch.rand(3, 171, 498, generator=RANDOM.manual_seed(0))
+    expected = torch.rand(171, 498, generator=RANDOM)
+    covered = torch.rand(171, 498, generator=RANDOM) > 0.6
+    one, *others = by_threads(lambda: _continue_shadow(dark, expected, covered))
+    assert all(torch.equal(one, other) for other in others)
+
+
+@pytest.mark.slow
+def test_an_embedded_scene() -> None:
+    from drivesem.synth.demo import demo_scene
+
+    for index in (0, 1):
+        one, *others = by_threads(
+            lambda index=index: torch.cat(
+                [
+                    part.values.flatten()
+                    for source in demo_scene(0, index).objects.source or ()
+                    for part in (source.foreground, source.shadow)
+                    if part is not None
+                ]
+            )
+        )
+        assert all(torch.equal(one, other) for other in others)
