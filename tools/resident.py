@@ -26,6 +26,8 @@ from scene_ir import files
 
 _SECONDS = 0.5
 """Between two looks."""
+_STOPPED = 130, 143
+"""Exit codes of a command that was interrupted: what it did until then counts."""
 _EARLY = 0.1
 """Share of the frames in which caches fill: the line is fitted to the rest."""
 
@@ -47,14 +49,16 @@ class Resident:
 
 
 def watch(words: Sequence[str], run: Path) -> Resident:
-    """Give a command and look at it until it ends. run: the folder that it writes. RuntimeError where it fails."""
+    """Give a command and look at it until it ends. run: the folder that it writes. RuntimeError where it fails; an
+    interrupt is no failure.
+    """
     start = time.monotonic()
     process = subprocess.Popen([sys.executable, "-m", "drivesem.cli", *words])
     looks: list[tuple[float, int, float]] = []
     while process.poll() is None:
         looks.append((round(time.monotonic() - start, 1), _frames_in(run), _resident_mb(process.pid)))
         time.sleep(_SECONDS)
-    if process.returncode:
+    if process.returncode not in (0, *_STOPPED):
         raise RuntimeError(f"exit code {process.returncode}")
     return told("drivesem " + " ".join(words), looks)
 

@@ -107,7 +107,7 @@ def _attacked(
     work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
     answers = ask(todo, work, build, config, Bar("attacking frames"))
     failed = failed | answers.failed
-    empty = {name for name, result in answers.results.items() if result is None}
+    empty = {name for name, usable in answers.results.items() if not usable}
     done = [name for name in names if name not in failed and name not in empty]
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
     if must_find:
@@ -193,12 +193,15 @@ class Worker:
         config = _settled(config)
         return replace(self, config=config, params=params_of(config), method=attack_method(config))
 
-    def attack(self, identifier: str, out: Path) -> FrameResult | None:
-        """One frame, from the source to its folder; None where it has no vehicle to attack."""
+    def attack(self, identifier: str, out: Path) -> bool:
+        """One frame, from the source to its folder; False where it has no vehicle to attack. The result, a quarter
+        of a megabyte, is in the folder alone: a night has thousands.
+        """
         try:
-            return self.attack_scene(identifier, self.source.scene(identifier), out)
+            self.attack_scene(identifier, self.source.scene(identifier), out)
         except NoVehicleError:
-            return None
+            return False
+        return True
 
     def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
         """One frame that has been taken apart, to its folder. Raises NoVehicleError where it has no vehicle."""
@@ -375,7 +378,7 @@ def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -
         raise UsageError("--objective", expected, config.objective)
 
 
-def _attacker(config: Attack, out: Path) -> Callable[[str], FrameResult | None]:
+def _attacker(config: Attack, out: Path) -> Callable[[str], bool]:
     return partial(Worker.of(config).attack, out=out)
 
 

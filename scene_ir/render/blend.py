@@ -259,20 +259,18 @@ def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray
 
     farther: (P,) how much farther b's outline is, which decides where the footprints are not apart.
     """
-    gaps, signs = [], []
-    for corners in (a, b):
-        for start, end in ((0, 1), (1, 2)):
-            axis = corners[:, end] - corners[:, start]
-            axis = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
-            pa, pb = np.einsum("pkc,pc->pk", a, axis), np.einsum("pkc,pc->pk", b, axis)
-            at = axis @ eye
-            for direction in (1.0, -1.0):
-                low, high, where = (pa * direction).max(axis=1), (pb * direction).min(axis=1), at * direction
-                gaps.append(high - low)
-                signs.append(np.where(where <= low, 1, np.where(where >= high, -1, 0)))
-    best = np.argmax(gaps, axis=0)
-    pair = np.arange(len(a))
-    return np.where(np.array(gaps)[best, pair] > 0, np.array(signs)[best, pair], np.sign(farther))
+    axes = np.concatenate([corners[:, 1:3] - corners[:, 0:2] for corners in (a, b)], axis=1)
+    axes = axes / np.maximum(np.linalg.norm(axes, axis=2, keepdims=True), 1e-9)
+    pa, pb = (np.einsum("pkc,pac->pak", corners, axes) for corners in (a, b))
+    at = axes @ eye
+    # Along each axis and against it, in turn.
+    low = np.stack([pa.max(axis=2), -pa.min(axis=2)], axis=2).reshape(len(a), 8)
+    high = np.stack([pb.min(axis=2), -pb.max(axis=2)], axis=2).reshape(len(a), 8)
+    where = np.stack([at, -at], axis=2).reshape(len(a), 8)
+    gaps = high - low
+    signs = np.where(where <= low, 1, np.where(where >= high, -1, 0))
+    best, pair = gaps.argmax(axis=1), np.arange(len(a))
+    return np.where(gaps[pair, best] > 0, signs[pair, best], np.sign(farther))
 
 
 def _nearest_distance(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:

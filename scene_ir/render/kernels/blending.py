@@ -54,25 +54,234 @@ def span_of(stack: Stack, k: int, y: int):
     return out
 
 
-@wp.func
-def clamp_pixel(image: wp.array3d(dtype=wp.float32), over: wp.array2d(dtype=wp.uint8), y: int, x: int):
-    """Clamp a pixel to [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5).
+# What follows is written in C, a row of a draw at a time: of Warp's own indices and vectors a CPU makes one number after
+# the other. The pragma lets its compiler take several pixels at once, which lie in arrays of their own.
 
-    Rectangles overlap: a pixel that was clamped before stays as it is.
+_ROW = """
+    float* const red = (float*)((char*)PLANES.data + y * PLANES.strides[1]);
+    float* const green = (float*)((char*)red + PLANES.strides[0]);
+    float* const blue = (float*)((char*)green + PLANES.strides[0]);
+"""
+_EACH = """
+    #pragma clang loop vectorize(assume_safety)
+    for (int x = x0; x < x1; ++x) {
+"""
+_SHADE = (
+    _ROW.replace("PLANES", "image")
+    + """
+    const float* const f = (const float*)factor.data + 3 * origin;
+    float* const under = (float*)under_shadow.data + 3 * origin;
+"""
+    + _EACH
+    + """
+        under[3 * x] = red[x];
+        under[3 * x + 1] = green[x];
+        under[3 * x + 2] = blue[x];
+        red[x] *= f[3 * x];
+        green[x] *= f[3 * x + 1];
+        blue[x] *= f[3 * x + 2];
+    }
+"""
+)
+_LAY = (
+    _ROW.replace("PLANES", "image")
+    + """
+    const float* const c = (const float*)colour.data + 4 * origin;
+    const float* const alpha = (const float*)opacity.data + origin;
+    const float* const z = (const float*)depth.data + origin;
+    float* const under = (float*)under_layer.data + 4 * origin;
+    float* const closest = (float*)((char*)nearest.data + y * nearest.strides[0]);
+    wp::int64* const who = (wp::int64*)((char*)number.data + y * number.strides[0]);
+"""
+    + _EACH
+    + """
+        const float clear = 1.0f - alpha[x];
+        under[4 * x] = red[x];
+        under[4 * x + 1] = green[x];
+        under[4 * x + 2] = blue[x];
+        under[4 * x + 3] = 0.0f;
+        red[x] = c[4 * x] + clear * red[x];
+        green[x] = c[4 * x + 1] + clear * green[x];
+        blue[x] = c[4 * x + 2] + clear * blue[x];
+        closest[x] = alpha[x] >= 0.5f ? z[x] : closest[x];
+        who[x] = alpha[x] >= 0.5f ? (wp::int64)(draw + 1) : who[x];
+    }
+    if (image.shape[0] > 3) {
+        float* const inverse = (float*)((char*)blue + image.strides[0]);
     """
-    bits = 0
-    if over[y, x] != wp.uint8(0):
-        return
-    for c in range(3):
-        away = wp.abs(image[c, y, x] - 0.5)
-        if away > 0.5 + model.SATURATED:
-            bits += 1 << c
-        elif away >= 0.5 - model.SATURATED:
-            bits += 8 << c
-        if away > 0.5:
-            image[c, y, x] = wp.clamp(image[c, y, x], 0.0, 1.0)
-    if bits > 0:
-        over[y, x] = wp.uint8(bits)
+    + _EACH
+    + """
+            under[4 * x + 3] = inverse[x];
+            inverse[x] = c[4 * x + 3] + (1.0f - alpha[x]) * inverse[x];
+        }
+    }
+"""
+)
+_CLAMP = (
+    """
+    wp::uint8* const told = (wp::uint8*)((char*)over.data + y * over.strides[0]);
+    for (int channel = 0; channel < 3; ++channel) {
+        float* const plane = (float*)((char*)image.data + y * image.strides[1] + channel * image.strides[0]);
+    """
+    + _EACH
+    + """
+            const float v = plane[x];
+            const float away = v > 0.5f ? v - 0.5f : 0.5f - v;
+            const int bits = away > 0.5f + SATURATEDf ? 1 : (away >= 0.5f - SATURATEDf ? 8 : 0);
+            const float kept = v < 0.0f ? 0.0f : (v > 1.0f ? 1.0f : v);
+            plane[x] = told[x] >= 64 ? v : kept;
+            told[x] |= (wp::uint8)(told[x] >= 64 ? 0 : bits << channel);
+        }
+    }
+    for (int x = x0; x < x1; ++x) told[x] |= 64;
+"""
+)
+_START = (
+    """
+    for (int channel = 0; channel < grad.shape[0]; ++channel) {
+        const char* const given = (const char*)grad_image.data + y * grad_image.strides[1] + channel * grad_image.strides[0];
+        float* const plane = (float*)((char*)grad.data + y * grad.strides[1] + channel * grad.strides[0]);
+        const wp::uint8* const told = (const wp::uint8*)((const char*)over.data + y * over.strides[0]);
+        const int gone = channel < 3 ? 1 << channel : 0, half = channel < 3 ? 8 << channel : 0;
+        const int step = grad_image.strides[2];
+    """
+    + _EACH
+    + """
+            const float g = *(const float*)(given + x * step);
+            plane[x] = told[x] & gone ? 0.0f : (told[x] & half ? 0.5f * g : g);
+        }
+    }
+"""
+)
+_LIFT = (
+    _ROW.replace("PLANES", "grad")
+    + """
+    const float* const alpha = (const float*)opacity.data + origin;
+    const float* const under = (const float*)under_layer.data + 4 * origin;
+    float* const to_c = (float*)grad_colour.data + 4 * origin;
+    float* const to_alpha = (float*)grad_opacity.data + origin;
+"""
+    + _EACH
+    + """
+        const float clear = 1.0f - alpha[x];
+        to_c[4 * x] = red[x];
+        to_c[4 * x + 1] = green[x];
+        to_c[4 * x + 2] = blue[x];
+        to_c[4 * x + 3] = 0.0f;
+        to_alpha[x] = -(red[x] * under[4 * x] + green[x] * under[4 * x + 1] + blue[x] * under[4 * x + 2]);
+        red[x] *= clear;
+        green[x] *= clear;
+        blue[x] *= clear;
+    }
+    if (grad.shape[0] > 3) {
+        float* const inverse = (float*)((char*)blue + grad.strides[0]);
+    """
+    + _EACH
+    + """
+            to_c[4 * x + 3] = inverse[x];
+            to_alpha[x] -= inverse[x] * under[4 * x + 3];
+            inverse[x] *= 1.0f - alpha[x];
+        }
+    }
+"""
+)
+_UNSHADE = (
+    _ROW.replace("PLANES", "grad")
+    + """
+    const float* const f = (const float*)factor.data + 3 * origin;
+    const float* const under = (const float*)under_shadow.data + 3 * origin;
+    float* const to_f = (float*)grad_factor.data + 3 * origin;
+"""
+    + _EACH
+    + """
+        to_f[3 * x] = red[x] * under[3 * x];
+        to_f[3 * x + 1] = green[x] * under[3 * x + 1];
+        to_f[3 * x + 2] = blue[x] * under[3 * x + 2];
+        red[x] *= f[3 * x];
+        green[x] *= f[3 * x + 1];
+        blue[x] *= f[3 * x + 2];
+    }
+"""
+)
+
+
+@wp.func_native(_SHADE)
+def shade_row(
+    image: wp.array3d(dtype=wp.float32),
+    y: int,
+    x0: int,
+    x1: int,
+    origin: int,
+    factor: wp.array(dtype=wp.vec3f),
+    under_shadow: wp.array(dtype=wp.vec3f),
+):
+    """Columns [x0, x1) of a row darkened; origin: the packed pixel that column 0 would have."""
+
+
+@wp.func_native(_LAY)
+def lay_row(
+    image: wp.array3d(dtype=wp.float32),
+    y: int,
+    x0: int,
+    x1: int,
+    origin: int,
+    draw: int,
+    colour: wp.array(dtype=wp.vec4f),
+    opacity: wp.array(dtype=wp.float32),
+    depth: wp.array(dtype=wp.float32),
+    under_layer: wp.array(dtype=wp.vec4f),
+    nearest: wp.array2d(dtype=wp.float32),
+    number: wp.array2d(dtype=wp.int64),
+):
+    """A layer over them."""
+
+
+@wp.func_native(_CLAMP.replace("SATURATED", str(model.SATURATED)))
+def clamp_row(image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, over: wp.array2d(dtype=wp.uint8)):
+    """Kept in [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it was
+    done (6): rectangles overlap, and a pixel that was clamped before stays as it is.
+    """
+
+
+@wp.func_native(_START)
+def start_row(
+    grad_image: wp.array3d(dtype=wp.float32),
+    y: int,
+    x0: int,
+    x1: int,
+    over: wp.array2d(dtype=wp.uint8),
+    grad: wp.array3d(dtype=wp.float32),
+):
+    """The gradient to pixels before they were clamped: see `blend.clamp_colour`."""
+
+
+@wp.func_native(_LIFT)
+def lift_row(
+    grad: wp.array3d(dtype=wp.float32),
+    y: int,
+    x0: int,
+    x1: int,
+    origin: int,
+    opacity: wp.array(dtype=wp.float32),
+    under_layer: wp.array(dtype=wp.vec4f),
+    grad_colour: wp.array(dtype=wp.vec4f),
+    grad_opacity: wp.array(dtype=wp.float32),
+):
+    """Back through `lay_row`."""
+
+
+@wp.func_native(_UNSHADE)
+def unshade_row(
+    grad: wp.array3d(dtype=wp.float32),
+    y: int,
+    x0: int,
+    x1: int,
+    origin: int,
+    factor: wp.array(dtype=wp.vec3f),
+    under_shadow: wp.array(dtype=wp.vec3f),
+    grad_factor: wp.array(dtype=wp.vec3f),
+):
+    """Back through `shade_row`."""
 
 
 @wp.kernel
@@ -95,59 +304,19 @@ def blend_kernel(
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
         s = span_of(shadows, k, y)
-        for x in range(s.x0, s.x1):
-            f = factor[s.origin + x]
-            v = wp.vec3f(image[0, y, x], image[1, y, x], image[2, y, x])
-            under_shadow[s.origin + x] = v
-            image[0, y, x] = v[0] * f[0]
-            image[1, y, x] = v[1] * f[1]
-            image[2, y, x] = v[2] * f[2]
+        shade_row(image, y, s.x0, s.x1, s.origin, factor, under_shadow)
     for k in range(layers.order.shape[0]):
         s = span_of(layers, k, y)
-        for x in range(s.x0, s.x1):
-            p = s.origin + x
-            a = opacity[p]
-            c = colour[p]
-            below = wp.vec4f(image[0, y, x], image[1, y, x], image[2, y, x], 0.0)
-            if image.shape[0] > 3:
-                below[3] = image[3, y, x]
-                image[3, y, x] = c[3] + (1.0 - a) * below[3]
-            under_layer[p] = below
-            image[0, y, x] = c[0] + (1.0 - a) * below[0]
-            image[1, y, x] = c[1] + (1.0 - a) * below[1]
-            image[2, y, x] = c[2] + (1.0 - a) * below[2]
-            if a >= 0.5:
-                number[y, x] = wp.int64(s.draw + 1)
-                nearest[y, x] = depth[p]
+        lay_row(
+            image, y, s.x0, s.x1, s.origin, s.draw, colour, opacity, depth, under_layer, nearest, number
+        )  # fmt: skip
     if clamped:
         for k in range(shadows.order.shape[0]):
             s = span_of(shadows, k, y)
-            for x in range(s.x0, s.x1):
-                clamp_pixel(image, over, y, x)
+            clamp_row(image, y, s.x0, s.x1, over)
         for k in range(layers.order.shape[0]):
             s = span_of(layers, k, y)
-            for x in range(s.x0, s.x1):
-                clamp_pixel(image, over, y, x)
-
-
-@wp.func
-def start_gradient(
-    grad_image: wp.array3d(dtype=wp.float32),
-    over: wp.array2d(dtype=wp.uint8),
-    y: int,
-    x: int,
-    grad: wp.array3d(dtype=wp.float32),
-):
-    """The gradient to a pixel before it was clamped: see `blend.clamp_colour`."""
-    bits = wp.int32(over[y, x])
-    for c in range(grad.shape[0]):
-        g = grad_image[c, y, x]
-        if bits != 0 and c < 3:
-            if (bits >> c) % 2 == 1:
-                g = 0.0
-            if (bits >> (c + 3)) % 2 == 1:
-                g = 0.5 * g
-        grad[c, y, x] = g
+            clamp_row(image, y, s.x0, s.x1, over)
 
 
 @wp.kernel
@@ -169,39 +338,16 @@ def blend_backward_kernel(
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
         s = span_of(shadows, k, y)
-        for x in range(s.x0, s.x1):
-            start_gradient(grad_image, over, y, x, grad)
+        start_row(grad_image, y, s.x0, s.x1, over, grad)
     for k in range(layers.order.shape[0]):
         s = span_of(layers, k, y)
-        for x in range(s.x0, s.x1):
-            start_gradient(grad_image, over, y, x, grad)
+        start_row(grad_image, y, s.x0, s.x1, over, grad)
     for i in range(layers.order.shape[0]):
         s = span_of(layers, layers.order.shape[0] - 1 - i, y)
-        for x in range(s.x0, s.x1):
-            p = s.origin + x
-            g = wp.vec4f(grad[0, y, x], grad[1, y, x], grad[2, y, x], 0.0)
-            clear = 1.0 - opacity[p]
-            if grad.shape[0] > 3:
-                g[3] = grad[3, y, x]
-                grad[3, y, x] = g[3] * clear
-            grad_colour[p] = g
-            grad_opacity[p] = -wp.dot(g, under_layer[p])
-            grad[0, y, x] = g[0] * clear
-            grad[1, y, x] = g[1] * clear
-            grad[2, y, x] = g[2] * clear
+        lift_row(grad, y, s.x0, s.x1, s.origin, opacity, under_layer, grad_colour, grad_opacity)
     for i in range(shadows.order.shape[0]):
         s = span_of(shadows, shadows.order.shape[0] - 1 - i, y)
-        for x in range(s.x0, s.x1):
-            p = s.origin + x
-            f = factor[p]
-            v = under_shadow[p]
-            g0 = grad[0, y, x]
-            g1 = grad[1, y, x]
-            g2 = grad[2, y, x]
-            grad_factor[p] = wp.vec3f(g0 * v[0], g1 * v[1], g2 * v[2])
-            grad[0, y, x] = g0 * f[0]
-            grad[1, y, x] = g1 * f[1]
-            grad[2, y, x] = g2 * f[2]
+        unshade_row(grad, y, s.x0, s.x1, s.origin, factor, under_shadow, grad_factor)
 
 
 class Blend(torch.autograd.Function):
@@ -238,7 +384,12 @@ class Blend(torch.autograd.Function):
         factor, opacity, under_shadow, under_layer, over = ctx.saved_tensors
         shadows, layers, edges = ctx.plan
         with_canvas = ctx.needs_input_grad[0]
-        grad = grad_image.clone() if with_canvas else torch.empty_like(grad_image)
+        contiguous = torch.contiguous_format
+        grad = (
+            grad_image.clone(memory_format=contiguous)
+            if with_canvas
+            else torch.empty_like(grad_image, memory_format=contiguous)
+        )
         # Packed pixels that lie in no picture do not exist: every entry is written.
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)

@@ -68,7 +68,8 @@ class _Parts:
 @dataclass(slots=True)
 class _Kept:
     """What the forward pass leaves to the backward one. turn (N, 2): cosine and sine of the yaws; painted: leaves and
-    results of the painter; needs: of each part, the pixels that were completed."""
+    results of the painter; needs, leaning: of each part, the pixels that were completed, and those that
+    `shading.leans`."""
 
     parts: _Parts
     pixels: Any
@@ -78,6 +79,7 @@ class _Kept:
     shadows: list[Any]
     turn: Tensor
     needs: dict[int, Tensor]
+    leaning: dict[int, Tensor]
     painted: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
 
@@ -119,6 +121,8 @@ class Photographed(torch.autograd.Function):
         ]
         darkened = array(shadow, wp.vec3f)
         needs: dict[int, Tensor] = {}
+        leaning: dict[int, Tensor] = {}
+        final = s.painter is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -131,19 +135,19 @@ class Photographed(torch.autograd.Function):
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
             launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
-            launch(shading.fill_kernel, [first, last], [pixels, looks], (), device)
-            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks], (), device)
+            leaning[start] = lean = _leaning(s.fragments.face[first:last], coverage[first:last]) + first
+            launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
+            launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
+            launch(shading.shade_kernel, [first, last], [pixels, photograph, looks, final, layers], (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, layers]
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
-            if s.painter is None:
-                launch(shading.combine_kernel, [first, last], [pixels, looks, layers], (), device)
 
         for kernel in (shading.look_kernel, ground.shadow_kernel):
             load(kernel)
         share(work, parts.edges)
-        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs)
+        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs, leaning)
         if s.painter is not None:
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
@@ -181,11 +185,7 @@ class Photographed(torch.autograd.Function):
         )
         shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
 
-        def combine(start: int, end: int) -> None:
-            first, last = parts.pixels[start], parts.pixels[end]
-            grad_look[first:last].zero_()
-            inputs = [pixels, looks, to_layers, grads]
-            launch(shading.combine_backward_kernel, [first, last], inputs, (), device)
+        final = kept.painted is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
@@ -193,22 +193,26 @@ class Photographed(torch.autograd.Function):
             launch(ground.shadow_backward_kernel, ranges, shadowed, (), device)
             if last == first:
                 return
-            if kept.painted is None:
-                combine(start, end)
+            grad_coverage[first:last].zero_()
+            if final:
+                grad_look[first:last].zero_()
                 grad_fill[first:last].zero_()
             need = kept.needs[start]
             if need.numel():
-                inputs = [array(need), pixels, vertices, photograph, looks, grads]
+                inputs = [array(need), pixels, vertices, photograph, looks, final, to_layers, grads]
                 launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
-            inputs = [pixels, photograph, looks, grads]
+            inputs = [pixels, photograph, looks, final, to_layers, grads]
             launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
-            launch(shading.keep_kernel, [first, last], [pixels, grads], (), device)
-            launch(shading.fill_backward_kernel, [first, last], [pixels, looks, grads], (), device)
+            lean = kept.leaning[start]
+            launch(shading.keep_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
+            launch(
+                shading.fill_backward_kernel, [0, lean.shape[0]], [array(lean), pixels, looks, grads], (), device
+            )
             launch(shading.look_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
 
         grad_code = None
         if kept.painted is not None:
-            combine(0, len(parts.pixels) - 1)
+            launch(shading.combine_backward_kernel, halves(size), [pixels, looks, to_layers, grads], (), device)
             leaves, painted = kept.painted
             grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
@@ -217,9 +221,14 @@ class Photographed(torch.autograd.Function):
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
             grads.put("mesh", grad_mesh)
             grads.put("halo", grad_halo)
-            grad_look += more
+            grad_look.copy_(more)
         share(work, parts.edges)
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
+
+
+def _leaning(face: Tensor, coverage: Tensor) -> Tensor:
+    """Which pixels `shading.leans`."""
+    return ((coverage < 1) & ((face >= 0) | (coverage > 0))).nonzero()[:, 0]

@@ -95,8 +95,8 @@ class Photograph:
 
 @wp.struct
 class Looks:
-    """What packed pixels show, stage by stage: where they look, at hits, and continued over the outline; premultiplied
-    RGB and opacity of mesh and halo; how much of the mesh is left to be completed."""
+    """What packed pixels show, stage by stage: where they look, continued over the outline, and of leaning pixels also
+    as found there; premultiplied RGB and opacity of mesh and halo; how much of the mesh is left to be completed."""
 
     found: wp.array(dtype=look_type)
     look: wp.array(dtype=look_type)
@@ -206,6 +206,21 @@ def own_dot(a: own_type, b: own_type):
     return total
 
 
+@wp.func
+def leans(pixels: Pixels, i: int):
+    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
+    return pixels.coverage[i] < 1.0 and (pixels.face[i] >= 0 or pixels.coverage[i] > 0.0)
+
+
+@wp.func
+def found_at(pixels: Pixels, looks: Looks, i: int):
+    """Where a pixel looks, as found, not continued over the outline."""
+    found = looks.look[i]
+    if leans(pixels, i):
+        found = looks.found[i]
+    return found
+
+
 @wp.kernel(enable_backward=False)
 def look_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: Looks):
     i = start + wp.tid()
@@ -226,7 +241,7 @@ def look_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: Looks):
         if then > NEAR_M:
             value[ch.MOVE] = (a[0] - wp.float32(at[1]) * change) / then
             value[ch.MOVE + 1] = (a[1] - wp.float32(at[2]) * change) / then
-    looks.found[i] = value
+    looks.look[i] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -237,7 +252,7 @@ def look_backward_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: 
         x = wp.float32(at[1])
         y = wp.float32(at[2])
         hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
-        v = looks.found[i]
+        v = found_at(pixels, looks, i)
         go = grads.look[i]
         # Back through the division, to the interpolated values.
         g = go
@@ -317,31 +332,28 @@ def fringe_of(pixels: Pixels, i: int):
     return out
 
 
-@wp.func
-def leans(pixels: Pixels, i: int):
-    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
-    return pixels.coverage[i] < 1.0 and (pixels.face[i] >= 0 or pixels.coverage[i] > 0.0)
+@wp.kernel(enable_backward=False)
+def find_kernel(start: int, leaning: wp.array(dtype=wp.int64), looks: Looks):
+    """Keeps what leaning pixels found, before `fill_kernel` continues what is beside them."""
+    i = wp.int32(leaning[start + wp.tid()])
+    looks.found[i] = looks.look[i]
 
 
 @wp.kernel(enable_backward=False)
-def fill_kernel(start: int, pixels: Pixels, looks: Looks):
-    i = start + wp.tid()
-    if leans(pixels, i):
-        f = fringe_of(pixels, i)
-        mean = looks.found[f.pixel[0]] * f.weight[0] + looks.found[f.pixel[1]] * f.weight[1]
-        mean += looks.found[f.pixel[2]] * f.weight[2] + looks.found[f.pixel[3]] * f.weight[3]
-        looks.look[i] = looks.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
-    else:
-        looks.look[i] = looks.found[i]
+def fill_kernel(start: int, leaning: wp.array(dtype=wp.int64), pixels: Pixels, looks: Looks):
+    i = wp.int32(leaning[start + wp.tid()])
+    f = fringe_of(pixels, i)
+    mean = found_at(pixels, looks, f.pixel[0]) * f.weight[0] + found_at(pixels, looks, f.pixel[1]) * f.weight[1]
+    mean += found_at(pixels, looks, f.pixel[2]) * f.weight[2] + found_at(pixels, looks, f.pixel[3]) * f.weight[3]
+    looks.look[i] = looks.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
 
 
 @wp.kernel(enable_backward=False)
-def keep_kernel(start: int, pixels: Pixels, grads: Gradients):
+def keep_kernel(start: int, leaning: wp.array(dtype=wp.int64), grads: Gradients):
     """Moves gradients of leaning pixels from `grad` to `kept`, so that `fill_backward_kernel` can spread them."""
-    i = start + wp.tid()
-    if leans(pixels, i):
-        grads.kept[i] = grads.look[i]
-        grads.look[i] = look_type()
+    i = wp.int32(leaning[start + wp.tid()])
+    grads.kept[i] = grads.look[i]
+    grads.look[i] = look_type()
 
 
 @wp.func
@@ -357,22 +369,23 @@ def fringe_to_coverage(pixels: Pixels, i: int, f: Fringe, to_own: float, to_weig
 
 
 @wp.kernel(enable_backward=False)
-def fill_backward_kernel(start: int, pixels: Pixels, looks: Looks, grads: Gradients):
-    i = start + wp.tid()
-    if leans(pixels, i):
-        f = fringe_of(pixels, i)
-        g = grads.kept[i]
-        rest = 1.0 - f.own
-        wp.atomic_add(grads.look, i, g * (f.own * f.hit))
-        to_own = f.hit * wp.dot(g, looks.found[i])
-        to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-        for n in range(4):
-            if f.known[n] > 0.0:
-                wp.atomic_add(grads.look, f.pixel[n], g * (rest * f.weight[n]))
-                along = wp.dot(g, looks.found[f.pixel[n]])
-                to_own -= f.weight[n] * along
-                to_weight[n] = rest * along
-        fringe_to_coverage(pixels, i, f, to_own, to_weight, grads)
+def fill_backward_kernel(
+    start: int, leaning: wp.array(dtype=wp.int64), pixels: Pixels, looks: Looks, grads: Gradients
+):
+    i = wp.int32(leaning[start + wp.tid()])
+    f = fringe_of(pixels, i)
+    g = grads.kept[i]
+    rest = 1.0 - f.own
+    wp.atomic_add(grads.look, i, g * (f.own * f.hit))
+    to_own = f.hit * wp.dot(g, looks.found[i])
+    to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    for n in range(4):
+        if f.known[n] > 0.0:
+            wp.atomic_add(grads.look, f.pixel[n], g * (rest * f.weight[n]))
+            along = wp.dot(g, found_at(pixels, looks, f.pixel[n]))
+            to_own -= f.weight[n] * along
+            to_weight[n] = rest * along
+    fringe_to_coverage(pixels, i, f, to_own, to_weight, grads)
 
 
 # --------------------------------------------------------------------------------------- looking up the photograph
@@ -559,8 +572,78 @@ def in_halo(pixels: Pixels, i: int):
     return pixels.nearest[i] >= wp.int64(0) and pixels.coverage[i] < 1.0
 
 
+# --------------------------------------------------------------------------------------------- mesh and halo as one
+
+
+@wp.func
+def lay(pixels: Pixels, looks: Looks, layers: Layers, i: int, m: wp.vec4f, h: wp.vec4f):
+    """A pixel's mesh m and halo h as one."""
+    c = wp.vec3f(0.0, 0.0, 0.0)
+    inverse = float(0.0)
+    solid = float(0.0)
+    z = float(wp.inf)
+    if in_mesh(pixels, i):
+        share = pixels.coverage[i]
+        near = looks.look[i][ch.W_NOW]
+        a = m[3] * share
+        c = wp.vec3f(m[0], m[1], m[2]) * share
+        solid = a
+        inverse = a / wp.max(near, NEAR_M)
+        z = near
+    if in_halo(pixels, i):
+        share = 1.0 - pixels.coverage[i]
+        near = looks.look[wp.int32(pixels.nearest[i])][ch.W_NOW]
+        a = h[3] * share
+        c += wp.vec3f(h[0], h[1], h[2]) * share
+        solid += a
+        inverse += a / wp.max(near, NEAR_M)
+        z = wp.min(z, near)
+    layers.colour[i] = wp.vec4f(c[0], c[1], c[2], inverse)
+    layers.opacity[i] = solid
+    layers.depth[i] = z
+
+
+@wp.func
+def to_part(looks: Looks, to_layers: Layers, i: int, j: int):
+    """The gradient to what pixel i shows of mesh or halo, by the look of pixel j, before its share."""
+    g = to_layers.colour[i]
+    return wp.vec4f(g[0], g[1], g[2], to_layers.opacity[i] + g[3] / wp.max(looks.look[j][ch.W_NOW], NEAR_M))
+
+
+@wp.func
+def to_nearness(looks: Looks, to_layers: Layers, i: int, j: int, solid: float, grads: Gradients):
+    """Adds what the gradient to opacity / depth means for the depth there. solid: the part's opacity."""
+    inverse = to_layers.colour[i][3]
+    z = looks.look[j][ch.W_NOW]
+    if inverse != 0.0 and z > NEAR_M:
+        to_z = look_type()
+        to_z[ch.W_NOW] = -inverse * solid / (z * z)
+        wp.atomic_add(grads.look, j, to_z)
+
+
 @wp.kernel(enable_backward=False)
-def shade_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Looks):
+def combine_kernel(start: int, pixels: Pixels, looks: Looks, layers: Layers):
+    i = start + wp.tid()
+    lay(pixels, looks, layers, i, looks.mesh[i], looks.halo[i])
+
+
+@wp.kernel(enable_backward=False)
+def combine_backward_kernel(start: int, pixels: Pixels, looks: Looks, to_layers: Layers, grads: Gradients):
+    i = start + wp.tid()
+    to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
+    if in_mesh(pixels, i):
+        to_mesh = to_part(looks, to_layers, i, i) * pixels.coverage[i]
+    if in_halo(pixels, i):
+        j = wp.int32(pixels.nearest[i])
+        to_halo = to_part(looks, to_layers, i, j) * (1.0 - pixels.coverage[i])
+    grads.mesh[i] = to_mesh
+    grads.halo[i] = to_halo
+
+
+@wp.kernel(enable_backward=False)
+def shade_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Looks, final: bool, layers: Layers):
+    """final: whether no painter comes before mesh and halo become one."""
     i = start + wp.tid()
     at = pixels.table[i]
     to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
@@ -585,18 +668,35 @@ def shade_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Look
     looks.mesh[i] = to_mesh
     looks.halo[i] = to_halo
     looks.fill[i] = left
+    if final:
+        lay(pixels, looks, layers, i, to_mesh, to_halo)
 
 
 @wp.kernel(enable_backward=False)
-def shade_backward_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Looks, grads: Gradients):
+def shade_backward_kernel(
+    start: int,
+    pixels: Pixels,
+    photograph: Photograph,
+    looks: Looks,
+    final: bool,
+    to_layers: Layers,
+    grads: Gradients,
+):
     i = start + wp.tid()
+    to_share = float(0.0)
     at = pixels.table[i]
     xy = wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
     wh = photograph.frame_wh[at[0]]
     if in_mesh(pixels, i):
         a = looks.look[i]
         uv = lookup(a, xy)
-        g = grads.mesh[i]
+        g = to_part(looks, to_layers, i, i)
+        m = looks.mesh[i]
+        to_share = wp.dot(g, m)
+        to_nearness(looks, to_layers, i, i, m[3] * pixels.coverage[i], grads)
+        g = g * pixels.coverage[i]
+        if not final:
+            g = grads.mesh[i]
         texel = texel_around(photograph, at[0], uv)
         c = texel.value
         to_look = look_type()
@@ -620,14 +720,22 @@ def shade_backward_kernel(start: int, pixels: Pixels, photograph: Photograph, lo
     if in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
         b = looks.look[j]
+        g2 = to_part(looks, to_layers, i, j)
+        h = looks.halo[i]
+        to_share -= wp.dot(g2, h)
+        to_nearness(looks, to_layers, i, j, h[3] * (1.0 - pixels.coverage[i]), grads)
+        g2 = g2 * (1.0 - pixels.coverage[i])
+        if not final:
+            g2 = grads.halo[i]
         texel2 = texel_around(photograph, at[0], lookup(b, xy))
         if (
             texel2.value[ch.ALPHA] != 0.0 or texel2.to_u[ch.ALPHA] != 0.0 or texel2.to_v[ch.ALPHA] != 0.0
         ):  # else there is nothing near
-            to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, grads.halo[i])
+            to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, g2)
             to_look2[ch.MOVE] += wp.dot(to_texel2, texel2.to_u)
             to_look2[ch.MOVE + 1] += wp.dot(to_texel2, texel2.to_v)
             wp.atomic_add(grads.look, j, to_look2)
+    wp.atomic_add(grads.coverage, i, to_share)
 
 
 # ------------------------------------------------------------------- completion of what the photograph did not see
@@ -823,6 +931,8 @@ def complete_kernel(
     vertices: Vertices,
     photograph: Photograph,
     looks: Looks,
+    final: bool,
+    layers: Layers,
 ):
     i = wp.int32(need[start + wp.tid()])
     at = pixels.table[i]
@@ -834,7 +944,10 @@ def complete_kernel(
     eye = eye_of(photograph, at)
     c = completed(v, facing, texel, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o])
     f = looks.fill[i]
-    looks.mesh[i] = looks.mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
+    m = looks.mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
+    looks.mesh[i] = m
+    if final:
+        lay(pixels, looks, layers, i, m, looks.halo[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -845,6 +958,8 @@ def complete_backward_kernel(
     vertices: Vertices,
     photograph: Photograph,
     looks: Looks,
+    final: bool,
+    to_layers: Layers,
     grads: Gradients,
 ):
     i = wp.int32(need[start + wp.tid()])
@@ -856,7 +971,9 @@ def complete_backward_kernel(
     eye = eye_of(photograph, at)
     facing = a[ch.TURNED] + a[ch.COS_THEN]
     c = completed(v, facing, texel.value, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o])
-    g = grads.mesh[i]
+    g = to_part(looks, to_layers, i, i) * pixels.coverage[i]
+    if not final:
+        g = grads.mesh[i]
     f = looks.fill[i]
     to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
     grads.fill[i] = grads.fill[i] + g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
@@ -873,74 +990,6 @@ def complete_backward_kernel(
     wp.atomic_add(grads.turn, o, wp.vec2d(wp.float64(to_turn[0]), wp.float64(to_turn[1])))
     light = wp.vec4d(wp.float64(to_sun[0]), wp.float64(to_sun[1]), wp.float64(to_sun[2]), wp.float64(to_sun[3]))
     wp.atomic_add(grads.sun, o, light)
-
-
-# --------------------------------------------------------------------------------------------- mesh and halo as one
-
-
-@wp.kernel(enable_backward=False)
-def combine_kernel(start: int, pixels: Pixels, looks: Looks, layers: Layers):
-    i = start + wp.tid()
-    c = wp.vec3f(0.0, 0.0, 0.0)
-    inverse = float(0.0)
-    solid = float(0.0)
-    z = float(wp.inf)
-    if in_mesh(pixels, i):
-        share = pixels.coverage[i]
-        m = looks.mesh[i]
-        near = looks.look[i][ch.W_NOW]
-        a = m[3] * share
-        c = wp.vec3f(m[0], m[1], m[2]) * share
-        solid = a
-        inverse = a / wp.max(near, NEAR_M)
-        z = near
-    if in_halo(pixels, i):
-        share = 1.0 - pixels.coverage[i]
-        h = looks.halo[i]
-        near = looks.look[wp.int32(pixels.nearest[i])][ch.W_NOW]
-        a = h[3] * share
-        c += wp.vec3f(h[0], h[1], h[2]) * share
-        solid += a
-        inverse += a / wp.max(near, NEAR_M)
-        z = wp.min(z, near)
-    layers.colour[i] = wp.vec4f(c[0], c[1], c[2], inverse)
-    layers.opacity[i] = solid
-    layers.depth[i] = z
-
-
-@wp.kernel(enable_backward=False)
-def combine_backward_kernel(start: int, pixels: Pixels, looks: Looks, to_layers: Layers, grads: Gradients):
-    i = start + wp.tid()
-    g = to_layers.colour[i]
-    to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    to_share = float(0.0)
-    if in_mesh(pixels, i):
-        m = looks.mesh[i]
-        z = looks.look[i][ch.W_NOW]
-        safe = wp.max(z, NEAR_M)
-        to_a = to_layers.opacity[i] + g[3] / safe
-        to_share = g[0] * m[0] + g[1] * m[1] + g[2] * m[2] + to_a * m[3]
-        to_mesh = wp.vec4f(g[0], g[1], g[2], to_a) * pixels.coverage[i]
-        if g[3] != 0.0 and z > NEAR_M:
-            to_z = look_type()
-            to_z[ch.W_NOW] = -g[3] * m[3] * pixels.coverage[i] / (safe * safe)
-            wp.atomic_add(grads.look, i, to_z)
-    if in_halo(pixels, i):
-        h = looks.halo[i]
-        j = wp.int32(pixels.nearest[i])
-        z = looks.look[j][ch.W_NOW]
-        safe = wp.max(z, NEAR_M)
-        to_a = to_layers.opacity[i] + g[3] / safe
-        to_share -= g[0] * h[0] + g[1] * h[1] + g[2] * h[2] + to_a * h[3]
-        to_halo = wp.vec4f(g[0], g[1], g[2], to_a) * (1.0 - pixels.coverage[i])
-        if g[3] != 0.0 and z > NEAR_M:
-            to_z = look_type()
-            to_z[ch.W_NOW] = -g[3] * h[3] * (1.0 - pixels.coverage[i]) / (safe * safe)
-            wp.atomic_add(grads.look, j, to_z)
-    grads.mesh[i] = to_mesh
-    grads.halo[i] = to_halo
-    grads.coverage[i] = to_share
 
 
 @wp.kernel(enable_backward=True)

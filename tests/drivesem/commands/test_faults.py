@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import errno
+import gc
 import itertools
 import json
 import os
 import resource
 import shutil
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
+from drivesem.attack.objective import Objective
 from drivesem.cli import main
+from drivesem.run import attack as run_attack
+from drivesem.run.frame import AttackedScene
+from drivesem.run.results import FrameResult
 from drivesem.scenes.sources import PhotographSource
 from scene_ir import files
 from scene_ir.types import SceneIR
@@ -241,3 +247,28 @@ def test_a_frame_for_which_the_device_has_no_memory(
     assert attack(tiny_kitti, out, "--keep-going") == 0
     assert done(out) == [NAMES[0], NAMES[2]]
     assert listed(out)[NAMES[1]].startswith(told)
+
+
+def test_results_are_in_their_folders_alone(
+    tiny_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While frames are attacked: those of a night take gigabytes."""
+    living: list[weakref.ref[Objective]] = []
+    write = run_attack.write_frame
+
+    def results() -> int:
+        return sum(isinstance(one, FrameResult) for one in gc.get_objects())
+
+    before = results()
+
+    def watched(attacked: AttackedScene, folder: Path) -> FrameResult:
+        gc.collect()
+        assert not [one for one in living if one() is not None], "of an earlier frame"
+        result = write(attacked, folder)
+        living.append(weakref.ref(attacked.objective))
+        assert results() <= before + 1
+        return result
+
+    monkeypatch.setattr(run_attack, "write_frame", watched)
+    assert attack(tiny_kitti, tmp_path / "run") == 0
+    assert len(living) == len(NAMES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import platform
 import re
 import signal
 import subprocess
@@ -216,3 +217,28 @@ def _lives(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+_PINS: list[bytearray] = []
+
+
+def resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def scatter(job: int) -> float:
+    """Take 240 MB in small pieces, and let go of all but one in a hundred of them. How much was taken."""
+    before = resident_mb()
+    pieces = [bytearray(b"x" * 30_000) for _ in range(8_000)]
+    _PINS.extend(pieces[::100])
+    return resident_mb() - before
+
+
+@_NO_PROC
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc's malloc_trim")
+def test_memory_that_is_free_goes_back_after_each_job() -> None:
+    before = resident_mb()
+    for _, outcome in outcomes(scatter, stumbling, [1, 2, 3], Sharing(workers=1)):
+        assert outcome() > 150
+        assert resident_mb() - before < 60
+    _PINS.clear()
