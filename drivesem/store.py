@@ -49,12 +49,15 @@ class _Version:
 
 
 class Store:
-    """A folder of a store. setting: what named it on the command line."""
+    """A folder of a store. setting: what named it on the command line; home: for its copy, by default the user's
+    cache. In another process, or on another machine, the copy lies under the same name.
+    """
 
-    def __init__(self, url: str, setting: str) -> None:
+    def __init__(self, url: str, setting: str, home: Path | None = None) -> None:
         self.url, self._setting = url.rstrip("/"), setting
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drivesem" / "stores"
-        self._home = home / hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        name = hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        self._home = home or cache / "drivesem" / "stores" / name
         # A run is called as its folder is.
         self.folder = (
             self._home / "copy" / (re.sub(r"[^\w.-]", "_", self.url.rsplit("/", 1)[-1]).strip(".") or "_")
@@ -62,6 +65,9 @@ class Store:
         self._known: dict[str, _Version | None] = {}
         self._read: set[str] = set()
         self._not_before = 0.0
+
+    def __reduce__(self) -> tuple[type[Store], tuple[str, str, Path]]:
+        return type(self), (self.url, self._setting, self._home)
 
     def fetch(self) -> None:
         """Bring here what the store has and the copy lacks. Raises UsageError for a store that cannot be read."""
@@ -322,26 +328,20 @@ def stored(config: C) -> Iterator[C]:
     if not isinstance(config, Output) or config.out is None or not is_url(config.out):
         yield config
         return
-    store = opened(config.out)
+    store = Store(config.out, "--out")
+    write_to(store)
     try:
         store.fetch()
         yield replace(config, out=str(store.folder))
         store.keep(now=True)
     finally:
-        closed()
+        write_to(None)
 
 
-def opened(url: str) -> Store:
-    """From now on `keep` is about this store."""
+def write_to(store: Store | None) -> None:
+    """From now on this process' command writes there."""
     global _open
-    _open = Store(url, "--out")
-    return _open
-
-
-def closed() -> None:
-    """From now on `keep` is about nothing."""
-    global _open
-    _open = None
+    _open = store
 
 
 def current() -> Store | None:

@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,9 +26,11 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 J = TypeVar("J")
-_PATIENCE_S = 10.0
+_PATIENCE_S, _PAUSE_S = 10.0, 1.0
 _TRIES = 3
-"""How often a job may be in hand when a process ends, before it is listed."""
+"""How often a process may end with a job in hand, before that is listed; and before it is ready, until it is given
+up.
+"""
 
 
 class _Process:
@@ -50,11 +53,14 @@ class _Process:
 
 @dataclass(frozen=True, slots=True)
 class _InHand:
-    """An actor and the job that it does, None while it is getting ready. tries: of the job, before this one."""
+    """An actor and the job that it does, None while it is getting ready. tries: of the job, before this one; gone:
+    how often in a row the actor ended before it was ready.
+    """
 
     actor: Any
     job: Any = None
     tries: int = 0
+    gone: int = 0
 
 
 def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J, Callable[[], Any]]]:
@@ -107,8 +113,12 @@ def _shared(
         except ray.exceptions.RayActorError as error:
             if getattr(error, "actor_init_failed", False):
                 raise
-            # Begun anew by Ray where there is room: only then it gets a job again.
-            pending[hand.actor.ready.remote()] = _InHand(hand.actor)
+            # Begun anew by Ray where there is room: only then it gets a job again. Or never: where the head takes
+            # this machine for lost, it ends all that this process began.
+            gone = hand.gone + (hand.job is None)
+            if gone < _TRIES:
+                time.sleep(_PAUSE_S * gone)
+                pending[hand.actor.ready.remote()] = _InHand(hand.actor, gone=gone)
             ready = False
             if hand.job is not None and hand.tries + 1 < _TRIES:
                 left.appendleft((hand.job, hand.tries + 1))
@@ -121,6 +131,9 @@ def _shared(
             yield hand.job, outcome
         if not left and not any(one.job is not None for one in pending.values()):
             return
+    raise UsageError(
+        "--engine", "a Ray cluster that lasts (the same command goes on)", "none of its processes left"
+    )
 
 
 def _hand_over(result: Any, error: Exception | None) -> Any:

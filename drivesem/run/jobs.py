@@ -38,7 +38,7 @@ class Start:
     build: Callable[[], Callable[[Any], Any]]
     threads: int
     keep_going: bool
-    url: str | None = None
+    elsewhere: store.Store | None = None
 
 
 def begin(start: Start) -> None:
@@ -46,8 +46,7 @@ def begin(start: Start) -> None:
     global _work
     keep_freed()
     torch.set_num_threads(start.threads)
-    if start.url is not None:
-        store.opened(start.url)
+    store.write_to(start.elsewhere)
     _work = partial(attempt, start.build(), start.keep_going)
 
 

@@ -56,9 +56,7 @@ def _outcomes(
     apart: bool,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     if config.engine == "ray":
-        elsewhere = store.current()
-        url = None if elsewhere is None else elsewhere.url
-        yield from on_ray(Start(build, 1, config.keep_going, url), jobs, config)
+        yield from on_ray(Start(build, 1, config.keep_going, store.current()), jobs, config)
         return
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,7 +72,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     Plain.writes_left, Plain.raised = float("inf"), KeyboardInterrupt
     MemoryFileSystem.store.clear()
     yield another
-    store.closed()
+    store.write_to(None)
 
 
 def write(folder: Path, told: dict[str, str]) -> None:
@@ -171,6 +172,14 @@ def test_between_commits_there_is_what_was_there_at_one(tmp_path: Path, machine:
             break
     assert reached == 2
     assert cut > 12
+
+
+def test_on_another_machine_the_copy_lies_under_the_same_name(tmp_path: Path, machine: Any) -> None:
+    one = Store(f"plain://{tmp_path}/run", "--out")
+    machine()
+    other = pickle.loads(pickle.dumps(one))
+    assert (other.url, other.folder) == (one.url, one.folder)
+    assert Store(one.url, "--out").folder != one.folder
 
 
 def test_damaged_files_are_not_there_and_names_stay_in_the_folder(tmp_path: Path, machine: Any) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 import ray
 
 from drivesem.cli import main
+from drivesem.run import cluster as clusters
 from drivesem.run.workers import outcomes
 from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
@@ -93,6 +95,27 @@ def test_a_node_that_is_gone_costs_what_it_had_in_hand(tmp_path: Path, cluster: 
     assert sum(len((tmp_path / str(job)).read_text()) for job in jobs) <= len(jobs) + 1
 
 
+def test_processes_that_never_come_back_end_it_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where the head takes the machine of the command for lost."""
+
+    class Gone:
+        exceptions = ray.exceptions
+
+        def wait(self, references: list[object], num_returns: int) -> tuple[list[object], list[object]]:
+            return references[:1], references[1:]
+
+        def get(self, reference: object) -> None:
+            raise ray.exceptions.ActorDiedError
+
+    class Actor:
+        class ready:  # noqa: N801
+            remote = object
+
+    monkeypatch.setattr(clusters, "_PAUSE_S", 0.0)
+    with pytest.raises(UsageError, match="--engine: expected a Ray cluster that lasts"):
+        list(clusters._shared(Gone(), [Actor(), Actor()], deque([(1, 0)])))  # type: ignore[arg-type]
+
+
 def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And not what RAY_ADDRESS or the last cluster's file speak of."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
@@ -114,40 +137,56 @@ def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[s
         Sharing(address="auto").check()
 
 
-@pytest.mark.slow
-def test_each_command_that_works_through_frames_makes_on_a_cluster_what_it_makes_here(
+Alike = Callable[..., None]
+
+
+@pytest.fixture
+def alike(
     tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+) -> Alike:
+    """Runs a command here and on the cluster, and compares its two folders, but for the files that are named."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    data, ray_words = tmp_path / "kitti", ("--engine", "ray", "--address", cluster.address)
 
-    def alike(words: list[str], out: str, *figures: str) -> None:
-        told, others = [], (*figures, "config.yaml")
-        for folder, sharing in ((out, ("--workers", "2")), (f"{out}-ray", ray_words)):
-            capsys.readouterr()
-            if sharing == ray_words:
-                assert main([*words, *sharing, "--out", str(tmp_path / folder), "--json"]) == 0
-            else:
-                alone = [sys.executable, "-m", "drivesem.cli", *words, *sharing, "--out", str(tmp_path / folder)]
-                subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
+    def run(words: list[str], out: str, *figures: str) -> None:
+        told, others = [], (*figures, "config.yaml", ".lock")
+        alone = [sys.executable, "-m", "drivesem.cli", *words, "--workers", "1", "--out", str(tmp_path / out)]
+        subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
+        shared = ["--engine", "ray", "--address", cluster.address, "--out", str(tmp_path / f"{out}-ray"), "--json"]
+        assert main([*words, *shared]) == 0
+        for folder in (out, f"{out}-ray"):
             told.append({n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(others)})
         assert told[0] == told[1]
         assert told[0]
 
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
+    tmp_path: Path, cluster: Any, alike: Alike
+) -> None:
     alike(["synth", "--frames", "2", "--seed", "5"], "kitti")
-    read = ["--dataset", "kitti", "--root", str(data)]
+    read = ["--dataset", "kitti", "--root", str(tmp_path / "kitti")]
     alike(["derender", "--no-fit", *read], "scenes")
     alike(["eval", "--detector", "squeezedet", *read], "figures")
-    study = ["study", "labels", "--quick", "--limit", "1", "--steps", "1", "--peer", "off", "--bootstrap", "0"]
-    alike(study, "study", "study.", "largest", "label_sets")
-    run = tmp_path / "study" / "arms" / "translate"
-    alike(["confirm", "--run", str(run)], "confirm")
-    alike(["holes", str(run), "--samples", "24", "--fresh", "8"], "holes")
     # Each machine brings what it made to the store; this one fetches it.
     url = f"file://{tmp_path}/elsewhere/kitti"
-    assert main(["synth", "--frames", "2", "--seed", "5", *ray_words, "--out", url]) == 0
-    assert contents(place(url)) == contents(data)
+    words = ["synth", "--frames", "2", "--seed", "5", "--engine", "ray", "--address", cluster.address]
+    assert main([*words, "--out", url]) == 0
+    (tmp_path / "kitti" / ".lock").unlink()
+    assert contents(place(url)) == contents(tmp_path / "kitti")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_studies_and_questions_by_a_cluster_are_those_asked_here(tmp_path: Path, alike: Alike) -> None:
+    study = ["study", "labels", "--quick", "--limit", "1", "--steps", "1", "--peer", "off", "--bootstrap", "0"]
+    alike(study, "study", "study.", "largest", "label_sets", "arms/combo")
+    run = str(tmp_path / "study" / "arms" / "translate")
+    alike(["confirm", "--run", run], "confirm")
+    alike(["holes", run, "--samples", "24", "--fresh", "8"], "holes")
 
 
 @pytest.mark.slow
