@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from drivesem.run.jobs import Start, begin, do, ended
@@ -71,7 +70,7 @@ def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J
     """
     if not jobs:
         return
-    ray = _loaded(config.address)
+    ray = _loaded()
     if not ray.is_initialized():  # it stays until this process ends: commands ask more than once
         _connect(ray, config.address)
     count = min(config.workers or max(int(ray.cluster_resources().get("CPU", 1)), 1), len(jobs))
@@ -86,14 +85,15 @@ def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J
 
 def _connect(ray: ModuleType, address: str | None) -> None:
     host, _, port = (address or "").removeprefix("ray://").rpartition(":")
-    before = signal.getsignal(signal.SIGTERM)
+    before, expected = signal.getsignal(signal.SIGTERM), "a Ray cluster"
     try:
         if host and port.isdecimal():  # Ray itself would go on asking for minutes
             socket.create_connection((host, int(port)), _PATIENCE_S).close()
         # Not whatever cluster ran here last, which is what Ray takes without an address.
+        expected = "a Ray cluster (which may ask for RAY_AUTH_MODE=token)"
         ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR")
     except OSError as error:
-        raise UsageError("--address", "a Ray cluster", f"{address}: {error}") from error
+        raise UsageError("--address", expected, f"{address}: {error}") from error
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
 
@@ -142,10 +142,7 @@ def _hand_over(result: Any, error: Exception | None) -> Any:
     return result
 
 
-def _loaded(address: str | None) -> ModuleType:
-    if address is not None and (Path.home() / ".ray" / "auth_token").is_file():
-        # `ray start` asks for this token where it finds it; `ray.init` shows it, but only when told so.
-        os.environ.setdefault("RAY_AUTH_MODE", "token")
+def _loaded() -> ModuleType:
     try:
         import ray
     except ImportError as error:
