@@ -25,7 +25,19 @@ from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.errors import SceneError
-from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth, weather
+from tools.bench import (
+    depth,
+    derender,
+    evaluation,
+    found,
+    label_free,
+    moves,
+    parts,
+    redraw,
+    rivals,
+    synth,
+    weather,
+)
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -50,6 +62,7 @@ def run(config: BenchTool) -> int:
     config.check()
     measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
         "derender": _derender,
+        "parts": _parts,
         "depth": _depth,
         "found": _found,
         "label-free": _label_free,
@@ -71,6 +84,12 @@ def _derender(config: BenchTool, console: Console) -> Measured:
     rows = list(watched(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)
+
+
+def _parts(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    rows = list(watched(parts.measure(config), len(label_free.names(config)), console))
+    return _measured(parts, {"rows": [asdict(row) for row in rows], "summary": parts.summary(rows)})
 
 
 def _depth(config: BenchTool, console: Console) -> Measured:
