@@ -152,7 +152,9 @@ def _kept_scenes(config: Scenes) -> KeptScenes | None:
         return None
     from drivesem.scenes.kept import KeptScenes
 
-    return KeptScenes(Path(config.cache), config.cache_gb)
+    kept = KeptScenes(Path(config.cache), config.cache_gb)
+    kept.make_room()  # the limit may be lower than the last command's, and this one may add nothing
+    return kept
 
 
 def open_source(config: Scenes) -> SceneSource:
