@@ -25,7 +25,7 @@ layers = [torch.zeros(n << 18) for n in (8, 16, 30)]
 del layers
 print(told().fordblks >> 20)
 """
-"""How many MB glibc has at hand of 54 that were freed. Counted by glibc: the system takes pages away as it likes."""
+"""How many MB of 54 that were freed glibc has at hand. Faults do not tell: the system may take pages away."""
 
 
 def kept_mb(how: str, **environment: str) -> int:
