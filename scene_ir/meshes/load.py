@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -147,15 +148,15 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     files.write_bytes(file, content)
 
 
-class _Beside(trimesh.resolvers.Resolver):
+class _Beside(Resolver):
     """Files that a mesh file names, such as materials and textures: regular ones below `root`, of `most` bytes."""
 
     def __init__(self, folder: Path, root: Path, most: int) -> None:
         self._folder, self._root, self._most = folder, root, most
 
-    def get(self, name: str) -> bytes:
+    def get(self, key: str) -> bytes:
         """What is in the file. Raises FormatError."""
-        path = self._folder / name.strip().replace("\\", "/")
+        path = self._folder / key.strip().replace("\\", "/")
         if not path.resolve().is_relative_to(self._root.resolve()):
             raise FormatError(str(path), f"a file in {self._root}", "one elsewhere")
         return files.read_bytes(path, self._most)
