@@ -13,14 +13,13 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pycocotools import mask as run_length
 
-from drivesem.data.classes import ClassMap
 from drivesem.data.frames import PNG_COMPRESSION, Frames, as_photograph, check_focal, images_by_place, pinhole
 from drivesem.data.label_table import (
     REGION,
@@ -32,6 +31,7 @@ from drivesem.data.label_table import (
     shortest,
     to_coco,
 )
+from drivesem.data.photographs import focal_of, read_pixels
 from drivesem.data.truth import Exposure, Place, TrackedObject
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -44,12 +44,7 @@ CATEGORIES = {
 }
 """KITTI's types and their supercategory; ids are counted from 1, in this order."""
 CATEGORY_IDS = {name: i + 1 for i, name in enumerate(CATEGORIES)}
-COCO_ROAD_USERS = ClassMap(
-    classes={"car": "Car", "truck": "Truck", "person": "Pedestrian"},
-    ignored={"bus": None, "train": None, "bicycle": "Cyclist", "motorcycle": "Cyclist"},
-)
-"""The classes of COCO 2017 that are on the road. A KITTI cyclist includes the bicycle, so that a bicycle alone is
-neither; buses and trains look like nothing the detectors know."""
+Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _SHOWN = 3
 """Ids that an error names."""
 
@@ -302,10 +297,15 @@ class _Rows:
             if not isinstance(row.get(key, ""), str):
                 raise FormatError(self.at(i, key), "text", json.dumps(row[key])[:60])
 
-    def own(self, key: str) -> NDArray[np.int64]:
-        """As `whole`, each once."""
-        ids = self.whole(key)
-        seen: set[int] = set()
+    def ids(self, key: str) -> Ids:
+        """Whole numbers (N,), or texts where all are, under a key. FormatError naming a row with neither."""
+        values = [row.get(key) for row in self.rows]
+        return np.array(values, np.str_) if values and set(map(type, values)) == {str} else self.whole(key)
+
+    def own(self, key: str) -> Ids:
+        """As `ids`, each once."""
+        ids = self.ids(key)
+        seen: set[int | str] = set()
         for i, value in enumerate(ids.tolist()):
             if value in seen:
                 raise FormatError(self.at(i, key), "an id of its own", value)
@@ -344,11 +344,16 @@ class _Rows:
                 raise FormatError(self.at(i, "bbox"), expected, json.dumps(value)[:60])
         return np.array(values, dtype=np.float64).reshape(len(values), 4)
 
-    def places(self, key: str, ids: NDArray[np.int64], what: str) -> NDArray[np.int64]:
-        """The place of each row's number under a key among `ids`. FormatError naming one that is not there."""
-        values = self.whole(key)
+    def places(self, key: str, ids: Ids, what: str) -> NDArray[np.int64]:
+        """The place of each row's id under a key among `ids`. FormatError naming one that is not there."""
+        values = self.ids(key)
+        if len(values) and len(ids) and values.dtype.kind != ids.dtype.kind:
+            kind = "texts" if ids.dtype.kind == "U" else "whole numbers"
+            raise FormatError(
+                self.at(0, key), f"{kind}, as the ids of the {what} are", json.dumps(values[0].item())
+            )
         order = np.argsort(ids)
-        found = values * 0
+        found = np.zeros(len(values), np.int64)
         other = np.ones(len(values), np.bool_)
         if len(ids):
             found = order[np.searchsorted(ids[order], values).clip(0, len(ids) - 1)]
@@ -452,8 +457,9 @@ class _File:
             raise FormatError(str(path), "images, annotations and categories", found)
         self.path = path
         tables = {n: _Rows.of(f"{path}: {n}", content.get(n)) for n in ("images", "categories", "annotations")}
-        self.images, self.image_ids = _by_id(tables["images"])
-        self.categories, self.category_ids = _by_id(tables["categories"])
+        self.images, self.image_ids = _by_id(tables["images"], tables["images"].own("id"))
+        tables["categories"].own("id")
+        self.categories, self.category_ids = _by_id(tables["categories"], tables["categories"].whole("id"))
         self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
         self.annotations = tables["annotations"]
         self.images.texts("file_name")
@@ -462,8 +468,7 @@ class _File:
         self.kind = self.annotations.places("category_id", self.category_ids, "categories")
 
 
-def _by_id(rows: _Rows) -> tuple[_Rows, NDArray[np.int64]]:
-    ids = rows.own("id")
+def _by_id(rows: _Rows, ids: Ids) -> tuple[_Rows, Any]:
     order = np.argsort(ids, kind="stable")
     return rows.some(order.tolist()), ids[order]
 
@@ -525,7 +530,7 @@ def _results(path: Path, content: list[Any], truth: LabelTable | None) -> LabelT
         raise FormatError(str(path), "labels beside a list of results", "none")
     if truth.kind_ids is None:
         raise FormatError(str(path), "categories (a COCO data set), as the labels are no COCO file", "a list")
-    image_ids = truth.image_ids
+    image_ids: Ids | None = truth.image_ids
     if image_ids is None:
         image_ids = np.array([int(name) if name.isdecimal() else -1 for name in truth.frames], np.int64)
     rows = _Rows.of(str(path), content)
@@ -561,7 +566,8 @@ class CocoDataset(Frames[_Image]):
     root: the folder that holds `annotations/instances_*.json`, all of which are read, or one JSON file. images:
     where the images lie; by default `images/PART`, `PART`, `images`, `PART` with its year ("val2017") beside
     `annotations`, or the JSON's own folder, whichever is there first. focal_px: the focal length of images without
-    "camera". kinds: categories that are objects here, the others are background; None: all.
+    "camera"; by default EXIF's, or a usual one. kinds: categories that are objects here, others are background;
+    None: all.
 
     A frame's identifier is its file name without suffix, folders joined by "_". `kind` is the category's name as
     written; `COCO_ROAD_USERS` reads COCO's own. Unknown truncation and 3D boxes are NaN, unknown occlusion 3, as
@@ -628,14 +634,15 @@ class CocoDataset(Frames[_Image]):
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph, camera, labels, and masks (M, H, W) where every object has a segmentation.
 
-        Raises FormatError naming the file and field: an image that is missing or of another size; an image without
-        "camera" where no focal_px was given; a segmentation that does not decode.
+        Raises FormatError naming the file and field: an image that is missing or of another size; a camera that is
+        none; a segmentation that does not decode.
         """
         entry = self._entry(identifier)
         path, record = entry.told.path, entry.record
-        camera = self._camera(f"{path}: {record['file_name']}", record)
+        size_hw = (record["height"], record["width"])
+        image = read_pixels(entry.path, size_hw)
+        camera, told = self._camera(entry)
         labels = self.labels(identifier)
-        image = files.read_image(entry.path, (camera.height, camera.width))
         rows, _, objects = self._things(identifier)
         rows = rows.some(objects.tolist())
         masks = None
@@ -650,15 +657,16 @@ class CocoDataset(Frames[_Image]):
             camera=camera,
             labels=labels,
             masks=masks,
-            provenance={"dataset": "coco", "image": str(record["file_name"]), "folder": path.name},
+            provenance={"dataset": "coco", "image": str(record["file_name"]), "folder": path.name, **told},
         )
 
-    def _camera(self, where: str, record: Mapping[str, Any]) -> Camera:
+    def _camera(self, entry: _Image) -> tuple[Camera, dict[str, str]]:
+        """The camera of an image, and what its provenance says of it."""
+        record, where = entry.record, f"{entry.told.path}: {entry.record['file_name']}"
         height, width = record["height"], record["width"]
         if "camera" not in record:
-            if self.focal_px is None:
-                raise FormatError(f"{where}: camera", "intrinsics, or a focal length (focal_px)", "neither")
-            return pinhole(height, width, self.focal_px)
+            focal = focal_of(entry.path, self.focal_px)
+            return pinhole(height, width, focal.length_px), {"focal": str(focal)}
         camera = record["camera"] if isinstance(record["camera"], dict) else {}
         if "projection" in camera:
             values = _numbers(f"{where}: camera.projection", camera["projection"], 12)
@@ -670,7 +678,7 @@ class CocoDataset(Frames[_Image]):
             )
             projection, intrinsics = None, torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
-            return Camera(intrinsics, height, width, projection)
+            return Camera(intrinsics, height, width, projection), {}
         except SceneError as error:
             raise FormatError(f"{where}: {error.field}", error.expected, error.actual) from error
 

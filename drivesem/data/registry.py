@@ -77,9 +77,9 @@ _TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Wr
 LAYOUTS = tuple(_TABLE_WRITERS)
 
 
-def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
+def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_px: float | None = None) -> Dataset:
     """The data set `name` under `root`, a folder or its URL. with_points: read laser points too, which only KITTI
-    has.
+    has. focal_px: of photographs in COCO's and YOLO's layouts that tell no camera.
 
     RangeError for an unknown name, or one without points; FormatError for a bad folder; UsageError for a URL that
     cannot be read.
@@ -90,6 +90,8 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Data
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
         return kitti.KittiDataset(place(root), with_points=True)
+    if name in ("coco", "yolo"):
+        return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(place(root), focal_px=focal_px)
     return DATASETS[name](place(root))
 
 

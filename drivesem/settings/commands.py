@@ -16,6 +16,8 @@ import tyro
 from drivesem.settings.blocks import (
     DATASETS,
     DEMO,
+    FINDER,
+    SCENES,
     Asking,
     Attacking,
     Bootstrap,
@@ -230,9 +232,10 @@ class Derender(Scenes, FrameCommand):
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
-    """A photograph without labels: vehicles are found by the shipped detector and placed by a small network."""
-    focal: Annotated[float, Within(0, ends="()", expected="positive px")] | None = None
-    """Focal length of PHOTO in px; by default EXIF's, or 0.58 of its longer side."""
+    """A photograph without labels, or a folder of them: vehicles are found by a detector and placed by a small
+    network."""
+    finder: Annotated[str, tyro.conf.arg(aliases=["--detector"])] = FINDER
+    """Of PHOTO, and of --dataset photographs: the detector that finds the vehicles, shipped or a file."""
     velodyne: Flag = False
     """Read the laser's points too (KITTI, where a frame has them)."""
     fit: bool = True
@@ -252,13 +255,17 @@ class Derender(Scenes, FrameCommand):
         alone, beside = self.photo is None, f"--dataset {self.dataset}"
         demo = self.dataset == DEMO
         refuse(not alone and not demo, "PHOTO", "no --dataset beside it", beside)
-        refuse(self.focal is not None and alone, "--focal", "a PHOTO beside it", "none")
         photographs = "a PHOTO or a --dataset of photographs beside it"
         refuse(self.meshes is not None and alone and demo, "--meshes", photographs, beside)
         refuse(self.segmenter is not None and alone and demo, "--segmenter", photographs, beside)
         refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti beside it", beside)
         refuse(self.device != "cpu", "--device", "cpu", self.device)
         refuse(self.cache is not None, "--cache", "none: scenes are what is written", self.cache)
+        refuse(self.dataset == SCENES, "--dataset", "photographs to take apart", beside)
+
+    def _check_photographs(self, beside: str) -> None:
+        if self.photo is None:
+            super()._check_photographs(beside)
 
 
 @dataclass(frozen=True, kw_only=True)
