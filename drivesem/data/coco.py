@@ -203,9 +203,11 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     records: list[dict[str, Any]] = []
     for i, (name, identifier) in enumerate(zip(names, table.frames, strict=True)):
         suffix = images[identifier].suffix.lower() if identifier in images else ".png"
+        file_name = f"{name}{suffix}" if identifier in images else table.image_files.get(i, f"{name}{suffix}")
         width, height = table.sizes_wh[i].tolist()
-        record = {"id": image_ids[i], "file_name": f"{name}{suffix}", "width": width, "height": height}
-        records.append(record | ({"camera": table.cameras[i]} if i in table.cameras else {}))
+        record = {"id": image_ids[i], "file_name": file_name, "width": width, "height": height}
+        record |= {"camera": table.cameras[i]} if i in table.cameras else {}
+        records.append(record | ({"drivesem": table.told[i]} if i in table.told else {}))
     annotations: list[dict[str, Any]] = []
     own = [] if table.box_ids is None else table.box_ids.tolist()
     free = max(own, default=0) + 1

@@ -227,12 +227,20 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     if folder is None:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
     paths = text_files(folder)
-    lines = _Lines([str(file) for file in paths], [files.read_text(file) for file in paths], scored)
+    table = table_of({file.stem: file for file in paths}, scored)
+    if scored and not len(table):
+        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
+    return table
+
+
+def table_of(paths: Mapping[str, Path], scored: bool = False) -> LabelTable:
+    """The labels, or detections where `scored`, of label files by their frames. FormatError as `_Lines`."""
+    lines = _Lines(
+        [str(file) for file in paths.values()], [files.read_text(file) for file in paths.values()], scored
+    )
     if not scored:
         lines.check_sizes()
-    if scored and not lines.kinds:
-        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    return lines.table([file.stem for file in paths], scored)
+    return lines.table(list(paths), scored)
 
 
 def _line(

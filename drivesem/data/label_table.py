@@ -60,7 +60,9 @@ class LabelTable:
     pose (N, 7): length, height, width, x, y, z m, yaw rad, NaN where unknown; area (N,) px^2, NaN where unknown.
     sizes_wh (F, 2) px, 0 where unknown; image_ids (F,), box_ids (N,), kind_ids: COCO's ids, where known, of images
     also texts.
-    extra: further columns (N) by name, None where a box has none; cameras: by frame, COCO's "camera" entries.
+    extra: further columns (N) by name, None where a box has none; cameras: by frame, COCO's "camera" entries;
+    image_files: by frame, where its image lies if it is not named after the frame; told: by frame, what else is
+    known of it, as JSON.
     """
 
     frames: tuple[str, ...]
@@ -82,6 +84,8 @@ class LabelTable:
     kind_ids: NDArray[np.int64] | None = None
     extra: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     cameras: Mapping[int, Any] = field(default_factory=dict)
+    image_files: Mapping[int, str] = field(default_factory=dict)
+    told: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -154,6 +158,8 @@ class LabelTable:
             sizes_wh=sizes,
             image_ids=ids,
             cameras={int(new[i]): camera for i, camera in self.cameras.items() if new[i] >= 0},
+            image_files={int(new[i]): name for i, name in self.image_files.items() if new[i] >= 0},
+            told={int(new[i]): words for i, words in self.told.items() if new[i] >= 0},
         )
 
     def labels(self) -> Labels:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.data import coco, kitti, vkitti1, vkitti2, yolo
+from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.virtual import VirtualDataset
@@ -67,7 +67,7 @@ WRITERS: dict[str, Callable[[Path], Writer]] = {
 """Writers by the name of their layout."""
 
 
-_TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+_TABLE_WRITERS: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
     "kitti": kitti.write_table,
     "coco": coco.write_table,
     "yolo": yolo.write_table,
@@ -75,6 +75,10 @@ _TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Wr
     "vkitti2": vkitti2.write_table,
 }
 LAYOUTS = tuple(_TABLE_WRITERS)
+"""That are read and written."""
+_WRITTEN_ONLY: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+    "fiftyone": fiftyone.write_table
+}
 
 
 def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_px: float | None = None) -> Dataset:
@@ -147,7 +151,7 @@ def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, 
     out: a folder, or a .json file for COCO. Numbers are written so that they read back as they were; sums of
     decimals are rounded to 1e-9 px. FormatError for what the layout cannot do without.
     """
-    return _TABLE_WRITERS[layout](table, out, images)
+    return (_TABLE_WRITERS | _WRITTEN_ONLY)[layout](table, out, images)
 
 
 def images_beside(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from scene_ir.derender.derender import DerenderSettings
 
 DEMO_SCENES = 10
-_RECORD = "scene.json"
-"""What every scene's folder has."""
+_RECORD, _BEFORE = "scene.json", "before"
+"""What every scene's folder has, and some hold."""
 _MOST_FACES = 5000
 """Of a user's mesh, as of the heaviest template: more show in no photograph, and cost time in every fit."""
 
@@ -148,12 +148,7 @@ class SceneFolders:
     """
 
     def __init__(self, root: Path) -> None:
-        records = [root / _RECORD] if (root / _RECORD).is_file() else sorted(root.rglob(_RECORD))
-        if not records:
-            raise FormatError(str(root), f"a scene of drivesem derender ({_RECORD}), or folders of some", "none")
-        self._folders = {_named(record.parent, root): record.parent for record in records}
-        if len(self._folders) < len(records):
-            raise FormatError(str(root), "scenes with names of their own", "two alike")
+        self._folders = scene_folders(root)
 
     def identifiers(self) -> Iterator[str]:
         return iter(self._folders)
@@ -167,6 +162,19 @@ class SceneFolders:
         from scene_ir.io import load_scene
 
         return load_scene(self._folders[identifier]).as_photographed()
+
+
+def scene_folders(root: Path) -> dict[str, Path]:
+    """The scenes that a folder is or holds, by name. FormatError where there is none."""
+    records = [root / _RECORD] if (root / _RECORD).is_file() else sorted(root.rglob(_RECORD))
+    # a scene whose vehicles were exchanged holds the one before
+    records = [record for record in records if record.parent.name != _BEFORE]
+    if not records:
+        raise FormatError(str(root), f"a scene of drivesem derender ({_RECORD}), or folders of some", "none")
+    folders = {_named(record.parent, root): record.parent for record in records}
+    if len(folders) < len(records):
+        raise FormatError(str(root), "scenes with names of their own", "two alike")
+    return folders
 
 
 def _named(folder: Path, root: Path) -> str:

@@ -759,13 +759,16 @@ class Check(Tiles, Device, Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Command):
-    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, and say what is lost."""
+    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, or to FiftyOne, and say what is lost."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file."""
+    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or
+    the counterexamples of a run of drivesem attack."""
     out: Annotated[str, tyro.conf.arg(aliases=["-o"])]
     """Folder to write, new or empty; or a .json file for COCO."""
-    to_format: Annotated[Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2"], tyro.conf.arg(aliases=["--to"])]
+    to_format: Annotated[
+        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone"], tyro.conf.arg(aliases=["--to"])
+    ]
     """Layout to write."""
     from_format: Annotated[
         Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"], tyro.conf.arg(aliases=["--from"])
@@ -778,9 +781,30 @@ class Convert(Command):
     image_size: str | None = None
     """WIDTHxHEIGHT of all images, px, instead of looking at them."""
     copy_images: Flag = False
-    """Also copy the images into the new layout (KITTI, COCO and YOLO)."""
+    """Also copy the images into the new layout."""
     map: Annotated[str, Parsed(class_map)] | None = None
     """Classes by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Hand a run's counterexamples on: as training data with moved labels, as tables, or as 3D files."""
+
+    run: Run = None
+    """Folder of a run of drivesem attack; for gltf also a scene of drivesem derender, or a folder of some."""
+    out: Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])] = None
+    """Folder to write, new or empty."""
+    to_format: Annotated[
+        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone", "tables", "gltf"],
+        tyro.conf.arg(aliases=["--to"]),
+    ]
+    """kitti, coco, yolo, vkitti1, vkitti2, fiftyone: a data set with its images, and where each is from; coco also
+    holds what the detector found. tables: frames, failures and parameters as CSV, and as Parquet where pyarrow is
+    there. gltf: vehicles and surroundings in 3D, textured by the photograph."""
+    grade: Literal["all", "threshold", "certain", "confirmed", "shared"] = "threshold"
+    """Frames with a failure of at least this grade (docs/grades.md); all: also those that withstood."""
+    map: Annotated[str, Parsed(class_map)] | None = None
+    """Classes by name, with commas: Car=car,Truck=truck; Truck=- leaves a class out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -908,7 +932,7 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Check, Anchors, Train, Retrain),
+    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""
