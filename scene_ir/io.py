@@ -133,15 +133,7 @@ def load_scene(folder: Path) -> SceneIR:
     if not folder.is_dir():
         raise FormatError(str(folder), "a folder with a scene", "no such folder")
     root = _record(folder)
-    camera_node = root["camera"]
-    camera = camera_node.build(
-        lambda: Camera(
-            camera_node["intrinsics"].tensor(3, 3),
-            camera_node["height"].integer(),
-            camera_node["width"].integer(),
-            None if camera_node["projection"].value is None else camera_node["projection"].tensor(3, 4),
-        )
-    )
+    camera = _camera(root["camera"])
     size = (camera.height, camera.width)
     arrays = _Arrays(folder / "arrays.npz")
     images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
@@ -185,6 +177,22 @@ def load_scene(folder: Path) -> SceneIR:
             provenance=provenance,
             front=front,
             before=before,
+        )
+    )
+
+
+def load_camera(folder: Path) -> Camera:
+    """The camera of the scene in `folder`, from its record alone. FormatError naming file and key."""
+    return _camera(_record(Path(folder))["camera"])
+
+
+def _camera(node: _Node) -> Camera:
+    return node.build(
+        lambda: Camera(
+            node["intrinsics"].tensor(3, 3),
+            node["height"].integer(),
+            node["width"].integer(),
+            None if node["projection"].value is None else node["projection"].tensor(3, 4),
         )
     )
 

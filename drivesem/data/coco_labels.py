@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from scene_ir.errors import FormatError
 
 _IN_FOLDERS = re.compile(r"[/\\:]|^\.")
 """In names of files, what makes them more than a stem and a suffix."""
+Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _SHOWN = 3
 """Ids that an error names."""
 
@@ -82,10 +83,15 @@ class Rows:
             if not isinstance(row.get(key, ""), str):
                 raise FormatError(self.at(i, key), "text", json.dumps(row[key])[:60])
 
-    def own(self, key: str) -> NDArray[np.int64]:
-        """As `whole`, each once."""
-        ids = self.whole(key)
-        seen: set[int] = set()
+    def ids(self, key: str) -> Ids:
+        """Whole numbers (N,), or texts where all are, under a key. FormatError naming a row with neither."""
+        values = self.values(key)
+        return np.array(values, np.str_) if values and set(map(type, values)) == {str} else self.whole(key)
+
+    def own(self, key: str) -> Ids:
+        """As `ids`, each once."""
+        ids = self.ids(key)
+        seen: set[int | str] = set()
         for i, value in enumerate(ids.tolist()):
             if value in seen:
                 raise FormatError(self.at(i, key), "an id of its own", value)
@@ -124,11 +130,16 @@ class Rows:
                 raise FormatError(self.at(i, "bbox"), expected, json.dumps(value)[:60])
         return np.array(values, dtype=np.float64).reshape(len(values), 4)
 
-    def places(self, key: str, ids: NDArray[np.int64], what: str) -> NDArray[np.int64]:
-        """The place of each row's number under a key among `ids`. FormatError naming one that is not there."""
-        values = self.whole(key)
+    def places(self, key: str, ids: Ids, what: str) -> NDArray[np.int64]:
+        """The place of each row's id under a key among `ids`. FormatError naming one that is not there."""
+        values = self.ids(key)
+        if len(values) and len(ids) and values.dtype.kind != ids.dtype.kind:
+            kind = "texts" if ids.dtype.kind == "U" else "whole numbers"
+            raise FormatError(
+                self.at(0, key), f"{kind}, as the ids of the {what} are", json.dumps(values[0].item())
+            )
         order = np.argsort(ids)
-        found = values * 0
+        found = np.zeros(len(values), np.int64)
         other = np.ones(len(values), np.bool_)
         if len(ids):
             found = order[np.searchsorted(ids[order], values).clip(0, len(ids) - 1)]
@@ -234,8 +245,9 @@ class AnnotationFile:
             raise FormatError(str(path), "images, annotations and categories", found)
         self.path = path
         tables = {n: Rows.of(f"{path}: {n}", content.get(n)) for n in ("images", "categories", "annotations")}
-        self.images, self.image_ids = _by_id(tables["images"])
-        self.categories, self.category_ids = _by_id(tables["categories"])
+        self.images, self.image_ids = _by_id(tables["images"], tables["images"].own("id"))
+        tables["categories"].own("id")
+        self.categories, self.category_ids = _by_id(tables["categories"], tables["categories"].whole("id"))
         self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
         self.annotations = tables["annotations"]
         self.images.texts("file_name")
@@ -244,8 +256,7 @@ class AnnotationFile:
         self.kind = self.annotations.places("category_id", self.category_ids, "categories")
 
 
-def _by_id(rows: Rows) -> tuple[Rows, NDArray[np.int64]]:
-    ids = rows.own("id")
+def _by_id(rows: Rows, ids: Ids) -> tuple[Rows, Any]:
     order = np.argsort(ids, kind="stable")
     return rows.some(order.tolist()), ids[order]
 
@@ -307,7 +318,7 @@ def _results(path: Path, content: list[Any], truth: LabelTable | None) -> LabelT
         raise FormatError(str(path), "labels beside a list of results", "none")
     if truth.kind_ids is None:
         raise FormatError(str(path), "categories (a COCO data set), as the labels are no COCO file", "a list")
-    image_ids = truth.image_ids
+    image_ids: Ids | None = truth.image_ids
     if image_ids is None:
         image_ids = np.array([int(name) if name.isdecimal() else -1 for name in truth.frames], np.int64)
     rows = Rows.of(str(path), content)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -146,10 +146,10 @@ def _plain_columns(lines: Sequence[str], fields: int) -> tuple[list[str], NDArra
     if values.size != len(lines) * told or not np.isfinite(values).all():
         return None
     values = values.reshape(len(lines), told)
-    if flat is None:
-        return kinds, values
-    pose = np.tile(np.array(UNKNOWN_POSE, np.float64), (len(lines), 1))
-    return kinds, np.concatenate([values[:, :_BEFORE_POSE], pose, values[:, _BEFORE_POSE:]], axis=1)
+    if flat is not None:
+        pose = np.tile(np.array(UNKNOWN_POSE, np.float64), (len(lines), 1))
+        values = np.concatenate([values[:, :_BEFORE_POSE], pose, values[:, _BEFORE_POSE:]], axis=1)
+    return kinds, values[:, : fields - 1]  # without scores that nobody asked for
 
 
 def _without_pose(rests: Sequence[str]) -> list[str] | None:
@@ -185,11 +185,16 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     folder = label_folder(path) if path.is_dir() else None
     if folder is None:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
-    names = text_files(folder)
-    paths = [f"{folder}{os.sep}{name}" for name in names]
-    lines = Lines(paths, [files.read_text(file) for file in paths], scored)
+    paths = {name.removesuffix(".txt"): f"{folder}{os.sep}{name}" for name in text_files(folder)}
+    table = table_of(paths, scored)
+    if scored and not len(table):
+        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
+    return table
+
+
+def table_of(paths: Mapping[str, Path | str], scored: bool = False) -> LabelTable:
+    """The labels, or detections where `scored`, of label files by their frames. FormatError as `Lines`."""
+    lines = Lines(list(map(str, paths.values())), list(map(files.read_text, paths.values())), scored)
     if not scored:
         lines.check_sizes()
-    if scored and not lines.kinds:
-        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    return lines.table([name.removesuffix(".txt") for name in names], scored)
+    return lines.table(list(paths), scored)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.data import coco, kitti, vkitti1, vkitti2, yolo
+from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
 from drivesem.data.layouts import LAYOUTS
 from drivesem.data.truth import Exposure, Place
@@ -67,18 +67,21 @@ WRITERS: dict[str, Callable[[Path], Writer]] = {
 """Writers by the name of their layout."""
 
 
-_TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+_TABLE_WRITERS: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
     "kitti": kitti.write_table,
     "coco": coco.write_table,
     "yolo": yolo.write_table,
     "vkitti1": vkitti1.write_table,
     "vkitti2": vkitti2.write_table,
 }
+_WRITTEN_ONLY: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+    "fiftyone": fiftyone.write_table
+}
 
 
-def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
+def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_px: float | None = None) -> Dataset:
     """The data set `name` under `root`, a folder or its URL. with_points: read laser points too, which only KITTI
-    has.
+    has. focal_px: of photographs in COCO's and YOLO's layouts that tell no camera.
 
     RangeError for an unknown name, or one without points; FormatError for a bad folder; UsageError for a URL that
     cannot be read.
@@ -89,6 +92,8 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Data
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
         return kitti.KittiDataset(place(root), with_points=True)
+    if name in ("coco", "yolo"):
+        return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(place(root), focal_px=focal_px)
     return DATASETS[name](place(root))
 
 
@@ -98,7 +103,7 @@ def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, 
     out: a folder, or a .json file for COCO. Numbers are written so that they read back as they were; sums of
     decimals are rounded to 1e-9 px. FormatError for what the layout cannot do without.
     """
-    return _TABLE_WRITERS[layout](table, out, images)
+    return (_TABLE_WRITERS | _WRITTEN_ONLY)[layout](table, out, images)
 
 
 def images_beside(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:

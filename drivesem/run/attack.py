@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -76,6 +76,7 @@ def attack_run(config: Attack) -> RunSummary:
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, WRITTEN)
     names, without, failed = select_frames(worker.source, config)
+    _check_any(config, names, without, failed)
     return _attacked(worker, (_of_part(names, config.part), without, failed), out, start, must_find=True)
 
 
@@ -109,6 +110,8 @@ def _attacked(
     failed = failed | answers.failed
     empty = {name for name, usable in answers.results.items() if not usable}
     done = [name for name in names if name not in failed and name not in empty]
+    if names and not done and config.part is None:
+        _check_any(config, done, without_vehicles + len(empty), failed)
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
     if must_find:
         _check_sight(worker, results)
@@ -119,6 +122,19 @@ def _attacked(
         seconds=round(time.perf_counter() - start, 3),
     )
     return conclude(out, config, summary, results)
+
+
+def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mapping[str, str]) -> None:
+    """UsageError where no frame can be attacked: figures of none would say nothing."""
+    if names:
+        return
+    found = [f"{without} frames without"] if without else []
+    if failed:
+        found.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
+    expected = "frames with cars, vans or trucks to attack (drivesem derender --sheet draws what it makes of one)"
+    raise UsageError(
+        f"--root {config.root}" if config.root else "--dataset", expected, "; ".join(found) or "no frame"
+    )
 
 
 def conclude(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:

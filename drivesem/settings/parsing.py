@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import tyro
 
@@ -62,11 +62,19 @@ def _refuse_unknown(words: Sequence[str]) -> None:
     settings = fields(COMMANDS[words[0]])
     known = {"--help", *(option(field.name) for field in settings)}
     known |= {option(f"no-{field.name}") for field in settings if str(field.type) == "bool"}
+    known |= _aliases(words[0])
     for word in words[1:]:
         name = word.partition("=")[0]
         if name.startswith("--") and name.replace("_", "-") not in known:
             expected = f"an option of drivesem {words[0]} (its --help lists them)"
             raise UsageError("command line", expected, _meant(name, known))
+
+
+def _aliases(command: str) -> set[str]:
+    """Other names of a command's options."""
+    kinds = get_type_hints(COMMANDS[command], include_extras=True).values()
+    markers = (marker for kind in kinds for marker in getattr(kind, "__metadata__", ()))
+    return {name for marker in markers for name in getattr(marker, "aliases", None) or ()}
 
 
 def _refused(command: str, text: str) -> UsageError:
