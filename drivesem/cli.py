@@ -19,11 +19,14 @@ from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse
 from drivesem.store import stored
+from scene_ir.errors import shown
 
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
 _EXIT_ENDED = 143
+_LONGEST_LINE = 2000
+"""Characters: what is wrong with a file may be what it holds."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         if not _is_bad_input(error):
             raise
-        sys.stderr.write(f"drivesem: {' '.join(str(error).split())}\n")
+        sys.stderr.write(f"drivesem: {' '.join(shown(error, _LONGEST_LINE).split())}\n")
         return _EXIT_BAD_INPUT
 
 

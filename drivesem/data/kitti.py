@@ -59,6 +59,9 @@ UNKNOWN_SIZE, UNKNOWN_POSITION, UNKNOWN_ANGLE = -1.0, -1000.0, -10.0
 _UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 DEPTH_SCALE = 256
 """Values a metre in `depth_2`."""
+_MOST_LINES = 10_000
+"""Of one frame: KITTI's have at most some 30."""
+_MOST_FLAG = 2**31
 INSTANCES = 256
 """Values a semantic id in `instance_2`: the lower byte is the instance."""
 SEMANTIC_NAMES = (
@@ -106,6 +109,8 @@ class _Lines:
             for row in np.flatnonzero(self.values[:, high] < self.values[:, low])[:1].tolist():
                 first, last = self.values[row, [low, high]].tolist()
                 raise FormatError(self.where(row, FIELDS[high + 1]), f"at least {first:g}", f"{last:g}")
+        for row in np.flatnonzero(np.abs(self.values[:, 1]) >= _MOST_FLAG)[:1].tolist():
+            raise FormatError(self.where(row, "occluded"), "a flag, such as 0 to 3", f"{self.values[row, 1]:g}")
 
     def where(self, row: int, field: str = "") -> str:
         """File and line of a row, and the field; blank lines are counted too."""
@@ -203,6 +208,8 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
 
 
 def _scene_labels(name: str, text: str, scored: bool) -> Labels:
+    if text.count("\n") > _MOST_LINES:
+        raise FormatError(name, f"at most {_MOST_LINES:,} lines", f"{text.count(chr(10)):,}")
     lines = _Lines([name], [text], scored)
     lines.check_scene(scored)
     return lines.table([name], scored).labels()

@@ -26,7 +26,7 @@ from scene_ir import files
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
 from scene_ir.io import to_tensor
 from scene_ir.types import Camera, Frame, Labels
@@ -125,15 +125,9 @@ def _positive(value: Any) -> float:
 
 def _header(path: Path) -> tuple[Any, int, int]:
     """EXIF, width and height, as seen upright. FormatError."""
-    from PIL import Image, UnidentifiedImageError
-
-    files.read_bytes(path)
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            width, height = image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error
+    with files.opened_image(path) as image:
+        exif = image.getexif()
+        width, height = image.size
     return (exif, height, width) if _turns(exif) % 2 else (exif, width, height)
 
 

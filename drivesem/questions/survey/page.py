@@ -25,6 +25,7 @@ from drivesem.questions.realism.comparison import vehicles
 from drivesem.questions.realism.frechet import Floats
 from drivesem.questions.survey.agreement import alpha, interval, nominal
 from drivesem.run.finished import Frame, Run
+from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError, ShapeError
@@ -187,10 +188,10 @@ def write_key(path: Path, items: Sequence[Item], facts: Mapping[str, Any]) -> No
 def read_key(path: Path) -> tuple[str, list[Item]]:
     """The survey's name and items. Raises FormatError where the file is no key."""
     data = files.read_json(path)
-    try:
-        return str(data["survey"]), [Item(**item) for item in data["items"]]
-    except (KeyError, TypeError) as error:
-        raise FormatError(str(path), "a key of drivesem survey", error) from error
+    if not isinstance(data, dict) or "items" not in data:
+        raise FormatError(str(path), "a key of drivesem survey", "something else")
+    items: tuple[Item, ...] = from_json(tuple[Item, ...], data["items"], f"{path}: items")
+    return from_json(str, data.get("survey"), f"{path}: survey"), list(items)
 
 
 def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Response]:
@@ -210,7 +211,7 @@ def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Respons
         if line["named"] not in CHOICES:
             raise FormatError(f"{where}: named", f"one of {', '.join(CHOICES)}", repr(line["named"]))
         rating = line["realism"] or ""
-        if not (rating.isdecimal() and LEAST <= int(rating) <= MOST):
+        if rating not in map(str, range(LEAST, MOST + 1)):
             raise FormatError(f"{where}: realism", f"a whole number from {LEAST} to {MOST}", repr(line["realism"]))
         if not line["participant"]:
             raise FormatError(f"{where}: participant", "a name", "nothing")

@@ -1,0 +1,84 @@
+"""Files of detectors, which may come from anywhere: regular ones only, up to a size."""
+
+from __future__ import annotations
+
+import itertools
+import stat
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from detectors.base import DetectorError
+
+_MOST_STATE = 1 << 32
+_MOST_YAML = 1 << 18
+"""Bytes of a YAML file: settings are short, and reading is slow."""
+
+
+def check_file(path: Path, what: str, most: int) -> None:
+    """DetectorError for what is missing, no regular file (a device never ends), or larger than `most` bytes."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise DetectorError(f"{path}: expected {what}, found {reason}") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise DetectorError(f"{path}: expected {what}, found no regular file")
+    if status.st_size > most:
+        raise DetectorError(f"{path}: expected {what} of at most {most:,} bytes, found {status.st_size:,} bytes")
+
+
+def read_file(path: Path, what: str, most: int) -> bytes:
+    """The bytes of a file. DetectorError as `check_file`, and where it cannot be read."""
+    check_file(path, what, most)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DetectorError(f"{path}: expected {what}, found {error.strerror}") from None
+
+
+def read_text(path: Path, what: str, most: int) -> str:
+    """The text of a UTF-8 file. DetectorError as `read_file`, and where it is no text."""
+    try:
+        return read_file(path, what, most).decode("utf-8")
+    except UnicodeDecodeError:
+        raise DetectorError(f"{path}: expected {what}, found bytes that are no text") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without aliases, a few of which stand for gigabytes."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(problem="an alias", problem_mark=self.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def read_state(path: Path, what: str) -> Any:
+    """What `torch.save` wrote, tensors and plain values alone (`weights_only`). DetectorError where it is none of
+    these, or an archive whose parts are larger than the file: torch packs nothing, so that such a file claims
+    memory that it does not fill.
+    """
+    check_file(path, what, _MOST_STATE)
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                claimed = sum(member.file_size for member in archive.infolist())
+            if claimed > path.stat().st_size:
+                raise ValueError(f"parts of {claimed:,} bytes in a file of {path.stat().st_size:,}")
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and torch have errors of their own
+        lines = itertools.islice((line.strip() for line in str(error).splitlines() if line.strip()), 2)
+        raise DetectorError(f"{path}: expected {what}, found {' '.join(lines) or type(error).__name__}") from None
+
+
+def read_yaml(path: Path) -> Any:
+    """The value in a YAML file. DetectorError where it is none, or has aliases."""
+    text = read_text(path, "a YAML file", _MOST_YAML)
+    try:
+        return yaml.load(text, _Loader)  # a subclass of SafeLoader
+    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
+        raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None
