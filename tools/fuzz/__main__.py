@@ -12,6 +12,7 @@ beside the project's own errors, any warning, and a child that dies. Exit code 1
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import tempfile
@@ -45,8 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         ):
             forms[0].read(root)
         return 0
-    share, more = divmod(given.count, len(forms))
-    outcomes = [fuzz(form, given.seed, share + (i < more), given.out, tell=True) for i, form in enumerate(forms)]
+    every = sum(form.share for form in forms)
+    counts = [math.ceil(given.count * form.share / every) for form in forms]
+    outcomes = [
+        fuzz(form, given.seed, count, given.out, tell=True) for form, count in zip(forms, counts, strict=True)
+    ]
     _print(outcomes, given.seed)
     if given.out is not None:
         files.write_json(

@@ -50,12 +50,15 @@ CLASSES = ("Undefined", "Sky", "Road", "Car")
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """make: writes a valid folder; read: the readers, of that folder; files: globs of what is damaged."""
+    """make: writes a valid folder; read: the readers, of that folder; files: globs of what is damaged; share: of
+    the inputs, against other formats: those that take long get fewer.
+    """
 
     name: str
     make: Callable[[Path], object]
     read: Callable[[Path], object]
     files: tuple[str, ...] = ("**/*",)
+    share: float = 1.0
 
 
 # ---- valid folders ----
@@ -474,6 +477,7 @@ FORMATS: dict[str, Format] = {
             _vkitti1,
             each(partial(_frames, "vkitti1"), partial(_table, "vkitti1")),
             ("**/*.txt",),
+            share=0.25,
         ),
         Format(
             "virtual kitti 2",
@@ -488,7 +492,7 @@ FORMATS: dict[str, Format] = {
         ),
         Format("yolo", partial(_dataset, "yolo"), each(partial(_frames, "yolo"), partial(_table, "yolo"))),
         Format("scene folder", partial(save_scene, scene()), load_scene),
-        Format("run", _run, each(load_run, _report), ("*.json", "*.yaml", "**/*.json", "**/*.png")),
+        Format("run", _run, each(load_run, _report), ("*.json", "*.yaml", "**/*.json", "**/*.png"), share=0.1),
         Format("theta.json", _run_with_scene, _theta, ("frames/a/*.json",)),
         Format(
             "settings yaml",
@@ -500,6 +504,7 @@ FORMATS: dict[str, Format] = {
                 lambda root: load_spec(root / "spec.yaml"),
                 lambda root: budget_of(str(root / "budget.yaml")),
             ),
+            share=0.25,
         ),
         Format("darknet", lambda root: darknet.save(_net(), root / "net.cfg"), _darknet),
         Format("obj", _meshes, partial(_meshes_of, ("a.obj",)), ("a.obj", "a.mtl", "image.png")),
