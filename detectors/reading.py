@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from detectors.base import DetectorError
 
 _MOST_STATE = 1 << 32
-_MOST_YAML = 1 << 18
-"""Bytes of a YAML file: settings are short, and reading is slow."""
 
 
 def check_file(path: Path, what: str, most: int) -> None:
@@ -48,15 +45,6 @@ def read_text(path: Path, what: str, most: int) -> str:
         raise DetectorError(f"{path}: expected {what}, found bytes that are no text") from None
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML without aliases, a few of which stand for gigabytes."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.MarkedYAMLError(problem="an alias", problem_mark=self.peek_event().start_mark)
-        return super().compose_node(parent, index)
-
-
 def read_state(path: Path, what: str) -> Any:
     """What `torch.save` wrote, tensors and plain values alone (`weights_only`). DetectorError where it is none of
     these, or an archive whose parts are larger than the file: torch packs nothing, so that such a file claims
@@ -73,12 +61,3 @@ def read_state(path: Path, what: str) -> Any:
     except Exception as error:  # pickle, zip and torch have errors of their own
         lines = itertools.islice((line.strip() for line in str(error).splitlines() if line.strip()), 2)
         raise DetectorError(f"{path}: expected {what}, found {' '.join(lines) or type(error).__name__}") from None
-
-
-def read_yaml(path: Path) -> Any:
-    """The value in a YAML file. DetectorError where it is none, or has aliases."""
-    text = read_text(path, "a YAML file", _MOST_YAML)
-    try:
-        return yaml.load(text, _Loader)  # a subclass of SafeLoader
-    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
-        raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None

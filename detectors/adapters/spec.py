@@ -10,11 +10,12 @@ from typing import Any, Literal, get_args
 
 import torch
 import torch.nn.functional as F
+import yaml
 from torch import Tensor
 
 from detectors.adapters import coco
 from detectors.base import DetectorError
-from detectors.reading import read_yaml
+from detectors.reading import read_text
 
 Resize = Literal["letterbox", "stretch"]
 Channels = Literal["rgb", "bgr"]
@@ -25,6 +26,8 @@ Input = Literal["batch", "image", "list"]
 MOST_SIDE = 8192
 """px of a network's input: far above any, so that none takes all memory."""
 _MOST_CLASSES = 10_000
+_MOST_YAML = 1 << 18
+"""Bytes of a YAML file: settings are short, and reading is slow."""
 NO_CLASS = ""
 """Name of a column of scores that is no class: background, or a number that was never given."""
 
@@ -112,10 +115,28 @@ def prepare(images: Tensor, spec: Spec) -> Tensor:
 
 def load_spec(path: Path) -> dict[str, Any]:
     """The settings of a YAML file, each checked; to be laid over a format's own. DetectorError names file, key."""
-    loaded = read_yaml(path)
+    loaded = _read_yaml(path)
     if not isinstance(loaded, dict):
         raise DetectorError(f"{path}: expected a mapping of settings, found {type(loaded).__name__}")
     return checked(loaded, str(path))
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without aliases, a few of which stand for gigabytes."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(problem="an alias", problem_mark=self.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def _read_yaml(path: Path) -> Any:
+    """The value in a YAML file. DetectorError where it is none, or has aliases."""
+    text = read_text(path, "a YAML file", _MOST_YAML)
+    try:
+        return yaml.load(text, _Loader)  # a subclass of SafeLoader
+    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
+        raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None
 
 
 def settings_of(path: Path, spec: Path | None) -> dict[str, Any]:
