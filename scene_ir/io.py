@@ -129,7 +129,11 @@ def load_scene(folder: Path) -> SceneIR:
 
     Raises FormatError naming file and key: a missing file or key, another version, a wrong shape or type.
     """
-    folder = Path(folder)
+    return _load(Path(folder), with_before=True)
+
+
+def _load(folder: Path, with_before: bool) -> SceneIR:
+    """with_before: whether it may be what became of another scene."""
     if not folder.is_dir():
         raise FormatError(str(folder), "a folder with a scene", "no such folder")
     root = _record(folder)
@@ -163,7 +167,9 @@ def load_scene(folder: Path) -> SceneIR:
     ignore = root["ignore"]
     provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
     changed = root["version"].value > 3 and root["before"].flag()
-    before = load_scene(folder / "before") if changed else None
+    if changed and not with_before:
+        raise FormatError(f"{root['before'].where}", "false, in the scene before another", "true")
+    before = _load(files.below(folder, "before"), with_before=False) if changed else None
     return root.build(
         lambda: SceneIR(
             camera=camera,

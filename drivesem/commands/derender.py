@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_run
 from drivesem.scenes.sources import Photographs, SceneSource
 from drivesem.settings.commands import Derender

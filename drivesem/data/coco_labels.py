@@ -21,6 +21,8 @@ from scene_ir.errors import FormatError
 _IN_FOLDERS = re.compile(r"[/\\:]|^\.")
 """In names of files, what makes them more than a stem and a suffix."""
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
+_MOST_FLAG = 2**31
+"""Above occlusions and sides of images."""
 _SHOWN = 3
 """Ids that an error names."""
 
@@ -111,6 +113,13 @@ class Rows:
             if missing is None or self.rows[i].get(key) is not None:
                 raise FormatError(self.at(i, key), "a finite number", json.dumps(values[i]))
         return found
+
+    def flags(self, key: str, missing: int) -> NDArray[np.int64]:
+        """Numbers (N,) under a key as whole ones, `missing` where a row has none. FormatError for a huge one."""
+        found = self.column(key, float(missing))
+        for i in np.flatnonzero(np.abs(found) >= _MOST_FLAG)[:1].tolist():
+            raise FormatError(self.at(i, key), f"less than {_MOST_FLAG:,}", f"{found[i]:g}")
+        return found.astype(np.int64)
 
     def boxes(self) -> NDArray[np.float64]:
         """Left, top, width, height (N, 4). FormatError naming the first row that has no such box."""
@@ -206,7 +215,7 @@ class Rows:
             else np.zeros(len(self), np.bool_),
             score=self.column("score", None) if scored else np.full(len(self), np.nan),
             truncation=column("truncation", -1.0),
-            occlusion=column("occlusion", -1.0).astype(np.int64),
+            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else np.full(len(self), -1),
             alpha=column("alpha"),
             pose=pose,
             area=np.where(np.isnan(area), boxes[:, 2] * boxes[:, 3], area),
@@ -282,11 +291,11 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
     frames = [identifier_of(row) for row in told.images.rows]
     if len(set(frames)) != len(frames):
         frames = [str(i) for i in told.image_ids.tolist()]
-    sizes_wh = np.stack([told.images.column(key, 0.0) for key in ("width", "height")], axis=1)
+    sizes_wh = np.stack([told.images.flags(key, 0) for key in ("width", "height")], axis=1)
     table = told.annotations.table(frames, told.kinds, told.category_ids, told.frame, told.kind, scored)
     return replace(
         _merged_regions(table.rows(np.argsort(table.frame, kind="stable"))),
-        sizes_wh=sizes_wh.astype(np.int64),
+        sizes_wh=sizes_wh,
         image_ids=told.image_ids,
         cameras={i: row["camera"] for i, row in enumerate(told.images.rows) if "camera" in row},
     )

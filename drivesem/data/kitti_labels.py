@@ -33,6 +33,8 @@ UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 _BEFORE_POSE = FIELDS.index("height") - 1
 """Numbers of a line before its 3D box."""
 
+_MOST_FLAG = 2**31
+
 
 def finite_number(where: str, text: str) -> float:
     """A finite number."""
@@ -69,6 +71,8 @@ class Lines:
             for row in np.flatnonzero(self.values[:, high] < self.values[:, low])[:1].tolist():
                 first, last = self.values[row, [low, high]].tolist()
                 raise FormatError(self.where(row, FIELDS[high + 1]), f"at least {first:g}", f"{last:g}")
+        for row in np.flatnonzero(np.abs(self.values[:, 1]) >= _MOST_FLAG)[:1].tolist():
+            raise FormatError(self.where(row, "occluded"), "a flag, such as 0 to 3", f"{self.values[row, 1]:g}")
 
     def where(self, row: int, field: str = "") -> str:
         """File and line of a row, and the field; blank lines are counted too."""

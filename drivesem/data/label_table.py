@@ -280,11 +280,17 @@ def positional(value: float) -> str:
 
 
 def matrix_of(camera: Any) -> NDArray[np.float64]:
-    """The projection (3, 4) px of a COCO "camera" entry of this project."""
-    if "projection" in camera:
-        return np.array(camera["projection"], np.float64).reshape(3, 4)
-    fx, fy, cx, cy = (float(camera[k]) for k in ("fx", "fy", "cx", "cy"))
-    return np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]], np.float64)
+    """The projection (3, 4) px of a COCO "camera" entry of this project. FormatError for another's."""
+    told = camera if isinstance(camera, dict) else {}
+    if "projection" in told:
+        values = told["projection"]
+    else:
+        fx, fy, cx, cy = (told.get(k) for k in ("fx", "fy", "cx", "cy"))
+        values = [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
+    good = isinstance(values, list) and all(type(v) in (int, float) and math.isfinite(v) for v in values)
+    if not good or len(values) != 12:
+        raise FormatError("camera", "projection (12 numbers), or fx, fy, cx, cy", repr(camera))
+    return np.array(values, np.float64).reshape(3, 4)
 
 
 def camera_entry(projection: Tensor) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +25,6 @@ _PLANE_X, _PLANE_Y, _PLANE_UNIT, _ORIENTATION = 0xA20E, 0xA20F, 0xA210, 0x0112
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 _TURNED = {1: 0, 3: 2, 6: 3, 8: 1}
 """EXIF's orientations without mirroring, and quarter turns to the left that put them upright."""
-
-
 _OTHER_CHANNELS = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
 """Pillow's modes of 8 bits that are not red, green and blue, but can be."""
 
@@ -37,17 +34,11 @@ def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
 
     FormatError where the file is missing, does not decode, has more bits, or is not of `size_hw`.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    data = files.read_bytes(path)
-    width, height = files.check_pixels(path, data)
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            if image.mode not in _OTHER_CHANNELS:
-                return files.read_image(path, size_hw)
-            pixels = np.array(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error
+    with files.opened_image(path, files.read_bytes(path)) as image:
+        width, height = image.size
+        if image.mode not in _OTHER_CHANNELS:
+            return files.read_image(path, size_hw)
+        pixels = np.array(image.convert("RGB"))
     if size_hw is not None and (height, width) != size_hw:
         raise FormatError(str(path), f"{size_hw[1]}x{size_hw[0]} px", f"{width}x{height} px")
     return pixels
@@ -113,15 +104,9 @@ def _positive(value: Any) -> float:
 
 def _header(path: Path) -> tuple[Any, int, int]:
     """EXIF, width and height, as seen upright. FormatError."""
-    from PIL import Image, UnidentifiedImageError
-
-    files.read_bytes(path)
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            width, height = image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error
+    with files.opened_image(path) as image:
+        exif = image.getexif()
+        width, height = image.size
     return (exif, height, width) if _turns(exif) % 2 else (exif, width, height)
 
 

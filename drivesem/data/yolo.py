@@ -43,6 +43,8 @@ TABLE_DECIMALS = 15
 """Of a table's shares, all that float64 has: in 4000 px that is 4e-12 px, far below other files' decimals."""
 PARTS = ("train", "val", "test")
 """Keys of `data.yaml` that name images."""
+_DIGITS = 18
+"""Of a class number: Python makes no number of thousands."""
 EDGE = 1e-4
 """How far beyond the image a share may reach: rounding."""
 
@@ -143,9 +145,10 @@ def _read_text(path: Path, kinds: Mapping[int, str], size_wh: tuple[int, int], s
         if len(parts) != 5 + scored:
             expected = "6 fields: class cx cy w h score" if scored else "5 fields: class cx cy w h"
             raise FormatError(where, expected, len(parts))
-        if not parts[0].isdecimal() or int(parts[0]) not in kinds:
-            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(parts[0]))
-        told.kinds.append(int(parts[0]))
+        number_text = parts[0]
+        if not (number_text.isdecimal() and len(number_text) <= _DIGITS and int(number_text) in kinds):
+            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(number_text))
+        told.kinds.append(int(number_text))
         cx, cy, w, h = (_share(f"{where}: {name}", part) for name, part in zip(_SHARES, parts[1:5], strict=True))
         width, height = size_wh
         told.boxes.append([(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height])

@@ -18,6 +18,7 @@ from drivesem.report import grading
 from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
 from drivesem.report.page import Page, ShownRun
+from drivesem.report.policy import script_hash
 from drivesem.run.results import RunSummary
 from drivesem.truth.grades import Grade
 
@@ -68,7 +69,8 @@ def render_report(page: Page, at: Path) -> str:
     first = runs[0]
     return template.render(
         style=Markup(_part("style.css")),
-        script=Markup(_part("page.js")),
+        script=Markup(script := _part("page.js")),
+        script_hash=Markup(script_hash(script)),
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,

@@ -126,6 +126,8 @@ def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "
 def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     if not (folder / CONFIG).is_file():
         raise UsageError(setting, "a folder of drivesem attack", folder)
+    for file in (CONFIG, METRICS, MANIFEST):
+        files.below(folder, file)
     settings = files.read_yaml(folder / CONFIG)
     if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
@@ -153,7 +155,8 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
 
 
 def _frame(folder: Path) -> Frame:
-    pictures = {name: files.below(folder, file) for name, file in PICTURES.items()}
+    files.check_links(folder)
+    pictures = {name: folder / file for name, file in PICTURES.items()}
     for path in pictures.values():
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from torch import distributed
 
 from detectors.augment import AugmentSettings
@@ -22,6 +21,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
 from drivesem.report.progress import training_bar
+from drivesem.report.terminal import Console
 from drivesem.run.folder import SHARING, claim
 from drivesem.run.workers import mapping
 from drivesem.settings.commands import SYNTH, Train

@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.attack.space import parse_params
 from drivesem.questions.holes.frame import Effort, look_again, look_around
 from drivesem.questions.holes.merged import merged
@@ -22,6 +20,7 @@ from drivesem.questions.holes.results import (
     load_recheck,
 )
 from drivesem.report.answer import Answer
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, folder_of, trusted_attack
