@@ -124,8 +124,8 @@ def motor_yacht(kit: Kit) -> None:
         h = (0.095 if deck < decks else 0.03) * long
         lean = 0.1 * long
         if deck < decks:
-            low, high = (rectangle((x0, x1), y - 0.03 * long, w),
-                rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w))  # fmt: skip
+            low = rectangle((x0, x1), y - 0.03 * long, w)
+            high = rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w)
             kit.add(WHITE, prism(low, high))
             a, b = 0.35, 0.88
             strip = [low * (1 - v) + high * v for v in (a, b)]
