@@ -180,9 +180,8 @@ def rowing_boat(kit: Kit) -> None:
     kit.both(oar, tube([grip, lock, end], 0.022, 6), beams(end - 0.1 * way, end + 0.4 * way, 0.035, 0.14))
     kit.both(STEEL, torus(lock.tolist(), 0.04, 0.01, "x", 12))
     for x in np.linspace(-0.36, 0.3, 7) * long:
-        rib = [(x, y + 0.02, z * 0.92) for y, z in zip(*(np.array([np.interp(x, outer[:, j, 0], outer[:, j, k])
-            for j in range(13)]) for k in (1, 2)), strict=True)]  # fmt: skip
-        kit.add(inside, tube(np.array(rib)[1:-1] + 0.04 * UP, 0.014, 4))
+        y, z = (np.array([np.interp(x, outer[:, j, 0], outer[:, j, k]) for j in range(1, 12)]) for k in (1, 2))
+        kit.add(inside, tube(np.stack([0 * y + x, y + 0.06, 0.86 * z], 1), 0.014, 4))
 
 
 def fishing_boat(kit: Kit) -> None:
