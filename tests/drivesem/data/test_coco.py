@@ -17,7 +17,7 @@ from pycocotools import mask as run_length
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from drivesem.data import coco
+from drivesem.data import coco, coco_labels
 from drivesem.data.label_table import from_coco, shortest, to_coco
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
@@ -346,3 +346,14 @@ def test_regions_are_of_the_object_they_lie_on(make_exposure: Callable[..., Expo
     things = make_exposure().objects
     assert coco._kinds_of_region([39.5, 9.5, 45.5, 12.5], things) == ("Truck",)
     assert coco._kinds_of_region([5, 12, 24, 23], things) == tuple(coco.CATEGORIES)  # the car has a label
+
+
+@given(st.text(st.sampled_from("ab. /\\:"), min_size=1, max_size=7))
+def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
+    try:
+        told = "_".join(Path(name).with_suffix("").parts)
+    except ValueError:
+        with pytest.raises(ValueError, match="empty name"):
+            coco_labels.identifier_of({"file_name": name})
+        return
+    assert coco_labels.identifier_of({"file_name": name}) == told
