@@ -124,8 +124,8 @@ def motor_yacht(kit: Kit) -> None:
         h = (0.095 if deck < decks else 0.03) * long
         lean = 0.1 * long
         if deck < decks:
-            low, high = (rectangle((x0, x1), y - 0.03 * long, w),
-                rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w))  # fmt: skip
+            low = rectangle((x0, x1), y - 0.03 * long, w)
+            high = rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w)
             kit.add(WHITE, prism(low, high))
             a, b = 0.35, 0.88
             strip = [low * (1 - v) + high * v for v in (a, b)]
@@ -180,9 +180,8 @@ def rowing_boat(kit: Kit) -> None:
     kit.both(oar, tube([grip, lock, end], 0.022, 6), beams(end - 0.1 * way, end + 0.4 * way, 0.035, 0.14))
     kit.both(STEEL, torus(lock.tolist(), 0.04, 0.01, "x", 12))
     for x in np.linspace(-0.36, 0.3, 7) * long:
-        rib = [(x, y + 0.02, z * 0.92) for y, z in zip(*(np.array([np.interp(x, outer[:, j, 0], outer[:, j, k])
-            for j in range(13)]) for k in (1, 2)), strict=True)]  # fmt: skip
-        kit.add(inside, tube(np.array(rib)[1:-1] + 0.04 * UP, 0.014, 4))
+        y, z = (np.array([np.interp(x, outer[:, j, 0], outer[:, j, k]) for j in range(1, 12)]) for k in (1, 2))
+        kit.add(inside, tube(np.stack([0 * y + x, y + 0.06, 0.86 * z], 1), 0.014, 4))
 
 
 def fishing_boat(kit: Kit) -> None:

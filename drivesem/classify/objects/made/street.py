@@ -165,8 +165,8 @@ def wheeled_bin(kit: Kit) -> None:
     for y in (0.35 * h, 0.62 * h):
         s = 0.74 + 0.26 * y / h
         kit.add(coat, box((0.0, y - 0.01, -w * s - 0.012), (d * s + 0.008, y + 0.01, w * s + 0.012)))
-    front, rear = (rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w),
-        rectangle((-0.95 * d, 0.9 * d), h + 0.1, 0.92 * w))  # fmt: skip
+    front = rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w)
+    rear = rectangle((-0.95 * d, 0.9 * d), h + 0.1, 0.92 * w)
     front[[1, 2], 1] -= 0.02
     rear[[1, 2], 1] -= 0.05
     kit.add(lid, prism(front, rear))
@@ -307,8 +307,8 @@ def house_mailbox(kit: Kit) -> None:
     gable = np.array([[0, foot + tall, -half], [0, foot + tall, half], [0, foot + tall + pitch, 0.0]])
     kit.add(coat, prism(gable - deep * AHEAD, gable + deep * AHEAD))
     for side in (1, -1):
-        eave, ridge = (np.array([0, foot + tall - 0.25 * pitch, 1.25 * half * side]),
-            np.array([0, foot + tall + pitch, 0]))  # fmt: skip
+        eave = np.array([0, foot + tall - 0.25 * pitch, 1.25 * half * side])
+        ridge = np.array([0, foot + tall + pitch, 0])
         ring = np.array([eave, ridge, ridge + 0.025 * UP, eave + 0.025 * UP])
         kit.add(roof, prism(ring - 1.25 * deep * AHEAD, ring + 1.25 * deep * AHEAD))
     trim = CHROME if kit.chance(0.5) else BLACK

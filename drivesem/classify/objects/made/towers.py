@@ -116,8 +116,8 @@ def radio_mast(kit: Kit) -> None:
 
 def water_tower(kit: Kit) -> None:
     """A tank high up, on braced legs or on one stem."""
-    coat, r = (paint(kit.tint(((0.6, 0.62, 0.62), (0.3, 0.45, 0.55), (0.5, 0.45, 0.35), (0.45, 0.1, 0.05)))),
-        kit.between(0.2, 0.28))  # fmt: skip
+    coat = paint(kit.tint(((0.6, 0.62, 0.62), (0.3, 0.45, 0.55), (0.5, 0.45, 0.35), (0.45, 0.1, 0.05))))
+    r = kit.between(0.2, 0.28)
     top, tall = kit.between(0.5, 0.62), kit.between(0.16, 0.26)
     if kit.chance(0.6):
         flat = kit.chance(0.5)
@@ -154,8 +154,8 @@ def water_tower(kit: Kit) -> None:
 def clock_tower(kit: Kit) -> None:
     """A square shaft of stone with a clock on each side beneath a steep roof."""
     half, stone = kit.between(0.09, 0.125), dull(kit.tint((*STONES, (0.42, 0.2, 0.1))))
-    trim, roof = (dull(kit.tint(STONES[:1])), dull(kit.tint(((0.05, 0.06, 0.07), (0.06, 0.2, 0.15),
-        (0.25, 0.06, 0.03)))))  # fmt: skip
+    trim = dull(kit.tint(STONES[:1]))
+    roof = dull(kit.tint(((0.05, 0.06, 0.07), (0.06, 0.2, 0.15), (0.25, 0.06, 0.03))))
     shaft, head = kit.between(0.46, 0.56), kit.between(0.13, 0.17)
     kit.add(stone, loft(_square([(1.12 * half, 0), (1.12 * half, 0.06), (half, 0.08), (half, shaft)])))
     kit.add(trim, loft(_square([(half, shaft - 0.02), (1.18 * half, shaft), (1.18 * half, shaft + 0.015)])))

@@ -54,6 +54,7 @@ def _template(kit: Kit, kind: str, coat: Surface) -> tuple[float, float, float]:
     variant = kit.count(0, 1 << 20)
     mesh, size = template(kind, variant), typical_size_lhw(kind, variant)
     assert mesh.colours is not None
+    # the unit box's y points down: turned up, which is a reflection, so the winding turns with it
     vertices = mesh.vertices.double().numpy() * np.array([size[0], -size[1], size[2]])
     faces = mesh.faces.numpy()[:, ::-1]
     colours = mesh.colours.numpy()[faces[:, 0]]

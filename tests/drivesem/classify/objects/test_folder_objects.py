@@ -51,12 +51,33 @@ def test_an_object_with_its_materials(tmp_path: Path) -> None:
     torch.testing.assert_close(vertices.amax(0) + vertices.amin(0), torch.zeros(3))
     red = model.specular > 0
     assert int(red.sum()) == 6
-    torch.testing.assert_close(model.diffuse[red], torch.tensor([[0.8, 0.1, 0.2]]).expand(6, 3), atol=2e-3, rtol=0)
-    torch.testing.assert_close(model.specular[red], torch.full((6,), 0.5), atol=3e-3, rtol=0)
+    torch.testing.assert_close(model.diffuse[red], torch.tensor([[0.8, 0.1, 0.2]]).expand(6, 3))
+    torch.testing.assert_close(model.specular[red], torch.full((6,), 0.5))
     assert set(model.shininess[red].tolist()) == {40.0}
     assert set(model.shininess[~red].tolist()) == {5.0}
     corners = vertices[model.mesh.faces]
     assert float(torch.det(corners).sum()) / 6 == pytest.approx(0.125, rel=1e-4)  # outwards as in the file
+
+
+@pytest.mark.parametrize(
+    ("lines", "diffuse", "specular", "shininess"),
+    [
+        ("", 0.5, 0.1, 10.0),
+        ("Kd 0.25 0.25 0.25\n", 0.25, 0.1, 10.0),
+        ("Ks 0.75 0.75 0.75\nNs -5\n", 0.5, 0.75, 0.0),
+        ("Kd nan 0 0\nKs 1e999 0 0\nNs nan\n", 0.5, 0.1, 10.0),
+        ("Kd 7 7 7\nKs -1 -1 -1\nNs 1e30\n", 1.0, 0.0, 1000.0),
+        ("Kd a b c\nKs 1 1\n", 0.5, 0.1, 10.0),
+    ],
+)
+def test_materials_that_say_little_or_nonsense(
+    tmp_path: Path, lines: str, diffuse: float, specular: float, shininess: float
+) -> None:
+    shapenet(tmp_path, BUS, "abc", mtl=f"newmtl red\n{lines}newmtl blue\n{lines}")
+    model = open_objects(str(tmp_path)).load("bus/abc")
+    assert model.diffuse.unique().tolist() == pytest.approx([diffuse])
+    assert model.specular.unique().tolist() == pytest.approx([specular])
+    assert model.shininess.unique().tolist() == [shininess]
 
 
 def test_a_texture_beside_the_models_is_averaged(tmp_path: Path) -> None:
