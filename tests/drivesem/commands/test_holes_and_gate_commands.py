@@ -21,7 +21,7 @@ from detectors.types import Detections
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
 from drivesem.questions.gate import asking as gate_asking
-from drivesem.questions.holes.results import load, load_recheck
+from drivesem.questions.holes.results import load, load_inside
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
@@ -169,19 +169,22 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     """After the holes, which are kept: of seeds that neither the rule nor its probability knew."""
     out, name = tmp_path / "holes", Path("0") / "frames" / "demo-000"
     shutil.copytree(looked, out)
-    kept, checked = out / "runs" / name / "holes.json", out / "rechecks" / "16" / name / "recheck.json"
+    kept = out / "runs" / name / "holes.json"
     written = kept.stat().st_mtime_ns
     words = [str(attacked), *HOLES, "--out", str(out)]
     found = holes([*words, "--recheck", "16"], capsys)
     assert kept.stat().st_mtime_ns == written
     assert (found["rechecked"], found["hold"]) == (len(found["holes"]), len(found["holes"]))
+    (checked,) = (out / "rechecks" / "16" / "0").glob("*/frames/demo-000/recheck.json")
+    (fresh,) = (out / "fresh" / "0").glob("*/frames/demo-000/fresh.json")
     again = found["holes"][0]["recheck"]
     assert again["draws"] == 16 * len(found["holes"][0]["failures"])
     assert again["probability"] >= 0.8
     assert again["interval"][0] <= again["probability"] <= again["interval"][1]
     assert again["holds"]
-    for around, inside in zip(load(kept).around, load_recheck(checked).inside, strict=True):
-        known = {*around.asked.values, *around.near.values, *around.fresh.values}
+    inside_first, inside_again = load_inside(fresh).inside, load_inside(checked).inside
+    for around, first, inside in zip(load(kept).around, inside_first, inside_again, strict=True):
+        known = {*around.asked.values, *around.near.values, *first.values}
         assert len(inside.values) == 16
         assert not known & set(inside.values)
     page, rows = (out / "holes.md").read_text(), (out / "holes.csv").read_text().splitlines()
