@@ -156,7 +156,7 @@ def _planted_across(config: Bench, console: Console) -> Measured:
     judged = [asked.results[job] for job in frames if job in asked.results]
     rows = across_names.rows_of(faults, pools, judged, tuple(first.workers))
     told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
-    summed += across_names.chance_rows(pools, config.seed)
+    summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
     return Measured(
         {
             "rows": told,

@@ -618,6 +618,9 @@ class Bench(Regions, Scenes, FrameCommand):
     def check(self) -> None:
         super().check()
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
+        refuse(
+            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
+        )
         only = "--dataset demo, but for bench planted and bench night"
         refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)
 

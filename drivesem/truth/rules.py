@@ -24,7 +24,7 @@ interval and outside of it, at least."""
 _FOLDS, _OBJECTS = 5, 3
 """Of a pooled rule: parts of the objects, each of which is told by the rule of the others; objects, at least,
 whose failures lie inside."""
-_BEYOND_CHANCE = 2.0
+_BEYOND_CHANCE = 1.5
 """Standard errors, over objects, by which such a rule tells failures of objects that it was not made of."""
 _RULES = 8
 """Pooled rules, at most."""

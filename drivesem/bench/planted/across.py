@@ -18,7 +18,7 @@ from drivesem.attack.budgets import budget_of
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.bench.planted.naming import looked_around
-from drivesem.bench.planted.pool import FramePool
+from drivesem.bench.planted.pool import FramePool, hidden
 from drivesem.bench.planted.remembering import Remembering
 from drivesem.bench.planted.yardstick import attack_settings, certain_of, methods_of, seen_without
 from drivesem.questions.holes.results import Samples
@@ -164,21 +164,27 @@ def _inside(values: np.ndarray, bands: np.ndarray) -> np.ndarray:
 
 def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None:
     """The fault and how often it hides what; None where that is too much or too little."""
-    pictures = hit = count = hidden = found = still = 0
+    pictures = hit = count = lost = found = still = 0
     cars: set[tuple[str, int]] = set()
     for pool in pools:
         known, before = pool.found, pool.hidden_as_photographed(fault)
         found, still = found + len(known), still + len(known & before)
-        for state in pool.states:
-            own = [car for car in state if car.margin > 0 and car.index not in before]
-            lost = [car.index for car in own if car.hidden(fault, pool.t_star)]
-            cars |= {(pool.frame, index) for index in lost}
-            pictures, hit, count, hidden = pictures + 1, hit + bool(lost), count + len(own), hidden + len(lost)
-    if not found or not count or still > AS_PHOTOGRAPHED * found or not HIT[0] <= hidden / count <= HIT[1]:
+        own = [
+            (number, car)
+            for number, state in enumerate(pool.states)
+            for car in state
+            if car.margin > 0 and car.index not in before
+        ]
+        gone = hidden([car for _, car in own], fault, pool.t_star)
+        lost_here = [place for place, one in zip(own, gone, strict=True) if one]
+        cars |= {(pool.frame, car.index) for _, car in lost_here}
+        pictures, hit = pictures + len(pool.states), hit + len({number for number, _ in lost_here})
+        count, lost = count + len(own), lost + len(lost_here)
+    if not found or not count or still > AS_PHOTOGRAPHED * found or not HIT[0] <= lost / count <= HIT[1]:
         return None
     if len(cars) < CARS or len({frame for frame, _ in cars}) < FRAMES:
         return None
-    return Planted(fault, hit / pictures, hidden / count, still / found)
+    return Planted(fault, hit / pictures, lost / count, still / found)
 
 
 @dataclass(frozen=True)

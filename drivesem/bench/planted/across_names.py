@@ -11,7 +11,7 @@ import numpy as np
 from detectors.planted import PlantedFault
 from drivesem.bench.planted.across import AcrossFrame, Planted
 from drivesem.bench.planted.naming import agrees
-from drivesem.bench.planted.pool import FramePool, bands_by_label
+from drivesem.bench.planted.pool import FramePool, bands_by_label, hidden
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import wilson
 from drivesem.truth.rules import Flags, Floats, Where, cover, in_words
@@ -25,13 +25,14 @@ SHAMS = 40
 _SHARE = 0.05
 """Of the cars in Halton's states, or of all cars in half of their states, that chance loses."""
 METHOD = (
-    "Each fault is one detector's, in all frames. By an attack: searches in some of the frames, samples around "
-    "what they lose for certain, and a few of Halton's states of every frame. By Halton's states: those alone, as "
-    "many passes, and all there are. Pooled rules of either (drivesem holes) name a fault where the first one has "
-    "its features and about its bands (half of both bands' hull), in part where it has one of them; further rules are "
-    "those after the first, or all where there is no fault. Passes: what one detector takes; here states and "
-    "pictures serve all faults. No fault: the detector as it is, in the same frames. Chance: cars are lost by "
-    "lot, car by car or state by state. Intervals: Wilson's, 95 %."
+    "Each fault is one detector's, in all frames. By an attack: searches in some of the frames, samples "
+    "around what they lose for certain, and a few of Halton's states of every frame. By Halton's states: "
+    "those alone, as many passes, and all there are. Pooled rules of either (drivesem holes) name a fault "
+    "where the first one has its features, each about where its band is (half of both bands' hull), in part "
+    "where it has one of them; further rules are those after the first, or all where there is no fault. "
+    "Passes: what one detector takes; here states and pictures serve all faults. No fault: the detector as it "
+    "is, in the same frames. Chance: cars are lost by lot, state by state or car by car. Intervals: Wilson's, "
+    "95 %."
 )
 TITLE = "faults of a detector named by pooled rules"
 COLUMNS: Columns = {
@@ -153,20 +154,18 @@ def drawn_evidence(fault: PlantedFault | None, pools: Sequence[FramePool], state
     objects: list[int] = []
     for number, pool in enumerate(pools):
         before = set() if fault is None else pool.hidden_as_photographed(fault)
-        for state in pool.states[:states]:
-            for car in state:
-                if car.index in before:
-                    continue
-                rows.append(car.described)
-                fails.append(car.margin < 0 if fault is None else car.lost(fault, pool.t_star))
-                objects.append(_car(number, car.index))
+        cars = [car for state in pool.states[:states] for car in state if car.index not in before]
+        gone = [False] * len(cars) if fault is None else hidden(cars, fault, pool.t_star)
+        rows += [car.described for car in cars]
+        fails += [car.margin < 0 or one for car, one in zip(cars, gone, strict=True)]
+        objects += [_car(number, car.index) for car in cars]
     table = np.array(rows, np.float64).reshape(len(rows), len(names))
     columns = {name: table[:, i] for i, name in enumerate(names)}
     passes = sum(len(pool.states[:states]) for pool in pools)
     return Evidence(columns, np.array(fails, np.bool_), np.array(objects, np.int64), passes)
 
 
-def chance_rows(pools: Sequence[FramePool], seed: int, shams: int = SHAMS) -> list[dict[str, Any]]:
+def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[str, Any]]:
     """How often a rule is told of failures by lot."""
     plain = drawn_evidence(None, pools, max(len(pool.states) for pool in pools))
     rows = []

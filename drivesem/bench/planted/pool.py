@@ -48,12 +48,19 @@ class SeenCar:
 
     def hidden(self, fault: PlantedFault, t_star: float) -> bool:
         """Whether the fault hides it: it is found, and with the fault is not."""
-        if self.margin < 0 or not self.told:
-            return False
-        rows = [1 + FEATURES.index(name) for name in fault.names]
-        told = torch.tensor(self.told, dtype=torch.float64)
-        by = fault.depth * fault.share(told[:, rows].T)
-        return not bool((lowered_probability(told[:, 0], by) >= t_star).any())
+        return hidden([self], fault, t_star)[0]
+
+
+def hidden(cars: Sequence[SeenCar], fault: PlantedFault, t_star: float) -> list[bool]:
+    """Which cars a fault hides, see `SeenCar.hidden`."""
+    counts = [len(car.told) if car.margin > 0 else 0 for car in cars]
+    rows = [row for car, count in zip(cars, counts, strict=True) if count for row in car.told]
+    if not rows:
+        return [False] * len(cars)
+    told = torch.tensor(rows, dtype=torch.float64)
+    by = fault.depth * fault.share(told[:, [1 + FEATURES.index(name) for name in fault.names]].T)
+    still = (lowered_probability(told[:, 0], by) >= t_star).split(counts)
+    return [count > 0 and not bool(seen.any()) for count, seen in zip(counts, still, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +95,8 @@ class FramePool:
 
     def hidden_as_photographed(self, fault: PlantedFault) -> set[int]:
         """Cars that the fault hides in any look before a change."""
-        return {car.index for look in self.looks for car in look if car.hidden(fault, self.t_star)}
+        cars = [car for look in self.looks for car in look]
+        return {car.index for car, lost in zip(cars, hidden(cars, fault, self.t_star), strict=True) if lost}
 
     @property
     def found(self) -> set[int]:
@@ -101,13 +109,12 @@ def bands_by_label(pools: Sequence[FramePool], fault: PlantedFault) -> tuple[Ban
     """Where a fault hides cars in features of their labels: from the 5th to the 95th percentile over all states. A
     detector's boxes grow and shrink with what it sees, and a fault goes by them. Empty where it hides none.
     """
-    rows = [
-        [car.described[pool.names.index(name)] for name in fault.names]
-        for pool in pools
-        for state in (*pool.looks, *pool.states)
-        for car in state
-        if car.hidden(fault, pool.t_star)
-    ]
+    rows: list[list[float]] = []
+    for pool in pools:
+        cars = [car for state in (*pool.looks, *pool.states) for car in state]
+        for car, gone in zip(cars, hidden(cars, fault, pool.t_star), strict=True):
+            if gone:
+                rows.append([car.described[pool.names.index(name)] for name in fault.names])
     if len(rows) < 2:
         return ()
     ends = torch.tensor(rows, dtype=torch.float64).quantile(torch.tensor([0.05, 0.95], dtype=torch.float64), 0)
