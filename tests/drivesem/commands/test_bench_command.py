@@ -11,7 +11,7 @@ import torch
 
 from drivesem.attack.space import combo
 from drivesem.bench import climb, memory, render, step
-from drivesem.bench.planted import across, yardstick
+from drivesem.bench.planted import across, across_names, yardstick
 from drivesem.bench.planted.pool import FramePool, SeenCar
 from drivesem.bench.scenes import bench_scene
 from drivesem.cli import main
@@ -207,29 +207,33 @@ def test_planted_across(
     monkeypatch.setattr(FramePool, "make", pool)
     monkeypatch.setattr(across.Across, "_attempt", attempt)
     monkeypatch.setattr(across, "KINDS", (("height_px",), ("aspect",), ("lightness",)))
+    monkeypatch.setattr(across, "FRAMES", 2)
+    monkeypatch.setattr(across, "CARS", 3)
+    scene = bench_scene(1, 600).scene
+    monkeypatch.setattr(across.Across, "_scene", lambda *_: scene)
+    monkeypatch.setattr(across_names, "SHAMS", 2)
     words = [
         "bench",
         "planted",
         "--methods",
         "climb",
         "--limit",
-        "5",
+        "3",
         "--workers",
         "1",
         "--json",
         "--across",
-        "16",
+        "24",
     ]
     for _ in range(2):
         assert main([*words, "--faults", "2", "--out", str(tmp_path)]) == 0
         result = json.loads(capsys.readouterr().out)
-    assert len(made) == 5
-    assert len(searched) == 10
+    assert (len(made), len(searched)) == (3, 6)
     assert result["unplanted"] == ["aspect"], "all of one aspect"
     planted = list(dict.fromkeys(row["fault"] for row in result["rows"] if row["fault"]))
     assert [text.split("=")[0] for text in planted] == ["height_px", "lightness"]
     in_turn = [*planted, ""]
-    assert [fault for _, fault in searched] == [in_turn[i % 3] for i in range(10)]
+    assert [fault for _, fault in searched] == [in_turn[i % 3] for i in range(6)]
     named = [row for row in result["rows"] if row["by"] == "halton's states, all" and row["fault"]]
     assert all(row["named"] for row in named)
     assert {row["by"]: row["faults"] for row in result["summary"]}["climb"] == 2
