@@ -198,6 +198,38 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert holes(words, capsys)["holes"][0]["recheck"] is None
 
 
+def test_cars_beside_are_shown_too(looked: Path) -> None:
+    """By default four states of the frame, in which both cars change."""
+    kept = load(looked / "runs" / "0" / "frames" / "demo-000" / "holes.json")
+    (beside,) = kept.beside
+    assert (beside.label, len(beside.objects)) == ("Car", 8)
+    assert set(beside.by_object()) == {0, 1}
+    assert all(len(samples.margins) == 4 for samples in beside.by_object().values())
+
+
+def test_without_contrast_there_are_none(
+    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--contrast", "0"]
+    holes([*words, "--out", str(tmp_path / "out")], capsys)
+    assert load(tmp_path / "out" / "runs" / "0" / "frames" / "demo-000" / "holes.json").beside == ()
+
+
+def test_an_answer_of_an_older_version_is_refused_in_one_line(
+    attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "holes"
+    shutil.copytree(looked, out)
+    kept = out / "runs" / "0" / "frames" / "demo-000" / "holes.json"
+    old = json.loads(kept.read_text())
+    kept.write_text(json.dumps(old | {"schema": 2}))
+    capsys.readouterr()
+    assert main(["holes", str(attacked), *HOLES, "--out", str(out)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("drivesem: ")
+    assert "holes.json" in said
+
+
 def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = []
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
