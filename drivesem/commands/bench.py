@@ -151,10 +151,11 @@ def _planted_across(config: Bench, console: Console) -> Measured:
     console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
     texts = tuple(one.fault.text for one in faults)
     second, frames = across.Across.of(config, texts), list(enumerate(pool.frame for pool in pools))
+    frames = frames[: config.searched]
     build = partial(across.judge_of, config, texts)
     asked = ask(frames, second.judge, build, config, Bar("searches", remaining=True), lambda job: job[1])
     judged = [asked.results[job] for job in frames if job in asked.results]
-    rows = across_names.rows_of(faults, pools, judged, tuple(first.workers))
+    rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
     told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
     summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
     return Measured(

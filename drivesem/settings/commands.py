@@ -604,6 +604,8 @@ class Bench(Regions, Scenes, FrameCommand):
     across: Count | None = None
     """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
     many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    searched: NotNegative | None = None
+    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
     naming: str | None = None
     """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
     whether that is the fault; the same of the detector without a fault."""
@@ -620,6 +622,9 @@ class Bench(Regions, Scenes, FrameCommand):
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
         refuse(
             self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
+        )
+        refuse(
+            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
         )
         only = "--dataset demo, but for bench planted and bench night"
         refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)

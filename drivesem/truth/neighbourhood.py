@@ -110,10 +110,13 @@ class Neighbourhood:
         """Another detector in the place of the objective's, which sees the same pictures."""
         return replace(self._camera, detector=detector, t_star=t_star)
 
+    def look(self, sample: Sample, camera: Camera | None = None) -> Look:
+        """What the objective's detector, or another camera's, makes of a sample. Costs a pass."""
+        return (camera or self._camera).see(sample.exposure)
+
     def fails(self, sample: Sample, camera: Camera | None = None) -> bool:
-        """Whether the object is not found, by the objective's detector, or another camera's. Costs a pass."""
-        camera = camera or self._camera
-        return not bool(camera.see(sample.exposure).judged.found[self.index])
+        """Whether the object is not found, by either. Costs a pass."""
+        return not bool(self.look(sample, camera).judged.found[self.index])
 
     def margin(self, sample: Sample) -> float:
         """How far the object is from being lost, in logits beyond t*: below 0 where it is. Costs a pass."""

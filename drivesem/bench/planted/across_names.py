@@ -110,7 +110,7 @@ class NameRow:
 def rows_of(
     planted: Sequence[Planted], pools: Sequence[FramePool], judged: Sequence[AcrossFrame], methods: Sequence[str]
 ) -> list[NameRow]:
-    """Of each fault and of none, by each method and by Halton's states alone."""
+    """Of each fault and of none, by each method, and by Halton's states alone: as many passes, and all of them."""
     rows = []
     for one in (*planted, None):
         fault = None if one is None else one.fault
@@ -120,8 +120,8 @@ def rows_of(
             most = max(most, searched.passes)
             rows.append(_row(one, method, searched, pools))
         states = max(len(pool.states) for pool in pools)
-        for by, count in ((AS_MANY, min(-(-most // len(pools)), states)), (ALL, states)):
-            rows.append(_row(one, by, drawn_evidence(fault, pools, count), pools))
+        counts = {ALL: states} if not methods else {AS_MANY: min(-(-most // len(pools)), states), ALL: states}
+        rows += [_row(one, by, drawn_evidence(fault, pools, count), pools) for by, count in counts.items()]
     return rows
 
 

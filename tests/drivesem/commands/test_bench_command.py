@@ -244,6 +244,7 @@ def test_planted_across(
     ("words", "message"),
     [
         (["planted", "--across", "4", "--naming", "climb"], "--naming: expected no --across beside it"),
+        (["planted", "--searched", "4"], "--searched: expected --across beside it"),
         (["planted", "--across", "4", "--budget", "mars"], "--budget: expected"),
         (["planted", "--methods", "halton,luck"], "--methods: expected names among"),
         (

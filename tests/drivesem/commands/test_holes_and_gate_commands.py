@@ -70,6 +70,21 @@ class Blind:
         return found
 
 
+class Imagining(Blind):
+    """The same, and a car in the sky."""
+
+    def decode(self, raw: Tensor) -> list[Detections]:
+        sky = Detections(torch.tensor([[10.0, 1.0, 40.0, 16.0]]), torch.tensor([0]), torch.tensor([0.95]))
+        return [
+            Detections(
+                torch.cat([sky.boxes_xyxy, found.boxes_xyxy]),
+                torch.cat([sky.labels, found.labels]),
+                torch.cat([sky.scores, found.scores]),
+            )
+            for found in super().decode(raw)
+        ]
+
+
 class Other(Blind):
     """The same of other classes."""
 
@@ -266,6 +281,7 @@ def gate(
         "better": Blind(blind.boxes, (2.0, 3.0)),
         "worse": Blind(blind.boxes, (low - 0.3, high)),
         "other": Other(blind.boxes, blind.band),
+        "seeing things": Imagining(blind.boxes, blind.band),
     }
     monkeypatch.setattr(gate_asking, "load_predictor", lambda name, *_: known[name])
 
@@ -297,7 +313,22 @@ def test_a_worse_one_does_not_and_a_better_one_does(
     assert int(suite.attrib["failures"]) == sum(row["grew"] for row in told["rows"]) > 0
     code, told = gate("better")
     assert (code, told["passed"]) == (0, True)
-    assert told["rows"][-1]["difference"] < -0.05
+    phantoms, whole = told["rows"][-1], told["rows"][-2]
+    assert (whole["level"], phantoms["level"]) == ("all", "phantoms")
+    assert whole["difference"] < -0.05
+    assert (phantoms["before"], phantoms["after"]) == (0, 0)
+
+
+def test_one_that_sees_what_is_not_there_does_not_pass(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
+) -> None:
+    """It loses no more objects."""
+    code, told = gate("seeing things")
+    assert (code, told["passed"]) == (1, False)
+    assert [row["hole"] for row in told["rows"] if row["grew"]] == ["phantoms"]
+    phantoms = told["rows"][-1]
+    assert (phantoms["before"], phantoms["after"]) == (0, 1)
+    assert "phantoms" in (tmp_path / "seeing things" / "gate.md").read_text()
 
 
 def test_other_classes_are_no_comparison(
