@@ -318,6 +318,8 @@ class Holes(Trust, FrameCommand):
     """States around each failure, within what the run could change; each is seen once, with nuisances."""
     fresh: Count = 32
     """Further ones inside of the rule that was found, which it is held against."""
+    contrast: NotNegative = 4
+    """States of every frame in which all objects change: they say where none is lost, for rules of many."""
     recheck: Count | None = None
     """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
     reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
@@ -604,6 +606,13 @@ class Bench(Regions, Scenes, FrameCommand):
     """Climb and planted: what attacks may move, with commas."""
     faults: Count | None = None
     """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    budget: str = "paper"
+    """Planted: how far attacks may go (drivesem attack --budget)."""
+    across: Count | None = None
+    """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
+    many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    searched: NotNegative | None = None
+    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
     naming: str | None = None
     """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
     whether that is the fault; the same of the detector without a fault."""
@@ -618,6 +627,12 @@ class Bench(Regions, Scenes, FrameCommand):
     def check(self) -> None:
         super().check()
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
+        refuse(
+            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
+        )
+        refuse(
+            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
+        )
         only = "--dataset demo, but for bench planted and bench night"
         refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)
 
