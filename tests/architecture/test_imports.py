@@ -99,6 +99,7 @@ RULES = (
         "drivesem.report",
         (
             "drivesem.run.results",
+            "drivesem.classify.results",
             "drivesem.truth.grades",
             "drivesem.evaluation",
             "scene_ir.errors",

@@ -13,7 +13,7 @@ from drivesem.attack.methods.ascent import Ascent
 from drivesem.attack.methods.base import Problem
 
 Form = Literal["raw", "l2", "unit"]
-"""raw: the gradient times the step alpha, as in the paper's equation; l2: its direction only, group by group; unit:
+"""raw: the gradient times the step alpha, as in the paper's equation; l2: its direction only, by group; unit:
 the same, but no longer than the step alpha, as the paper's program has it for classifiers."""
 
 
