@@ -28,7 +28,7 @@ VIEWS = {"forward": (0.0, 0.0), "top": (0.35, 0.0), "left": (0.0, 0.5), "right":
 """Pitch and yaw, rad, of the object before the camera (the paper's four views)."""
 DISTANCE = 2.2
 """From the camera to the object's middle, in object sizes."""
-_FOCAL = 1.5
+_FOCAL = 1.85
 """Of the camera, in widths of the picture: an object turned any way stays in it."""
 _LAMP = (0.5, -0.8, 0.2)
 """Where the lamp is, in camera space: to the right of the camera and above it."""
@@ -141,7 +141,7 @@ def generated_background(name: str) -> Tensor:
     share = 1 / (1 + np.exp(np.clip((horizon - rows) / soft, -30, 30)))
     picture = upper * (1 - share) + ground * share
     for cells in (4, 12, 40, 120):
-        noise = rng.normal(0, rng.uniform(0.01, 0.06), (cells, cells, 3)).astype(np.float32)
+        noise = rng.normal(0, rng.uniform(0.005, 0.04), (cells, cells, 3)).astype(np.float32)
         noise = noise[..., :1] + 0.15 * noise
         picture = picture + cv2.resize(noise, (DRAWN_PX, DRAWN_PX), interpolation=cv2.INTER_CUBIC)
     return torch.from_numpy(np.clip(picture, 0, 1).astype(np.float32).transpose(2, 0, 1).copy())

@@ -14,10 +14,11 @@ from torch import Tensor
 from drivesem.attack.theta import ParameterSpec, Projected, ThetaSpace
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.geometry import weld
 from scene_ir.types import LATTICE, LATTICE_POINTS
 
 Shape = Literal["each", "smooth"]
-"""each: every vertex by itself, as in the paper; smooth: by a 4x4x4 lattice around the object."""
+"""each: every place at which vertices are by itself, as in the paper; smooth: by a 4x4x4 lattice around all."""
 
 
 class Moved(StrEnum):
@@ -84,7 +85,9 @@ class Change:
 
 
 class ObjectSpace(ThetaSpace[Moved]):
-    """theta (D,) of one object with vertices (V, 3); 0 is the object as it is. reach: bounds either way."""
+    """theta (D,) of one object with vertices (V, 3); 0 is the object as it is. reach: bounds either way. Vertices
+    at one place move as one, so that surfaces which meet there do not come apart.
+    """
 
     def __init__(
         self,
@@ -95,7 +98,8 @@ class ObjectSpace(ThetaSpace[Moved]):
         shape: Shape = "each",
     ) -> None:
         specs = {Moved.VERTEX: _vertex_spec(shape), Moved.POSE: _POSE, Moved.LIGHTING: _LIGHTING}
-        super().__init__(params, specs, len(vertices), vertices)
+        self._place = weld(vertices)
+        super().__init__(params, specs, int(self._place.max()) + 1, vertices)
         self._weights = None
         if shape == "smooth":
             low, high = vertices.aminmax(dim=0)
@@ -112,6 +116,8 @@ class ObjectSpace(ThetaSpace[Moved]):
         offsets = self.block(theta, Moved.VERTEX)
         if offsets is not None and self._weights is not None:
             offsets = self._weights @ offsets.reshape(LATTICE_POINTS, 3)
+        elif offsets is not None:
+            offsets = offsets.index_select(0, self._place)
         return Change(offsets, self.block(theta, Moved.POSE), self.block(theta, Moved.LIGHTING))
 
     def project(self, theta: Tensor) -> Projected:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import to_clip
+from scene_ir.geometry import to_clip, weld
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Fragments, Layout
 from scene_ir.types import Camera, check_finite, check_shape
@@ -23,8 +23,6 @@ _DARKEST = 1e-4
 """Of linear light: gamma has a slope there."""
 _CREASE_COS = 0.766
 """Cosine of 40 degrees: faces of one corner that meet at less are shaded as one smooth surface."""
-_WELD = 1e-6
-"""Vertices closer than this are one, where normals are averaged."""
 _UP = 0.4
 """How much more of the environment's light comes from above than from below, either way from the mean."""
 _SHOWS = 2 / 255
@@ -160,8 +158,7 @@ def over(drawn: Tensor, background: Tensor) -> Tensor:
 
 def _smoothed(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs (Q,), (Q,) int64: a corner (3 * face + place) and a face that its normal is averaged over."""
-    keys = (vertices / _WELD).round().to(torch.int64)
-    welded = torch.unique(keys, dim=0, return_inverse=True)[1][faces].reshape(-1)  # (3F,)
+    welded = weld(vertices)[faces].reshape(-1)  # (3F,)
     order = torch.argsort(welded, stable=True)
     counts = torch.bincount(welded)
     begins = counts.cumsum(0) - counts
