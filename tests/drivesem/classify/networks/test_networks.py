@@ -1,4 +1,4 @@
-"""Classifiers: torchvision's names of weights, passes that are checked by hand, files and what is wrong with them."""
+"""Classifiers: torchvision's names of weights, passes checked by hand, files and what is wrong with them."""
 
 import json
 
@@ -15,23 +15,9 @@ from drivesem.classify.networks.vgg import VGG16, PooledVGG16
 from scene_ir.errors import FormatError, RangeError
 
 CLASSES = ("box", "ball", "pole")
-VGG_CONVOLUTIONS = {
-    0: (3, 64),
-    2: (64, 64),
-    5: (64, 128),
-    7: (128, 128),
-    10: (128, 256),
-    12: (256, 256),
-    14: (256, 256),
-}
-VGG_CONVOLUTIONS |= {
-    17: (256, 512),
-    19: (512, 512),
-    21: (512, 512),
-    24: (512, 512),
-    26: (512, 512),
-    28: (512, 512),
-}
+VGG_CONVOLUTIONS = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256)}
+VGG_CONVOLUTIONS |= dict.fromkeys((12, 14), (256, 256)) | {17: (256, 512)}
+VGG_CONVOLUTIONS |= dict.fromkeys((19, 21, 24, 26, 28), (512, 512))
 
 
 def seeded(seed=0):
@@ -54,9 +40,10 @@ def vgg_file(small=False):
 def resnet_names():
     """torchvision's names and shapes of ResNet-50."""
     shapes = {"conv1.weight": (64, 3, 7, 7), "fc.weight": (1000, 2048), "fc.bias": (1000,)}
-    norm = lambda name, size: {
-        f"{name}.{part}": (size,) for part in ("weight", "bias", "running_mean", "running_var")
-    }
+
+    def norm(name, size):
+        return {f"{name}.{part}": (size,) for part in ("weight", "bias", "running_mean", "running_var")}
+
     shapes |= norm("bn1", 64)
     before = 64
     for layer, (count, width) in enumerate(((3, 64), (4, 128), (6, 256), (3, 512)), start=1):
@@ -72,6 +59,7 @@ def resnet_names():
     return shapes
 
 
+@pytest.mark.slow
 def test_torchvisions_file_of_vgg16(tmp_path):
     tensors = vgg_file()
     torch.save(tensors, tmp_path / "vgg16.pth")
@@ -110,9 +98,8 @@ def test_a_block_of_resnet50_by_hand():
     x = torch.rand(1, 256, 8, 8, generator=seeded())
 
     def norm(x, bn):
-        return (x - bn.running_mean.view(-1, 1, 1)) / (
-            bn.running_var.view(-1, 1, 1) + 1e-5
-        ).sqrt() * bn.weight.view(-1, 1, 1) + bn.bias.view(-1, 1, 1)
+        mean, scale = bn.running_mean.view(-1, 1, 1), bn.weight / (bn.running_var + 1e-5).sqrt()
+        return (x - mean) * scale.view(-1, 1, 1) + bn.bias.view(-1, 1, 1)
 
     inner = F.relu(norm(F.conv2d(x, block.conv1.weight), block.bn1))
     inner = F.relu(norm(F.conv2d(inner, block.conv2.weight, stride=2, padding=1), block.bn2))
