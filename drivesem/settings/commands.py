@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import tyro
 
 from drivesem.settings.blocks import (
+    CERTIFYING_DRAWS,
     DATASETS,
     DEMO,
     FINDER,
@@ -929,6 +930,78 @@ class Retrain(Trust, Training, FrameCommand):
         refuse(one, "--dataset and --root", "both or none", "one of them")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Classify(FrameCommand):
+    """Image classifiers instead of detectors: objects whose shape, pose or light changes until a network errs."""
+
+    what: tyro.conf.Positional[Literal["data", "train", "attack"]]
+    """data: pictures of all objects, by split and class; train: a network on these; attack: look for changes that
+    a network gets wrong."""
+    objects: str | None = None
+    """Where objects come from: ShapeNetCore v2's folder, or one of meshes by class; by default 12 classes that are
+    made by code."""
+    split: Literal["train", "val", "test"] = "test"
+    """Attack: whose objects."""
+    views: str = "forward,top,left,right"
+    """From where each object is seen, with commas."""
+    backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
+    """Photographs to put behind objects; by default pictures that are made."""
+    network: str = "squeezenet"
+    """Attack: squeezenet, or weights that classify train wrote; train: squeezenet, vgg16, vgg16-pooled or resnet50
+    (docs/classify.md)."""
+    weights: str | None = None
+    """Train: what the network begins with, such as torchvision's file; squeezenet needs none."""
+    data: Annotated[str, Folder("a folder of classify data")] | None = None
+    """Train: pictures that classify data wrote; by default they are made now."""
+    layers: Literal["last", "all"] = "last"
+    """Train: the last layer, on features that are computed once, as in the paper; or the whole network."""
+    epochs: Count = 20
+    """Train: how often each picture is shown."""
+    batch: Count = 32
+    """Train: pictures a step."""
+    rate: Annotated[float, POSITIVE] | None = None
+    """Train: learning rate of Adam; by default 0.003 for the last layer, 0.0001 for all."""
+    params: str | None = None
+    """Attack: what is changed, with commas: vertex, pose, lighting; by default pose,vertex, and pose alone for
+    random and halton."""
+    shape: Literal["each", "smooth"] = "each"
+    """Attack: whether vertices move each by itself, as in the paper, or with a 4x4x4 lattice around the object."""
+    method: Literal["si-fgsm", "sgd", "scw", "random", "halton"] = "si-fgsm"
+    """Attack: by the gradient, after the paper, or samples of --within; of these the misclassified one with the
+    highest softmax of a wrong class is kept."""
+    steps: Count = 5
+    """Attack: steps along the gradient; an attack ends at the first that is misclassified."""
+    queries: Annotated[Count, Of(("random", "halton"))] = 5
+    """Attack: samples of each picture."""
+    step_vertex: Annotated[float, POSITIVE] | None = None
+    """Attack: length of a step, in object sizes; by default the paper's for VGG-16, as are the next ones."""
+    step_pose: Annotated[float, POSITIVE] | None = None
+    """Attack: the same, in radians."""
+    step_lighting: Annotated[float, POSITIVE] | None = None
+    """Attack: the same, as a share of the light."""
+    within_vertex: Annotated[float, POSITIVE] | None = None
+    """Attack: how far a vertex may go along each axis."""
+    within_pose: Annotated[float, POSITIVE] | None = None
+    """Attack: how far pitch, yaw and roll may go, rad; of random and halton by default 0.75."""
+    within_lighting: Annotated[float, POSITIVE] | None = None
+    """Attack: how far the light may go."""
+    constant: Annotated[float, Of(("scw",)), POSITIVE] = 0.1
+    """Attack: what a logit counts beside the size of the change."""
+    norm: Annotated[Literal[1, 2], Of(("scw",))] = 2
+    """Attack: the norm of the change that is kept small."""
+    draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
+    """Attack: draws before a change and after it, in which a failure must hold to be certain: right in 15 of 16,
+    then wrong in 12 of 16."""
+    nuisances: str = "shift_px=3"
+    """Attack: what a draw changes of a picture (docs/grades.md)."""
+
+    def check(self) -> None:
+        super().check()
+        needless = self.weights is not None and self.what != "train"
+        refuse(needless, "--weights", "classify train (an attack takes --network FILE)", f"classify {self.what}")
+        refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
+
+
 _ALL: tuple[type[Command], ...] = (
     *(
         Attack,
@@ -948,6 +1021,7 @@ _ALL: tuple[type[Command], ...] = (
         Verify,
     ),
     *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
+    Classify,
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""
