@@ -25,7 +25,7 @@ class Ordered:
 
     That depends on the picture's size, and on the number of threads. Given weights in another order, oneDNN lays
     them out anew at each call: from one of its own orders into another that takes as long as the convolution of a
-    whole picture. So each size is asked about once. There are few orders, two or three of a layer, and each is kept
+    whole picture. So each size is asked about once. There are few orders, two or three of a layer, each kept
     once.
     """
 
