@@ -222,7 +222,7 @@ def derender_settings(
     from scene_ir.derender.derender import DerenderSettings
     from scene_ir.derender.silhouette import OwnMesh
 
-    settings = DerenderSettings(fit=fit)
+    settings = DerenderSettings() if fit else DerenderSettings.fast()
     if segmenter is not None:
         from drivesem.scenes.segmenter import OnnxSegmenter
 
