@@ -111,7 +111,7 @@ def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
 
 def told_of(run: Path, result: FrameResult) -> dict[str, Any]:
     """What a picture of a run is: the run and frame it is from, the surest grade of its failures, theta."""
-    grades = [failure.grade or Grade.THRESHOLD for failure in result.failures]
+    grades = [Grade(failure.grade or Grade.THRESHOLD) for failure in result.failures]
     return {
         "run": run.resolve().name,
         "frame": result.identifier,

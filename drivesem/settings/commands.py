@@ -914,6 +914,16 @@ class Retrain(Trust, Training, FrameCommand):
         refuse(one, "--dataset and --root", "both or none", "one of them")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Command):
+    """Say what is installed, which optional parts work, what each missing one would give, and how to get it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Presets(Command):
+    """List the presets that --config takes by name."""
+
+
 _ALL: tuple[type[Command], ...] = (
     *(
         Attack,
@@ -932,7 +942,23 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
+    *(
+        Derender,
+        Render,
+        Edit,
+        Synth,
+        Bench,
+        Gradcheck,
+        Eval,
+        Convert,
+        Export,
+        Check,
+        Anchors,
+        Train,
+        Retrain,
+        Doctor,
+        Presets,
+    ),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""
