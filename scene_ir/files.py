@@ -34,12 +34,15 @@ _NPZ_LEVEL = 1
 
 _MOST_BYTES = 1 << 30
 """Of a file that is read whole, and of all arrays of an NPZ."""
+_READ_AT_ONCE = 1 << 24
+"""Bytes of a file that turns out longer than it said."""
 _MOST_PIXELS = 1 << 26
 """Of an image: 8192 x 8192."""
 _MOST_YAML = 1 << 18
 """Bytes of a YAML file: settings are short, and reading is slow."""
 _INTEGERS = 1 << 63
 """Integers lie below it, as in the arrays that are made of them."""
+_INTEGER_DIGITS = len(str(_INTEGERS))
 _ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
@@ -181,10 +184,12 @@ def below(folder: Path, name: str) -> Path:
     return path
 
 
-def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
-    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes."""
+def check_regular(path: Path | str, most: int = _MOST_BYTES) -> int:
+    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes.
+    Its size.
+    """
     try:
-        status = path.stat()
+        status = os.stat(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL, or half a character, in the name
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise FormatError(str(path), "a readable file", reason.lower()) from error
@@ -194,18 +199,32 @@ def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
         raise FormatError(str(path), "a regular file", "a device, a pipe or a socket")
     if status.st_size > most:
         raise FormatError(str(path), f"at most {most:,} bytes", f"{status.st_size:,}")
+    return status.st_size
 
 
-def read_bytes(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read."""
-    check_regular(path, most)
+def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
+    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read.
+
+    Calls the system as seldom as can be: tens of thousands of small files are read at once.
+    """
+    size = check_regular(path, most)
     try:
-        return path.read_bytes()
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        try:
+            data = os.read(descriptor, size + 1)
+            if len(data) != size:  # it changed meanwhile, or is longer than one call reads
+                parts = [data]
+                while parts[-1]:
+                    parts.append(os.read(descriptor, _READ_AT_ONCE))
+                data = b"".join(parts)
+        finally:
+            os.close(descriptor)
+        return data
     except OSError as error:
         raise FormatError(str(path), "a readable file", (error.strerror or str(error)).lower()) from error
 
 
-def read_text(path: Path, most: int = _MOST_BYTES) -> str:
+def read_text(path: Path | str, most: int = _MOST_BYTES) -> str:
     """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
     try:
         return read_bytes(path, most).decode("utf-8")
@@ -225,7 +244,7 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str, where: str) -> Any:
     """The value of JSON text. where: the file. FormatError as `read_json`."""
     try:
-        value = json.loads(text, parse_int=_integer)
+        value = json.loads(text, parse_int=_integer if _long_numbers(text) else None)
         if _ODD.search(text):
             _check_texts(value)
     except json.JSONDecodeError as error:
@@ -239,6 +258,19 @@ def parse_json(text: str, where: str) -> Any:
     except RecursionError as error:
         raise FormatError(where, "JSON", "lists or objects that are nested too deep") from error
     return value
+
+
+def _long_numbers(text: str) -> bool:
+    """Whether there are as many digits in a row as an integer beyond 64 bits has: then each is looked at, which
+    takes as long as all the rest of the reading.
+    """
+    digits = np.frombuffer(text.encode("utf-8", "surrogatepass"), np.uint8) - np.uint8(ord("0")) < 10
+    run = 1
+    while run < _INTEGER_DIGITS and digits.size:
+        step = min(run, _INTEGER_DIGITS - run)
+        digits = digits[:-step] & digits[step:]
+        run += step
+    return bool(digits.any())
 
 
 def _integer(text: str) -> int:

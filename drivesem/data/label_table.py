@@ -14,14 +14,17 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from scene_ir.errors import FormatError
-from scene_ir.types import Labels
+
+if TYPE_CHECKING:  # torch takes a second to load, and most of what reads label files needs none
+    from torch import Tensor
+
+    from scene_ir.types import Labels
 
 Edges = Literal["xyxy", "xywh"]
 """How boxes are held: left, top, right, bottom where pixel centres are whole numbers (KITTI), or left, top, width,
@@ -166,6 +169,10 @@ class LabelTable:
         """All boxes as a scene takes them, float32: objects in file order, and what is ignored as regions. Unknown
         are NaN, and an occlusion of 3.
         """
+        import torch
+
+        from scene_ir.types import Labels
+
         boxes = torch.from_numpy(self.boxes if self.edges == "xyxy" else from_coco(self.boxes)).float()
         objects = ~self.ignore
         pose = torch.from_numpy(self.pose[objects]).float()
@@ -280,16 +287,16 @@ def matrix_of(camera: Any) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]], np.float64)
 
 
-def camera_entry(projection: torch.Tensor) -> dict[str, Any]:
+def camera_entry(projection: Tensor) -> dict[str, Any]:
     """COCO's "camera" entry of a projection (3, 4) px."""
     values = shortest(projection)
     places = {"fx": 0, "fy": 5, "cx": 2, "cy": 6}
     return {**{name: values[i] for name, i in places.items()}, "projection": values}
 
 
-def shortest(values: torch.Tensor) -> list[float]:
+def shortest(values: Tensor) -> list[float]:
     """float32 values as the shortest decimals that read back as the same float32."""
-    return [float(str(v)) for v in values.to(torch.float32).flatten().numpy()]
+    return [float(str(v)) for v in values.float().flatten().numpy()]
 
 
 def known_pose(pose: Sequence[float]) -> bool:

@@ -1,4 +1,4 @@
-"""Layouts by name: who reads and writes their data sets and their labels, and which one lies at a path."""
+"""Layouts by name: who reads and writes their data sets, and who writes their labels."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
+from drivesem.data.layouts import LAYOUTS, layout_of
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.virtual import VirtualDataset
 from drivesem.store import place
-from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
 
@@ -74,8 +74,6 @@ _TABLE_WRITERS: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Writt
     "vkitti1": vkitti1.write_table,
     "vkitti2": vkitti2.write_table,
 }
-LAYOUTS = tuple(_TABLE_WRITERS)
-"""That are read and written."""
 _WRITTEN_ONLY: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
     "fiftyone": fiftyone.write_table
 }
@@ -124,52 +122,6 @@ def _looks_like(folder: Path) -> str | None:
         return layout_of(folder)
     except FormatError:
         return None
-
-
-def layout_of(path: Path) -> str | None:
-    """One of LAYOUTS by what lies there; None for a folder of none. FormatError for a file of none, or nothing."""
-    if path.is_file():
-        if path.suffix.lower() == ".json":
-            return "coco"
-        if path.suffix.lower() in (".yaml", ".yml"):
-            return "yolo"
-        raise FormatError(str(path), "a .json or .yaml file, or a folder of labels", f"a {path.suffix or 'file'}")
-    if not path.is_dir():
-        raise FormatError(str(path), "a file or folder of labels", "nothing there")
-    if (path / "data.yaml").is_file():
-        return "yolo"
-    if any((path / "annotations").glob("instances_*.json")):
-        return "coco"
-    if (path / "vkitti_1.3.1_rgb").is_dir():
-        return "vkitti1"
-    if any(p.is_dir() for pattern in ("Scene[0-9]*", "vkitti_2*") for p in path.glob(pattern)):
-        return "vkitti2"
-    folder = kitti.label_folder(path)
-    if folder is None:
-        return None
-    # YOLO's lines begin with a class number, KITTI's with a name
-    begins = (files.read_text(file).split(None, 1)[:1] for file in kitti.text_files(folder))
-    first = next((words[0] for words in begins if words), "")
-    return "yolo" if first.isdecimal() else "kitti"
-
-
-def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
-    """The labels, or detections where `scored`, of a path. truth: the labels beside which detections are read, for
-    COCO's ids, YOLO's classes and image sizes. FormatError naming file, line or entry, and field.
-    """
-    if not path.exists():
-        raise FormatError(str(path), "a file or folder of labels", "nothing there")
-    if layout == "kitti":
-        return kitti.read_table(path, scored)
-    if layout in ("coco", "yolo"):
-        return (coco if layout == "coco" else yolo).read_table(path, scored, truth)
-    if layout not in LAYOUTS:
-        raise RangeError("layout", f"one of {', '.join(LAYOUTS)}", layout)
-    if scored:
-        raise FormatError(str(path), "detections with scores", "Virtual KITTI, which holds labels only")
-    dataset = DATASETS[layout](path)
-    assert isinstance(dataset, VirtualDataset)
-    return dataset.table()
 
 
 def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, Path]) -> Written:

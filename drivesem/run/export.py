@@ -12,8 +12,8 @@ from drivesem.data.label_table import Written, to_coco
 from drivesem.report.tables import csv_text
 from drivesem.run.conversion import Conversion, convert
 from drivesem.run.finished import Run
-from drivesem.run.labels import told_of
 from drivesem.run.results import Failure, FrameResult
+from drivesem.run.training_data import told_of
 from drivesem.settings.errors import UsageError
 from drivesem.truth.grades import Grade
 from scene_ir import files

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -53,6 +54,8 @@ _NAMES = (
 )
 """What material and mesh names say of a part; the first that is found counts."""
 _DEFAULT_COLOUR = 0.8
+_MOST_BYTES = 1 << 30
+"""Of a mesh file, and of each file that it names."""
 _CAB = 0.2
 """Windows whose centre is farther than this from the middle, in lengths, are those of a cab."""
 
@@ -83,7 +86,7 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
         raise RangeError("front", "auto or an axis at right angles to up, such as +x", front)
     if not metres_per_unit > 0:
         raise RangeError("metres_per_unit", "a positive number", metres_per_unit)
-    scene = _read(file)
+    scene = read_scene(file)
     own = _own(scene, file)
     if own is not None:
         extent = own.vertices.amax(dim=0) - own.vertices.amin(dim=0)
@@ -145,16 +148,45 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     files.write_bytes(file, content)
 
 
-def _read(file: Path) -> trimesh.Scene:
+class _Beside(Resolver):
+    """Files that a mesh file names, such as materials and textures: regular ones below `root`, of `most` bytes."""
+
+    def __init__(self, folder: Path, root: Path, most: int) -> None:
+        self._folder, self._root, self._most = folder, root, most
+
+    def get(self, key: str) -> bytes:
+        """What is in the file. Raises FormatError."""
+        path = self._folder / key.strip().replace("\\", "/")
+        if not path.resolve().is_relative_to(self._root.resolve()):
+            raise FormatError(str(path), f"a file in {self._root}", "one elsewhere")
+        return files.read_bytes(path, self._most)
+
+    def keys(self) -> list[str]:
+        """No names: files are asked for one by one."""
+        return []
+
+    def namespaced(self, namespace: str) -> _Beside:
+        """Files below a folder beside the mesh."""
+        return _Beside(self._folder / namespace, self._root, self._most)
+
+    def write(self, name: str, data: str | bytes) -> None:
+        """Raises FormatError: nothing is written when a mesh is read."""
+        raise FormatError(str(self._folder / name), "a mesh that is read", "one that is written")
+
+
+def read_scene(file: Path, root: Path | None = None, most: int = _MOST_BYTES) -> trimesh.Scene:
+    """The scene in a mesh file. root: the folder below which materials and textures may lie, the file's own where
+    none is given; most: bytes of any file. Raises FormatError for a file that is missing, too large, or no mesh.
+    """
     if file.suffix.lower() not in _SUFFIXES:
         raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
     if not file.is_file():
         raise FormatError(str(file), "a mesh file", "no such file")
-    files.check_regular(file)
+    files.check_regular(file, most)
     try:
-        return trimesh.load_scene(file, process=False)
+        return trimesh.load_scene(file, process=False, resolver=_Beside(file.parent, root or file.parent, most))
     except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        reason = next(iter(f"{type(error).__name__}: {error}".splitlines()))
         raise FormatError(str(file), "a readable mesh", reason) from None
 
 

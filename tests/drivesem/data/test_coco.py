@@ -17,7 +17,7 @@ from pycocotools import mask as run_length
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from drivesem.data import coco
+from drivesem.data import coco, coco_labels
 from drivesem.data.classes import COCO_ROAD_USERS
 from drivesem.data.label_table import from_coco, shortest, to_coco
 from drivesem.data.registry import WRITERS, open_dataset
@@ -256,14 +256,14 @@ def test_ids_of_images_may_be_texts(tmp_path: Path) -> None:
     labels = coco.CocoDataset(path).labels("000000000139")
     assert labels.kind == numbered.kind
     assert torch.equal(labels.boxes_xyxy, numbered.boxes_xyxy)
-    table = coco.read_table(path, False, None)
+    table = coco_labels.read_table(path, False, None)
     coco.write_table(table, tmp_path / "again.json", {})
     again = files.read_json(tmp_path / "again.json")
     assert [row["id"] for row in again["images"]] == ["cam-139"]
     assert {row["image_id"] for row in again["annotations"]} == {"cam-139"}
     found = [{"image_id": "cam-139", "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}]
     files.write_json(tmp_path / "found.json", found)
-    assert len(coco.read_table(tmp_path / "found.json", True, table)) == 1
+    assert len(coco_labels.read_table(tmp_path / "found.json", True, table)) == 1
 
 
 def test_ids_of_two_kinds_are_refused(tmp_path: Path) -> None:
@@ -370,7 +370,7 @@ def test_images_missing_or_of_another_size(tmp_path: Path) -> None:
 
 
 def test_bad_requests(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"annotations: expected instances_\*\.json, found none"):
+    with pytest.raises(FormatError, match=r"expected a COCO folder, with annotations.*found neither"):
         coco.CocoDataset(tmp_path)
     path = foreign(tmp_path)
     with pytest.raises(RangeError, match="expected one of 1 identifiers, found 'no'"):
@@ -386,3 +386,14 @@ def test_regions_are_of_the_object_they_lie_on(make_exposure: Callable[..., Expo
     things = make_exposure().objects
     assert coco._kinds_of_region([39.5, 9.5, 45.5, 12.5], things) == ("Truck",)
     assert coco._kinds_of_region([5, 12, 24, 23], things) == tuple(coco.CATEGORIES)  # the car has a label
+
+
+@given(st.text(st.sampled_from("ab. /\\:"), min_size=1, max_size=7))
+def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
+    try:
+        told = "_".join(Path(name).with_suffix("").parts)
+    except ValueError:
+        with pytest.raises(ValueError, match="empty name"):
+            coco_labels.identifier_of({"file_name": name})
+        return
+    assert coco_labels.identifier_of({"file_name": name}) == told
