@@ -289,7 +289,8 @@ class CocoDataset(Frames[_Image]):
         self._kinds = kinds
         paths = files_of(root)
         if not paths:
-            raise FormatError(str(root / "annotations"), "instances_*.json", "none")
+            expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
+            raise FormatError(str(root), expected, "neither")
         entries: dict[str, _Image] = {}
         for path in paths:
             told = AnnotationFile(path, files.read_json(path))

@@ -143,10 +143,8 @@ class Rows:
         """The place of each row's id under a key among `ids`. FormatError naming one that is not there."""
         values = self.ids(key)
         if len(values) and len(ids) and values.dtype.kind != ids.dtype.kind:
-            kind = "texts" if ids.dtype.kind == "U" else "whole numbers"
-            raise FormatError(
-                self.at(0, key), f"{kind}, as the ids of the {what} are", json.dumps(values[0].item())
-            )
+            expected = f"{'texts' if ids.dtype.kind == 'U' else 'whole numbers'}, as the ids of the {what} are"
+            raise FormatError(self.at(0, key), expected, json.dumps(values[0].item()))
         order = np.argsort(ids)
         found = np.zeros(len(values), np.int64)
         other = np.ones(len(values), np.bool_)

@@ -196,9 +196,9 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     return table
 
 
-def table_of(paths: Mapping[str, Path | str], scored: bool = False) -> LabelTable:
+def table_of(paths: Mapping[str, str], scored: bool = False) -> LabelTable:
     """The labels, or detections where `scored`, of label files by their frames. FormatError as `Lines`."""
-    lines = Lines(list(map(str, paths.values())), list(map(files.read_text, paths.values())), scored)
+    lines = Lines(list(paths.values()), [files.read_text(file) for file in paths.values()], scored)
     if not scored:
         lines.check_sizes()
     return lines.table(list(paths), scored)

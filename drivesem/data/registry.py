@@ -8,11 +8,11 @@ from typing import Any, Protocol
 
 from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
-from drivesem.data.layouts import LAYOUTS
+from drivesem.data.layouts import LAYOUTS, layout_of
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.virtual import VirtualDataset
 from drivesem.store import place
-from scene_ir.errors import RangeError
+from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
 
 
@@ -92,9 +92,36 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_p
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
         return kitti.KittiDataset(place(root), with_points=True)
-    if name in ("coco", "yolo"):
-        return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(place(root), focal_px=focal_px)
-    return DATASETS[name](place(root))
+    folder = place(root)
+    if not folder.exists():
+        raise FormatError(str(root), f"the folder of a data set ({name}: {_HOLDS[name]})", "nothing there")
+    try:
+        if name in ("coco", "yolo"):
+            return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(folder, focal_px=focal_px)
+        return DATASETS[name](folder)
+    except FormatError as error:
+        other = _looks_like(folder)
+        if other in (None, name):
+            raise
+        found = f"{error.actual}; it looks like {other} (--dataset {other})"
+        raise FormatError(error.field, error.expected, found) from error
+
+
+_HOLDS = {
+    "coco": "annotations/instances_*.json, or such a file itself",
+    "kitti": "training/image_2, label_2 and calib",
+    "vkitti1": "vkitti_1.3.1_rgb and its kin",
+    "vkitti2": "Scene01 and its kin",
+    "yolo": "data.yaml, or such a file itself",
+}
+"""What lies in a data set's folder."""
+
+
+def _looks_like(folder: Path) -> str | None:
+    try:
+        return layout_of(folder)
+    except FormatError:
+        return None
 
 
 def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, Path]) -> Written:

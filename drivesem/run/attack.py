@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,6 +60,9 @@ from scene_ir.types import SceneIR
 
 PEERS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures: what is confirmed of one is shown to another."""
+WITHOUT_GRADIENT = "climb"
+"""The method for detectors that have no gradient, where nobody asked for one: of those that need none, it finds
+most failures that hold."""
 _AROUND = 3
 """Passes of a frame in which no method has a say."""
 WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
@@ -72,7 +76,13 @@ def attack_run(config: Attack) -> RunSummary:
     config = _settled(config)
     aim_of(config)
     check_device(config.device)
-    worker = Worker.of(config)
+    detector = _load(config)
+    suited = _suited(config, detector)
+    worker = Worker.of(suited, detector)
+    if suited.method != config.method:
+        told = f"--method {suited.method} takes the place of {config.method}"
+        sys.stderr.write(f"{config.detector} has no gradient: {told}\n")
+    config = suited
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, WRITTEN)
     names, without, failed = select_frames(worker.source, config)
@@ -106,7 +116,7 @@ def _attacked(
     if todo and config.backend == "warp" and config.device == "cpu":
         make_ready(config)
     work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
-    answers = ask(todo, work, build, config, Bar("attacking frames"))
+    answers = ask(todo, work, build, config, Bar("attacking frames", remaining=True))
     failed = failed | answers.failed
     empty = {name for name, usable in answers.results.items() if not usable}
     done = [name for name in names if name not in failed and name not in empty]
@@ -376,6 +386,15 @@ def _load(config: Attack) -> Predictor:
         return load_detector(config.detector, config.device, getattr(torch, config.precision))
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
+
+
+def _suited(config: Attack, detector: Predictor) -> Attack:
+    """The settings with a method that needs no gradient, where the detector has none and nobody asked for one."""
+    if isinstance(detector, Detector) or config.method != Attack().method:
+        return config
+    suited = replace(config, method=WITHOUT_GRADIENT)
+    suited.check()
+    return suited
 
 
 def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -> None:

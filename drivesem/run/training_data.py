@@ -1,4 +1,4 @@
-"""A run's counterexamples as training data: pictures, moved labels, where they are from."""
+"""The counterexamples of a run as training data: pictures, labels that moved along, and what each picture is."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
     if not names:
         raise FormatError(str(run / "frames"), f"frames with {RESULT}", "none")
     folders = [run / "frames" / name for name in names]
-    table = table_of({name: folder / LABELS for name, folder in zip(names, folders, strict=True)})
+    table = table_of({name: str(folder / LABELS) for name, folder in zip(names, folders, strict=True)})
     results = [load_frame(folder / RESULT) for folder in folders]
     sizes = [size_of_image(folder / PICTURE) for folder in folders]
     failure: list[str | None] = [None] * len(table)
@@ -60,7 +60,7 @@ def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
 
 def told_of(run: Path, result: FrameResult) -> dict[str, Any]:
     """What a picture of a run is: the run and frame it is from, the surest grade of its failures, theta."""
-    grades = [failure.grade or Grade.THRESHOLD for failure in result.failures]
+    grades = [Grade(failure.grade or Grade.THRESHOLD) for failure in result.failures]
     return {
         "run": run.resolve().name,
         "frame": result.identifier,

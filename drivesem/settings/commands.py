@@ -1002,6 +1002,16 @@ class Classify(FrameCommand):
         refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Command):
+    """Say what is installed, which optional parts work, what each missing one would give, and how to get it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Presets(Command):
+    """List the presets that --config takes by name."""
+
+
 _ALL: tuple[type[Command], ...] = (
     *(
         Attack,
@@ -1021,7 +1031,7 @@ _ALL: tuple[type[Command], ...] = (
         Verify,
     ),
     *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
-    Classify,
+    *(Classify, Doctor, Presets),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""

@@ -21,6 +21,7 @@ TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
+    *("CONTRIBUTING.md", "CITATION.cff"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
 LOADED_WHERE_USED = (

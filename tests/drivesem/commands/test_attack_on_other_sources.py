@@ -178,12 +178,24 @@ def test_scenes_are_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         (["--dataset", "scenes", "--root", "."], r"expected a scene of drivesem derender"),
         (["--dataset", "photographs", "--root", "."], r"expected photographs (.png, .jpg), found none"),
         (["--dataset", "photographs"], "--root: expected the folder of data set 'photographs'"),
+        (["--dataset", "coco", "--root", "."], "found neither"),
+        (
+            ["--dataset", "coco", "--root", "none"],
+            "none: expected the folder of a data set (coco: ann",
+        ),
         (["--focal", "700"], "--focal: expected --dataset coco, yolo, photographs"),
         (["--finder", "yolov3-slim"], "--finder: expected --dataset photographs"),
     ],
 )
 def test_bad_sources_are_one_line(words: list[str], message: str, refused: Any) -> None:
     assert message in refused("attack", *words)
+
+
+def test_a_folder_of_another_layout_is_recognised(plain_coco: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*ATTACK, "--dataset", "kitti", "--root", str(plain_coco)]) == 2
+    assert "it looks like coco (--dataset coco)" in capsys.readouterr().err
+    assert main(["eval", "--detector", "squeezedet", "--dataset", "yolo", "--root", str(plain_coco)]) == 2
+    assert "it looks like coco (--dataset coco)" in capsys.readouterr().err
 
 
 def test_nothing_to_attack_is_said(plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
