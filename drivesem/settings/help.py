@@ -27,6 +27,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     "How large, and who else": ("holes", "gate", "transfer", "study", "worth"),
     "Train, and hand on": ("train", "retrain", "anchors", "export", "convert"),
     "Scenes and data": ("derender", "render", "edit", "synth", "eval"),
+    "Classifiers of images": ("classify",),
     "Is all well": ("doctor", "presets", "check", "gradcheck", "bench"),
 }
 """Every command, by what one wants to know."""
