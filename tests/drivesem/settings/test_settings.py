@@ -50,6 +50,7 @@ def test_resolved_configuration_reads_back(tmp_path: Path) -> None:
 
 _NEEDED: dict[str, tuple[str, ...]] = {
     "study": ("single",),
+    "classify": ("attack",),
     "explain": ("--run", "run"),
     "confirm": ("--run", "run"),
     "plausibility": ("--run", "run"),
