@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.questions.evaluate.figures import evaluate_files
 from drivesem.questions.evaluate.report import print_result
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Eval
 
 _FILE_WIDTH = 120

@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from pycocotools import mask as run_length
 
-from drivesem.data.classes import ClassMap
 from drivesem.data.coco_labels import AnnotationFile, Rows, files_of, firsts, identifier_of, numbers_of
 from drivesem.data.frames import PNG_COMPRESSION, Frames, as_photograph, check_focal, images_by_place, pinhole
 from drivesem.data.label_table import (
@@ -33,6 +32,7 @@ from drivesem.data.label_table import (
     shortest,
     to_coco,
 )
+from drivesem.data.photographs import focal_of, read_pixels
 from drivesem.data.truth import Exposure, Place, TrackedObject
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -45,12 +45,6 @@ CATEGORIES = {
 }
 """KITTI's types and their supercategory; ids are counted from 1, in this order."""
 CATEGORY_IDS = {name: i + 1 for i, name in enumerate(CATEGORIES)}
-COCO_ROAD_USERS = ClassMap(
-    classes={"car": "Car", "truck": "Truck", "person": "Pedestrian"},
-    ignored={"bus": None, "train": None, "bicycle": "Cyclist", "motorcycle": "Cyclist"},
-)
-"""The classes of COCO 2017 that are on the road. A KITTI cyclist includes the bicycle, so that a bicycle alone is
-neither; buses and trains look like nothing the detectors know."""
 
 
 def _encode(mask: np.ndarray) -> dict[str, Any]:
@@ -207,9 +201,11 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     records: list[dict[str, Any]] = []
     for i, (name, identifier) in enumerate(zip(names, table.frames, strict=True)):
         suffix = images[identifier].suffix.lower() if identifier in images else ".png"
+        file_name = f"{name}{suffix}" if identifier in images else table.image_files.get(i, f"{name}{suffix}")
         width, height = table.sizes_wh[i].tolist()
-        record = {"id": image_ids[i], "file_name": f"{name}{suffix}", "width": width, "height": height}
-        records.append(record | ({"camera": table.cameras[i]} if i in table.cameras else {}))
+        record = {"id": image_ids[i], "file_name": file_name, "width": width, "height": height}
+        record |= {"camera": table.cameras[i]} if i in table.cameras else {}
+        records.append(record | ({"drivesem": table.told[i]} if i in table.told else {}))
     annotations: list[dict[str, Any]] = []
     own = [] if table.box_ids is None else table.box_ids.tolist()
     free = max(own, default=0) + 1
@@ -271,7 +267,8 @@ class CocoDataset(Frames[_Image]):
     root: the folder that holds `annotations/instances_*.json`, all of which are read, or one JSON file. images:
     where the images lie; by default `images/PART`, `PART`, `images`, `PART` with its year ("val2017") beside
     `annotations`, or the JSON's own folder, whichever is there first. focal_px: the focal length of images without
-    "camera". kinds: categories that are objects here, the others are background; None: all.
+    "camera"; by default EXIF's, or a usual one. kinds: categories that are objects here, others are background;
+    None: all.
 
     A frame's identifier is its file name without suffix, folders joined by "_". `kind` is the category's name as
     written; `COCO_ROAD_USERS` reads COCO's own. Unknown truncation and 3D boxes are NaN, unknown occlusion 3, as
@@ -292,7 +289,8 @@ class CocoDataset(Frames[_Image]):
         self._kinds = kinds
         paths = files_of(root)
         if not paths:
-            raise FormatError(str(root / "annotations"), "instances_*.json", "none")
+            expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
+            raise FormatError(str(root), expected, "neither")
         entries: dict[str, _Image] = {}
         for path in paths:
             told = AnnotationFile(path, files.read_json(path))
@@ -338,14 +336,15 @@ class CocoDataset(Frames[_Image]):
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph, camera, labels, and masks (M, H, W) where every object has a segmentation.
 
-        Raises FormatError naming the file and field: an image that is missing or of another size; an image without
-        "camera" where no focal_px was given; a segmentation that does not decode.
+        Raises FormatError naming the file and field: an image that is missing or of another size; a camera that is
+        none; a segmentation that does not decode.
         """
         entry = self._entry(identifier)
         path, record = entry.told.path, entry.record
-        camera = self._camera(f"{path}: {record['file_name']}", record)
+        size_hw = (record["height"], record["width"])
+        image = read_pixels(entry.path, size_hw)
+        camera, told = self._camera(entry)
         labels = self.labels(identifier)
-        image = files.read_image(entry.path, (camera.height, camera.width))
         rows, _, objects = self._things(identifier)
         rows = rows.some(objects.tolist())
         masks = None
@@ -360,15 +359,16 @@ class CocoDataset(Frames[_Image]):
             camera=camera,
             labels=labels,
             masks=masks,
-            provenance={"dataset": "coco", "image": str(record["file_name"]), "folder": path.name},
+            provenance={"dataset": "coco", "image": str(record["file_name"]), "folder": path.name, **told},
         )
 
-    def _camera(self, where: str, record: Mapping[str, Any]) -> Camera:
+    def _camera(self, entry: _Image) -> tuple[Camera, dict[str, str]]:
+        """The camera of an image, and what its provenance says of it."""
+        record, where = entry.record, f"{entry.told.path}: {entry.record['file_name']}"
         height, width = record["height"], record["width"]
         if "camera" not in record:
-            if self.focal_px is None:
-                raise FormatError(f"{where}: camera", "intrinsics, or a focal length (focal_px)", "neither")
-            return pinhole(height, width, self.focal_px)
+            focal = focal_of(entry.path, self.focal_px)
+            return pinhole(height, width, focal.length_px), {"focal": str(focal)}
         camera = record["camera"] if isinstance(record["camera"], dict) else {}
         if "projection" in camera:
             values = numbers_of(f"{where}: camera.projection", camera["projection"], 12)
@@ -380,7 +380,7 @@ class CocoDataset(Frames[_Image]):
             )
             projection, intrinsics = None, torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
-            return Camera(intrinsics, height, width, projection)
+            return Camera(intrinsics, height, width, projection), {}
         except SceneError as error:
             raise FormatError(f"{where}: {error.field}", error.expected, error.actual) from error
 

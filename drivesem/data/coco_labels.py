@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from scene_ir.errors import FormatError
 
 _IN_FOLDERS = re.compile(r"[/\\:]|^\.")
 """In names of files, what makes them more than a stem and a suffix."""
+Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
+_MOST_FLAG = 2**31
+"""Above occlusions and sides of images."""
 _SHOWN = 3
 """Ids that an error names."""
 
@@ -82,10 +85,15 @@ class Rows:
             if not isinstance(row.get(key, ""), str):
                 raise FormatError(self.at(i, key), "text", json.dumps(row[key])[:60])
 
-    def own(self, key: str) -> NDArray[np.int64]:
-        """As `whole`, each once."""
-        ids = self.whole(key)
-        seen: set[int] = set()
+    def ids(self, key: str) -> Ids:
+        """Whole numbers (N,), or texts where all are, under a key. FormatError naming a row with neither."""
+        values = self.values(key)
+        return np.array(values, np.str_) if values and set(map(type, values)) == {str} else self.whole(key)
+
+    def own(self, key: str) -> Ids:
+        """As `ids`, each once."""
+        ids = self.ids(key)
+        seen: set[int | str] = set()
         for i, value in enumerate(ids.tolist()):
             if value in seen:
                 raise FormatError(self.at(i, key), "an id of its own", value)
@@ -106,6 +114,13 @@ class Rows:
                 raise FormatError(self.at(i, key), "a finite number", json.dumps(values[i]))
         return found
 
+    def flags(self, key: str, missing: int) -> NDArray[np.int64]:
+        """Numbers (N,) under a key as whole ones, `missing` where a row has none. FormatError for a huge one."""
+        found = self.column(key, float(missing))
+        for i in np.flatnonzero(np.abs(found) >= _MOST_FLAG)[:1].tolist():
+            raise FormatError(self.at(i, key), f"less than {_MOST_FLAG:,}", f"{found[i]:g}")
+        return found.astype(np.int64)
+
     def boxes(self) -> NDArray[np.float64]:
         """Left, top, width, height (N, 4). FormatError naming the first row that has no such box."""
         values = self.values("bbox")
@@ -124,11 +139,14 @@ class Rows:
                 raise FormatError(self.at(i, "bbox"), expected, json.dumps(value)[:60])
         return np.array(values, dtype=np.float64).reshape(len(values), 4)
 
-    def places(self, key: str, ids: NDArray[np.int64], what: str) -> NDArray[np.int64]:
-        """The place of each row's number under a key among `ids`. FormatError naming one that is not there."""
-        values = self.whole(key)
+    def places(self, key: str, ids: Ids, what: str) -> NDArray[np.int64]:
+        """The place of each row's id under a key among `ids`. FormatError naming one that is not there."""
+        values = self.ids(key)
+        if len(values) and len(ids) and values.dtype.kind != ids.dtype.kind:
+            expected = f"{'texts' if ids.dtype.kind == 'U' else 'whole numbers'}, as the ids of the {what} are"
+            raise FormatError(self.at(0, key), expected, json.dumps(values[0].item()))
         order = np.argsort(ids)
-        found = values * 0
+        found = np.zeros(len(values), np.int64)
         other = np.ones(len(values), np.bool_)
         if len(ids):
             found = order[np.searchsorted(ids[order], values).clip(0, len(ids) - 1)]
@@ -195,7 +213,7 @@ class Rows:
             else np.zeros(len(self), np.bool_),
             score=self.column("score", None) if scored else np.full(len(self), np.nan),
             truncation=column("truncation", -1.0),
-            occlusion=column("occlusion", -1.0).astype(np.int64),
+            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else np.full(len(self), -1),
             alpha=column("alpha"),
             pose=pose,
             area=np.where(np.isnan(area), boxes[:, 2] * boxes[:, 3], area),
@@ -234,8 +252,9 @@ class AnnotationFile:
             raise FormatError(str(path), "images, annotations and categories", found)
         self.path = path
         tables = {n: Rows.of(f"{path}: {n}", content.get(n)) for n in ("images", "categories", "annotations")}
-        self.images, self.image_ids = _by_id(tables["images"])
-        self.categories, self.category_ids = _by_id(tables["categories"])
+        self.images, self.image_ids = _by_id(tables["images"], tables["images"].own("id"))
+        tables["categories"].own("id")
+        self.categories, self.category_ids = _by_id(tables["categories"], tables["categories"].whole("id"))
         self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
         self.annotations = tables["annotations"]
         self.images.texts("file_name")
@@ -244,8 +263,7 @@ class AnnotationFile:
         self.kind = self.annotations.places("category_id", self.category_ids, "categories")
 
 
-def _by_id(rows: Rows) -> tuple[Rows, NDArray[np.int64]]:
-    ids = rows.own("id")
+def _by_id(rows: Rows, ids: Ids) -> tuple[Rows, Any]:
     order = np.argsort(ids, kind="stable")
     return rows.some(order.tolist()), ids[order]
 
@@ -271,11 +289,11 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
     frames = [identifier_of(row) for row in told.images.rows]
     if len(set(frames)) != len(frames):
         frames = [str(i) for i in told.image_ids.tolist()]
-    sizes_wh = np.stack([told.images.column(key, 0.0) for key in ("width", "height")], axis=1)
+    sizes_wh = np.stack([told.images.flags(key, 0) for key in ("width", "height")], axis=1)
     table = told.annotations.table(frames, told.kinds, told.category_ids, told.frame, told.kind, scored)
     return replace(
         _merged_regions(table.rows(np.argsort(table.frame, kind="stable"))),
-        sizes_wh=sizes_wh.astype(np.int64),
+        sizes_wh=sizes_wh,
         image_ids=told.image_ids,
         cameras={i: row["camera"] for i, row in enumerate(told.images.rows) if "camera" in row},
     )
@@ -307,7 +325,7 @@ def _results(path: Path, content: list[Any], truth: LabelTable | None) -> LabelT
         raise FormatError(str(path), "labels beside a list of results", "none")
     if truth.kind_ids is None:
         raise FormatError(str(path), "categories (a COCO data set), as the labels are no COCO file", "a list")
-    image_ids = truth.image_ids
+    image_ids: Ids | None = truth.image_ids
     if image_ids is None:
         image_ids = np.array([int(name) if name.isdecimal() else -1 for name in truth.frames], np.int64)
     rows = Rows.of(str(path), content)

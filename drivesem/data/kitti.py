@@ -49,6 +49,8 @@ from scene_ir.types import FOCAL_PX, Camera, Frame, Labels
 
 DEPTH_SCALE = 256
 """Values a metre in `depth_2`."""
+_MOST_LINES = 10_000
+"""Of one frame: KITTI's have at most some 30."""
 INSTANCES = 256
 """Values a semantic id in `instance_2`: the lower byte is the instance."""
 SEMANTIC_NAMES = (
@@ -76,6 +78,8 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
 
 
 def _scene_labels(name: str, text: str, scored: bool) -> Labels:
+    if text.count("\n") > _MOST_LINES:
+        raise FormatError(name, f"at most {_MOST_LINES:,} lines", f"{text.count(chr(10)):,}")
     lines = Lines([name], [text], scored)
     _check_scene(lines, scored)
     return lines.table([name], scored).labels()

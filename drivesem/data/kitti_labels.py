@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -32,6 +32,8 @@ UNKNOWN_SIZE, UNKNOWN_POSITION, UNKNOWN_ANGLE = -1.0, -1000.0, -10.0
 UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 _BEFORE_POSE = FIELDS.index("height") - 1
 """Numbers of a line before its 3D box."""
+
+_MOST_FLAG = 2**31
 
 
 def finite_number(where: str, text: str) -> float:
@@ -69,6 +71,8 @@ class Lines:
             for row in np.flatnonzero(self.values[:, high] < self.values[:, low])[:1].tolist():
                 first, last = self.values[row, [low, high]].tolist()
                 raise FormatError(self.where(row, FIELDS[high + 1]), f"at least {first:g}", f"{last:g}")
+        for row in np.flatnonzero(np.abs(self.values[:, 1]) >= _MOST_FLAG)[:1].tolist():
+            raise FormatError(self.where(row, "occluded"), "a flag, such as 0 to 3", f"{self.values[row, 1]:g}")
 
     def where(self, row: int, field: str = "") -> str:
         """File and line of a row, and the field; blank lines are counted too."""
@@ -146,10 +150,10 @@ def _plain_columns(lines: Sequence[str], fields: int) -> tuple[list[str], NDArra
     if values.size != len(lines) * told or not np.isfinite(values).all():
         return None
     values = values.reshape(len(lines), told)
-    if flat is None:
-        return kinds, values
-    pose = np.tile(np.array(UNKNOWN_POSE, np.float64), (len(lines), 1))
-    return kinds, np.concatenate([values[:, :_BEFORE_POSE], pose, values[:, _BEFORE_POSE:]], axis=1)
+    if flat is not None:
+        pose = np.tile(np.array(UNKNOWN_POSE, np.float64), (len(lines), 1))
+        values = np.concatenate([values[:, :_BEFORE_POSE], pose, values[:, _BEFORE_POSE:]], axis=1)
+    return kinds, values[:, : fields - 1]  # without scores that nobody asked for
 
 
 def _without_pose(rests: Sequence[str]) -> list[str] | None:
@@ -185,11 +189,16 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     folder = label_folder(path) if path.is_dir() else None
     if folder is None:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
-    names = text_files(folder)
-    paths = [f"{folder}{os.sep}{name}" for name in names]
-    lines = Lines(paths, [files.read_text(file) for file in paths], scored)
+    paths = {name.removesuffix(".txt"): f"{folder}{os.sep}{name}" for name in text_files(folder)}
+    table = table_of(paths, scored)
+    if scored and not len(table):
+        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
+    return table
+
+
+def table_of(paths: Mapping[str, str], scored: bool = False) -> LabelTable:
+    """The labels, or detections where `scored`, of label files by their frames. FormatError as `Lines`."""
+    lines = Lines(list(paths.values()), [files.read_text(file) for file in paths.values()], scored)
     if not scored:
         lines.check_sizes()
-    if scored and not lines.kinds:
-        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    return lines.table([name.removesuffix(".txt") for name in names], scored)
+    return lines.table(list(paths), scored)

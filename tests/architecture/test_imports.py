@@ -21,6 +21,7 @@ TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
+    *("CONTRIBUTING.md", "CITATION.cff"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
 LOADED_WHERE_USED = (
@@ -53,7 +54,7 @@ class Rule:
 
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
-_JOINED = ("drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
+_JOINED = ("drivesem.attack.theta", "drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
 _BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "store", "synth")
 _BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings", "store")
 MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
@@ -99,6 +100,7 @@ RULES = (
         "drivesem.report",
         (
             "drivesem.run.results",
+            "drivesem.classify.results",
             "drivesem.truth.grades",
             "drivesem.evaluation",
             "scene_ir.errors",
