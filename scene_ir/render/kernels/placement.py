@@ -26,8 +26,8 @@ RELIT, RELIT_MORE = model.RELIT[0], model.RELIT[1] - model.RELIT[0]
 
 @wp.struct
 class Templates:
-    """Of vertices: where they are in the unit box, by how much they are bent there (3, V), their unit normals, their
-    objects, how much of them is paint, and how squarely the photograph's sun meets them.
+    """Of vertices: where they are in the unit box, by how much they are bent there (3, V), their unit normals,
+    their objects, how much of them is paint, and how squarely the photograph's sun meets them.
     """
 
     unit: wp.array(dtype=wp.vec3f)
