@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -130,11 +130,9 @@ class Reference:
             )
             if not worst <= AGREES:
                 self.incremental.disagrees = True
-                warnings.warn(
-                    f"detector {self.detector.name}: passes on changed regions differ from whole ones by "
-                    f"{worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on",
-                    RuntimeWarning,
-                    stacklevel=2,
+                sys.stderr.write(
+                    f"drivesem: detector {self.detector.name}: passes on changed regions differ from whole ones by "
+                    f"{worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on\n"
                 )
                 return whole
         return raw

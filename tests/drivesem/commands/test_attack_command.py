@@ -11,6 +11,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 import torch
 
+from detectors.incremental import reference
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
@@ -388,3 +389,30 @@ def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
     ((name, reason),) = told["frames_failed"].items()
     assert told["frames"] == 1
     assert reason.startswith(f"frame {name}: gradient of objects[0].yaw")
+
+
+def test_regions_that_disagree_are_told_in_one_line_and_passes_are_whole_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """No difference at all is small enough: as of a detector whose layers are not what its whole pass computes."""
+    words = [*WORDS, "--limit", "2", "--workers", "1"]
+    expected = attack([*words, "--whole", "--out", str(tmp_path / "whole")], capsys)
+    monkeypatch.setattr(reference, "AGREES", -1.0)
+    passes = []
+    changed = reference.Reference._changed
+    monkeypatch.setattr(
+        reference.Reference, "_changed", lambda self, *given: passes.append(0) or changed(self, *given)
+    )
+    assert main([*words, "--out", str(tmp_path / "regions")]) == 0
+    told = capsys.readouterr()
+    assert told.err.count("passes on changed regions differ") == 1
+    assert len(passes) == 1
+    (line,) = [line for line in told.err.splitlines() if "regions" in line and "differ" in line]
+    assert line.startswith("drivesem: detector squeezedet: ")
+    assert without_times(json.loads(told.out)) == without_times(expected)
+    for name in ("result.json", "theta.json"):
+        pairs = zip(
+            sorted((tmp_path / "whole").rglob(name)), sorted((tmp_path / "regions").rglob(name)), strict=True
+        )
+        for whole, regions in pairs:
+            assert without_times(json.loads(regions.read_text())) == without_times(json.loads(whole.read_text()))
