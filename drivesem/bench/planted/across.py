@@ -101,13 +101,13 @@ class AcrossFrame:
     attempts: tuple[AcrossAttempt, ...]
 
 
-def plant_across(pools: Sequence[FramePool], names: Sequence[str], seed: int) -> Planted | None:
-    """A fault of such features; None where none could be drawn. Equal arguments, equal faults."""
+def plant_across(pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0) -> Planted | None:
+    """The n-th fault of such features; None where none could be drawn. Equal arguments, equal faults."""
     rows = [FEATURES.index(name) for name in names]
     values, still, cars, frames = _reached(pools, rows)
     if not len(values):
         return None
-    rng = np.random.default_rng([seed, *"+".join(names).encode()])
+    rng = np.random.default_rng([seed, *"+".join(names).encode(), *([nth] if nth else [])])
     for _ in range(_TRIES):
         bands = np.array([_band(column, rng) for column in values.T])
         each = (values >= bands[:, 0]) & (values <= bands[:, 1])
