@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.attack.space import parse_params
@@ -19,6 +17,7 @@ from drivesem.bench.planted import across, across_names, summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import open_source

@@ -23,6 +23,7 @@ from drivesem.bench.tables import Section
 from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
+from scene_ir.derender.derender import DerenderSettings
 from scene_ir.errors import SceneError
 from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth, weather
 from tools.bench.settings import BenchTool
@@ -65,7 +66,8 @@ def run(config: BenchTool) -> int:
 def _derender(config: BenchTool, console: Console) -> Measured:
     _on_cpu(config)
     frames = _frames(config, derender)
-    measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config))
+    settings = DerenderSettings.fast() if config.fast else DerenderSettings()
+    measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config), settings)
     rows = list(watched(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)

@@ -43,6 +43,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
+    fast: Flag = False
+    """Of derender: as drivesem derender --fast does."""
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
@@ -65,5 +67,6 @@ class BenchTool(Tiles, DataSource, FrameCommand):
         fewest = 10 if self.what == "synth" else 1
         few = self.frames is not None and self.frames < fewest
         refuse(few, "--frames", f"at least {fewest}", self.frames)
+        refuse(self.fast and self.what != "derender", "--fast", "derender before it", self.what)
         both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
         refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.attack.space import parse_params
 from drivesem.questions.holes.frame import Effort, Further, look_around, look_inside
 from drivesem.questions.holes.merged import Explained, merged
@@ -25,6 +23,7 @@ from drivesem.questions.holes.results import (
     load_inside,
 )
 from drivesem.report.answer import Answer
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, folder_of, trusted_attack

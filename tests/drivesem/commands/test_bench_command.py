@@ -14,6 +14,7 @@ from drivesem.bench import climb, memory, render, step
 from drivesem.bench.planted import across, across_names, yardstick
 from drivesem.bench.planted.pool import FramePool, SeenCar
 from drivesem.bench.scenes import bench_scene
+from drivesem.bench.timing import Taken
 from drivesem.cli import main
 from drivesem.commands import bench
 
@@ -74,10 +75,11 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
         def __init__(self) -> None:
             self.calls = 0
 
-        def ms(self, call: Any) -> float:
+        def taken(self, call: Any) -> Taken:
             slow = 10 if self.calls in (2, 3) else 1
             self.calls += 1
-            return slow * (3.0 if call is stepping else 2.0)
+            ms = 3.0 if call is stepping else 2.0
+            return Taken(slow * ms, 2 * ms - 2.0)
 
     class Stepping:
         def __call__(self) -> None: ...
@@ -90,6 +92,7 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
     assert row.repetitions == 3
     assert (row.ratio, row.ratio_iqr) == (1.5, 0.0)
     assert (row.step_ms, row.detector_ms) == (3.0, 2.0)
+    assert (row.cpu_ratio, row.step_cpu_ms, row.detector_cpu_ms) == (2.0, 4.0, 2.0)
 
 
 def test_render_rows() -> None:
@@ -99,6 +102,7 @@ def test_render_rows() -> None:
         assert row.forward_ms > 0
         assert row.backward_ms > 0
         assert row.forward_backward_ms > row.backward_ms
+        assert row.both_cpu_ms > 0
     found = list(render.measure_verbs(render.SceneSize(1, 600), 0.0, 0, "cpu"))
     assert [(row.verb, row.backward_ms is None) for row in found[:4]] == [
         ("rasterize", True), ("interpolate", False), ("texture", False), ("antialias", False),

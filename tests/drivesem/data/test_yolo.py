@@ -95,10 +95,11 @@ def test_boxes_round_trip(
     assert told.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
 
 
-def test_without_a_calibration_a_focal_length_is_needed(folder: Path) -> None:
+def test_without_a_calibration_a_usual_focal_length_is_taken(folder: Path) -> None:
     (folder / "calib/train/000000.txt").unlink()
-    with pytest.raises(FormatError, match=r"images/train/000000\.png: expected a calibration, .*neither"):
-        yolo.YoloDataset(folder).frame("000000")
+    usual = yolo.YoloDataset(folder).frame("000000")
+    assert float(usual.camera.intrinsics[0, 0]) == pytest.approx(0.58 * 80)
+    assert usual.provenance["focal"] == "46.4 px, default"
     camera = yolo.YoloDataset(folder, focal_px=70.0).frame("000000").camera
     assert camera.intrinsics.tolist() == [[70, 0, 39.5], [0, 70, 19.5], [0, 0, 1]]
 
