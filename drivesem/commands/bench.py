@@ -145,7 +145,8 @@ def _planted_across(config: Bench, console: Console) -> Measured:
     pooling = ask(names, first.pool, partial(across.pool_of, config), config, Bar("states", remaining=True))
     pools = [pooling.results[name] for name in names if name in pooling.results]
     kinds = across.KINDS[1::8] if config.quick else across.KINDS
-    planted = [across.plant_across(pools, kind, config.seed) for kind in kinds]
+    kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
+    planted = [across.plant_across(pools, kind, config.seed, nth) for kind, nth in kinds]
     faults = [one for one in planted if one is not None]
     console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
     texts = tuple(one.fault.text for one in faults)
@@ -161,7 +162,7 @@ def _planted_across(config: Bench, console: Console) -> Measured:
         {
             "rows": told,
             "summary": summed,
-            "unplanted": ["+".join(kind) for kind, one in zip(kinds, planted, strict=True) if one is None],
+            "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
             "failed": failed | pooling.failed | asked.failed,
             "method": across_names.METHOD,
         },

@@ -612,6 +612,8 @@ class Bench(Regions, Scenes, FrameCommand):
     across: Count | None = None
     """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
     many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    each: Count = 1
+    """Planted, with --across: so many faults of each kind."""
     searched: NotNegative | None = None
     """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
     naming: str | None = None

@@ -24,7 +24,7 @@ interval and outside of it, at least."""
 _FOLDS, _OBJECTS = 5, 3
 """Of a pooled rule: parts of the objects, each of which is told by the rule of the others; objects, at least,
 whose failures lie inside."""
-_BEYOND_CHANCE = 1.5
+_BEYOND_CHANCE = 1.0
 """Standard errors, over objects, by which such a rule tells failures of objects that it was not made of."""
 _RULES = 8
 """Pooled rules, at most."""
@@ -67,7 +67,7 @@ def fit(
     (n,) by name; fails: (n,). only: features that it may ask for; support: share of the samples inside, at least.
 
     An interval must be worth what it takes to write it down (minimum description length): half a logarithm of the
-    samples for its share, one for each bound, which may lie at any of them, and the choice among features. Each
+    samples for its share, the choice among the ends that are tried for each bound, and that among features. Each
     feature is tried as the first.
     """
     names = [name for name in (features if only is None else only) if float(np.ptp(features[name])) > 0]
@@ -121,7 +121,7 @@ def description(
             int(low > features[name].min()) + int(high < features[name].max())
             for name, (low, high) in where.items()
         )
-    return (shares + bounds) * math.log(max(n, 2)) - told
+    return shares * math.log(max(n, 2)) + bounds * _bound(n) - told
 
 
 def cover(features: Mapping[str, Floats], fails: Flags, objects: NDArray[np.int64]) -> list[Rule]:
@@ -221,11 +221,16 @@ def _interval(values: Floats, fails: Flags, support: float) -> tuple[float, tupl
         return None
     gain = _likelihood(inner, count) + _likelihood(total - inner, n - count) - _likelihood(total, n)
     bounds = (start > 0).astype(int) + (stop < n)
-    gain = np.where(usable, gain - (0.5 + bounds) * math.log(n), -np.inf)
+    gain = np.where(usable, gain - 0.5 * math.log(n) - bounds * _bound(n), -np.inf)
     a, b = np.unravel_index(int(gain.argmax()), gain.shape)
     if not gain[a, b] > 0:
         return None
     return float(gain[a, b]), (_end(ranked, int(ends[a])), _end(ranked, int(ends[b])))
+
+
+def _bound(n: int) -> float:
+    """What it takes to write down a bound: which of the ends that are tried it is, of n samples."""
+    return math.log(max(min(n, _CUTS), 2))
 
 
 def _end(ranked: Floats, place: int) -> float:

@@ -22,6 +22,8 @@ AS_MANY, ALL = "halton's states, as many passes", "halton's states, all"
 CHANCE = "chance"
 SHAMS = 40
 """Detectors of each kind whose failures follow nothing."""
+SHARP = 0.3
+"""Share of the cars in its bands by labels that a fault hides, from which it counts as sharp."""
 _SHARE = 0.05
 """Of the cars in Halton's states, or of all cars in half of their states, that chance loses."""
 METHOD = (
@@ -30,9 +32,9 @@ METHOD = (
     "those alone, as many passes, and all there are. Pooled rules of either (drivesem holes) name a fault "
     "where the first one has its features, each about where its band is (half of both bands' hull), in part "
     "where it has one of them; further rules are those after the first, or all where there is no fault. "
-    "Passes: what one detector takes; here states and pictures serve all faults. No fault: the detector as it "
-    "is, in the same frames. Chance: cars are lost by lot, state by state or car by car. Intervals: Wilson's, "
-    "95 %."
+    "Sharp: the fault hides three in ten or more of the cars that lie in its bands by their labels. Passes: "
+    "what one detector takes; here states and pictures serve all faults. No fault: the detector as it is, in "
+    "the same frames. Chance: cars are lost by lot, state by state or car by car. Intervals: Wilson's, 95 %."
 )
 TITLE = "faults of a detector named by pooled rules"
 COLUMNS: Columns = {
@@ -41,6 +43,7 @@ COLUMNS: Columns = {
     "hit": ("Halton's pictures that it hits", "hit"),
     "cars": ("cars in them", "cars"),
     "still": ("cars as photographed", "still"),
+    "sharp": ("cars inside by labels", "sharp"),
     "failures": ("failures", "failures"),
     "objects": ("of objects", "objects"),
     "passes": ("passes", "passes"),
@@ -94,6 +97,7 @@ class NameRow:
     hit: float | None
     cars: float | None
     still: float | None
+    sharp: float | None
     failures: int
     objects: int
     passes: int
@@ -185,18 +189,22 @@ def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[
 
 
 def summary_rows(rows: Sequence[NameRow]) -> list[dict[str, Any]]:
-    """Of faults, and of none, by what named them."""
+    """Of faults, of the sharp ones, and of none, by what named them."""
     found = []
     for by in dict.fromkeys(row.by for row in rows):
-        for planted in (True, False):
-            own = [row for row in rows if row.by == by and bool(row.fault) == planted]
+        of_by = [row for row in rows if row.by == by]
+        sharp = [row for row in of_by if row.sharp is not None and row.sharp >= SHARP]
+        parts = {"": [row for row in of_by if row.fault], ", sharp faults": sharp}
+        parts[", no fault"] = [row for row in of_by if not row.fault]
+        for which, own in parts.items():
             if not own:
                 continue
+            planted = which != ", no fault"
             named = sum(row.named for row in own)
             low, high = wilson(named, len(own)) if planted else (None, None)
             found.append(
                 {
-                    "by": by if planted else f"{by}, no fault",
+                    "by": by + which,
                     "faults": len(own),
                     "named": named if planted else None,
                     "low": low,
@@ -221,6 +229,7 @@ def _row(one: Planted | None, by: str, evidence: Evidence, pools: Sequence[Frame
         hit=None if one is None else one.hit,
         cars=None if one is None else one.cars,
         still=None if one is None else one.still,
+        sharp=None if one is None else one.sharp,
         failures=int(evidence.fails.sum()),
         objects=len(np.unique(evidence.objects[evidence.fails])),
         passes=evidence.passes,

@@ -122,6 +122,23 @@ def bands_by_label(pools: Sequence[FramePool], fault: PlantedFault) -> tuple[Ban
     return tuple(Band(name, start, end) for name, start, end in named if start < end)
 
 
+def sharpness(pools: Sequence[FramePool], fault: PlantedFault) -> float:
+    """Share of the cars found at Halton's states, inside of a fault's bands by label, that it hides."""
+    bands = bands_by_label(pools, fault)
+    inside = lost = 0
+    for pool in pools:
+        rows = [pool.names.index(band.feature) for band in bands]
+        ends = [(row, band.low, band.high) for row, band in zip(rows, bands, strict=True)]
+        cars = [
+            car
+            for state in pool.states
+            for car in state
+            if car.margin > 0 and all(low <= car.described[row] <= high for row, low, high in ends)
+        ]
+        inside, lost = inside + len(cars), lost + sum(hidden(cars, fault, pool.t_star))
+    return lost / inside if inside else 0.0
+
+
 @torch.no_grad()
 def _seen(objective: Objective, samples: dict[int, Sample], margins: dict[int, float]) -> tuple[SeenCar, ...]:
     if not samples:

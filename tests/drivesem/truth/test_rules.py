@@ -132,6 +132,6 @@ def test_a_description_is_shorter_where_a_rule_tells() -> None:
     fails = failing(contains(truth, features, 96), 0)
     assert description(truth, features, fails) < description({}, features, fails)
     assert description({"yaw_deg": (0.2, 0.5)}, features, fails) > description({}, features, fails)
-    # Two bounds, each a logarithm of the samples.
+    # Two bounds, each one of the 48 ends that are tried.
     more = description(truth, features, fails) - description(truth, features, fails, bounds=0)
-    assert more == pytest.approx(2 * np.log(96))
+    assert more == pytest.approx(2 * np.log(48))
