@@ -364,6 +364,16 @@ def test_coco_s_cameras_of_other_projects(said: Callable[..., str], tmp_path: Pa
     assert message in said("convert", path, "--to", "kitti", "--out", tmp_path / "out")
 
 
+def test_coco_s_own_keys_that_json_cannot_say(said: Callable[..., str], tmp_path: Path) -> None:
+    row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 5, 4], "area": 20, "mood": float("nan")}
+    image = {"id": 1, "file_name": "a.png", "height": 96, "width": 320}
+    content = {"images": [image], "categories": [{"id": 1, "name": "Car"}], "annotations": [row]}
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps(content))
+    message = "annotations[0]: expected finite numbers, found NaN or infinity"
+    assert message in said("convert", path, "--to", "coco", "--out", tmp_path / "out")
+
+
 @pytest.mark.parametrize("name", ["result.json", "scene/depth.bin", "counterexample.png"])
 def test_links_of_a_run_stay_in_it(
     write_run: Callable[..., Path], said: Callable[..., str], tmp_path: Path, name: str
