@@ -143,8 +143,18 @@ def _text(
         for name, number in categories
     ]
     tables = {"images": images, "annotations": annotations, "categories": named}
-    lines = {name: ",\n".join(json.dumps(row, allow_nan=False) for row in rows) for name, rows in tables.items()}
+    lines = {
+        name: ",\n".join(_entry_text(name, i, row) for i, row in enumerate(rows)) for name, rows in tables.items()
+    }
     return "{" + start + ",\n".join(f'"{name}": [\n{text}\n]' for name, text in lines.items()) + end + "}\n"
+
+
+def _entry_text(table: str, place: int, row: Any) -> str:
+    """An entry as JSON. FormatError for NaN and infinity, which JSON has not, in keys of another project."""
+    try:
+        return json.dumps(row, allow_nan=False)
+    except ValueError as error:
+        raise FormatError(f"{table}[{place}]", "finite numbers", "NaN or infinity") from error
 
 
 def _objects(exposure: Exposure) -> Iterable[dict[str, Any]]:

@@ -230,7 +230,7 @@ class YoloDataset(Frames[Path]):
         path = root / "data.yaml" if root.is_dir() else root
         content = _mapping(path)
         self.class_names = _names(path, content)
-        base = path.parent / str(content.get("path") or ".")
+        base = path.parent / _inside(path, "path", str(content.get("path") or "."))
         folders = list(dict.fromkeys(folder for part in PARTS for folder in _folders(path, content, part)))
         if not folders:
             raise FormatError(f"{path}: train", "a folder of images", "none")
@@ -307,7 +307,14 @@ def _folders(path: Path, content: Mapping[str, Any], part: str) -> list[str]:
     folders = [value] if isinstance(value, str) else value
     if not isinstance(folders, list) or any(not isinstance(f, str) or f.endswith(".txt") for f in folders):
         raise FormatError(f"{path}: {part}", "a folder of images, or a list of folders", repr(value)[:60])
-    return folders
+    return [_inside(path, part, folder) for folder in folders]
+
+
+def _inside(path: Path, key: str, folder: str) -> str:
+    """A folder that a YAML file names, if its name stays below that file's own. FormatError."""
+    if Path(folder).is_absolute() or ".." in Path(folder).parts or "\0" in folder:
+        raise FormatError(f"{path}: {key}", f"a folder in {path.parent}", repr(folder))
+    return folder
 
 
 def _beside(image: Path, folder: str) -> Path:

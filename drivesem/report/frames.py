@@ -14,6 +14,7 @@ from drivesem.report import grading
 from drivesem.report.page import ShownRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
 from scene_ir import files
+from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -562,6 +563,8 @@ def _near(xyxy: tuple[float, float, float, float], marks: Sequence[Mark]) -> tup
 
 def _opened(one: Outcome, name: str) -> Image:
     path = one.run.folder / "frames" / one.result.identifier / name
+    if not path.is_file():
+        raise FormatError(str(path), "a picture of the run", "none")
     with files.opened_image(path) as picture:
         return picture.convert("RGB")
 
