@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import re
 import signal
 import sys
@@ -26,6 +27,7 @@ from scene_ir.errors import shown
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
+_EXIT_PIPE = 141
 _EXIT_ENDED = 143
 _CODE = re.compile(r"(?:^|[,@])(?:module|torchscript|export|ultralytics):([^,]+)")
 """Detectors whose files are code (`detectors.adapters.choose.RUNS_CODE`, which a test holds this against)."""
@@ -34,8 +36,8 @@ _LONGEST_LINE = 2000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 143 ended by
-    SIGTERM.
+    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 nobody reads
+    on, 143 ended by SIGTERM.
     """
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
@@ -45,6 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
         return _EXIT_ENDED if isinstance(error, _EndedError) else _EXIT_INTERRUPTED
+    except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the interpreter's last words go
+        return _EXIT_PIPE
     except (ValueError, OSError) as error:
         if not _is_bad_input(error):
             raise

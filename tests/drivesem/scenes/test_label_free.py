@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,14 @@ from detectors.types import CLASSES, Detections
 from drivesem.cli import main
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.scenes.label_free import FITTING, detect, label_free, settings_for
+from drivesem.scenes.label_free import FITTING, detect, has_places, label_free, placed_by_boxes, settings_for
 from drivesem.synth.frames import SynthFrame, generate_frame
 from scene_ir.derender import pose
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.io import load_scene
-from scene_ir.types import Camera, Frame
+from scene_ir.types import Camera, Frame, Labels
 
 KITTI = Path(__file__).parents[3].parent / "shared" / "data" / "kitti"
 SEED, FRAMES = 2027, range(12)
@@ -183,6 +184,62 @@ def test_a_larger_picture_of_the_same_street_gives_the_same_cars(streets: list[S
     sides = (two.boxes_xyxy[0, 2:] - two.boxes_xyxy[0, :2]) / 2
     apart = (one.boxes_xyxy - (two.boxes_xyxy[0] - 0.5) / 2).abs().amax(1).min()
     assert float(apart) < 0.25 * float(sides.max())
+
+
+def boxed(frame: Frame, kind: tuple[str, ...], boxes: list[list[float]], **known: torch.Tensor) -> Frame:
+    """The frame with labels that say 2D boxes, and what else is `known`."""
+    count = len(kind)
+    labels = Labels(
+        kind=kind,
+        boxes_xyxy=torch.tensor(boxes),
+        truncation=known.get("truncation", torch.full((count,), math.nan)),
+        occlusion=known.get("occlusion", torch.full((count,), 3, dtype=torch.int64)),
+        translation=torch.full((count, 3), math.nan),
+        yaw=torch.full((count,), math.nan),
+        size_lhw=torch.full((count, 3), math.nan),
+        ignore_xyxy=torch.tensor([[1.0, 2.0, 30.0, 40.0]]),
+    )
+    return replace(frame, labels=labels)
+
+
+def test_labelled_boxes_are_placed_and_stay() -> None:
+    boxes = [
+        [600.0, 180.0, 700.0, 240.0],
+        [50.0, 150.0, 90.0, 260.0],
+        [300.0, 100.0, 300.0, 140.0],
+        [5.0, 5.0, 90.0, 60.0],
+    ]
+    frame = boxed(frame_of(), ("car", "person", "truck", "dog"), boxes)
+    assert frame.labels is not None
+    assert not has_places(frame.labels)
+    labels = placed_by_boxes(frame).labels
+    assert labels is not None
+    assert has_places(labels)
+    assert labels.kind == ("Car", "Pedestrian", "Truck", "dog")
+    assert torch.equal(labels.boxes_xyxy, frame.labels.boxes_xyxy)
+    assert torch.equal(labels.ignore_xyxy, frame.labels.ignore_xyxy)
+    known = torch.isfinite(labels.translation).all(1)
+    assert known.tolist()[2:] == [False, False]  # a box without area, and what is no road user
+    assert bool(known[0])
+    assert 5 < float(labels.translation[0, 2]) < 60
+    assert int(labels.occlusion[0]) == 0
+    assert 0 <= float(labels.truncation[0]) < 0.2
+    assert placed_by_boxes(frame).provenance["places"] == "estimated"
+
+
+def test_what_labels_say_is_not_estimated() -> None:
+    told = {"truncation": torch.tensor([0.4]), "occlusion": torch.tensor([1])}
+    labels = placed_by_boxes(boxed(frame_of(), ("Car",), [[600.0, 180.0, 700.0, 240.0]], **told)).labels
+    assert labels is not None
+    assert (float(labels.truncation[0]), int(labels.occlusion[0])) == (pytest.approx(0.4), 1)
+
+
+def test_of_two_cars_in_one_place_the_larger_stays() -> None:
+    boxes = [[602.0, 182.0, 698.0, 239.0], [600.0, 180.0, 700.0, 240.0]]
+    labels = placed_by_boxes(boxed(frame_of(), ("car", "car"), boxes)).labels
+    assert labels is not None
+    assert torch.isfinite(labels.translation[:, 2]).tolist() == [False, True]
+    assert bool(torch.isnan(labels.size_lhw[0]).all())
 
 
 def test_derender_takes_a_photograph(

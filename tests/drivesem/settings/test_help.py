@@ -113,6 +113,14 @@ def test_presets_of_a_wheel_are_found(tmp_path: Path, monkeypatch: pytest.Monkey
         presets.cache_clear()
 
 
+def test_a_reader_that_has_enough_ends_the_command() -> None:
+    words = (
+        f"set -o pipefail; {sys.executable} -u -m drivesem.cli --tyro-print-completion bash | head -1 > /dev/null"
+    )
+    ended = subprocess.run(["bash", "-c", words], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) in ((141, ""), (0, ""))
+
+
 def test_completion_is_offered() -> None:
     words = [sys.executable, "-m", "drivesem.cli", "--tyro-print-completion", "bash"]
     script = subprocess.run(words, capture_output=True, text=True, check=True).stdout
