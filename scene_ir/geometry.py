@@ -83,6 +83,12 @@ def clip_boxes(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(boxes_xyxy.clamp(min=0), limit)
 
 
+def weld(vertices: Tensor, within: float = 1e-6) -> Tensor:
+    """Which place (V,) int64, counted from 0, each of the vertices (V, 3) is at: those at one place share it."""
+    keys = (vertices.detach() / within).round().to(torch.int64)
+    return torch.unique(keys, dim=0, return_inverse=True)[1]
+
+
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals (V, 3), pointing outwards for outward-wound faces."""
     corners = vertices[faces]

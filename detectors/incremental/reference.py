@@ -131,8 +131,8 @@ class Reference:
             if not worst <= AGREES:
                 self.incremental.disagrees = True
                 sys.stderr.write(
-                    f"drivesem: detector {self.detector.name}: passes on changed regions differ from whole ones by "
-                    f"{worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on\n"
+                    f"drivesem: detector {self.detector.name}: passes on changed regions differ from whole ones "
+                    f"by {worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on\n"
                 )
                 return whole
         return raw

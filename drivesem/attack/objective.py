@@ -370,10 +370,7 @@ def _together(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, T
     gradients = torch.autograd.grad(losses, leaves)
     for objective, gradient in zip(objectives, gradients, strict=True):
         objective.passes += GRADIENT_PASSES
-        bad = (~torch.isfinite(gradient)).nonzero()
-        if len(bad):
-            i = int(bad[0])
-            raise RangeError(f"gradient of {objective.space.name(i)}", "a finite value", float(gradient[i]))
+        objective.space.check_gradient(gradient)
     return [(loss.detach(), gradient) for loss, gradient in zip(losses, gradients, strict=True)]
 
 

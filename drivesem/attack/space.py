@@ -7,17 +7,18 @@ photographed is theta = 0. What is *feasible* inside the bounds is decided by `d
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
 import torch
 from torch import Tensor
 
+from drivesem.attack.theta import ParameterSpec, ThetaSpace
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import yaw_matrix
-from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR, check_finite
+from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
 
 class Parameter(StrEnum):
@@ -35,18 +36,6 @@ class Parameter(StrEnum):
 
 SIX = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
 """The paper's parameters. The others need a budget that goes beyond the paper's."""
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterSpec:
-    """Facts of one parameter. size: coordinates a car (`per_object`) or a scene; unit: of theta, for people;
-    names: of the coordinates, after `objects[i].` where it belongs to a car.
-    """
-
-    size: int
-    per_object: bool
-    unit: str
-    names: tuple[str, ...]
 
 
 def _lattice_names() -> tuple[str, ...]:
@@ -194,7 +183,7 @@ def combo(number: int) -> tuple[Parameter, ...]:
     return COMBOS[number]
 
 
-class ParameterSpace:
+class ParameterSpace(ThetaSpace[Parameter]):
     """The vector theta (D,) of one scene: names, bounds, steps, and the way from theta to a perturbed scene.
 
     Blocks follow each other in the order of `Parameter`; a block of a parameter of cars is (N, size), row-major.
@@ -208,27 +197,13 @@ class ParameterSpace:
         budget: Budget | None = None,
         steps: StepSizes | None = None,
     ) -> None:
+        super().__init__(normalise_params(params), SPECS, len(scene.objects), scene.objects.translation)
         self.scene = scene
-        self.params = normalise_params(params)
         self.budget = budget or Budget()
         self.budget.check(self.params)
         self.steps = steps or StepSizes()
-        self.count = len(scene.objects)
-        self._slices: dict[Parameter, slice] = {}
-        start = 0
-        for parameter in self.params:
-            spec = SPECS[parameter]
-            end = start + spec.size * (self.count if spec.per_object else 1)
-            self._slices[parameter] = slice(start, end)
-            start = end
-        self.dim = start
         # Constant, as nobody asks for a gradient to the photographed scene.
         self._axes = _ground_axes_of(scene).detach()
-        reference = scene.objects.translation
-        self.theta0 = reference.new_zeros(self.dim)
-        self.lower = reference.new_zeros(self.dim)
-        self.upper = reference.new_zeros(self.dim)
-        self.step = reference.new_zeros(self.dim)
         for parameter, where in self._slices.items():
             low, high = self._bounds(parameter)
             self.lower[where] = low
@@ -238,36 +213,11 @@ class ParameterSpace:
                 for bound in (self.lower, self.upper):
                     bound[where].view(self.count, SPECS[parameter].size)[behind_camera(scene)] = 0
 
-    @property
-    def blocks(self) -> Mapping[Parameter, slice]:
-        """Where theta holds each of its parameters, in its order."""
-        return self._slices
-
-    def slice_of(self, parameter: Parameter) -> slice | None:
-        """Where theta holds `parameter`, or None where it is held."""
-        return self._slices.get(parameter)
-
-    def name(self, i: int) -> str:
-        """The name of coordinate `i`, for instance `objects[3].yaw`."""
-        parameter, owner, k = self._locate(i)
-        spec = SPECS[parameter]
-        return f"objects[{owner}].{spec.names[k]}" if spec.per_object else spec.names[k]
-
-    def describe(self, i: int) -> str:
-        """Name, unit and bounds of coordinate `i`: `objects[3].yaw, rad, [-0.35, 0.35]`."""
-        parameter, _, _ = self._locate(i)
-        return f"{self.name(i)}, {SPECS[parameter].unit}, [{float(self.lower[i]):g}, {float(self.upper[i]):g}]"
-
     def unflatten(self, theta: Tensor) -> Perturbation:
         """theta (D,) as named tensors (views of it). Raises ShapeError."""
         if tuple(theta.shape) != (self.dim,):
             raise ShapeError("theta", f"shape ({self.dim},)", tuple(theta.shape))
-        parts = {}
-        for parameter, where in self._slices.items():
-            spec = SPECS[parameter]
-            shape = (self.count, spec.size) if spec.per_object else (spec.size,)
-            parts[parameter.value] = theta[where].reshape(shape)
-        return Perturbation(**parts)
+        return Perturbation(**{str(parameter): self.block(theta, parameter) for parameter in self.params})
 
     def flatten(self, perturbation: Perturbation) -> Tensor:
         """The inverse of `unflatten`. Raises ShapeError where a parameter is missing, unexpected or misshaped."""
@@ -298,10 +248,7 @@ class ParameterSpace:
         are. Mesh offsets are symmetric left to right, added to the source's.
         Raises ShapeError, and RangeError naming a coordinate that is not finite.
         """
-        finite = torch.isfinite(theta)
-        if not bool(finite.all()):
-            i = int((~finite).nonzero()[0])
-            raise RangeError(f"theta: {self.name(i)}", "a finite value", float(theta[i]))
+        self.check(theta)
         part = self.unflatten(theta)
         objects, environment = scene.objects, scene.environment
         changes: dict[str, Tensor] = {}
@@ -355,37 +302,6 @@ class ParameterSpace:
         if parameter is Parameter.SIZE:
             return 100 * value, "%"
         return None
-
-    def display(self, i: int, value: float) -> str:
-        """`value` of coordinate `i` as people write it: `0.21 m`, `5.7 deg`, `3 %`, `0.25`."""
-        physical = self.physical(i, value)
-        return f"{value:.3g}" if physical is None else f"{physical[0]:.3g} {physical[1]}"
-
-    def theta_by_name(self, theta: Tensor) -> dict[str, dict[str, float | str]]:
-        """theta (D,) for people: name -> value, unit, lower, upper, and display in metres, degrees or percent."""
-        check_finite("theta", theta)
-        self.unflatten(theta)
-        lower, upper = self.lower.tolist(), self.upper.tolist()
-        return {
-            self.name(i): {
-                "value": value,
-                "unit": SPECS[self._locate(i)[0]].unit,
-                "lower": lower[i],
-                "upper": upper[i],
-                "display": self.display(i, value),
-            }
-            for i, value in enumerate(theta.detach().cpu().tolist())
-        }
-
-    def _locate(self, i: int) -> tuple[Parameter, int, int]:
-        """Parameter, object (0 for a scene's parameter) and place within them of coordinate `i`."""
-        if not 0 <= i < self.dim:
-            raise RangeError("theta coordinate", f"an index in [0, {self.dim})", i)
-        for parameter, where in self._slices.items():
-            if i < where.stop:
-                owner, k = divmod(i - where.start, SPECS[parameter].size)
-                return parameter, owner, k
-        raise AssertionError("the slices cover theta")
 
     def _bounds(self, parameter: Parameter) -> tuple[Tensor | float, Tensor | float]:
         """Bounds of theta's block of `parameter`; they always hold 0."""

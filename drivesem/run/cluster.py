@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 J = TypeVar("J")
 _PATIENCE_S, _PAUSE_S = 10.0, 1.0
+_LOST_S = 60.0
+"""A process that ended is begun anew; one that is not back after so long is given up."""
 _TRIES = 3
-"""How often a process may end with a job in hand, before that is listed; and before it is ready, until it is given
-up.
-"""
+"""How often a process may end with a job in hand, before that is listed."""
 
 
 class _Process:
@@ -53,13 +53,13 @@ class _Process:
 @dataclass(frozen=True, slots=True)
 class _InHand:
     """An actor and the job that it does, None while it is getting ready. tries: of the job, before this one; gone:
-    how often in a row the actor ended before it was ready.
+    since when the actor has not been there, None where it was when it was last asked.
     """
 
     actor: Any
     job: Any = None
     tries: int = 0
-    gone: int = 0
+    gone: float | None = None
 
 
 def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J, Callable[[], Any]]]:
@@ -102,12 +102,19 @@ def _shared(
     ray: ModuleType, actors: Sequence[Any], left: deque[tuple[Any, int]]
 ) -> Iterator[tuple[Any, Callable[[], Any]]]:
     pending: dict[Any, _InHand] = {actor.ready.remote(): _InHand(actor) for actor in actors}
-    while pending:
-        (reference,), _ = ray.wait(list(pending), num_returns=1)
-        hand = pending.pop(reference)
+    absent: deque[tuple[float, _InHand]] = deque()  # and when they are asked again
+    while pending or absent:
+        while absent and (time.monotonic() >= absent[0][0] or not pending):
+            due, hand = absent.popleft()
+            time.sleep(max(due - time.monotonic(), 0))
+            pending[hand.actor.ready.remote()] = hand
+        done, _ = ray.wait(list(pending), num_returns=1, timeout=_PAUSE_S if absent else None)
+        if not done:
+            continue
+        hand = pending.pop(done[0])
         outcome: Callable[[], Any] | None = None
         try:
-            result, error = ray.get(reference) or (None, None)
+            result, error = ray.get(done[0]) or (None, None)
             outcome = partial(_hand_over, result, error)
             ready = True
         except ray.exceptions.RayActorError as error:
@@ -115,10 +122,10 @@ def _shared(
                 raise
             # Begun anew by Ray where there is room: only then it gets a job again. Or never: where the head takes
             # this machine for lost, it ends all that this process began.
-            gone = hand.gone + (hand.job is None)
-            if gone < _TRIES:
-                time.sleep(_PAUSE_S * gone)
-                pending[hand.actor.ready.remote()] = _InHand(hand.actor, gone=gone)
+            now = time.monotonic()
+            gone = now if hand.gone is None else hand.gone
+            if now - gone < _LOST_S:
+                absent.append((now + _PAUSE_S, _InHand(hand.actor, gone=gone)))
             ready = False
             if hand.job is not None and hand.tries + 1 < _TRIES:
                 left.appendleft((hand.job, hand.tries + 1))

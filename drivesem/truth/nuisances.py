@@ -90,19 +90,22 @@ class Nuisances:
 
     def draw(self, stream: str, number: int, scene: SceneIR) -> Draw:
         """The number-th draw of a stream, which its name alone decides, for this scene's picture and objects."""
+        return self.of_picture(stream, number, (scene.camera.height, scene.camera.width), len(scene.objects))
+
+    def of_picture(self, stream: str, number: int, hw: tuple[int, int], count: int = 0) -> Draw:
+        """The same of any picture, in which so many objects may be moved."""
         seed = int.from_bytes(hashlib.sha256(f"{stream}:{number}".encode()).digest()[:8], "big") >> 1
         generator = torch.Generator().manual_seed(seed)
 
         def uniform(*shape: int) -> Tensor:
             return 2 * torch.rand(shape, generator=generator) - 1
 
-        count, (height, width) = len(scene.objects), (scene.camera.height, scene.camera.width)
         camera = uniform(7).tolist()
         position, angle, size = uniform(count, 2), uniform(count), uniform(count)
         paint, weather, foliage = uniform(count, 5), uniform(4), uniform(3)
         quality = self.jpeg + (_GENTLEST_JPEG - self.jpeg) * (camera[6] + 1) / 2
         return Draw(
-            hw=(height, width),
+            hw=hw,
             shift_px=(self.shift_px * camera[0], self.shift_px * camera[1]),
             zoom=1 + self.scale * camera[2],
             gain=1 + self.gain * camera[3],

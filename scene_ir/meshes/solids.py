@@ -84,7 +84,7 @@ def quad_faces(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return cut.reshape(-1, 3)
 
 
-def _clean(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Solid:
+def cleaned(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Solid:
     """Merge coincident vertices (to 1 um), drop collapsed faces, turn the winding outwards (y up: see module)."""
     # a stable sort by rows: np.unique over rows takes five times as long
     key = np.rint(vertices.T * 1e6).astype(np.int64)
@@ -157,7 +157,7 @@ class Skin:
         faces = quad_faces(quads, vertices)
         both = np.concatenate([vertices, vertices * np.array([1.0, 1.0, -1.0])])
         faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
-        return _clean(both, faces, np.concatenate([material, material]))
+        return cleaned(both, faces, np.concatenate([material, material]))
 
 
 def coons(rim: np.ndarray, m: int, n: int) -> np.ndarray:
@@ -197,7 +197,7 @@ def revolve(profile: np.ndarray, material: np.ndarray, centre: Sequence[float]) 
     right = np.roll(index, -1, axis=1)
     quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], -1).reshape(-1, 4)
     flat = vertices.reshape(-1, 3)
-    return _clean(flat, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), material.reshape(-1).repeat(2))
+    return cleaned(flat, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), material.reshape(-1).repeat(2))
 
 
 def box(
@@ -233,7 +233,7 @@ def box(
     right = np.roll(index, -1, axis=1)
     quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], -1).reshape(-1, 4)
     strip = np.array([rear or material, material, material, material, front or material])
-    return _clean(vertices, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), strip.repeat(8).repeat(2))
+    return cleaned(vertices, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), strip.repeat(8).repeat(2))
 
 
 def assemble(solids: Sequence[Solid], name: str) -> Mesh:

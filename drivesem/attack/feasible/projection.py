@@ -11,7 +11,6 @@ feasible. The pose stays on the ground plane by construction of `ParameterSpace.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,16 +22,8 @@ from drivesem.attack.feasible.strain import StrainBound
 from drivesem.attack.feasible.surfaces import CarSurfaces, extents, lowest
 from drivesem.attack.feasible.weather import Fading, WeatherSet
 from drivesem.attack.space import Parameter, ParameterSpace, behind_camera, ground_axes
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
-
-
-@dataclass(frozen=True, slots=True)
-class Projected:
-    """theta (D,) in the feasible set, and the constraints that held it back, such as `objects[3]: collision`."""
-
-    theta: Tensor
-    active: tuple[str, ...]
-
 
 _HALVINGS = 5
 """Bisection steps a block: the scale of a block is found to 1/32."""

@@ -10,16 +10,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol, final
+from typing import ClassVar, Protocol, final
 
 import torch
 from torch import Tensor
 
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
-
-if TYPE_CHECKING:
-    from drivesem.attack.feasible.projection import Projected
-
 
 LOOKED_AT = 5
 """Of the iterates that a gradient pass saw, so many of the most promising are rendered and judged."""
@@ -29,9 +26,10 @@ _TINY = 1e-30
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What the detector makes of one theta. loss: the attack's objective, to be raised. lost: objects found in the
-    benign re-render and missed now; phantoms: new false positives; success: any of the two, all under `moved`
-    labels. success_paper: the same under `paper` labels. violations: what the render shows not to be feasible,
+    """What the network makes of one theta. loss: the attack's objective, to be raised. lost: what it got right in
+    the benign re-render and gets wrong now, such as objects that are missed, or the picture's class; phantoms: new
+    false positives, of which a classifier has none; success: any of the two, all under labels that move with
+    objects. success_paper: the same under the benign labels. violations: what the render shows not to be feasible,
     such as `objects[3]: visibility`; nothing is a success then.
     """
 
@@ -42,6 +40,11 @@ class Score:
     success_paper: bool
     violations: tuple[str, ...] = ()
 
+    @property
+    def failures(self) -> int:
+        """How much is wrong that was right."""
+        return self.lost + self.phantoms
+
 
 def check_counts(least: int = 1, **counts: int | None) -> None:
     """RangeError where one of the settings, None left out, is less than `least`."""
@@ -50,10 +53,10 @@ def check_counts(least: int = 1, **counts: int | None) -> None:
             raise RangeError(name, f"at least {least}", value)
 
 
-def check_rate(rate: float) -> None:
+def check_rate(rate: float, name: str = "rate") -> None:
     """RangeError where it is not positive."""
     if not (math.isfinite(rate) and rate > 0):
-        raise RangeError("rate", "a positive number", rate)
+        raise RangeError(name, "a positive number", rate)
 
 
 def _unseen(theta: Tensor) -> Score | None:
@@ -104,7 +107,8 @@ class Views(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What an attack sees of scene and detector: callables of theta (D,), which is 0 as photographed.
+    """What an attack sees of scene and network, a detector or a classifier: callables of theta (D,), which is 0 as
+    photographed.
 
     loss_and_grad: the objective to be raised, and its gradient (D,); for detectors that have one. project: onto
     the feasible set. score: re-render and judge, without a gradient; what was judged once is not rendered again.
@@ -210,9 +214,9 @@ class Attack(ABC):
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         """What the winner among feasible, newly scored thetas (D,) has most of, the more important first. Here:
-        failures (lost objects and phantoms) under `moved` labels, then the loss.
+        failures under `moved` labels, then the loss.
         """
-        return (score.lost + score.phantoms, score.loss)
+        return (score.failures, score.loss)
 
     @final
     def __call__(self, problem: Problem, theta0: Tensor, seed: int = 0) -> AttackResult:

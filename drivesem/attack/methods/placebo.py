@@ -12,7 +12,7 @@ from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
 from scene_ir.errors import ShapeError
 
 if TYPE_CHECKING:
-    from drivesem.attack.feasible.projection import Projected
+    from drivesem.attack.theta import Projected
 
 _DRAWS = 8
 """At most; after that nothing is changed."""

@@ -37,6 +37,9 @@ class SCW(Attack):
     and too late on the next. f is in sign steps as well: 1 is what the gradient at the start promises for one sign
     step of everything. So c says how many steps of change a step's worth of loss may cost, whatever the detector.
 
+    constant: None, or a fixed c, as the paper has it for classifiers: Adam runs once, size is the norm of theta in
+    its own units, and f is the negated loss itself, which is to be a hinge, 0 where the classifier is wrong.
+
     c is searched on a logarithmic scale: down from where something failed, up from where nothing did. steps: of
     Adam for each c; queries: in all, one for each iterate, whether its gradient was taken or it failed already.
     rate: of Adam, in steps alpha. early_stop: end at the first failure. RangeError for what cannot be.
@@ -47,18 +50,30 @@ class SCW(Attack):
     norm: Norm = 2
     rate: float = 1.0
     early_stop: bool = False
+    constant: float | None = None
 
     def __post_init__(self) -> None:
         check_counts(queries=self.queries, steps=self.steps)
+        if self.constant is not None:
+            check_rate(self.constant, "constant")
         if self.norm not in (1, 2):
             raise RangeError("norm", "1 or 2", self.norm)
         check_rate(self.rate)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
-        return (1.0, -float(problem.size(theta, self.norm))) if score.success else (0.0, score.loss)
+        return (1.0, -float(self.size(problem, theta))) if score.success else (0.0, score.loss)
+
+    def size(self, problem: Problem, theta: Tensor) -> Tensor:
+        """What is kept small: a norm () of theta (D,), differentiable but for the p-norm's corner at 0."""
+        if self.constant is None:
+            return problem.size(theta, self.norm)
+        return torch.linalg.vector_norm(theta, self.norm)
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         search = _Search(self, problem, theta0)
+        if self.constant is not None:
+            search.minimise(self.constant)
+            return search.proposals()
         c, low, high = _FIRST_C, 0.0, math.inf
         while search.left:
             if search.minimise(c):
@@ -71,12 +86,7 @@ class SCW(Attack):
                 c = low * _FACTOR
             else:
                 c = math.sqrt(low * high)
-        return Proposals(
-            thetas=tuple(search.thetas),
-            losses=tuple(search.losses),
-            queries=len(search.thetas),
-            active_constraints=tuple(search.active),
-        )
+        return search.proposals()
 
 
 @dataclass(slots=True)
@@ -97,6 +107,10 @@ class _Search:
         """How many iterates there may still be."""
         return 0 if self._stopped else self.attack.queries - len(self.thetas)
 
+    def proposals(self) -> Proposals:
+        """All that was tried, in order."""
+        return Proposals(tuple(self.thetas), tuple(self.losses), len(self.thetas), tuple(self.active))
+
     def minimise(self, c: float) -> bool:
         """Adam from the start at this c; whether any iterate failed."""
         change = torch.zeros_like(self.theta0).requires_grad_(True)
@@ -109,7 +123,7 @@ class _Search:
             if uphill is None and self.attack.early_stop:
                 self._stopped = True
                 break
-            objective = self.problem.size(theta, self.attack.norm)
+            objective = self.attack.size(self.problem, theta)
             if uphill is not None:
                 objective = objective - c * (uphill * theta).sum()
             (change.grad,) = torch.autograd.grad(objective, change)
@@ -137,6 +151,8 @@ class _Search:
             return None
         loss, gradient = self.problem.loss_and_grad(feasible.theta)
         self.losses.append(loss)
+        if self.attack.constant is not None:
+            return gradient
         if self._promise is None:
             self._promise = float((gradient * self.problem.step).abs().sum()) or 1.0
         return gradient / self._promise

@@ -82,7 +82,7 @@ def offset_of(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
     s = wp.sin(yaw)
     x = (c * sun[0] - s * sun[2]) * scale
     z = (c * sun[2] + s * sun[0]) * scale
-    length = wp.max(wp.sqrt(x * x + z * z), TINY)
+    length = wp.sqrt(wp.max(x * x + z * z, TINY * TINY))  # under the root: of 0, a root has no gradient
     part = wp.min(length, LONGEST) / length
     return wp.vec2d(x * part, z * part)
 

@@ -57,7 +57,7 @@ def test_it_writes_a_data_set_a_sheet_and_distributions(
         (["--edits", "nothing.yaml"], "nothing.yaml: expected a readable file"),
         (["--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
         (["--assets", "nowhere"], "--assets: expected a folder, found nowhere"),
-        (["--layout", "voc"], "command line: expected known options"),
+        (["--layout", "voc"], "--layout: expected one of kitti, vkitti2, vkitti1, coco, yolo, found voc"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -101,7 +101,9 @@ def test_processes_that_never_come_back_end_it_all(monkeypatch: pytest.MonkeyPat
     class Gone:
         exceptions = ray.exceptions
 
-        def wait(self, references: list[object], num_returns: int) -> tuple[list[object], list[object]]:
+        def wait(
+            self, references: list[object], num_returns: int, timeout: float | None
+        ) -> tuple[list[object], list[object]]:
             return references[:1], references[1:]
 
         def get(self, reference: object) -> None:
@@ -111,7 +113,8 @@ def test_processes_that_never_come_back_end_it_all(monkeypatch: pytest.MonkeyPat
         class ready:  # noqa: N801
             remote = object
 
-    monkeypatch.setattr(clusters, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(clusters, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(clusters, "_LOST_S", 0.05)
     with pytest.raises(UsageError, match="--engine: expected a Ray cluster that lasts"):
         list(clusters._shared(Gone(), [Actor(), Actor()], deque([(1, 0)])))  # type: ignore[arg-type]
 

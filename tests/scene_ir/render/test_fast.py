@@ -108,6 +108,14 @@ def test_fused_is_the_reference_at_and_behind_the_camera(photographed: SceneIR, 
     check(scene, values, active)
 
 
+def test_a_sun_overhead_casts_shadows_that_reach_nowhere(photographed: SceneIR) -> None:
+    """Their length has a kink at 0, where its gradient is 0 and not infinite times 0."""
+    scene = scene_to(photographed, torch.float32)
+    scene = scene.with_environment(sun=torch.tensor([0.0, -1.0, 0.0]))
+    active = ("translation", "yaw")
+    check(scene, draws(scene, 4, 0.5, active), active)
+
+
 def test_a_vehicle_that_the_photograph_never_showed(photographed: SceneIR) -> None:
     scene = scene_to(photographed, torch.float32)
     objects = scene.objects

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.theta import Projected
 
 GROUPS = (Group("near", slice(0, 2)), Group("wide", slice(2, 5)), Group("code", slice(5, 6)))
 STEP = torch.tensor([0.1, 0.1, 0.02, 0.02, 0.02, 0.25])

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.theta import Projected
 
 CARS = 4
 PLACE, PAINT, WEATHER = slice(0, 2 * CARS), slice(2 * CARS, 3 * CARS), slice(3 * CARS, 3 * CARS + 2)

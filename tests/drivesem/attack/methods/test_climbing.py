@@ -9,7 +9,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import LOOKED_AT, Attack, Group, Problem, Proposals, Score
 from drivesem.attack.methods.fgsm import FGSM
@@ -18,6 +17,7 @@ from drivesem.attack.methods.scw import SCW
 from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
 
 START = torch.zeros(6)

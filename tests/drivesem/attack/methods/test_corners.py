@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.corners import Corners, corners
 from drivesem.attack.methods.margin_search import LEAST_PASSES
 from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
 from tests.drivesem.attack.methods.street import BLIND_AT, CARS, DIM, PAINT, PLACE, WEATHER, Street
 

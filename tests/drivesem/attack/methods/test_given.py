@@ -2,9 +2,9 @@
 
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.given import Given
+from drivesem.attack.theta import Projected
 
 
 def problem(violations: tuple[str, ...] = ()) -> Problem:

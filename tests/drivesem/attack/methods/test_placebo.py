@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
 from drivesem.attack.methods.placebo import Placebo
+from drivesem.attack.theta import Projected
 from scene_ir.errors import ShapeError
 
 START = torch.zeros(6)

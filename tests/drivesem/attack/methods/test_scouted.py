@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.scouted import Scouted
 from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
 
 STEP, LIMIT = torch.full((2,), 0.01), torch.ones(2)

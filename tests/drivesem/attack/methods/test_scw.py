@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.scw import SCW
 from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.attack.theta import Projected
 
 START = torch.zeros(6)
 

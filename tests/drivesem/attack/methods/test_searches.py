@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Problem, Score
 from drivesem.attack.methods.cma_es import CMAES
 from drivesem.attack.methods.fgsm import FGSM
 from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.theta import Projected
 from drivesem.settings.commands import GRADIENT_FREE
 from scene_ir.errors import RangeError
 

@@ -3,9 +3,9 @@ import dataclasses
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
 from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
 
 STEP = torch.tensor([0.1, 0.2, 0.3])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import Projected
 from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.theta import Projected
 from drivesem.questions.explain.frame import Judge, weigh
 from drivesem.questions.explain.players import Player
 

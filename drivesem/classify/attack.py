@@ -1,0 +1,203 @@
+"""`drivesem classify attack`: a run of attacks on a classifier, resumable, and its report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from drivesem.attack.methods.base import Attack
+from drivesem.classify.grading import PictureGrader
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.loading import load_classifier
+from drivesem.classify.objective import ClassifierObjective, Seen
+from drivesem.classify.pictures import Shown, Studio, views_of
+from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of, steps_of
+from drivesem.classify.results import SCHEMA, ClassifiedFrame, ClassifiedRun, Verdict
+from drivesem.classify.scenes import ObjectScene, in_turn
+from drivesem.classify.space import ObjectSpace
+from drivesem.report.classified import write_page
+from drivesem.report.tables import csv_text
+from drivesem.run.ask import Bar, ask
+from drivesem.run.finished import METRICS
+from drivesem.run.folder import FRAMES, claim, folder_of
+from drivesem.run.frame import RESULT
+from drivesem.run.page import PAGE
+from drivesem.run.records import dump_record, load_record
+from drivesem.settings.commands import Classify
+from drivesem.settings.errors import UsageError
+from drivesem.truth.certificate import Rule
+from drivesem.truth.grades import Count, Grade
+from drivesem.truth.nuisances import Nuisances
+from scene_ir import files
+from scene_ir.errors import FormatError, RangeError, ShapeError
+from scene_ir.io import to_uint8
+
+CSV = "classified.csv"
+EMBEDDED_LIMIT = 48
+"""Pictures of the embedded objects that are attacked where --limit is not given: of each class four."""
+
+
+@dataclass(frozen=True)
+class Attacker:
+    """What one process needs: built once, used for many pictures."""
+
+    config: Classify
+    studio: Studio
+    network: Classifier
+    method: Attack
+    grader: PictureGrader
+
+    @classmethod
+    def of(cls, config: Classify) -> Attacker:
+        """Raises UsageError or SceneError for settings, objects or a network that cannot be used."""
+        studio = Studio.of(config)
+        network = load_classifier(config.network, studio.objects.classes, config.device)
+        grader = PictureGrader(Nuisances.of(config.nuisances), Rule(config.draws), config.seed)
+        params_of(config)
+        return cls(config, studio, network, attack_of(config), grader)
+
+    def shown(self) -> list[Shown]:
+        """The pictures to attack: classes in turn, and of an object its views in turn with the others'."""
+        names, views = in_turn(self.studio.objects.names(self.config.split)), views_of(self.config)
+        if not names:
+            raise UsageError("--split", "a split with objects", self.config.split)
+        limit = self.config.limit
+        if limit is None and self.config.objects is None:
+            limit = EMBEDDED_LIMIT
+        every = [Shown(self.config.split, name, view) for name in names for view in views]
+        if limit is None or limit >= len(every):
+            return every
+        # Rather a view of many objects than all of a few.
+        classes = len(self.studio.objects.classes)
+        turned = [
+            Shown(self.config.split, name, views[(i // classes + turn) % len(views)])
+            for turn in range(len(views))
+            for i, name in enumerate(names)
+        ]
+        return turned[:limit]
+
+    def attack(self, shown: Shown, out: Path) -> None:
+        """One picture, to its folder. Raises SceneError."""
+        start = time.perf_counter()
+        config = self.config
+        scene = self.studio.scene(shown)
+        space = ObjectSpace(scene.vertices, params_of(config), steps_of(config), reach_of(config), config.shape)
+        try:
+            found = attack_picture(scene, space, self)
+        except (RangeError, ShapeError) as error:
+            raise type(error)(f"{shown.identifier}: {error.field}", error.expected, error.actual) from error
+        classes = self.network.classes
+        record = ClassifiedFrame(
+            identifier=shown.identifier,
+            object=shown.name,
+            label=classes[scene.model.label],
+            view=shown.view,
+            benign=verdict(found.benign, classes),
+            attacked=verdict(found.attacked, classes),
+            grade=found.grade,
+            count=found.count,
+            sizes=space.sizes(found.theta),
+            moved=space.few(found.theta),
+            loss_trace=found.loss_trace,
+            queries=found.queries,
+            passes=found.passes,
+            seconds=round(time.perf_counter() - start, 3),
+        )
+        with files.whole_folder(out / FRAMES / shown.identifier) as part:
+            files.write_png(part / "benign.png", to_uint8(found.before))
+            files.write_png(part / "counterexample.png", to_uint8(found.after))
+            files.write_npz(part / "theta.npz", {"theta": found.theta.numpy().astype(np.float32)})
+            files.write_text(part / RESULT, dump_record(record, SCHEMA))
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What an attack on one picture came to. before, after: pictures (3, H, W) as they are written."""
+
+    theta: Tensor
+    before: Tensor
+    after: Tensor
+    benign: Seen
+    attacked: Seen
+    queries: int
+    passes: int
+    loss_trace: tuple[float, ...] = ()
+    grade: str | None = None
+    count: Count | None = None
+
+
+def attack_picture(scene: ObjectScene, space: ObjectSpace, attacker: Attacker) -> Found:
+    """Attack one picture in memory. One that is misclassified as it is stays as it is."""
+    config = attacker.config
+    objective = ClassifierObjective(scene, space, attacker.network, aimed_by(config))
+    before, benign = objective.picture(space.theta0), objective.benign
+    if not benign.right:
+        return Found(space.theta0, before, before, benign, benign, 0, objective.passes)
+    search = attacker.method(objective.problem(), space.theta0, config.seed)
+    after, attacked = objective.picture(search.theta), objective.see(search.theta)
+    passes = objective.passes
+    grade, count = None, None
+    if not attacked.right:
+        count = attacker.grader.count(scene.identifier, objective.look, before, after)
+        grade = str(Grade.CERTAIN if attacker.grader.rule.holds(count) else Grade.THRESHOLD)
+    return Found(
+        theta=search.theta,
+        before=before,
+        after=after,
+        benign=benign,
+        attacked=attacked,
+        queries=search.queries,
+        passes=passes,
+        loss_trace=search.loss_trace,
+        grade=grade,
+        count=count,
+    )
+
+
+def verdict(seen: Seen, classes: tuple[str, ...]) -> Verdict:
+    """What a network said, as it is written."""
+    return Verdict(classes[seen.predicted], round(seen.confidence, 6), round(seen.margin, 6))
+
+
+def attack_run(config: Classify) -> ClassifiedRun:
+    """Attack all pictures, as far as that is not done, and write report and figures. Raises UsageError or
+    SceneError.
+    """
+    start = time.perf_counter()
+    attacker = Attacker.of(config)
+    shown, params = attacker.shown(), tuple(str(one) for one in params_of(config))
+    name = f"classify-{Path(config.network).stem}-{config.method}-{'-'.join(params)}-seed{config.seed}"
+    out = folder_of(config.out, Path("runs") / name)
+    claim(out, config, (FRAMES, METRICS, PAGE, CSV))
+    todo = [one for one in shown if not (out / FRAMES / one.identifier / RESULT).is_file()]
+    work, build = partial(attacker.attack, out=out), partial(_attacker, config, out)
+    failed = ask(todo, work, build, config, Bar("attacking pictures"), lambda one: one.identifier).failed
+    done = [one.identifier for one in shown if one.identifier not in failed]
+    if not done:
+        raise FormatError("--objects", "a picture that can be attacked", f"none: {next(iter(failed.values()))}")
+    frames = [load_record(out / FRAMES / name / RESULT, ClassifiedFrame, SCHEMA) for name in done]
+    run = ClassifiedRun.of(
+        frames,
+        attacker.network.classes,
+        dict(sorted(failed.items())),
+        round(time.perf_counter() - start, 3),
+        out=str(out),
+        objects=config.objects or "embedded",
+        network=config.network,
+        method=config.method,
+        params=params,
+    )
+    files.write_json(out / METRICS, run.to_json())
+    files.write_text(out / CSV, csv_text([frame.row() for frame in frames]))
+    write_page(out / PAGE, run, frames)
+    return run
+
+
+def _attacker(config: Classify, out: Path) -> Callable[[Shown], None]:
+    return partial(Attacker.of(config).attack, out=out)

@@ -1,0 +1,54 @@
+"""How sure is it that a changed picture is misclassified? Draws of what a camera does, as for detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from drivesem.classify.objective import Seen
+from drivesem.truth.certificate import Rule
+from drivesem.truth.grades import Count
+from drivesem.truth.nuisances import Nuisances
+
+
+@dataclass(frozen=True, slots=True)
+class PictureGrader:
+    """nuisances: what a draw changes; rule: in how many draws a failure must hold; seed: of the draws."""
+
+    nuisances: Nuisances
+    rule: Rule
+    seed: int
+
+    @torch.no_grad()
+    def count(self, identifier: str, look: Callable[[Tensor], Seen], before: Tensor, after: Tensor) -> Count:
+        """Draws of the picture before the change that are right, and of the one after it (3, H, W) that are wrong,
+        until no more can change whether the failure is certain: first after the change, then before it.
+        """
+        stream = f"certificate:{identifier}:{self.seed}"
+        hw = (int(before.shape[1]), int(before.shape[2]))
+        held: dict[str, list[bool]] = {"after": [], "before": []}
+        margins: dict[str, list[float]] = {"after": [], "before": []}
+        for side, picture, needed in (("after", after, self.rule.after), ("before", before, self.rule.before)):
+            if side == "before" and sum(held["after"]) < self.rule.after:
+                break
+            for number in range(self.rule.draws):
+                if held[side].count(False) > self.rule.draws - needed:
+                    break
+                seen = look(self.nuisances.of_picture(stream, number, hw).picture(picture))
+                held[side].append(seen.right == (side == "before"))
+                margins[side].append(seen.margin)
+        return Count(
+            sum(held["before"]),
+            len(held["before"]),
+            sum(held["after"]),
+            len(held["after"]),
+            _mean(margins["before"]),
+            _mean(margins["after"]),
+        )
+
+
+def _mean(values: list[float]) -> float | None:
+    return round(sum(values) / len(values), 4) if values else None

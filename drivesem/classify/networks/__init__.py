@@ -1,0 +1,1 @@
+"""Networks that say of what class a picture is."""

@@ -1,0 +1,140 @@
+"""Classifiers by name or file: ready to be attacked, or to be trained on."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import detectors.registry
+from detectors.squeezedet import SqueezeDet
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.resnet import ResNet50
+from drivesem.classify.networks.squeezenet import SqueezeNet
+from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from scene_ir.errors import FormatError, RangeError
+from scene_ir.weights import load_into, read_weights
+
+ARCHITECTURES: dict[str, type[Classifier]] = {
+    kind.architecture: kind for kind in (SqueezeNet, VGG16, PooledVGG16, ResNet50)
+}
+"""By the name that weights files carry."""
+SHIPPED = detectors.registry.SHIPPED[SqueezeDet.name].parent / "squeezenet-objects.safetensors"
+"""The last layer of `squeezenet`, for the embedded objects; the rest is the shipped detector's."""
+_TORCH_FILES = (".pth", ".pt", ".bin")
+_BACKBONE = "backbone"
+"""Key of a file that holds a last layer alone: whose convolutions it reads."""
+
+
+def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cpu") -> Classifier:
+    """The shipped classifier, `squeezenet`, or one that `drivesem classify train` wrote; frozen, in eval mode.
+
+    Raises FormatError for a file that is none, is damaged, is another network's, or tells other classes apart.
+    """
+    path = SHIPPED if name_or_path == SqueezeNet.architecture else Path(name_or_path)
+    if path.suffix != ".safetensors":
+        expected = f"{SqueezeNet.architecture}, or weights that drivesem classify train wrote (.safetensors)"
+        raise FormatError("--network", expected, name_or_path)
+    metadata, tensors = read_weights(path)
+    network = _of(str(path), metadata.get("architecture"))(classes_of(path, metadata))
+    if network.classes != tuple(classes):
+        expected = f"one for the {len(classes)} classes {', '.join(classes)}"
+        raise FormatError(str(path), expected, f"one for {', '.join(network.classes)}")
+    if metadata.get(_BACKBONE) == SqueezeDet.name:
+        tensors = _of_squeezedet() | tensors
+    load_into(network, tensors, path)
+    return ready(network, device)
+
+
+def to_train(
+    architecture: str, weights: str | None, classes: Sequence[str], generator: torch.Generator
+) -> Classifier:
+    """A network with a new last layer for `classes`, and all else from a file: torchvision's (.pth), or a
+    safetensors file by the same names. squeezenet needs none.
+
+    Raises FormatError naming file and tensor where the file is another network's, RangeError for an unknown name.
+    """
+    if architecture not in ARCHITECTURES:
+        raise RangeError("--network", f"one of {', '.join(ARCHITECTURES)}", architecture)
+    network = ARCHITECTURES[architecture](classes)
+    if weights is None:
+        if architecture != SqueezeNet.architecture:
+            raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")
+        tensors, path = _of_squeezedet(), Path(SqueezeDet.name)
+    else:
+        path = Path(weights)
+        tensors = _tensors(path)
+    network.retarget(classes, generator)
+    own, name = network.state_dict(), type(network).head
+    # Of the file's own last layer, which tells other classes apart, nothing is used.
+    kept = {key: tensor for key, tensor in tensors.items() if key.rpartition(".")[0] != name}
+    load_into(network, kept | {f"{name}.{part}": own[f"{name}.{part}"] for part in ("weight", "bias")}, path)
+    return network
+
+
+def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str], last_only: bool = False) -> None:
+    """Write weights as float16, what was counted in training as float32. last_only: of a squeezenet, the last
+    layer alone, to be read beside the shipped detector.
+    """
+    name = type(network).head
+    learned = {key for key, _ in network.named_parameters()}
+    tensors = {
+        key: value.detach().cpu().contiguous().to(torch.float16 if key in learned else torch.float32)
+        for key, value in network.state_dict().items()
+        if value.is_floating_point() and (not last_only or key.startswith(f"{name}."))
+    }
+    metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
+    if last_only:
+        metadata[_BACKBONE] = SqueezeDet.name
+    detectors.registry.write_weights(path, metadata, tensors)
+
+
+def ready(network: Classifier, device: str = "cpu") -> Classifier:
+    """Frozen, in eval mode, channels-last."""
+    network.requires_grad_(False)
+    return network.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def classes_of(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """The classes that a weights file is for. Raises FormatError."""
+    try:
+        names = json.loads(metadata.get("classes", ""))
+    except ValueError:
+        names = None
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise FormatError(f"{path}: classes", "a list of names", repr(metadata.get("classes"))[:60])
+    return tuple(names)
+
+
+def _of(path: str, architecture: str | None) -> type[Classifier]:
+    if architecture not in ARCHITECTURES:
+        raise FormatError(f"{path}: architecture", f"one of {', '.join(ARCHITECTURES)}", architecture)
+    return ARCHITECTURES[architecture]
+
+
+def _of_squeezedet() -> dict[str, Tensor]:
+    """The shipped detector's first convolutions, by the names that SqueezeNet gives them."""
+    _, tensors = read_weights(detectors.registry.SHIPPED[SqueezeDet.name])
+    beyond = ("convdet.", "fires.fire10.", "fires.fire11.")
+    return {name: tensor for name, tensor in tensors.items() if not name.startswith(beyond)}
+
+
+def _tensors(path: Path) -> dict[str, Tensor]:
+    """Floating tensors of a weights file. Raises FormatError."""
+    if path.suffix not in _TORCH_FILES:
+        return read_weights(path)[1]
+    try:
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise FormatError(str(path), "a file that can be read", error.strerror) from error
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
+        raise FormatError(
+            str(path), "tensors by name, as torch.save writes them", str(error).splitlines()[0]
+        ) from error
+    if not isinstance(loaded, dict) or not all(isinstance(tensor, Tensor) for tensor in loaded.values()):
+        raise FormatError(str(path), "tensors by name (a state_dict)", type(loaded).__name__)
+    return {str(name): tensor for name, tensor in loaded.items() if tensor.is_floating_point()}

@@ -1,0 +1,50 @@
+"""SqueezeNet 1.1 (Iandola et al. 2016, arXiv:1602.07360) up to its last Fire module, and one layer on what that
+finds anywhere. Its convolutions are the first ones of SqueezeDet, whose shipped weights hold them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from detectors.squeezedet import BGR_MEAN, Fire
+from drivesem.classify.networks.base import Classifier
+
+_FIRES = {
+    "fire2": (64, 16, 64),
+    "fire3": (128, 16, 64),
+    "fire4": (128, 32, 128),
+    "fire5": (256, 32, 128),
+    "fire6": (256, 48, 192),
+    "fire7": (384, 48, 192),
+    "fire8": (384, 64, 256),
+    "fire9": (512, 64, 256),
+}
+"""Channels in, of the squeeze, and of each expansion."""
+_POOLED = ("fire3", "fire5")
+"""A 3x3/2 pooling follows these, and the first convolution."""
+
+
+class SqueezeNet(Classifier):
+    """Mean and maximum of the last maps go to the last layer."""
+
+    architecture = "squeezenet"
+    head = "classifier"
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        mean = [value / 255 for value in reversed(BGR_MEAN)]
+        super().__init__(classes, mean, [1 / 255] * 3)
+        self.conv1 = nn.Conv2d(3, 64, 3, 2)
+        self.fires = nn.ModuleDict({name: Fire(*channels) for name, channels in _FIRES.items()})
+        self.classifier = nn.Linear(2 * 512, len(self.classes))
+
+    def encode(self, prepared: Tensor) -> Tensor:
+        x = F.max_pool2d(F.relu(self.conv1(prepared.flip(1))), 3, 2, ceil_mode=True)  # its weights read BGR
+        for name, fire in self.fires.items():
+            x = fire(x)
+            if name in _POOLED:
+                x = F.max_pool2d(x, 3, 2, ceil_mode=True)
+        return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)

@@ -1,0 +1,1 @@
+"""The objects that classifiers are shown: made by code, or read from folders of meshes."""

@@ -1,0 +1,68 @@
+"""The embedded objects: a hundred of each class, made by code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from zlib import crc32
+
+import numpy as np
+
+from drivesem.classify.objects.made.airplanes import AIRPLANES
+from drivesem.classify.objects.made.boats import BOATS
+from drivesem.classify.objects.made.cycles import MOTORCYCLES, SKATEBOARDS
+from drivesem.classify.objects.made.helmets import HELMETS
+from drivesem.classify.objects.made.street import BENCHES, MAILBOXES, TRASHCANS
+from drivesem.classify.objects.made.towers import TOWERS
+from drivesem.classify.objects.made.vehicles import BUSES, CARS, TRAINS
+from drivesem.classify.objects.surfaces import Kit
+from drivesem.classify.objects.types import CLASSES, ObjectModel, Split
+from scene_ir.errors import RangeError
+
+KINDS: Mapping[str, tuple[Callable[[Kit], None], ...]] = {
+    "airplane": AIRPLANES,
+    "bench": BENCHES,
+    "trashcan": TRASHCANS,
+    "bus": BUSES,
+    "car": CARS,
+    "helmet": HELMETS,
+    "mailbox": MAILBOXES,
+    "motorcycle": MOTORCYCLES,
+    "skateboard": SKATEBOARDS,
+    "tower": TOWERS,
+    "train": TRAINS,
+    "boat": BOATS,
+}
+"""What makes each class's objects; object n is of kind n modulo their number."""
+
+_RANGES: Mapping[Split, range] = {"train": range(70), "val": range(70, 80), "test": range(80, 100)}
+"""Numbers of each split's objects, in every class: 70, 10 and 20 %, as in the paper."""
+
+
+class EmbeddedObjects:
+    """A hundred different objects of each of the paper's classes: `ObjectSet`.
+
+    Each has a generator of its own, seeded by its name: the same proportions, parts and colours wherever and
+    whenever it is made.
+    """
+
+    classes: tuple[str, ...] = CLASSES
+
+    def names(self, split: Split) -> tuple[str, ...]:
+        """Names of a split's objects, in the order of classes."""
+        return tuple(f"{name}/{number:04d}" for name in self.classes for number in _RANGES[split])
+
+    def load(self, name: str) -> ObjectModel:
+        """The object "class/0000" to "class/0099". Raises RangeError for any other name."""
+        kind, _, number = name.partition("/")
+        most = _RANGES["test"].stop
+        if (
+            kind not in KINDS
+            or not (number.isascii() and number.isdecimal())
+            or len(number) != 4
+            or int(number) >= most
+        ):
+            raise RangeError("object", f"a class of {', '.join(self.classes)}, and 0000 to {most - 1:04d}", name)
+        make = KINDS[kind][int(number) % len(KINDS[kind])]
+        kit = Kit(np.random.default_rng([crc32(kind.encode()), int(number)]))
+        make(kit)
+        return kit.model(name, self.classes.index(kind))

@@ -1,0 +1,150 @@
+"""An object read from a mesh file: its materials a face, centred, its longest side 1."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from trimesh.visual import ColorVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from drivesem.classify.objects.types import ObjectModel
+from scene_ir.errors import FormatError
+from scene_ir.meshes.load import read_scene
+from scene_ir.meshes.lod import simplify
+from scene_ir.types import Mesh, Part
+
+Array = NDArray[np.float64]
+
+_MOST_BYTES = 1 << 28
+"""Of a mesh file, its materials and each texture: ten times the largest of usual objects."""
+_MOST_PIXELS = 1 << 26
+_TEXTURE_PX = 512
+"""Larger textures are averaged down to so many before faces look at them."""
+_PLACES = np.array([[4, 4, 4], [10, 1, 1], [1, 10, 1], [1, 1, 10], [5, 5, 2], [5, 2, 5], [2, 5, 5]]) / 12
+"""Barycentric places of a face whose texels are averaged."""
+_PLAIN = (0.5, 0.1, 10.0)
+"""Grey, specular share and exponent where a file says nothing."""
+_MOST_SHININESS = 1000.0
+_STEPS = 16
+"""Colours are told apart so finely, a channel, where a mesh is simplified."""
+_SMALL = 1e-14
+"""Twice the area, at longest side 1, below which a face has no direction and is left out."""
+
+
+def read_object(path: Path, name: str, label: int, folder: Path, most_triangles: int | None = None) -> ObjectModel:
+    """The object in a mesh file (OBJ with MTL, GLB, PLY), y up, its front towards -z.
+
+    glTF's front is +z: those files are turned by half. Kd (linear), Ks and Ns become diffuse colour, specular
+    share and exponent; a texture becomes the mean of some texels of each face. folder: where textures may lie.
+    most_triangles: a finer mesh is simplified. Raises FormatError for a file without an object that can be drawn.
+    """
+    scene = read_scene(path, folder, _MOST_BYTES)
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
+        raise FormatError(str(path), "a mesh with faces", "none")
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
+    faces = np.concatenate([np.asarray(p.faces, np.int64) + s for p, s in zip(parts, starts[:-1], strict=True)])
+    looks = np.concatenate([_looks(part, path) for part in parts])
+    used = np.unique(faces)
+    if not np.isfinite(vertices[used]).all():
+        raise FormatError(f"{path}: vertices", "finite coordinates", "NaN or infinity")
+    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
+    longest = float((high - low).max())
+    if not 0 < longest < np.inf:
+        raise FormatError(f"{path}: vertices", "an object with some extent", f"a longest side of {longest}")
+    unit = ((vertices - low) / longest - (high - low) / longest / 2) * (
+        [-1.0, 1.0, -1.0] if path.suffix.lower() == ".glb" else 1.0
+    )
+    unit = unit.astype(np.float32)
+    corners = unit[faces].astype(float)
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    faces, looks = faces[doubled > _SMALL], looks[doubled > _SMALL]
+    if len(faces) == 0:
+        raise FormatError(f"{path}: faces", "at least one face with an area", "none")
+    used, welded = np.unique(faces, return_inverse=True)
+    welded = torch.from_numpy(welded.reshape(-1, 3))
+    mesh = Mesh(torch.from_numpy(unit[used]), welded, torch.full((len(faces),), int(Part.OTHER)), name)
+    if most_triangles is not None and len(faces) > most_triangles:
+        mesh, looks = _simplified(mesh, looks, most_triangles)
+    table = torch.from_numpy(looks.astype(np.float32))
+    return ObjectModel(name, label, mesh, table[:, :3].contiguous(), table[:, 3], table[:, 4])
+
+
+def _simplified(mesh: Mesh, looks: Array, triangles: int) -> tuple[Mesh, Array]:
+    """About `triangles` faces of the same surface; borders between materials stay."""
+    rounded = np.rint(looks * [_STEPS, _STEPS, _STEPS, _STEPS, 1])
+    _, first, material = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    coarse = simplify(replace(mesh, part=torch.from_numpy(material.reshape(-1))), triangles)
+    part = coarse.part.numpy()
+    return replace(coarse, part=torch.full_like(coarse.part, int(Part.OTHER))), looks[first[part]]
+
+
+def _looks(part: trimesh.Trimesh, path: Path) -> Array:
+    """Linear RGB, specular share and exponent (F, 5) of a part's faces."""
+    count, visual = len(part.faces), part.visual
+    grey, specular, shininess = _PLAIN
+    rgb = np.full((count, 3), grey)
+    material: Any = getattr(visual, "material", None)
+    image, uv = None, getattr(visual, "uv", None)
+    if isinstance(visual, ColorVisuals):
+        if visual.defined:
+            rgb = _linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
+    elif isinstance(material, PBRMaterial):
+        image = material.baseColorTexture
+        rough = _number(material.roughnessFactor, 1.0, 1.0)
+        specular = 0.04 + 0.5 * _number(material.metallicFactor, 0.0, 1.0)
+        shininess = min(2 / max(rough, 0.1) ** 4, _MOST_SHININESS)
+        if material.baseColorFactor is not None:
+            rgb[:] = np.asarray(material.baseColorFactor, float)[:3] / 255.0
+        elif image is not None:
+            rgb[:] = 1.0
+    elif isinstance(material, SimpleMaterial):
+        image = material.image
+        said = material.kwargs  # as the MTL has it: what it leaves out, trimesh fills with grey
+        rgb[:] = _share(said.get("kd"), grey) if image is None else 1.0
+        specular = float(_share(said.get("ks"), specular).mean())
+        shininess = _number(said.get("ns"), shininess, _MOST_SHININESS)
+    if image is not None and uv is not None and len(uv) == len(part.vertices):
+        rgb = rgb * _texels(image, np.asarray(uv, float)[part.faces][..., :2], path)
+    return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])
+
+
+def _number(value: Any, other: float, most: float) -> float:
+    """What a material says, between 0 and `most`; another number where it says nothing, or nonsense."""
+    return min(max(float(value), 0.0), most) if isinstance(value, int | float) and value == value else other
+
+
+def _share(value: Any, other: float) -> Array:
+    """A colour (3,) in [0, 1] of an MTL; grey of another lightness where it has none, or nonsense."""
+    if not isinstance(value, list) or len(value) != 3 or not np.isfinite(value).all():
+        return np.full(3, other)
+    return np.array(value, float).clip(0, 1)
+
+
+def _texels(image: Any, uv: Array, path: Path) -> Array:
+    """Mean linear RGB (F, 3) of a texture at some places of faces with coordinates (F, 3, 2)."""
+    if image.width * image.height > _MOST_PIXELS:
+        raise FormatError(f"{path}: texture", f"at most {_MOST_PIXELS:,} px", f"{image.width}x{image.height}")
+    try:
+        small = image.convert("RGB")
+        small.thumbnail((_TEXTURE_PX, _TEXTURE_PX))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise FormatError(f"{path}: texture", "an image", str(error).splitlines()[0]) from error
+    pixels = _linear(np.asarray(small, float) / 255.0)
+    height, width = pixels.shape[:2]
+    places = np.einsum("pc,fcd->fpd", _PLACES, np.nan_to_num(uv, posinf=0.0, neginf=0.0))
+    columns = np.floor(np.mod(places[..., 0], 1.0) * width).astype(int).clip(0, width - 1)
+    rows = np.floor(np.mod(1.0 - places[..., 1], 1.0) * height).astype(int).clip(0, height - 1)
+    return pixels[rows, columns].mean(axis=1)
+
+
+def _linear(srgb: Array) -> Array:
+    """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clip(0) + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,136 @@
+"""What objects' surfaces look like, and an object in the making: solids, each with its surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from drivesem.classify.objects.types import ObjectModel
+from scene_ir.meshes.solids import Solid, mirrored
+from scene_ir.types import Mesh, Part
+
+Rgb = tuple[float, float, float]
+
+
+class Surface(NamedTuple):
+    """Linear RGB, the specular share, and Phong's exponent."""
+
+    diffuse: Rgb
+    specular: float
+    shininess: float
+
+
+def paint(rgb: Rgb) -> Surface:
+    """Glossy lacquer."""
+    return Surface(rgb, 0.30, 60.0)
+
+
+def plastic(rgb: Rgb) -> Surface:
+    """Half glossy."""
+    return Surface(rgb, 0.12, 18.0)
+
+
+def dull(rgb: Rgb) -> Surface:
+    """Wood, stone, cloth."""
+    return Surface(rgb, 0.03, 5.0)
+
+
+def metal(rgb: Rgb) -> Surface:
+    """Brushed or cast metal."""
+    return Surface(rgb, 0.45, 30.0)
+
+
+CHROME = Surface((0.50, 0.51, 0.53), 0.80, 90.0)
+STEEL = metal((0.28, 0.29, 0.30))
+IRON = metal((0.03, 0.03, 0.032))
+BLACK = plastic((0.012, 0.012, 0.013))
+RUBBER = Surface((0.016, 0.016, 0.017), 0.05, 8.0)
+GLASS = Surface((0.018, 0.026, 0.034), 0.90, 120.0)
+LAMP = Surface((0.80, 0.80, 0.74), 0.60, 60.0)
+TAIL_LAMP = Surface((0.42, 0.012, 0.012), 0.50, 50.0)
+AMBER = Surface((0.70, 0.25, 0.01), 0.40, 40.0)
+WHITE = paint((0.72, 0.72, 0.71))
+
+PAINTS: tuple[Rgb, ...] = (
+    *((0.55, 0.02, 0.02), (0.02, 0.06, 0.40), (0.70, 0.70, 0.69), (0.02, 0.02, 0.022), (0.60, 0.38, 0.01)),
+    *((0.02, 0.20, 0.05), (0.30, 0.31, 0.33), (0.60, 0.16, 0.01), (0.03, 0.30, 0.45), (0.22, 0.02, 0.04)),
+)
+"""Lacquers of things that come in any colour."""
+WOODS: tuple[Rgb, ...] = ((0.24, 0.11, 0.04), (0.13, 0.055, 0.022), (0.38, 0.22, 0.10), (0.20, 0.15, 0.10))
+STONES: tuple[Rgb, ...] = ((0.42, 0.40, 0.36), (0.26, 0.26, 0.25), (0.48, 0.36, 0.24), (0.30, 0.12, 0.07))
+
+
+class Kit:
+    """An object in the making, and the one generator that all its proportions and colours are drawn from.
+
+    Solids are in metres: x forward, y up, z to the right.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._solids: list[Solid] = []
+        self._surfaces: dict[Surface, int] = {}
+
+    def add(self, surface: Surface, *solids: Solid) -> None:
+        """Solids of one surface."""
+        for solid in solids:
+            self.painted([surface], Solid(solid.vertices, solid.faces, np.zeros(len(solid.faces), np.int64)))
+
+    def painted(self, surfaces: Sequence[Surface], solid: Solid) -> None:
+        """A solid whose materials are numbers of surfaces."""
+        numbers = np.array([self._surfaces.setdefault(s, len(self._surfaces)) for s in surfaces])
+        self._solids.append(Solid(solid.vertices, solid.faces, numbers[solid.material]))
+
+    def both(self, surface: Surface, *solids: Solid) -> None:
+        """Solids of one surface, and their twins on the other side of z = 0."""
+        self.add(surface, *solids, *(mirrored(solid) for solid in solids))
+
+    def between(self, low: float, high: float) -> float:
+        """A number drawn evenly."""
+        return float(self._rng.uniform(low, high))
+
+    def chance(self, share: float) -> bool:
+        """True in this share of objects."""
+        return bool(self._rng.random() < share)
+
+    def count(self, low: int, high: int) -> int:
+        """A whole number drawn evenly, both ends included."""
+        return int(self._rng.integers(low, high + 1))
+
+    def tint(self, colours: Sequence[Rgb], spread: float = 0.25) -> Rgb:
+        """One of the colours, lighter or darker by up to `spread`, each channel a little by itself."""
+        rgb = np.array(colours[int(self._rng.integers(len(colours)))])
+        shift = self._rng.uniform(1 - spread, 1 + spread) * self._rng.uniform(0.9, 1.1, 3)
+        red, green, blue = np.clip(rgb * shift + 0.004, 0.0, 0.9).tolist()
+        return red, green, blue
+
+    def lacquer(self, spread: float = 0.25) -> Surface:
+        """Paint of any usual colour."""
+        return paint(self.tint(PAINTS, spread))
+
+    def model(self, name: str, label: int) -> ObjectModel:
+        """All solids as one object: centred, longest side 1, the front turned to -z."""
+        counts = np.cumsum([0] + [len(s.vertices) for s in self._solids])
+        vertices = np.concatenate([s.vertices for s in self._solids])
+        faces = np.concatenate([s.faces + start for s, start in zip(self._solids, counts[:-1], strict=True)])
+        material = torch.from_numpy(np.concatenate([s.material for s in self._solids]))
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        unit = (vertices - (low + high) / 2) / (high - low).max()
+        table = list(self._surfaces)
+        mesh = Mesh(
+            vertices=torch.from_numpy((unit[:, [2, 1, 0]] * [1.0, 1.0, -1.0]).astype(np.float32)),
+            faces=torch.from_numpy(faces.astype(np.int64)),
+            part=torch.full((len(faces),), int(Part.OTHER), dtype=torch.int64),
+            name=name,
+        )
+        return ObjectModel(
+            name,
+            label,
+            mesh,
+            torch.tensor([s.diffuse for s in table], dtype=torch.float32)[material],
+            torch.tensor([s.specular for s in table], dtype=torch.float32)[material],
+            torch.tensor([s.shininess for s in table], dtype=torch.float32)[material],
+        )

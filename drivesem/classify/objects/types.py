@@ -1,0 +1,76 @@
+"""An object with its class and its materials, and a set of objects in three splits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from torch import Tensor
+
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.types import Mesh, check_finite, check_shape
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+CLASSES = (
+    *("airplane", "bench", "trashcan", "bus", "car", "helmet"),
+    *("mailbox", "motorcycle", "skateboard", "tower", "train", "boat"),
+)
+"""The paper's classes in its order: an object's label is its class's place here, unless its set says otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectModel:
+    """One object of a class.
+
+    name: of the object in its set, "bus/0007". label: its class's place in the set's classes. mesh: vertices
+    (V, 3) float32, centred, longest side 1, y up, the front towards -z, as ShapeNetCore v2 has it (not the unit
+    box of vehicles); faces (F, 3), counter-clockwise seen from outside. diffuse (F, 3): linear RGB in [0, 1];
+    specular (F,) in [0, 1]; shininess (F,), Phong's exponent, at least 0: float32, one a face.
+    Raises ShapeError for a shape or type, or no faces, RangeError for a value, naming the object.
+    """
+
+    name: str
+    label: int
+    mesh: Mesh
+    diffuse: Tensor
+    specular: Tensor
+    shininess: Tensor
+
+    def __post_init__(self) -> None:
+        if self.label < 0:
+            raise RangeError(f"{self.name}: label", "at least 0", self.label)
+        count = self.mesh.faces.shape[0]
+        if count == 0:
+            raise ShapeError(f"{self.name}: mesh.faces", "at least one face", "none")
+        check_shape(f"{self.name}: diffuse", self.diffuse, count, 3)
+        check_shape(f"{self.name}: specular", self.specular, count)
+        check_shape(f"{self.name}: shininess", self.shininess, count)
+        for field, values, most in (
+            ("diffuse", self.diffuse, 1.0),
+            ("specular", self.specular, 1.0),
+            ("shininess", self.shininess, float("inf")),
+        ):
+            check_finite(f"{self.name}: {field}", values)
+            low, high = float(values.min()), float(values.max())
+            if low < 0 or high > most:
+                expected = "at least 0" if most == float("inf") else "values in [0, 1]"
+                raise RangeError(f"{self.name}: {field}", expected, low if low < 0 else high)
+
+
+class ObjectSet(Protocol):
+    """Objects by name, in three splits that share none."""
+
+    classes: tuple[str, ...]
+    """Names of the classes, in the order of labels."""
+
+    def names(self, split: Split) -> tuple[str, ...]:
+        """Names of a split's objects, in the order of classes."""
+        ...
+
+    def load(self, name: str) -> ObjectModel:
+        """The object of that name, the same each time. Raises FormatError where it cannot be read, RangeError for
+        a name that the set does not have.
+        """
+        ...

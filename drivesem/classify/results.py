@@ -1,0 +1,161 @@
+"""What an attack on a classifier leaves behind, as plain dataclasses: written as JSON, read by the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivesem.truth.grades import Count, Grade
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a network says of one picture. predicted: a class; confidence: its softmax; margin: by how many logits
+    the true class is ahead of the best other one.
+    """
+
+    predicted: str
+    confidence: float
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClassifiedFrame:
+    """One picture of a run. label: the true class; sizes: the largest change of each parameter, in theta's units;
+    moved: pose and light by name, as people write them; grade, count: of a failure, see `truth.grades`; None where
+    there is none. queries: gradients and judged samples; passes: of the network, a gradient counted as 3.
+    """
+
+    identifier: str
+    object: str
+    label: str
+    view: str
+    benign: Verdict
+    attacked: Verdict
+    grade: str | None
+    count: Count | None
+    sizes: dict[str, float]
+    moved: dict[str, str]
+    loss_trace: tuple[float, ...]
+    queries: int
+    passes: int
+    seconds: float
+
+    @property
+    def right_before(self) -> bool:
+        return self.benign.predicted == self.label
+
+    @property
+    def right_after(self) -> bool:
+        return self.attacked.predicted == self.label
+
+    def row(self) -> dict[str, Any]:
+        """A line of the CSV."""
+        data = asdict(self)
+        count = self.count or Count()
+        flat = {key: data[key] for key in ("identifier", "object", "label", "view", "grade", "queries", "passes")}
+        for name in ("benign", "attacked"):
+            flat |= {f"{name}_{key}": value for key, value in data[name].items()}
+        flat |= {"right_before": count.before, "draws_before": count.before_draws}
+        flat |= {"wrong_after": count.after, "draws_after": count.after_draws}
+        return flat | {f"size_{key}": value for key, value in self.sizes.items()} | self.moved
+
+
+@dataclass(frozen=True, slots=True)
+class ClassTally:
+    """Pictures of one class. benign, attacked: classified rightly before and after the change."""
+
+    name: str
+    pictures: int
+    benign: int
+    attacked: int
+    certain: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClassifiedRun:
+    """The figures of a run; `to_json` is what `--json` prints. accuracy is the share of all its pictures, that is,
+    the mean of classes' accuracies weighed by their sizes, as in the paper.
+    """
+
+    out: str
+    objects: str
+    network: str
+    method: str
+    params: tuple[str, ...]
+    classes: tuple[ClassTally, ...]
+    frames_failed: dict[str, str]
+    queries: int
+    passes: int
+    seconds: float
+
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[ClassifiedFrame],
+        classes: Sequence[str],
+        failed: dict[str, str],
+        seconds: float,
+        **facts: Any,
+    ) -> ClassifiedRun:
+        """Count frames. facts: the fields that say what was asked."""
+        tallies = []
+        for name in classes:
+            own = [frame for frame in frames if frame.label == name]
+            benign, attacked = (sum(getattr(f, right) for f in own) for right in ("right_before", "right_after"))
+            certain = sum(frame.grade == Grade.CERTAIN for frame in own)
+            tallies.append(ClassTally(name, len(own), benign, attacked, certain))
+        return cls(
+            classes=tuple(tallies),
+            frames_failed=failed,
+            queries=sum(frame.queries for frame in frames),
+            passes=sum(frame.passes for frame in frames),
+            seconds=seconds,
+            **facts,
+        )
+
+    @property
+    def pictures(self) -> int:
+        return sum(one.pictures for one in self.classes)
+
+    @property
+    def benign(self) -> float | None:
+        """Accuracy before the change; None without pictures."""
+        return self._share("benign")
+
+    @property
+    def attacked(self) -> float | None:
+        """Accuracy after it."""
+        return self._share("attacked")
+
+    @property
+    def grades(self) -> dict[str, int]:
+        """How many failures are at least so sure."""
+        failures = sum(one.benign - one.attacked for one in self.classes)
+        return {str(Grade.THRESHOLD): failures, str(Grade.CERTAIN): sum(one.certain for one in self.classes)}
+
+    def _share(self, which: str) -> float | None:
+        total = sum(getattr(one, which) for one in self.classes)
+        return round(total / self.pictures, 4) if self.pictures else None
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object."""
+        return {
+            "schema": SCHEMA,
+            "out": self.out,
+            "objects": self.objects,
+            "network": self.network,
+            "method": self.method,
+            "params": list(self.params),
+            "pictures": self.pictures,
+            "accuracy": {"benign": self.benign, "attacked": self.attacked},
+            "grades": self.grades,
+            "classes": [asdict(one) for one in self.classes],
+            "frames_failed": self.frames_failed,
+            "queries": self.queries,
+            "passes": self.passes,
+            "seconds": self.seconds,
+        }

@@ -1,0 +1,159 @@
+"""Training a classifier on pictures of objects: its last layer, as in the paper, or all of it."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from rich.console import Console
+from torch import Tensor, nn
+
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.loading import save_classifier, to_train
+from drivesem.classify.networks.squeezenet import SqueezeNet
+from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.pictures import read_pictures, write_pictures
+from drivesem.report.progress import progress_bar
+from drivesem.run.folder import claim, folder_of
+from drivesem.settings.commands import Classify
+from scene_ir import files
+
+PICTURES = "pictures"
+"""Folder in --out where pictures are drawn, unless --data has them."""
+RECORD = "training.json"
+_RATES = {"last": 3e-3, "all": 1e-4}
+_EMBEDDED_AT_A_TIME = 32
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """images (N, 3, H, W) uint8, labels (N,)."""
+
+    images: Tensor
+    labels: Tensor
+
+    def batch(self, rows: Tensor, device: str) -> tuple[Tensor, Tensor]:
+        """Some of them, RGB in [0, 1]."""
+        return self.images[rows].to(device).float() / 255, self.labels[rows].to(device)
+
+
+def train_run(config: Classify) -> dict[str, Any]:
+    """Train, and write the weights and how it went: the JSON's form. Raises UsageError or SceneError."""
+    start = time.perf_counter()
+    out = folder_of(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
+    classes = open_objects(config.objects).classes
+    generator = torch.Generator().manual_seed(config.seed)
+    network = to_train(config.network, config.weights, classes, generator).to(config.device)
+    claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES))
+    folder = Path(config.data) if config.data else out / PICTURES
+    failed = {} if config.data else write_pictures(config, folder)[1]
+    splits = {name: Pictures(*read_pictures(folder, name, classes)) for name in ("train", "val", "test")}
+    fit = _fit_last if config.layers == "last" else _fit_all
+    curve, accuracy = fit(network, splits, config, generator)
+    last_only = config.layers == "last" and isinstance(network, SqueezeNet) and config.weights is None
+    path = out / f"{config.network}.safetensors"
+    facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
+    save_classifier(network, path, facts, last_only)
+    data = {
+        "out": str(out),
+        "weights": str(path),
+        "network": config.network,
+        "layers": config.layers,
+        "pictures": {name: len(split.labels) for name, split in splits.items()},
+        "accuracy": accuracy,
+        "epochs": curve,
+        "frames_failed": failed,
+        "seconds": round(time.perf_counter() - start, 3),
+    }
+    files.write_json(out / RECORD, data)
+    return data
+
+
+def _fit_last(
+    network: Classifier, splits: dict[str, Pictures], config: Classify, generator: torch.Generator
+) -> tuple[list[dict[str, float]], dict[str, float]]:
+    network.eval()
+    known = {name: embedded(network, split, config.device) for name, split in splits.items()}
+    # Fitted to features of mean 0 and deviation 1, whatever the network, and then told in its own.
+    deviation, mean = torch.std_mean(known["train"], dim=0)
+    deviation = deviation + 1e-3 * deviation.mean() + _TINY
+    known = {name: (features - mean) / deviation for name, features in known.items()}
+    labels = {name: split.labels.to(config.device) for name, split in splits.items()}
+    last = network.last
+
+    def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
+        return last(known["train"][rows]), labels["train"][rows]
+
+    @torch.no_grad()
+    def accuracy(name: str) -> float:
+        return round(float((last(known[name]).argmax(1) == labels[name]).float().mean()), 4)
+
+    curve = _fit(last, batch, accuracy, len(labels["train"]), config, generator)
+    figures = {name: accuracy(name) for name in splits}
+    with torch.no_grad():
+        last.weight /= deviation
+        last.bias -= last.weight @ mean
+    return curve, figures
+
+
+def _fit_all(
+    network: Classifier, splits: dict[str, Pictures], config: Classify, generator: torch.Generator
+) -> tuple[list[dict[str, float]], dict[str, float]]:
+    def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
+        network.train()
+        images, labels = splits["train"].batch(rows, config.device)
+        return network(images), labels
+
+    @torch.no_grad()
+    def accuracy(name: str) -> float:
+        network.eval()
+        features = embedded(network, splits[name], config.device)
+        said = network.last(features).argmax(1)
+        return round(float((said == splits[name].labels.to(said)).float().mean()), 4)
+
+    curve = _fit(network, batch, accuracy, len(splits["train"].labels), config, generator)
+    return curve, {name: accuracy(name) for name in splits}
+
+
+def _fit(
+    module: nn.Module,
+    batch: Any,
+    accuracy: Any,
+    count: int,
+    config: Classify,
+    generator: torch.Generator,
+) -> list[dict[str, float]]:
+    """Adam, with a rate that falls in a half cosine, over `count` pictures; what each epoch came to."""
+    rate = config.rate or _RATES[config.layers]
+    optimiser = torch.optim.Adam(module.parameters(), lr=rate)
+    steps = config.epochs * -(-count // config.batch)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    curve = []
+    with progress_bar(Console(stderr=True)) as progress:
+        task = progress.add_task("training", total=steps)
+        for epoch in range(1, config.epochs + 1):
+            total = 0.0
+            for rows in torch.randperm(count, generator=generator).split(config.batch):
+                scores, labels = batch(rows)
+                loss = F.cross_entropy(scores, labels)
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+                total += float(loss.detach()) * len(rows)
+                progress.advance(task)
+            curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val")})
+    return curve
+
+
+@torch.no_grad()
+def embedded(network: Classifier, pictures: Pictures, device: str) -> Tensor:
+    """Features (N, K) of pictures, computed once."""
+    rows = torch.arange(len(pictures.labels)).split(_EMBEDDED_AT_A_TIME)
+    return torch.cat([network.embed(pictures.batch(part, device)[0]) for part in rows])

@@ -1,0 +1,64 @@
+"""The page of a run on a classifier: figures by class, and each picture before and after."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import jinja2
+from markupsafe import Markup
+
+from drivesem.classify.results import ClassifiedFrame, ClassifiedRun
+from drivesem.report.tables import percent
+from drivesem.truth.grades import Grade
+from scene_ir import files
+
+_QUALITY = 90
+"""Of the page's pictures, which are copies of the folders'."""
+_ORDER = {Grade.CERTAIN: 0, Grade.THRESHOLD: 1, None: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class _Card:
+    frame: ClassifiedFrame
+    before: str
+    after: str
+    moved: str
+
+
+def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]) -> None:
+    """Write the page beside the run's folder of frames. Raises FormatError where a picture is missing."""
+    worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 2), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
+    cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    part = resources.files("drivesem.report")
+    template = environment.from_string(part.joinpath("classified.html").read_text(encoding="utf-8"))
+    style = Markup(part.joinpath("style.css").read_text(encoding="utf-8"))
+    rows = [
+        (one, percent(share(one.benign, one.pictures)), percent(share(one.attacked, one.pictures)))
+        for one in run.classes
+    ]
+    text = template.render(run=run, cards=cards, style=style, percent=percent, rows=rows)
+    files.write_text(path, text)
+
+
+def share(part: int, whole: int) -> float | None:
+    """A share; None of nothing."""
+    return part / whole if whole else None
+
+
+def _card(frame: ClassifiedFrame, folder: Path) -> _Card:
+    sizes = ", ".join(f"{name} {size:.3g}" for name, size in frame.sizes.items() if name == "vertex")
+    moved = ", ".join(f"{name.rpartition('.')[2]} {value}" for name, value in frame.moved.items())
+    told = "; ".join(words for words in (moved, sizes) if words)
+    return _Card(frame, _embedded(folder / "benign.png"), _embedded(folder / "counterexample.png"), told)
+
+
+def _embedded(path: Path) -> str:
+    image = files.read_image(path)[..., ::-1]
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

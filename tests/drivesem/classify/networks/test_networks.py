@@ -1,0 +1,227 @@
+"""Classifiers: torchvision's names of weights, passes checked by hand, files and what is wrong with them."""
+
+import json
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+
+from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
+from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
+from drivesem.classify.networks.resnet import ResNet50
+from drivesem.classify.networks.squeezenet import SqueezeNet
+from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from scene_ir.errors import FormatError, RangeError
+
+CLASSES = ("box", "ball", "pole")
+VGG_CONVOLUTIONS = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256)}
+VGG_CONVOLUTIONS |= dict.fromkeys((12, 14), (256, 256)) | {17: (256, 512)}
+VGG_CONVOLUTIONS |= dict.fromkeys((19, 21, 24, 26, 28), (512, 512))
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def vgg_file(small=False):
+    """Random weights under torchvision's names. small: the convolutions alone."""
+    tensors = {}
+    for place, (before, after) in VGG_CONVOLUTIONS.items():
+        tensors[f"features.{place}.weight"] = torch.randn(after, before, 3, 3, generator=seeded(place)) * 0.05
+        tensors[f"features.{place}.bias"] = torch.randn(after, generator=seeded(place)) * 0.1
+    if not small:
+        for place, (before, after) in {0: (25088, 4096), 3: (4096, 4096), 6: (4096, 1000)}.items():
+            tensors[f"classifier.{place}.weight"] = torch.full((after, before), 1e-3)
+            tensors[f"classifier.{place}.bias"] = torch.zeros(after)
+    return tensors
+
+
+def resnet_names():
+    """torchvision's names and shapes of ResNet-50."""
+    shapes = {"conv1.weight": (64, 3, 7, 7), "fc.weight": (1000, 2048), "fc.bias": (1000,)}
+
+    def norm(name, size):
+        return {f"{name}.{part}": (size,) for part in ("weight", "bias", "running_mean", "running_var")}
+
+    shapes |= norm("bn1", 64)
+    before = 64
+    for layer, (count, width) in enumerate(((3, 64), (4, 128), (6, 256), (3, 512)), start=1):
+        for block in range(count):
+            at = f"layer{layer}.{block}"
+            shapes |= {f"{at}.conv1.weight": (width, before, 1, 1), f"{at}.conv2.weight": (width, width, 3, 3)}
+            shapes |= {f"{at}.conv3.weight": (4 * width, width, 1, 1)}
+            shapes |= norm(f"{at}.bn1", width) | norm(f"{at}.bn2", width) | norm(f"{at}.bn3", 4 * width)
+            if block == 0:
+                shapes |= {f"{at}.downsample.0.weight": (4 * width, before, 1, 1)}
+                shapes |= norm(f"{at}.downsample.1", 4 * width)
+            before = 4 * width
+    return shapes
+
+
+@pytest.mark.slow
+def test_torchvisions_file_of_vgg16(tmp_path):
+    tensors = vgg_file()
+    torch.save(tensors, tmp_path / "vgg16.pth")
+    network = ready(to_train("vgg16", str(tmp_path / "vgg16.pth"), CLASSES, seeded()))
+    images = torch.rand(1, 3, 64, 64, generator=seeded())
+    x = (images - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+    for place in VGG_CONVOLUTIONS:
+        x = F.relu(F.conv2d(x, tensors[f"features.{place}.weight"], tensors[f"features.{place}.bias"], padding=1))
+        if place in (2, 7, 14, 21, 28):
+            x = F.max_pool2d(x, 2)
+    x = F.adaptive_avg_pool2d(x, 7).flatten(1)
+    for place in (0, 3):
+        x = F.relu(F.linear(x, tensors[f"classifier.{place}.weight"], tensors[f"classifier.{place}.bias"]))
+    with torch.no_grad():
+        torch.testing.assert_close(network.embed(images), x, rtol=1e-3, atol=1e-4)
+        expected = F.linear(x, network.last.weight, network.last.bias)
+        torch.testing.assert_close(network(images), expected, rtol=1e-3, atol=1e-4)
+    assert network(images).shape == (1, 3)
+
+
+def test_torchvisions_names_of_resnet50(tmp_path):
+    own = {k: tuple(v.shape) for k, v in ResNet50([str(i) for i in range(1000)]).state_dict().items()}
+    counted = {name for name in own if name.endswith("num_batches_tracked")}
+    assert {name: shape for name, shape in own.items() if name not in counted} == resnet_names()
+    file = {name: torch.zeros(shape) for name, shape in resnet_names().items()}
+    file = {name: t + ("running_var" in name) for name, t in file.items()}
+    torch.save(file | {name: torch.tensor(0) for name in counted}, tmp_path / "resnet50.pth")
+    network = ready(to_train("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
+    assert network.classes == CLASSES
+    assert torch.equal(network(torch.rand(1, 3, 64, 64)), torch.zeros(1, 3))
+
+
+def test_a_block_of_resnet50_by_hand():
+    network = ready(ResNet50(CLASSES))
+    block = network.get_submodule("layer2")[0]
+    x = torch.rand(1, 256, 8, 8, generator=seeded())
+
+    def norm(x, bn):
+        mean, scale = bn.running_mean.view(-1, 1, 1), bn.weight / (bn.running_var + 1e-5).sqrt()
+        return (x - mean) * scale.view(-1, 1, 1) + bn.bias.view(-1, 1, 1)
+
+    inner = F.relu(norm(F.conv2d(x, block.conv1.weight), block.bn1))
+    inner = F.relu(norm(F.conv2d(inner, block.conv2.weight, stride=2, padding=1), block.bn2))
+    inner = norm(F.conv2d(inner, block.conv3.weight), block.bn3)
+    beside = norm(F.conv2d(x, block.downsample[0].weight, stride=2), block.downsample[1])
+    with torch.no_grad():
+        torch.testing.assert_close(block(x), F.relu(inner + beside), rtol=1e-3, atol=1e-4)
+
+
+def test_vggs_convolutions_alone(tmp_path):
+    save_file(vgg_file(small=True), tmp_path / "vgg.safetensors")
+    network = ready(to_train("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
+    assert isinstance(network, PooledVGG16)
+    assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 512)
+
+
+def test_squeezenet_is_the_shipped_detectors_first_layers():
+    from detectors.registry import load_detector
+
+    network, detector = ready(to_train("squeezenet", None, CLASSES, seeded())), load_detector("squeezedet")
+    images = torch.rand(1, 3, 64, 64, generator=seeded())
+    maps = {}
+    detector.fires["fire9"].register_forward_hook(lambda module, given, out: maps.update(out=out))
+    pixels = 255 * images.flip(1) - torch.tensor([103.939, 116.779, 123.68]).view(3, 1, 1)
+    x = F.max_pool2d(F.relu(detector.conv1(pixels)), 3, 2, ceil_mode=True)
+    for name in ("fire2", "fire3", "fire4", "fire5", "fire6", "fire7", "fire8", "fire9"):
+        x = detector.fires[name](x)
+        x = F.max_pool2d(x, 3, 2, ceil_mode=True) if name in ("fire3", "fire5") else x
+    expected = torch.cat([x.mean((2, 3)), x.amax((2, 3))], 1)
+    torch.testing.assert_close(network.embed(images), expected, rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("last_only", [True, False])
+def test_what_is_written_is_read_again(tmp_path, last_only):
+    network = to_train("squeezenet", None, CLASSES, seeded(3))
+    save_classifier(network, tmp_path / "a.safetensors", {"fact": "1"}, last_only)
+    again = load_classifier(str(tmp_path / "a.safetensors"), CLASSES)
+    images = torch.rand(1, 3, 64, 64, generator=seeded())
+    with torch.no_grad():
+        torch.testing.assert_close(again(images), ready(network)(images), rtol=1e-2, atol=1e-2)
+    assert not any(p.requires_grad for p in again.parameters())
+    size = (tmp_path / "a.safetensors").stat().st_size
+    assert size < 20_000 if last_only else size > 1_000_000
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_a_new_last_layer_follows_from_its_generator(name):
+    one, other = (ARCHITECTURES[name](("a", "b")) for _ in range(2))
+    for network in (one, other):
+        network.retarget(CLASSES, seeded(5))
+    assert one.classes == CLASSES
+    assert torch.equal(one.last.weight, other.last.weight)
+    assert one.last.out_features == 3
+
+
+def wrong_shape(tensors):
+    return tensors | {"features.0.weight": torch.zeros(64, 3, 5, 5)}
+
+
+def missing(tensors):
+    del tensors["features.28.bias"]
+    return tensors
+
+
+def foreign(tensors):
+    return tensors | {"layer1.weight": torch.zeros(1)}
+
+
+def not_finite(tensors):
+    tensors["features.5.bias"][3] = torch.nan
+    return tensors
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (wrong_shape, r"features\.0\.weight: expected shape \(64, 3, 3, 3\), found \(64, 3, 5, 5\)"),
+        (missing, r"features\.28\.bias: expected a tensor, found none"),
+        (foreign, r"layer1\.weight: expected none, found a tensor"),
+        (not_finite, r"features\.5\.bias: expected finite numbers"),
+    ],
+)
+def test_weights_of_another_network(tmp_path, spoil, message):
+    save_file(spoil(vgg_file(small=True)), tmp_path / "other.safetensors")
+    with pytest.raises(FormatError, match=message):
+        to_train("vgg16-pooled", str(tmp_path / "other.safetensors"), CLASSES, seeded())
+
+
+def test_names_and_files_that_are_no_networks(tmp_path):
+    with pytest.raises(RangeError, match="squeezenet, vgg16, vgg16-pooled, resnet50"):
+        to_train("alexnet", None, CLASSES, seeded())
+    with pytest.raises(FormatError, match="--weights: expected a file with weights of vgg16, found nothing"):
+        to_train("vgg16", None, CLASSES, seeded())
+    (tmp_path / "torn.pth").write_bytes(b"PK no weights")
+    with pytest.raises(FormatError, match=r"torn\.pth"):
+        to_train("vgg16", str(tmp_path / "torn.pth"), CLASSES, seeded())
+    with pytest.raises(FormatError, match=r"gone\.pth"):
+        to_train("vgg16", str(tmp_path / "gone.pth"), CLASSES, seeded())
+    torch.save([1, 2], tmp_path / "list.pth")
+    with pytest.raises(FormatError, match=r"list\.pth: expected tensors by name"):
+        to_train("vgg16", str(tmp_path / "list.pth"), CLASSES, seeded())
+    with pytest.raises(FormatError, match="--network"):
+        load_classifier("resnet50", CLASSES)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"architecture": "squeezenet", "classes": json.dumps(["cat", "dog"])}, "found one for cat, dog"),
+        ({"architecture": "squeezenet", "classes": "cat"}, "classes: expected a list of names"),
+        ({"architecture": "squeezedet", "classes": json.dumps(CLASSES)}, "architecture: expected one of"),
+        ({}, "architecture: expected one of"),
+    ],
+)
+def test_a_file_for_something_else(tmp_path, metadata, message):
+    network = SqueezeNet(CLASSES)
+    save_file({k: v.clone() for k, v in network.state_dict().items()}, tmp_path / "other.safetensors", metadata)
+    with pytest.raises(FormatError, match=message):
+        load_classifier(str(tmp_path / "other.safetensors"), CLASSES)
+
+
+def test_parameters_of_the_published_networks():
+    thousand = [str(i) for i in range(1000)]
+    counts = {kind: sum(p.numel() for p in kind(thousand).parameters()) for kind in (VGG16, ResNet50)}
+    assert counts == {VGG16: 138_357_544, ResNet50: 25_557_032}

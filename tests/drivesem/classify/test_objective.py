@@ -1,0 +1,152 @@
+"""What a classifier is attacked for, by hand; and attacks on networks that are known."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.methods.scw import SCW
+from drivesem.attack.methods.sgd import SGD
+from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.classify.objective import ClassifierObjective, Seen, ahead, aim
+from drivesem.classify.scenes import DRAWN_PX, ObjectScene
+from drivesem.classify.space import Amounts, ObjectSpace, moved_of
+from scene_ir.errors import RangeError
+from tests.drivesem.classify.standins import model
+
+GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.5)
+WIDE = Amounts(0.5, 3.0, 0.9)
+SCORES = torch.tensor([2.0, 3.0, -1.0])
+
+
+def objective_of(network, aimed="logit", params="pose", kind="box", reach=WIDE):
+    scene = ObjectScene(kind, model(kind), "forward", GREY)
+    space = ObjectSpace(scene.vertices, moved_of(params), Amounts(0.002, 0.15, 0.2), reach)
+    return ClassifierObjective(scene, space, network, aimed)
+
+
+def test_aims_by_hand():
+    assert float(aim(SCORES, 1, "logit")) == -3
+    assert float(aim(SCORES, 1, "hinge")) == -1
+    assert float(aim(SCORES, 0, "hinge")) == 0
+    chances = [math.exp(s) / (math.exp(2) + math.exp(3) + math.exp(-1)) for s in (2, 3, -1)]
+    assert float(aim(SCORES, 1, "softmax")) == pytest.approx(chances[0])
+    assert float(aim(SCORES, 2, "softmax")) == pytest.approx(chances[1])
+    assert (float(ahead(SCORES, 1)), float(ahead(SCORES, 2))) == (1, -4)
+
+
+def test_what_is_said_of_a_picture():
+    seen = Seen(SCORES, 1)
+    assert (seen.predicted, seen.right, seen.margin) == (1, True, 1.0)
+    assert seen.confidence == pytest.approx(float(SCORES.softmax(0)[1]))
+    assert not Seen(SCORES, 0).right
+
+
+def test_loss_and_gradient(colours):
+    objective = objective_of(colours)
+    loss, gradient = objective.loss_and_grad(torch.tensor([0.1, 0.2, 0.0]))
+    seen = objective.see(torch.tensor([0.1, 0.2, 0.0]))
+    assert loss == pytest.approx(-float(seen.scores[0]), abs=0.02)  # what is judged is rounded to 8 bits
+    assert gradient.shape == (3,)
+    assert objective.passes == 1 + 3 + 1
+
+
+def test_a_picture_that_is_wrong_from_the_start_is_no_failure(colours):
+    objective = objective_of(colours, kind="ball")
+    object.__setattr__(objective.scene.model, "label", 2)
+    objective = ClassifierObjective(objective.scene, objective.space, colours, "logit")
+    score = objective.score(torch.zeros(3))
+    assert not objective.benign.right
+    assert (score.lost, score.phantoms, score.success, score.failures) == (0, 0, False, 0)
+
+
+def test_a_loss_that_is_no_number(colours):
+    objective = objective_of(colours)
+    objective.network = lambda images: images.mean(dim=(2, 3)) * math.nan
+    with pytest.raises(RangeError, match="a finite loss"):
+        objective.loss_and_grad(torch.zeros(3))
+
+
+class Narrow(nn.Module):
+    """Says box as long as it is red enough: less than `limit` below what it is at first."""
+
+    def __init__(self, network, limit):
+        super().__init__()
+        self.network, self.limit, self.first = network, limit, None
+
+    def forward(self, images):
+        red = self.network(images)[:, 0]
+        self.first = float(red[0].detach()) if self.first is None else self.first
+        return torch.stack([red - (self.first - self.limit), 0 * red, 0 * red - 1], dim=1)
+
+
+METHODS = {
+    "si-fgsm": (SiFGSM(5, early_stop=True), "logit"),
+    "sgd": (SGD(5, early_stop=True, form="unit"), "logit"),
+    "scw": (SCW(5, 5, early_stop=True, constant=0.1), "hinge"),
+    "halton": (Sampling(5, kind="halton"), "softmax"),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_papers_methods_find_a_failure_and_stop_at_it(name, colours):
+    method, aimed = METHODS[name]
+    params = "pose" if name == "halton" else "pose,vertex"
+    objective = objective_of(Narrow(colours, 0.02), aimed, params, reach=Amounts(0.05, 0.75, 0.9))
+    result = method(objective.problem(), objective.space.theta0, seed=0)
+    assert result.success_moved
+    assert not objective.see(result.theta).right
+    assert result.queries == 5 if name == "halton" else result.queries < 5
+    again = method(objective.problem(), objective.space.theta0, seed=0)
+    assert torch.equal(again.theta, result.theta)
+
+
+@pytest.mark.parametrize("name", ["si-fgsm", "sgd", "scw"])
+def test_the_true_score_falls(name, colours):
+    method, aimed = METHODS[name]
+    objective = objective_of(Narrow(colours, 99.0), aimed, "pose,vertex")
+    result = method(objective.problem(), objective.space.theta0, seed=0)
+    assert not result.success_moved
+    assert result.score.loss > objective.score(objective.space.theta0).loss
+    assert result.queries == 5
+
+
+class Chosen:
+    """A problem in which wrong answers are known by theta: (theta, misclassified, softmax of the wrong class)."""
+
+    def __init__(self, outcomes):
+        self.outcomes, self.asked = outcomes, []
+
+    def score(self, theta):
+        from drivesem.attack.methods.base import Score
+
+        if not bool(theta.any()):
+            return Score(0.05, 0, 0, False, False)
+        if not any(torch.equal(theta, t) for t in self.asked):
+            self.asked.append(theta.clone())
+        place = next(i for i, t in enumerate(self.asked) if torch.equal(t, theta))
+        wrong, softmax = self.outcomes[place]
+        return Score(softmax, int(wrong), 0, wrong, wrong)
+
+
+@pytest.mark.parametrize("kind", ["random", "halton"])
+@pytest.mark.parametrize(
+    ("outcomes", "winner"),
+    [
+        ([(False, 0.49), (True, 0.40), (True, 0.90), (True, 0.60), (False, 0.45)], 2),
+        ([(False, 0.49), (True, 0.30), (False, 0.48), (False, 0.10), (False, 0.45)], 1),
+        ([(False, 0.10), (False, 0.20), (False, 0.30), (False, 0.40), (False, 0.25)], 3),
+    ],
+)
+def test_of_five_samples_the_misclassified_one_with_the_highest_wrong_softmax(kind, outcomes, winner, colours):
+    from dataclasses import replace
+
+    objective, known = objective_of(colours, "softmax", reach=Amounts(0.05, 0.75, 0.5)), Chosen(outcomes)
+    problem = replace(objective.problem(), score=known.score)
+    result = Sampling(5, kind=kind)(problem, objective.space.theta0, seed=1)
+    assert len(known.asked) == 5
+    assert torch.equal(result.theta, known.asked[winner])
+    assert float(result.theta.abs().max()) <= 0.75
+    assert max(float(theta.abs().max()) for theta in known.asked) > 0.3

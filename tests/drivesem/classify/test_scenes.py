@@ -1,0 +1,108 @@
+"""Objects before a camera: views, gradients to what moves, backgrounds."""
+
+import numpy as np
+import pytest
+import torch
+
+from drivesem.classify.scenes import (
+    DRAWN_PX,
+    SEEN_PX,
+    VIEWS,
+    ObjectScene,
+    generated_background,
+    in_turn,
+    open_backgrounds,
+    rotation,
+)
+from drivesem.classify.space import Amounts, Change, ObjectSpace, moved_of
+from scene_ir import files
+from scene_ir.errors import FormatError
+from tests.drivesem.classify.standins import model
+
+GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
+
+
+def test_the_front_faces_the_camera_and_up_is_up():
+    scene = ObjectScene("box", model("box"), "forward", GREY)
+    placed, rest = scene.placed(), scene.vertices
+    front, top = rest[:, 2] < 0, rest[:, 1] > 0
+    assert float(placed[front, 2].max()) < float(placed[~front, 2].min())
+    assert float(placed[top, 1].max()) < float(placed[~top, 1].min())
+
+
+def test_views():
+    placed = {view: ObjectScene("box", model("box"), view, GREY).placed() for view in VIEWS}
+    rest = model("box").mesh.vertices
+    corner = (rest[:, 1] > 0) & (rest[:, 2] < 0)  # the upper edge of the front
+    assert float(placed["top"][corner, 1].mean()) > float(placed["forward"][corner, 1].mean())
+    sides = [float(placed[view][rest[:, 2] < 0, 0].mean()) for view in ("left", "forward", "right")]
+    assert sides[1] == pytest.approx(0, abs=1e-6)
+    assert sides[0] == pytest.approx(-sides[2], abs=1e-6)
+    assert abs(sides[0]) > 0.1
+
+
+def test_a_rotation_is_one_and_angles_add_to_the_view():
+    turn = rotation(torch.tensor([0.3, -0.5, 0.2]))
+    torch.testing.assert_close(turn @ turn.T, torch.eye(3))
+    assert float(torch.linalg.det(turn)) == pytest.approx(1)
+    forward, left = (ObjectScene("box", model("box"), view, GREY) for view in ("forward", "left"))
+    torch.testing.assert_close(forward.placed(Change(angles=torch.tensor([0.0, 0.5, 0.0]))), left.placed())
+
+
+def test_a_picture_has_its_background_around_the_object():
+    picture = ObjectScene("ball", model("ball"), "forward", GREY).picture()
+    assert picture.shape == (3, SEEN_PX, SEEN_PX)
+    torch.testing.assert_close(picture[:, 0, 0], torch.full((3,), 0.4))
+    middle = picture[:, SEEN_PX // 2, SEEN_PX // 2]
+    assert float(middle[1]) > float(middle[0]) > 0.2
+
+
+@pytest.mark.parametrize("params", ["pose", "vertex", "lighting"])
+def test_gradients_through_the_picture_and_through_a_score(params, colours):
+    """512 px drawn, 224 seen, and what a network makes of it."""
+    scene = ObjectScene("box", model("box"), "left", generated_background("box"))
+    space = ObjectSpace(scene.vertices, moved_of(params), Amounts(0.002, 0.15, 0.2))
+    weight = torch.nn.functional.avg_pool2d(
+        torch.randn(1, 3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(0)), 9, 1, 4
+    )[0].double()
+    step = 1e-2 if params == "lighting" else 2e-3
+    through = {
+        "image": lambda theta: (scene.picture(space.change(theta)).double() * weight).sum(),
+        "score": lambda theta: colours(scene.picture(space.change(theta))[None])[0, 0].double(),
+    }
+    for name, value in through.items():
+        leaf = torch.zeros(space.dim, requires_grad=True)
+        (gradient,) = torch.autograd.grad(value(leaf), leaf)
+        with torch.no_grad():
+            slopes = [(value(step * d) - value(-step * d)) / (2 * step) for d in torch.eye(space.dim)]
+        cosine = torch.nn.functional.cosine_similarity(torch.stack(slopes).double(), gradient.double(), dim=0)
+        assert float(cosine) >= 0.99, name
+
+
+def test_made_backgrounds_follow_from_their_names():
+    one = generated_background("a")
+    assert one.shape == (3, DRAWN_PX, DRAWN_PX)
+    assert bool((one >= 0).all() and (one <= 1).all())
+    assert torch.equal(one, generated_background("a"))
+    assert not torch.equal(one, generated_background("b"))
+
+
+def test_photographs_as_backgrounds(tmp_path):
+    wide = np.zeros((40, 90, 3), np.uint8)
+    wide[:, 25:65] = (200, 100, 50)
+    files.write_png(tmp_path / "wide.png", wide)
+    background = open_backgrounds(str(tmp_path))("anything")
+    expected = torch.tensor([200, 100, 50]).view(3, 1, 1).expand(3, DRAWN_PX, DRAWN_PX) / 255
+    torch.testing.assert_close(background, expected)
+
+
+def test_backgrounds_that_cannot_be_used(tmp_path):
+    with pytest.raises(FormatError, match="photographs"):
+        open_backgrounds(str(tmp_path))
+    (tmp_path / "torn.jpg").write_bytes(b"\xff\xd8 no picture")
+    with pytest.raises(FormatError, match=r"torn\.jpg"):
+        open_backgrounds(str(tmp_path))("anything")
+
+
+def test_classes_in_turn():
+    assert in_turn(["a/0", "a/1", "b/0", "b/1", "b/2"]) == ["a/0", "b/0", "a/1", "b/1", "b/2"]

@@ -1,0 +1,92 @@
+"""theta of an object: its blocks, names and bounds, and what it does."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivesem.classify.space import FARTHEST, Amounts, Moved, ObjectSpace, moved_of
+from scene_ir.errors import FormatError, RangeError, ShapeError
+
+TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
+STEPS = Amounts(0.002, 0.15, 0.2)
+
+
+def test_blocks_names_bounds_and_steps():
+    space = ObjectSpace(TRIANGLE, moved_of("lighting,pose,vertex"), STEPS, Amounts(0.05, 1.0, math.inf))
+    assert list(space.blocks) == [Moved.VERTEX, Moved.POSE, Moved.LIGHTING]
+    assert space.dim == 9 + 3 + 5
+    assert space.describe(4) == "vertices[1].y, object sizes, [-0.05, 0.05]"
+    assert space.describe(10) == "pose.yaw, rad, [-1, 1]"
+    assert space.describe(12) == "light.strength, share, [-0.9, 0.9]"
+    assert space.step[:9].unique().tolist() == pytest.approx([0.002])
+    assert space.step[9:12].unique().tolist() == pytest.approx([0.15])
+    assert space.step[12:].unique().tolist() == pytest.approx([0.2])
+    assert (space.display(10, math.pi / 2), space.display(13, 0.5), space.display(14, 0.5)) == (
+        "90 deg",
+        "50 %",
+        "0.5",
+    )
+
+
+def test_what_theta_does():
+    space = ObjectSpace(TRIANGLE, moved_of("vertex,pose"), STEPS)
+    theta = torch.arange(12.0)
+    change = space.change(theta)
+    assert change.light is None
+    assert torch.equal(change.angles, theta[9:])
+    # places are counted in the order of their coordinates
+    assert torch.equal(change.offsets, theta[:9].reshape(3, 3)[[0, 2, 1]])
+    assert space.sizes(theta) == {"vertex": 8.0, "pose": 11.0}
+    assert list(space.few(theta)) == ["pose.pitch", "pose.yaw", "pose.roll"]
+    with pytest.raises(ShapeError, match="theta"):
+        space.change(theta[1:])
+    theta[10] = math.nan
+    with pytest.raises(RangeError, match=r"pose\.yaw"):
+        space.change(theta)
+
+
+def test_vertices_at_one_place_move_as_one():
+    doubled = torch.cat([TRIANGLE, TRIANGLE[:1] + 1e-9])
+    space = ObjectSpace(doubled, moved_of("vertex"), STEPS)
+    assert space.dim == 9
+    offsets = space.change(torch.randn(9)).offsets
+    assert torch.equal(offsets[0], offsets[3])
+    assert len(offsets.unique(dim=0)) == 3
+
+
+def test_smooth_changes_move_neighbours_alike():
+    line = torch.stack([torch.linspace(-0.5, 0.5, 50)] * 3, dim=1)
+    space = ObjectSpace(line, moved_of("vertex"), STEPS, shape="smooth")
+    assert space.dim == 192
+    assert space.name(0) == "lattice[0,0,0].x"
+    offsets = space.change(torch.ones(192)).offsets
+    torch.testing.assert_close(offsets, torch.ones(50, 3))
+    rough = space.change(torch.randn(192, generator=torch.Generator().manual_seed(0))).offsets
+    assert float(rough.diff(dim=0).abs().max()) < 0.5
+
+
+@given(st.lists(st.floats(-9, 9), min_size=12, max_size=12))
+def test_projection_keeps_to_the_bounds_and_is_idempotent(values):
+    space = ObjectSpace(TRIANGLE, moved_of("vertex,pose"), STEPS, Amounts(0.05, 1.0, 1.0))
+    theta = torch.tensor(values, dtype=torch.float32)
+    once = space.project(theta)
+    assert bool((once.theta >= space.lower).all() and (once.theta <= space.upper).all())
+    assert torch.equal(space.project(once.theta).theta, once.theta)
+    assert space.project(once.theta).active == ()
+    beyond = {"vertex": bool((theta[:9].abs() > space.upper[0]).any()), "pose": bool((theta[9:].abs() > 1).any())}
+    assert once.active == tuple(f"{name}: bounds" for name, is_so in beyond.items() if is_so)
+
+
+@pytest.mark.parametrize("text", ["", "pose,pose", "pose,colour", "yaw"])
+def test_what_are_no_parameters(text):
+    with pytest.raises(FormatError, match="names among vertex, pose, lighting"):
+        moved_of(text)
+
+
+def test_amounts_are_positive():
+    with pytest.raises(RangeError, match="pose"):
+        Amounts(0.1, 0.0, 0.1)
+    assert FARTHEST.pose == pytest.approx(math.pi)
