@@ -147,7 +147,7 @@ def array(values: Tensor, dtype: Any = None) -> Any:
         made.shape[0] = values.shape[0]
         made._ref = values
         return made
-    made = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    made: Any = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     # Of a single vector Warp makes an array of one: only where the first side is the rows' can it be replaced.
     if seen is None and values.ndim and values.is_contiguous() and made.shape[0] == values.shape[0] > 1:
         _seen[key] = type(made), bytes(made)

@@ -558,8 +558,9 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
     where = np.flatnonzero(mask)
     pixel_of = np.zeros(len(where) + 1, dtype=np.int64)
-    pixel_of[labels.reshape(-1)[where]] = where
-    return np.asarray(distance), pixel_of.take(labels)
+    numbers = np.asarray(labels, dtype=np.int32)
+    pixel_of[numbers.reshape(-1)[where]] = where
+    return np.asarray(distance), pixel_of.take(numbers)
 
 
 def weights_at(corners: Tensor, xy: Tensor) -> Tensor:

@@ -27,12 +27,12 @@ def test_each_size_gives_what_torch_gives(kernel: int, inputs: int, outputs: int
     for height, width in SIZES:
         x = numbers(1, inputs, height, width)
         expected = F.conv2d(x, weight, bias, padding=reach)
-        scale = {"atol": 1e-5 * float(expected.abs().max()), "rtol": 1e-5}
-        torch.testing.assert_close(convolve(x, made, bias, padding=reach), expected, **scale)
+        atol = 1e-5 * float(expected.abs().max())
+        torch.testing.assert_close(convolve(x, made, bias, padding=reach), expected, atol=atol, rtol=1e-5)
         found = convolve(x, made, bias, padding=reach, slope=0.0)
-        torch.testing.assert_close(found, expected.relu(), **scale)
+        torch.testing.assert_close(found, expected.relu(), atol=atol, rtol=1e-5)
         found = convolve_onto(torch.ones_like(expected), x, made, padding=reach)
-        torch.testing.assert_close(found, F.conv2d(x, weight, padding=reach) + 1, **scale)
+        torch.testing.assert_close(found, F.conv2d(x, weight, padding=reach) + 1, atol=atol, rtol=1e-5)
 
 
 @needs_onednn

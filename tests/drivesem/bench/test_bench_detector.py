@@ -11,7 +11,7 @@ import torch
 
 from detectors.registry import load_detector
 from drivesem.bench import detector, memory, probe
-from drivesem.bench.timing import Clock
+from drivesem.bench.timing import Clock, Taken
 from drivesem.cli import main
 from drivesem.commands import bench
 
@@ -33,16 +33,19 @@ def test_both_gives_the_gradient_to_the_image() -> None:
 
 def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch: pytest.MonkeyPatch) -> None:
     class Ticks(Clock):
-        """Forward 2, both 5, decode 1, at worst 3 ms; ten times as slow in the second of three rounds."""
+        """Forward 2, both 5, decode 1, at worst 3 ms; ten times as slow in the second of three rounds. Four at
+        once take as long of the processor as three.
+        """
 
         def __init__(self) -> None:
             super().__init__()
             self.calls = 0
 
-        def ms(self, call: object) -> float:
-            turn, kind = divmod(self.calls, 4)
+        def taken(self, call: object) -> Taken:
+            turn, kind = divmod(self.calls, 6)
             self.calls += 1
-            return (2.0, 5.0, 1.0, 3.0)[kind] * (10 if turn == 1 else 1 + turn)
+            slow = 10 if turn == 1 else 1 + turn
+            return Taken((2.0, 5.0, 1.0, 3.0, 8.0, 20.0)[kind] * slow, (2.0, 5.0, 1.0, 3.0, 6.0, 15.0)[kind])
 
     monkeypatch.setattr(detector, "_peak_mb", lambda name, height, width: 12.5)
     image = torch.rand(1, 3, 32, 48)
@@ -51,6 +54,8 @@ def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch
     assert (row.forward_ms, row.forward_min_ms) == (6.0, 2.0)
     assert (row.both_ms, row.both_min_ms) == (15.0, 5.0)
     assert (row.decode_ms, row.decode_min_ms, row.decode_worst_ms) == (3.0, 1.0, 9.0)
+    assert (row.forward_cpu_ms, row.forward_each_cpu_ms) == (2.0, 1.5)
+    assert (row.both_cpu_ms, row.both_each_cpu_ms) == (5.0, 3.75)
     assert row.peak_mb == (12.5 if memory.supported() else None)
 
 

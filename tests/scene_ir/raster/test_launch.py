@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 import warp as wp
@@ -10,13 +12,11 @@ from torch import Tensor
 from scene_ir.raster import launch
 from scene_ir.raster.launch import array
 
-Told = tuple[int, int, list[int], list[int]]
 
-
-def told(values: Tensor, dtype: object = None) -> tuple[Told, Told]:
+def told(values: Tensor, dtype: Any = None) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Address, dimensions, shape and strides, as ours and as Warp's own."""
     made = array(values, dtype)
-    expected = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    expected: Any = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     fields = [(one.data, one.ndim, list(one.shape), list(one.strides)) for one in (made, expected)]
     assert made.grad == 0
     return fields[0], fields[1]
@@ -31,7 +31,7 @@ def told(values: Tensor, dtype: object = None) -> tuple[Told, Told]:
     ],
 )  # fmt: skip
 def test_arrays_are_those_that_warp_makes(
-    shape: tuple[int, ...], torch_dtype: torch.dtype, dtype: object, monkeypatch: pytest.MonkeyPatch
+    shape: tuple[int, ...], torch_dtype: torch.dtype, dtype: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of other lengths too, and of parts of a tensor; whether they were seen before or not."""
     monkeypatch.setattr(launch, "_seen", {})
