@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from drivesem.doctor import PARTS, about, examine
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Doctor
 
 _LOOKS = {"works": "green", "missing": "yellow", "broken": "red"}
@@ -31,12 +32,12 @@ def run(config: Doctor) -> int:
         table.add_column(column)
     for one in found:
         version = one.told if one.status == "works" else ""
-        table.add_row(one.part.name, f"[{_LOOKS[one.status]}]{one.status}[/]", version, one.part.gives)
+        table.add_row(one.part.name, Text(one.status, style=_LOOKS[one.status]), version, one.part.gives)
     console.print(table)
     for one in found:
         if one.status != "works":
-            console.print(f"{one.part.name}: {one.part.bring}", soft_wrap=True, highlight=False, markup=False)
+            console.print(f"{one.part.name}: {one.part.bring}", soft_wrap=True, highlight=False)
             if one.status == "broken":
-                console.print(f"    {one.told}", soft_wrap=True, highlight=False, markup=False)
+                console.print(f"    {one.told}", soft_wrap=True, highlight=False)
     console.print("all that is needed works" if fit else "drivesem cannot work here", soft_wrap=True)
     return 0 if fit else 1

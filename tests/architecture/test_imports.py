@@ -20,7 +20,7 @@ DOOR = ROOT / "drivesem" / "__init__.py"
 TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
-    *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
+    *("pyproject.toml", "constraints.txt", "constraints.lock", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
     *("CONTRIBUTING.md", "CITATION.cff"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
