@@ -21,11 +21,11 @@ from scene_ir.errors import FormatError
 
 ROOT = Path(__file__).parents[1]
 CONSTRAINTS, LOCK = ROOT / "constraints.txt", ROOT / "constraints.lock"
-_HEAD = "# constraints.txt with hashes, for CPython 3.11 on Linux, x86-64 (python -m tools.lock): docs/reliability.md\n"
+_HEAD = "# constraints.txt with hashes (python -m tools.lock), CPython 3.11, Linux: docs/reliability.md\n"
 
 
 def pinned(path: Path) -> dict[str, str]:
-    """Lines NAME==VERSION of a constraints file, by the name as registries have it. FormatError for other lines."""
+    """Lines NAME==VERSION of a constraints file, by the names that registries have. FormatError for other lines."""
     found = {}
     for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         match = re.fullmatch(r"([A-Za-z0-9._-]+)==(\S+)", line.strip())
