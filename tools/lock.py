@@ -25,7 +25,7 @@ _HEAD = "# constraints.txt with hashes (python -m tools.lock), CPython 3.11, Lin
 
 
 def pinned(path: Path) -> dict[str, str]:
-    """Lines NAME==VERSION of a constraints file, by the names that registries have. FormatError for other lines."""
+    """Lines NAME==VERSION of a constraints file, by the names that registries have. FormatError for others."""
     found = {}
     for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         match = re.fullmatch(r"([A-Za-z0-9._-]+)==(\S+)", line.strip())
