@@ -123,6 +123,7 @@ def mutated(name: str, data: bytes, rng: random.Random) -> bytes:
             ValueError,
             KeyError,
             IndexError,
+            AttributeError,
             TypeError,
             struct.error,
             zipfile.BadZipFile,
