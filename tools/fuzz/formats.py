@@ -23,6 +23,7 @@ from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import Parameter, ParameterSpace, parse_params
 from drivesem.data import kitti
 from drivesem.data.layouts import read_table
+from drivesem.data.photographs import photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
 from drivesem.questions.realism import weights as realism_weights
@@ -33,7 +34,6 @@ from drivesem.run.finished import load_run
 from drivesem.run.page import report_runs
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
 from drivesem.run.tally import tally
-from drivesem.scenes.label_free import photograph
 from drivesem.scenes.segmenter import OnnxSegmenter
 from drivesem.settings.commands import Attack, Report
 from drivesem.settings.edits import read_edits, read_frame_edit
