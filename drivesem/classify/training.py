@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
-from drivesem.classify.networks.squeezenet import SqueezeNet
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.report.progress import progress_bar
@@ -56,10 +55,9 @@ def train_run(config: Classify) -> dict[str, Any]:
     splits = {name: Pictures(*read_pictures(folder, name, classes)) for name in ("train", "val", "test")}
     fit = _fit_last if config.layers == "last" else _fit_all
     curve, accuracy = fit(network, splits, config, generator)
-    last_only = config.layers == "last" and isinstance(network, SqueezeNet) and config.weights is None
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
-    save_classifier(network, path, facts, last_only)
+    save_classifier(network, path, facts)
     data = {
         "out": str(out),
         "weights": str(path),
