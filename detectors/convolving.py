@@ -1,6 +1,6 @@
 """Convolutions with weights that stay as they are. In single precision on a CPU, weights lie as oneDNN wants them,
-where each pass would order them anew, and sums and rectifiers are part of the convolution. Images and weights are
-channels-last.
+where each pass would order them anew, and sums and rectifiers are part of the convolution (`Ordered`). Images and
+other weights are channels-last.
 """
 
 from __future__ import annotations
@@ -14,47 +14,107 @@ from torch import Tensor
 _ONEDNN = torch.ops.mkldnn
 _BACK_RELU = torch.ops.aten.threshold_backward.grad_input
 _BACK_LEAKY = torch.ops.aten.leaky_relu_backward.grad_input
+_MOST_SIZES = 1024
+"""Sizes that a layer's weights remember, as many as oneDNN does."""
+_UNSET = slice(108, 112)
+"""Between dtype and padded sides (oneDNN's dnnl_memory_desc, 64 bit)."""
 
 
-def ordered(weight: Tensor, stride: int = 1, padding: int | None = None) -> Tensor:
-    """Weights as `convolve` takes them: in oneDNN's own order where it computes, else channels-last. padding: by
-    default what keeps the size.
+class Ordered:
+    """Weights (O, I, k, k) in the order that oneDNN wants for the picture at hand.
+
+    That depends on the picture's size, and on the number of threads. Given weights in another order, oneDNN lays
+    them out anew at each call: from one of its own orders into another that takes as long as the convolution of a
+    whole picture. So each size is asked about once. There are few orders, two or three of a layer, each kept
+    once.
     """
+
+    def __init__(self, weight: Tensor) -> None:
+        self.plain = last(weight)
+        self._of_size: dict[tuple[object, ...], Tensor] = {}
+        self._of_order: dict[bytes, Tensor] = {}
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.plain.shape
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.plain.dtype
+
+    def at(self, x: Tensor, stride: int, padding: int) -> Tensor:
+        """Those for x (B, I, h, w)."""
+        key = x.shape, stride, padding, torch.get_num_threads()
+        found = self._of_size.get(key)
+        if found is None:
+            made = _ONEDNN._reorder_convolution_weight(
+                self.plain, [padding] * 2, [stride] * 2, [1, 1], 1, list(x.shape)
+            )
+            if len(self._of_size) >= _MOST_SIZES:
+                self._of_size.clear()
+            found = self._of_size[key] = self._of_order.setdefault(_order(made), made)
+        return found
+
+
+def _order(weight: Tensor) -> bytes:
+    """What tells oneDNN's orders apart: its description of a tensor, without four bytes that nobody sets."""
+    told = bytearray(_ONEDNN._get_mkldnn_serialized_md(weight).numpy().tobytes())
+    told[_UNSET] = bytes(4)
+    return bytes(told)
+
+
+def ordered(weight: Tensor) -> Tensor | Ordered:
+    """Weights as `convolve` takes them: in oneDNN's own order where it computes, else channels-last."""
     weight = last(weight)
     if weight.device.type != "cpu" or weight.dtype != torch.float32 or not torch.backends.mkldnn.is_available():
         return weight
-    reach = weight.shape[-1] // 2 if padding is None else padding
-    reordered: Tensor = _ONEDNN._reorder_convolution_weight(weight, [reach] * 2, [stride] * 2, [1, 1], 1)
-    return reordered
+    return Ordered(weight)
 
 
 def convolve(
     x: Tensor,
-    weight: Tensor,
+    weight: Tensor | Ordered,
     bias: Tensor | None = None,
     stride: int = 1,
     padding: int = 0,
     slope: float | None = None,
 ) -> Tensor:
     """slope: of a rectifier below 0 that comes after; None for none."""
-    if weight.is_mkldnn:
+    if isinstance(weight, Ordered):
         after = "none" if slope is None else "leaky_relu" if slope else "relu"
         scalars = [slope] if slope else []
         result: Tensor = _ONEDNN._convolution_pointwise(
-            x, weight, bias, [padding] * 2, [stride] * 2, [1, 1], 1, after, scalars, ""
+            x, weight.at(x, stride, padding), bias, [padding] * 2, [stride] * 2, [1, 1], 1, after, scalars, ""
         )
         return result
     return rectified(F.conv2d(x, weight, bias, stride, padding), slope)
 
 
 def convolve_onto(
-    total: Tensor, x: Tensor, weight: Tensor, stride: int = 1, padding: int = 0, slope: float | None = None
+    total: Tensor,
+    x: Tensor,
+    weight: Tensor | Ordered,
+    stride: int = 1,
+    padding: int = 0,
+    slope: float | None = None,
 ) -> Tensor:
     """`total`, in place, plus a convolution; then the rectifier."""
-    if weight.is_mkldnn:
+    if isinstance(weight, Ordered):
         after = "relu" if slope == 0 else None  # no other rectifier after a sum
         result: Tensor = _ONEDNN._convolution_pointwise_(
-            total, x, weight, None, [padding] * 2, [stride] * 2, [1, 1], 1, "add", 1.0, after, [], None
+            total,
+            x,
+            weight.at(x, stride, padding),
+            None,
+            [padding] * 2,
+            [stride] * 2,
+            [1, 1],
+            1,
+            "add",
+            1.0,
+            after,
+            [],
+            None,
         )
         return rectified(result, None if slope == 0 else slope)
     total += F.conv2d(x, weight, None, stride, padding)

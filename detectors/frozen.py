@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from detectors.convolving import convolve, convolve_onto, empty, last, mask, ordered, phases
+from detectors.convolving import Ordered, convolve, convolve_onto, empty, last, mask, ordered, phases
 
 BAND_ROWS = 24
 """Pooled rows a band of the stem: at 1242 px its 64 convolved channels take 8 MB, which a server's cache holds."""
@@ -30,11 +30,11 @@ class Convolution:
     """A convolution of odd size, stride 1, that keeps the image's size. Its input may come in parts.
 
     weights: one (out, part, k, k) for each part of the input channels; back: the weights that take a gradient of
-    the output to one of each part. Both as `_ordered` has them.
+    the output to one of each part. Both as `ordered` has them.
     """
 
-    weights: tuple[Tensor, ...]
-    back: tuple[Tensor, ...]
+    weights: tuple[Tensor | Ordered, ...]
+    back: tuple[Tensor | Ordered, ...]
     bias: Tensor
 
     def __call__(self, parts: Sequence[Tensor], rectify: bool = False) -> Tensor:
@@ -73,9 +73,9 @@ class Stem:
     """
 
     mean: Tensor
-    weight: Tensor
+    weight: Tensor | Ordered
     bias: Tensor
-    back: Tensor
+    back: Tensor | Ordered
     following: Convolution
 
 
@@ -142,9 +142,9 @@ def stem(layer: nn.Conv2d, bgr_mean: Sequence[float], following: Convolution, dt
     mean = weight.new_tensor(list(reversed(bgr_mean))) / 255
     return Stem(
         mean=mean.view(3, 1, 1),
-        weight=ordered(weight.to(dtype), stride=2, padding=0),
+        weight=ordered(weight.to(dtype)),
         bias=layer.bias.detach().to(dtype),
-        back=ordered(back.to(dtype), padding=back.shape[-1] - 1),
+        back=ordered(back.to(dtype)),
         following=following,
     )
 

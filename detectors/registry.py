@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from safetensors.torch import save
 from detectors import planted
 from detectors.adapters import choose
 from detectors.base import Detector, DetectorError, Predictor
+from detectors.reading import read_file, read_text
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
 from detectors.whole import write_whole
@@ -34,6 +37,7 @@ ONNX = "onnx:"
 
 DARKNET = "darknet:"
 """Before Darknet's files: darknet:FILE.cfg,FILE.weights, or the former alone where the latter has its name."""
+_MOST_CLASSES = 10_000
 _MOST_ANCHORS = 1000
 """Of a cell: each is a candidate at every place of the picture."""
 
@@ -102,6 +106,8 @@ def load_detector(
         )
     if not path.is_file():
         raise DetectorError(f"{path}: expected a weights file, found none")
+    if str(name_or_path) in SHIPPED:
+        _check_card(path)
     metadata, tensors = read_weights(path)
     architecture = metadata.get("architecture", "squeezedet")
     if architecture not in ARCHITECTURES:
@@ -109,7 +115,7 @@ def load_detector(
         raise DetectorError(f"{path}: expected architecture {known}, found {architecture!r}")
     try:
         settings: dict[str, Any] = {
-            "classes": tuple(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
+            "classes": _names(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
             "t_star": float(metadata.get("t_star", "0.5")),
         }
         if not 0 < settings["t_star"] <= 1:
@@ -120,12 +126,16 @@ def load_detector(
                 raise ValueError(f"anchors: expected at most {_MOST_ANCHORS}, found {len(settings['anchors'])}")
         if "cfg" in metadata:
             settings["cfg"] = cfg.parse(metadata["cfg"])
+        with torch.device("meta"):  # without memory, until it is known that the file fills it
+            _check_tensors(ARCHITECTURES[architecture](**settings), tensors, path)
         detector = ARCHITECTURES[architecture](**settings)
-    except (ValueError, TypeError, RecursionError) as error:
+    except DetectorError:
+        raise
+    except (ValueError, TypeError, OverflowError, RecursionError, RuntimeError) as error:
         raise DetectorError(
             f"{path}: expected metadata classes (list), t_star (number) and anchors (pairs, px): {error}"
         ) from None
-    _load_into(detector, tensors, path)
+    detector.load_state_dict(tensors)
     return _ready(detector, device, gradient_precision)
 
 
@@ -182,7 +192,27 @@ def _in_order(data: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + data[start:]
 
 
-def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:
+def _check_card(path: Path) -> None:
+    """DetectorError for shipped weights that are not those of their model card."""
+    card = path.with_suffix(".md")
+    said = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card, "a model card", 1 << 20))
+    found = hashlib.sha256(read_file(path, "a weights file", 1 << 30)).hexdigest()
+    if said is None or said[1] != found:
+        expected = f"the SHA-256 of {card.name}, {said[1] if said else 'which names none'}"
+        raise DetectorError(f"{path}: expected {expected}, found {found}")
+
+
+def _names(told: Any) -> tuple[str, ...]:
+    """Classes of metadata. ValueError where they are none."""
+    if not isinstance(told, list) or not all(isinstance(name, str) for name in told):
+        raise ValueError("classes: expected a list of names, found something else")
+    if not 1 <= len(told) <= _MOST_CLASSES:
+        raise ValueError(f"classes: expected 1 to {_MOST_CLASSES}, found {len(told)}")
+    return tuple(told)
+
+
+def _check_tensors(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    """DetectorError where tensors are not those of a detector, which may be without memory."""
     expected = detector.state_dict()
     missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or unexpected:
@@ -198,7 +228,6 @@ def _load_into(detector: Detector, tensors: dict[str, torch.Tensor], path: Path)
             )
         if not bool(torch.isfinite(tensor).all()):
             raise DetectorError(f"{path}: {key}: expected finite numbers, found NaN or infinity")
-    detector.load_state_dict(tensors)
 
 
 def _first(keys: list[str]) -> str:

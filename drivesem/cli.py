@@ -4,43 +4,56 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from types import FrameType
 from typing import NoReturn
 
 from drivesem.run.allocation import keep_freed
 from drivesem.run.lock import let_go
-from drivesem.settings.blocks import Command
+from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse
 from drivesem.store import stored
+from scene_ir.errors import shown
 
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
+_EXIT_PIPE = 141
 _EXIT_ENDED = 143
+_CODE = re.compile(r"(?:^|[,@])(?:module|torchscript|export|ultralytics):([^,]+)")
+"""Detectors whose files are code (`detectors.adapters.choose.RUNS_CODE`, which a test holds this against)."""
+_LONGEST_LINE = 2000
+"""Characters: what is wrong with a file may be what it holds."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 143 ended by
-    SIGTERM.
+    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 nobody reads
+    on, 143 ended by SIGTERM.
     """
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
+        _tell_of_code(config)
         with _sigterm_interrupts(), let_go(), stored(config) as config:
             return _run(config)
     except KeyboardInterrupt as error:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
         return _EXIT_ENDED if isinstance(error, _EndedError) else _EXIT_INTERRUPTED
+    except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the interpreter's last words go
+        return _EXIT_PIPE
     except (ValueError, OSError) as error:
         if not _is_bad_input(error):
             raise
-        sys.stderr.write(f"drivesem: {' '.join(str(error).split())}\n")
+        sys.stderr.write(f"drivesem: {' '.join(shown(error, _LONGEST_LINE).split())}\n")
         return _EXIT_BAD_INPUT
 
 
@@ -63,6 +76,15 @@ def _sigterm_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _tell_of_code(config: Command) -> None:
+    """Say which files' code will be run, by a setting that names such a detector."""
+    for setting in fields(config):
+        value = getattr(config, setting.name)
+        for text in value if isinstance(value, tuple) else (value,):
+            for word in _CODE.findall(text) if isinstance(text, str) else ():
+                sys.stderr.write(f"drivesem: {option(setting.name)}: runs the code in {shown(word)}\n")
 
 
 def _is_bad_input(error: Exception) -> bool:

@@ -16,30 +16,38 @@ import re
 import secrets
 import shutil
 import stat
+import struct
+import tokenize
 import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
 from scene_ir.errors import FormatError, ShapeError, WriteError
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 _NPZ_LEVEL = 1
 """zlib level: float maps shrink hardly further at higher ones, and take several times as long."""
 
 _MOST_BYTES = 1 << 30
 """Of a file that is read whole, and of all arrays of an NPZ."""
+_READ_AT_ONCE = 1 << 24
+"""Bytes of a file that turns out longer than it said."""
 _MOST_PIXELS = 1 << 26
 """Of an image: 8192 x 8192."""
 _MOST_YAML = 1 << 18
 """Bytes of a YAML file: settings are short, and reading is slow."""
 _INTEGERS = 1 << 63
 """Integers lie below it, as in the arrays that are made of them."""
+_INTEGER_DIGITS = len(str(_INTEGERS))
 _ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
@@ -168,6 +176,14 @@ def digest(path: Path) -> str:
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
+def check_card(path: Path, data: bytes) -> None:
+    """FormatError for weights, `data`, that are not those whose SHA-256 the model card beside them names."""
+    card = path.with_suffix(".md")
+    said, found = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card)), hashlib.sha256(data).hexdigest()
+    if said is None or said[1] != found:
+        raise FormatError(str(path), f"the SHA-256 of {card.name}, {said[1] if said else 'which has none'}", found)
+
+
 def below(folder: Path, name: str) -> Path:
     """The path of what another file names in `folder`. FormatError where it leads out of it: by an absolute name,
     `..`, or a link.
@@ -181,10 +197,21 @@ def below(folder: Path, name: str) -> Path:
     return path
 
 
-def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
-    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes."""
+def check_links(folder: Path) -> None:
+    """FormatError for a link in `folder`, or in a folder in it, that leads out of it."""
+    for place, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            path = Path(place, name)
+            if path.is_symlink():
+                below(folder, str(path.relative_to(folder)))
+
+
+def check_regular(path: Path | str, most: int = _MOST_BYTES) -> int:
+    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes.
+    Its size.
+    """
     try:
-        status = path.stat()
+        status = os.stat(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL, or half a character, in the name
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise FormatError(str(path), "a readable file", reason.lower()) from error
@@ -194,18 +221,32 @@ def check_regular(path: Path, most: int = _MOST_BYTES) -> None:
         raise FormatError(str(path), "a regular file", "a device, a pipe or a socket")
     if status.st_size > most:
         raise FormatError(str(path), f"at most {most:,} bytes", f"{status.st_size:,}")
+    return status.st_size
 
 
-def read_bytes(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read."""
-    check_regular(path, most)
+def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
+    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read.
+
+    Calls the system as seldom as can be: tens of thousands of small files are read at once.
+    """
+    size = check_regular(path, most)
     try:
-        return path.read_bytes()
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        try:
+            data = os.read(descriptor, size + 1)
+            if len(data) != size:  # it changed meanwhile, or is longer than one call reads
+                parts = [data]
+                while parts[-1]:
+                    parts.append(os.read(descriptor, _READ_AT_ONCE))
+                data = b"".join(parts)
+        finally:
+            os.close(descriptor)
+        return data
     except OSError as error:
         raise FormatError(str(path), "a readable file", (error.strerror or str(error)).lower()) from error
 
 
-def read_text(path: Path, most: int = _MOST_BYTES) -> str:
+def read_text(path: Path | str, most: int = _MOST_BYTES) -> str:
     """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
     try:
         return read_bytes(path, most).decode("utf-8")
@@ -225,7 +266,7 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str, where: str) -> Any:
     """The value of JSON text. where: the file. FormatError as `read_json`."""
     try:
-        value = json.loads(text, parse_int=_integer)
+        value = json.loads(text, parse_int=_integer if _long_numbers(text) else None)
         if _ODD.search(text):
             _check_texts(value)
     except json.JSONDecodeError as error:
@@ -239,6 +280,19 @@ def parse_json(text: str, where: str) -> Any:
     except RecursionError as error:
         raise FormatError(where, "JSON", "lists or objects that are nested too deep") from error
     return value
+
+
+def _long_numbers(text: str) -> bool:
+    """Whether there are as many digits in a row as an integer beyond 64 bits has: then each is looked at, which
+    takes as long as all the rest of the reading.
+    """
+    digits = np.frombuffer(text.encode("utf-8", "surrogatepass"), np.uint8) - np.uint8(ord("0")) < 10
+    run = 1
+    while run < _INTEGER_DIGITS and digits.size:
+        step = min(run, _INTEGER_DIGITS - run)
+        digits = digits[:-step] & digits[step:]
+        run += step
+    return bool(digits.any())
 
 
 def _integer(text: str) -> int:
@@ -283,22 +337,38 @@ def read_yaml(path: Path) -> Any:
         raise FormatError(str(path), "YAML", " ".join(str(error).split())) from error
 
 
-def check_pixels(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height that an image's header says. FormatError for no image, and one that would not fit."""
-    from PIL import Image, UnidentifiedImageError
+@contextmanager
+def opened_image(path: Path, data: bytes | None = None) -> Iterator[Image]:
+    """Pillow's view of an image file, of which the header alone is read as yet. data: what is in it, where that is
+    known. FormatError for no image, for one that would not fit, and for what Pillow raises inside.
+    """
+    from PIL import Image
 
+    if data is None:
+        check_regular(path)
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(path if data is None else io.BytesIO(data)) as image,
+        ):
             width, height = image.size
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        found = f"{len(data)} bytes that do not decode"
-        if isinstance(error, Image.DecompressionBombError):
-            found = "one of more"
-            raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", found) from error
+            if width * height > _MOST_PIXELS:
+                raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", f"{width}x{height}")
+            yield image
+    except FormatError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", "one of more") from error
+    # its readers of damaged headers, EXIF among them, raise what their parts do
+    except (OSError, ValueError, SyntaxError, ArithmeticError, LookupError, TypeError, struct.error) as error:
+        found = f"{path.stat().st_size if data is None else len(data)} bytes that do not decode"
         raise FormatError(str(path), "an image", found) from error
-    if width * height > _MOST_PIXELS:
-        raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", f"{width}x{height}")
-    return width, height
+
+
+def check_pixels(path: Path, data: bytes) -> tuple[int, int]:
+    """Width and height that an image's header says. FormatError as `opened_image`."""
+    with opened_image(path, data) as image:
+        return image.size
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -363,14 +433,26 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             if total > _MOST_BYTES:
                 raise FormatError(str(path), f"arrays of at most {_MOST_BYTES:,} bytes", f"{total:,}")
             return {
-                member.filename.removesuffix(".npy"): _array(bytearray(archive.read(member)))
+                member.filename.removesuffix(".npy"): _array(_unpacked(archive, member))
                 for member in archive.infolist()
             }
     except FormatError:
         raise
     # zipfile says by RuntimeError and its kin that it lacks a password, or the way in which a member is packed
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise FormatError(str(path), "an NPZ archive of arrays", str(error).splitlines()[0]) from error
+    except (
+        *(zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, OSError, RuntimeError),
+        *(tokenize.TokenError, SyntaxError, TypeError, OverflowError),  # of a header, which is Python's text
+    ) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FormatError(str(path), "an NPZ archive of arrays", reason) from error
+
+
+def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
+    """The bytes of a member, of which no more are unpacked than the archive's list says that there are."""
+    with archive.open(member) as stream:
+        data = bytearray(stream.read(member.file_size))
+        stream.read(1)  # to the end, where the checksum is looked at
+    return data
 
 
 def _array(data: bytearray) -> np.ndarray:

@@ -129,19 +129,15 @@ def load_scene(folder: Path) -> SceneIR:
 
     Raises FormatError naming file and key: a missing file or key, another version, a wrong shape or type.
     """
-    folder = Path(folder)
+    return _load(Path(folder), with_before=True)
+
+
+def _load(folder: Path, with_before: bool) -> SceneIR:
+    """with_before: whether it may be what became of another scene."""
     if not folder.is_dir():
         raise FormatError(str(folder), "a folder with a scene", "no such folder")
     root = _record(folder)
-    camera_node = root["camera"]
-    camera = camera_node.build(
-        lambda: Camera(
-            camera_node["intrinsics"].tensor(3, 3),
-            camera_node["height"].integer(),
-            camera_node["width"].integer(),
-            None if camera_node["projection"].value is None else camera_node["projection"].tensor(3, 4),
-        )
-    )
+    camera = _camera(root["camera"])
     size = (camera.height, camera.width)
     arrays = _Arrays(folder / "arrays.npz")
     images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
@@ -171,7 +167,9 @@ def load_scene(folder: Path) -> SceneIR:
     ignore = root["ignore"]
     provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
     changed = root["version"].value > 3 and root["before"].flag()
-    before = load_scene(folder / "before") if changed else None
+    if changed and not with_before:
+        raise FormatError(f"{root['before'].where}", "false, in the scene before another", "true")
+    before = _load(files.below(folder, "before"), with_before=False) if changed else None
     return root.build(
         lambda: SceneIR(
             camera=camera,
@@ -185,6 +183,22 @@ def load_scene(folder: Path) -> SceneIR:
             provenance=provenance,
             front=front,
             before=before,
+        )
+    )
+
+
+def load_camera(folder: Path) -> Camera:
+    """The camera of the scene in `folder`, from its record alone. FormatError naming file and key."""
+    return _camera(_record(Path(folder))["camera"])
+
+
+def _camera(node: _Node) -> Camera:
+    return node.build(
+        lambda: Camera(
+            node["intrinsics"].tensor(3, 3),
+            node["height"].integer(),
+            node["width"].integer(),
+            None if node["projection"].value is None else node["projection"].tensor(3, 4),
         )
     )
 

@@ -6,7 +6,6 @@ Format: eight bytes, the header's length; the header, JSON; then raw little-endi
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,26 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 _DTYPES = {"F16": "<f2", "F32": "<f4"}
+SHIPPED = Path(__file__).parent / "derender" / "weights"
 _HEADER = 8
 """Bytes that tell the header's length."""
 
 
 def read_weights(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and float32 tensors of a file of float16 or float32 tensors. FormatError naming file and key."""
+    """Metadata and float32 tensors of a file of float16 or float32 tensors. FormatError naming file and key; for
+    weights of this package also where they are not those of their model card.
+    """
     data = files.read_bytes(path)
+    if path.parent == SHIPPED:
+        files.check_card(path, data)
     length = int.from_bytes(data[:_HEADER], "little")
     if len(data) < _HEADER or len(data) - _HEADER < length:
         raise FormatError(str(path), "a safetensors file", f"{len(data)} bytes, cut short")
     try:
-        header: Any = json.loads(data[_HEADER : _HEADER + length])
-    except ValueError as error:
-        raise FormatError(f"{path}: header", "JSON", str(error).splitlines()[0]) from error
+        text = data[_HEADER : _HEADER + length].decode()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: header", "JSON", str(error)) from error
+    header: Any = files.parse_json(text, f"{path}: header")
     if not isinstance(header, dict):
         raise FormatError(f"{path}: header", "an object", type(header).__name__)
     metadata = header.pop("__metadata__", {})

@@ -85,6 +85,8 @@ def main() -> None:
     for name in told.classes or objects.classes:
         own = [n for n in names if n.startswith(f"{name}/")][told.start : told.start + told.each]
         models = [objects.load(n) for n in own]
+        if not models:
+            continue
         rows += [np.hstack([picture(m, VIEWS[view], told.size) for m in models]) for view in told.views]
     files.write_png(told.out, np.vstack(rows))
 

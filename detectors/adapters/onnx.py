@@ -20,7 +20,7 @@ from torch import Tensor
 from detectors import boxes
 from detectors.adapters import coco
 from detectors.adapters.formats import Shape, reading
-from detectors.adapters.spec import Fitted, Spec, fit, prepare, settings_of
+from detectors.adapters.spec import MOST_SIDE, Fitted, Spec, fit, prepare, settings_of
 from detectors.adapters.tiles import NMS_IOU, Window, cut, merge, windows
 from detectors.base import DetectorError
 from detectors.types import Detections
@@ -72,14 +72,15 @@ class OnnxPredictor:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            inputs = [(told.name, list(told.shape)) for told in session.get_inputs()]
+            shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
+            names = _names(session.get_modelmeta().custom_metadata_map)
         except Exception as error:  # ONNX Runtime's own classes differ from version to version
             raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
         settings = settings_of(path, spec)
-        self.input_hw = _input_hw(path, session.get_inputs(), settings.get("size"))
-        shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
-        names = _names(session.get_modelmeta().custom_metadata_map)
+        self.input_hw = _input_hw(path, inputs, settings.get("size"))
         self._reading = reading(shapes, self.input_hw, settings, names, str(path))
-        flat_image = len(session.get_inputs()[0].shape) == 3
+        flat_image = len(inputs[0][1]) == 3
         self._spec: Spec = replace(
             self._reading.spec, size=self.input_hw, **({"input": "image"} if flat_image else {})
         )
@@ -92,7 +93,7 @@ class OnnxPredictor:
         self._least_score = LEAST_SCORE if self._spec.least_score is None else self._spec.least_score
         self._tiling = tiling
         self._session = session
-        self._input = session.get_inputs()[0].name
+        self._input = inputs[0][0]
 
     def forward(self, images: Tensor) -> OnnxPredictions:
         """images (B, 3, H, W), RGB in [0, 1]; carries no gradient."""
@@ -147,16 +148,22 @@ def _runtime(path: Path) -> ModuleType:
     return onnxruntime
 
 
-def _input_hw(path: Path, inputs: Sequence[Any], size: tuple[int, int] | None) -> tuple[int, int]:
-    """Height and width px of the one image that a graph takes. size: a YAML file's, for sides left open."""
-    shape = list(inputs[0].shape) if len(inputs) == 1 else []
+def _input_hw(
+    path: Path, inputs: Sequence[tuple[str, list[Any]]], size: tuple[int, int] | None
+) -> tuple[int, int]:
+    """Height and width px of the one image that a graph takes. inputs: names and shapes; size: a YAML file's, for
+    sides left open.
+    """
+    shape = inputs[0][1] if len(inputs) == 1 else []
     if len(shape) in (3, 4) and (shape[-3] == 3 or not isinstance(shape[-3], int)):
         fixed = tuple(side if isinstance(side, int) else None for side in shape[-2:])
+        if not all(side is None or 1 <= side <= MOST_SIDE for side in fixed):
+            raise DetectorError(f"{path}: expected an input of 1 to {MOST_SIDE} px a side, found {shape}")
         if size is not None and all(side in (None, given) for side, given in zip(fixed, size, strict=True)):
             return size
         if size is None and None not in fixed:
             return fixed[0] or 0, fixed[1] or 0
-    found = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+    found = ", ".join(f"{name} {shape}" for name, shape in inputs)
     expected = f"of {size[0]} x {size[1]}" if size else "of fixed size (or `size` in a YAML file)"
     raise DetectorError(f"{path}: expected one input (1, 3, height, width) {expected}, found {found}")
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from detectors.adapters import coco
 from detectors.base import DetectorError
+from detectors.reading import read_text
 
 Resize = Literal["letterbox", "stretch"]
 Channels = Literal["rgb", "bgr"]
@@ -22,6 +23,11 @@ Activation = Literal["none", "sigmoid", "softmax"]
 Layout = Literal["xyxy", "cxcywh", "xywh", "yxyx"]
 Input = Literal["batch", "image", "list"]
 
+MOST_SIDE = 8192
+"""px of a network's input: far above any, so that none takes all memory."""
+_MOST_CLASSES = 10_000
+_MOST_YAML = 1 << 18
+"""Bytes of a YAML file: settings are short, and reading is slow."""
 NO_CLASS = ""
 """Name of a column of scores that is no class: background, or a number that was never given."""
 
@@ -109,13 +115,28 @@ def prepare(images: Tensor, spec: Spec) -> Tensor:
 
 def load_spec(path: Path) -> dict[str, Any]:
     """The settings of a YAML file, each checked; to be laid over a format's own. DetectorError names file, key."""
-    try:
-        loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None
+    loaded = _read_yaml(path)
     if not isinstance(loaded, dict):
         raise DetectorError(f"{path}: expected a mapping of settings, found {type(loaded).__name__}")
     return checked(loaded, str(path))
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without aliases, a few of which stand for gigabytes."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(problem="an alias", problem_mark=self.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def _read_yaml(path: Path) -> Any:
+    """The value in a YAML file. DetectorError where it is none, or has aliases."""
+    text = read_text(path, "a YAML file", _MOST_YAML)
+    try:
+        return yaml.load(text, _Loader)  # a subclass of SafeLoader
+    except (ValueError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
+        raise DetectorError(f"{path}: expected a YAML file, found {' '.join(str(error).split())}") from None
 
 
 def settings_of(path: Path, spec: Path | None) -> dict[str, Any]:
@@ -138,7 +159,7 @@ def checked(settings: Mapping[Any, Any], where: str) -> dict[str, Any]:
         expected, read = _READERS[key]
         try:
             found[key] = read(value)
-        except (TypeError, ValueError, KeyError):
+        except (TypeError, ValueError, KeyError, OverflowError):
             raise DetectorError(f"{where}: {key}: expected {expected}, found {value!r}") from None
     return found
 
@@ -167,7 +188,7 @@ def _number(least: float, most: float) -> Callable[[Any], float]:
 
 
 def _whole(value: Any) -> int:
-    if isinstance(value, bool) or int(value) != value or value < 1:
+    if isinstance(value, bool) or int(value) != value or not 1 <= value <= MOST_SIDE:
         raise ValueError
     return int(value)
 
@@ -205,7 +226,7 @@ def _classes(value: Any) -> tuple[str, ...]:
         return CLASS_LISTS[value]
     names = tuple(NO_CLASS if name in (None, "-") else str(name) for name in value)
     real = [name for name in names if name != NO_CLASS]
-    if not real or len(set(real)) != len(real):
+    if not real or len(set(real)) != len(real) or len(names) > _MOST_CLASSES:
         raise ValueError
     return names
 
@@ -217,8 +238,8 @@ def _text(value: Any) -> str:
 
 
 _READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "size": ("a number of px, or [height, width]", _size),
-    "multiple": ("a whole number", _whole),
+    "size": (f"a number of px up to {MOST_SIDE}, or [height, width]", _size),
+    "multiple": (f"a whole number up to {MOST_SIDE}", _whole),
     "resize": _one_of(Resize),
     "centred": ("true or false", _truth),
     "pad": ("a number in [0, 1]", _number(0, 1)),

@@ -20,6 +20,7 @@ from detectors.adapters import coco
 from detectors.adapters.dense import DenseDetector, DensePredictions
 from detectors.adapters.spec import CLASS_LISTS, NO_CLASS, load_spec
 from detectors.base import DetectorError
+from detectors.reading import read_state
 
 BACKGROUND = 1
 """Columns of scores before the first class."""
@@ -139,12 +140,10 @@ def load(name: str, weights: str = "default", spec: Path | None = None) -> Torch
 
 
 def _load_into(model: nn.Module, path: Path) -> None:
-    if not path.is_file():
-        raise DetectorError(f"{path}: expected a weights file, found none")
+    state = read_state(path, f"weights of {type(model).__name__}")
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
         model.load_state_dict(state)
-    except Exception as error:  # pickle, zip and torch have errors of their own
+    except (RuntimeError, TypeError, AttributeError, ValueError) as error:
         lines = itertools.islice((line.strip() for line in str(error).splitlines() if line.strip()), 2)
         raise DetectorError(
             f"{path}: expected weights of {type(model).__name__}, found {' '.join(lines)}"

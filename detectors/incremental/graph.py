@@ -17,7 +17,7 @@ import torch.fx
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors.convolving import last, ordered, phases
+from detectors.convolving import Ordered, ordered, phases
 from detectors.incremental.regions import Span
 
 
@@ -161,32 +161,24 @@ class Parts:
 @dataclass(frozen=True, slots=True)
 class Kernel:
     """A convolution's weights as they are used: of a plain one `weights` and `back` (see `convolving.phases`) of
-    each source; else those of all sources, and no `back`.
+    each source; else none, and the layer's own are taken.
     """
 
-    weights: tuple[Tensor, ...]
-    back: tuple[Tensor, ...]
+    weights: tuple[Tensor | Ordered, ...]
+    back: tuple[Tensor | Ordered, ...]
     bias: Tensor | None
 
     @classmethod
     def of(cls, layer: Convolved) -> Kernel:
         counts = [source.channels for source in layer.sources]
         if not layer.plain:
-            return cls((layer.weight.detach(),), (), layer.bias)
-        stride = layer.stride[0]
+            return cls((), (), layer.bias)
         parts = layer.weight.detach().split(counts, 1)
         return cls(
-            tuple(_laid_out(part, stride) for part in parts),
-            tuple(_laid_out(phases(part, stride), 1) for part in parts),
+            tuple(ordered(part.contiguous()) for part in parts),
+            tuple(ordered(phases(part, layer.stride[0])) for part in parts),
             layer.bias,
         )
-
-
-def _laid_out(weight: Tensor, stride: int) -> Tensor:
-    """In oneDNN's own order where that helps: with strides and single places, at some small sizes, it takes thirty
-    times as long as without (oneDNN of torch 2.13).
-    """
-    return ordered(weight.contiguous(), padding=0) if stride == 1 and weight.shape[-1] > 1 else last(weight)
 
 
 @dataclass(frozen=True, slots=True)

@@ -189,7 +189,7 @@ def _given(
 def _convolved(layer: Convolved, kernel: Kernel, inputs: Sequence[Tensor]) -> Tensor:
     if not layer.plain:
         joined = inputs[0] if len(inputs) == 1 else torch.cat(list(inputs), 1)
-        weight = kernel.weights[0].to(joined)
+        weight = layer.weight.to(joined)
         result = F.conv2d(joined, weight, kernel.bias, layer.stride, 0, layer.dilation, layer.groups)
         return rectified(result, layer.slope)
     stride, final = layer.stride[0], len(inputs) - 1
@@ -262,9 +262,8 @@ def _back(graph: Graph, step: Step, k: int, total: Tensor, trace: Traces) -> lis
             )
             return [into]
         case Convolved():
-            weight = graph.kernels[layer].weights[0].to(total)
             window = F.conv_transpose2d(
-                total, weight, None, layer.stride, groups=layer.groups, dilation=layer.dilation
+                total, layer.weight.to(total), None, layer.stride, groups=layer.groups, dilation=layer.dilation
             )
             return list(window.split([source.channels for source in layer.sources], 1))
         case Rectified():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -27,7 +27,9 @@ AGREES = 1e-3
 _BLOCK = 8  # bytes of an int64
 """Pixels to which regions are rounded, so that the next step's often fit into this one's plan."""
 _PLANS = 16
-_ROOM = 16
+_AHEAD = 8
+"""Pixels that each plan but the first reaches beyond what is asked for."""
+_ROOM = 32
 """Pixels by which a plan's region may be larger than what is asked for: a new plan, oneDNN's first look at its
 sizes included, takes as long as a tenth of a pass, and an attack's steps move cars only a little."""
 
@@ -128,11 +130,9 @@ class Reference:
             )
             if not worst <= AGREES:
                 self.incremental.disagrees = True
-                warnings.warn(
-                    f"detector {self.detector.name}: passes on changed regions differ from whole ones by "
-                    f"{worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on",
-                    RuntimeWarning,
-                    stacklevel=2,
+                sys.stderr.write(
+                    f"drivesem: detector {self.detector.name}: passes on changed regions differ from whole ones "
+                    f"by {worst:.2g} of a logit (at most {AGREES:g} is expected): whole passes from here on\n"
                 )
                 return whole
         return raw
@@ -152,10 +152,11 @@ class Reference:
             if region.contains(changed) and around.contains(region):
                 self._plans.insert(0, self._plans.pop(i))
                 return plan
-        # A plan for all of a frame's steps so far serves the next ones too.
+        # A plan for all of a frame's steps so far serves the next ones too, and those that go a little further.
         for region, _ in self._plans:
             if around.contains(region):
                 changed = changed.joined(region)
+        changed = changed.grown(_AHEAD) if self._plans else changed
         top, left = self.trunk.at
         within = Rect(top, top + changed.hw[0], left, left + changed.hw[1])
         moved = changed.placed((top, left), self.shapes.hw[self.incremental.graph.layers[0]])

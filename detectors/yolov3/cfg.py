@@ -15,12 +15,20 @@ from detectors.base import DetectorError
 ACTIVATIONS = ("leaky", "linear")
 NO_MATCH = 1.0
 """Default of a head's `iou_thresh`: only the best anchor answers for an object."""
+_MOST_WHOLE = 1 << 20
 _NUMBERS_A_BOX = 5
 """x, y, width, height, objectness; the classes follow."""
 
 
 _MOST_LAYERS = 1000
 """YOLOv3 has 107."""
+_MOST_ANCHORS = 1000
+_MOST_SIDE = 63
+"""px of a kernel or a window; 13 in networks that are known."""
+_MOST_STRIDE = 1024
+"""px of the input, whose sides are padded to multiples of it; 64 at most in networks that are known."""
+_MOST_NUMBERS = 256, 4096
+"""That a layer, and all of them, may give for a pixel of the input: YOLOv3's give 32 and 329."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +140,7 @@ def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
     layers: list[Layer] = []
     channels: list[int] = []
     strides: list[int] = []
+    numbers: list[float] = []
     width = _Reader(sections[0], source).integer("channels", 3)
     if width != 3:
         raise DetectorError(f"{source}:{sections[0].line}: channels: expected 3, found {width}")
@@ -146,7 +155,16 @@ def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
         layers.append(layer)
         channels.append(channel)
         strides.append(stride)
+        numbers.append(channel / stride**2)
+        if stride > _MOST_STRIDE or numbers[-1] > _MOST_NUMBERS[0] or sum(numbers) > _MOST_NUMBERS[1]:
+            most, in_all = _MOST_NUMBERS
+            expected = f"a stride up to {_MOST_STRIDE}, numbers a pixel up to {most}, {in_all} in all"
+            raise reader.fail("filters, stride", expected, f"{stride}, {numbers[-1]:g}, {sum(numbers):g}")
     cfg = Cfg(tuple(sections), tuple(layers), tuple(channels), tuple(strides))
+    if cfg.stride > _MOST_STRIDE:
+        raise DetectorError(
+            f"{source}: expected strides with a multiple of at most {_MOST_STRIDE}, found {cfg.stride}"
+        )
     counts = {head.classes for _, head in cfg.heads}
     if len(counts) != 1:
         found = ", ".join(map(str, sorted(counts))) or "no [yolo]"
@@ -195,7 +213,7 @@ class _Reader:
             f"{self.source}:{self.section.line}: [{self.section.kind}] {key}: expected {expected}, found {found}"
         )
 
-    def integer(self, key: str, default: int | None = None, least: int = 1) -> int:
+    def integer(self, key: str, default: int | None = None, least: int = 1, most: int = _MOST_WHOLE) -> int:
         text = self.section.options.get(key)
         if text is None:
             if default is None:
@@ -204,6 +222,8 @@ class _Reader:
         (value,) = self._integers(key, [text])
         if value < least:
             raise self.fail(key, f"an integer of at least {least}", value)
+        if value > most:
+            raise self.fail(key, f"at most {most}", value)
         return value
 
     def integers(self, key: str) -> list[int]:
@@ -242,7 +262,7 @@ def _convolution(reader: _Reader, _here: int) -> Convolution:
         raise reader.fail("activation", " or ".join(ACTIVATIONS), activation)
     if reader.integer("groups", 1) != 1:
         raise reader.fail("groups", "1", reader.section.options["groups"])
-    size = reader.integer("size", 1)
+    size = reader.integer("size", 1, most=_MOST_SIDE)
     padding = size // 2 if reader.integer("pad", 0, 0) else reader.integer("padding", 0, 0)
     if 2 * padding != size - 1:
         raise reader.fail("pad", f"{(size - 1) / 2:g} px for a size of {size}", padding)
@@ -257,8 +277,8 @@ def _convolution(reader: _Reader, _here: int) -> Convolution:
 
 
 def _max_pool(reader: _Reader, _here: int) -> MaxPool:
-    stride = reader.integer("stride", 1)
-    size = reader.integer("size", stride)
+    stride = reader.integer("stride", 1, most=_MOST_SIDE)
+    size = reader.integer("size", stride, most=_MOST_SIDE)
     if reader.integer("padding", size - 1, 0) != size - 1:
         raise reader.fail("padding", str(size - 1), reader.section.options["padding"])
     return MaxPool(size, stride)
@@ -293,6 +313,8 @@ def _head(reader: _Reader, _here: int) -> Head:
     if not numbers or len(numbers) % 2 or not all(0 < n < math.inf for n in numbers):
         raise reader.fail("anchors", "pairs of positive numbers", repr(text))
     anchors = tuple(zip(numbers[::2], numbers[1::2], strict=True))
+    if len(anchors) > _MOST_ANCHORS:
+        raise reader.fail("anchors", f"at most {_MOST_ANCHORS}", len(anchors))
     if reader.integer("num", len(anchors)) != len(anchors):
         raise reader.fail("num", f"{len(anchors)}, as many as anchors", reader.section.options["num"])
     mask = reader.integers("mask") if "mask" in reader.section.options else list(range(len(anchors)))

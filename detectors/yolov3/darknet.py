@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from detectors.adapters import coco
 from detectors.base import DetectorError
+from detectors.reading import read_text
 from detectors.whole import write_whole
 from detectors.yolov3 import cfg, weights
 from detectors.yolov3.yolov3 import YoloV3
@@ -22,9 +25,13 @@ def load(cfg_path: Path, weights_path: Path | None = None) -> YoloV3:
 
     Raises DetectorError, in one line, where a file is missing, damaged, or does not fit the others.
     """
-    description = cfg.parse(_text(cfg_path, "a Darknet .cfg"), str(cfg_path))
-    detector = YoloV3(_classes(cfg_path.with_suffix(".names"), description.classes), cfg=description)
-    weights.read(detector.network, weights_path or cfg_path.with_suffix(".weights"))
+    description = cfg.parse(read_text(cfg_path, "a Darknet .cfg", _MOST_TEXT), str(cfg_path))
+    classes, path = _classes(cfg_path.with_suffix(".names"), description.classes), weights_path
+    path = path or cfg_path.with_suffix(".weights")
+    with torch.device("meta"):  # without memory, until it is known that the file fills it
+        weights.check(YoloV3(classes, cfg=description).network, path)
+    detector = YoloV3(classes, cfg=description)
+    weights.read(detector.network, path)
     return detector
 
 
@@ -37,7 +44,9 @@ def save(detector: YoloV3, cfg_path: Path, seen: int = 0) -> None:
 
 def _classes(path: Path, count: int) -> tuple[str, ...]:
     if path.is_file():
-        names = tuple(line.strip() for line in _text(path, "class names").splitlines() if line.strip())
+        names = tuple(
+            line.strip() for line in read_text(path, "class names", _MOST_TEXT).splitlines() if line.strip()
+        )
         if len(names) != count:
             raise DetectorError(f"{path}: expected {count} classes as in the .cfg, found {len(names)}")
     elif count == len(coco.NAMES):
@@ -45,16 +54,3 @@ def _classes(path: Path, count: int) -> tuple[str, ...]:
     else:
         raise DetectorError(f"{path}: expected the {count} classes of the .cfg, a line each, found no file")
     return tuple(_OURS.get(name, name) for name in names)
-
-
-def _text(path: Path, what: str) -> str:
-    """A file's text. DetectorError where there is none, or too much."""
-    try:
-        size = path.stat().st_size
-        if not path.is_file() or size > _MOST_TEXT:
-            found = f"{size:,} bytes" if path.is_file() else "no regular file"
-            raise DetectorError(f"{path}: expected {what}, found {found}")
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "bytes that are no text"
-        raise DetectorError(f"{path}: expected {what}, found {reason}") from None

@@ -14,11 +14,23 @@ import torch
 from torch import Tensor
 
 from detectors.base import DetectorError
+from detectors.reading import check_file, read_file
 from detectors.whole import write_whole
 from detectors.yolov3.network import Block, Network
 
 VERSION = (0, 2, 0)
 _VERSION_BYTES = 12
+_MOST_BYTES = 1 << 30
+"""YOLOv3's have 248 MB."""
+
+
+def check(network: Network, path: Path) -> None:
+    """DetectorError for a file that has not as many bytes as the network takes, which may be without memory."""
+    check_file(path, "Darknet weights", _MOST_BYTES)
+    expected, found = 4 * sum(tensor.numel() for tensor in _tensors(network)), path.stat().st_size
+    if not _VERSION_BYTES + 4 <= found - expected <= _VERSION_BYTES + 8:
+        numbers = (found - _VERSION_BYTES - 8) / 4
+        raise DetectorError(f"{path}: expected {expected // 4:,} numbers after the header, found {numbers:,.10g}")
 
 
 @torch.no_grad()
@@ -26,10 +38,7 @@ def read(network: Network, path: Path) -> int:
     """Fill a network from a file; how many images it was trained on. DetectorError where the file is missing or
     has not as many numbers as the network takes.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DetectorError(f"{path}: expected Darknet weights, found {error.strerror}") from None
+    content = read_file(path, "Darknet weights", _MOST_BYTES)
     if len(content) < _VERSION_BYTES:
         raise DetectorError(f"{path}: expected Darknet weights, found {len(content)} bytes")
     major, minor, _ = np.frombuffer(content, "<i4", 3)

@@ -146,9 +146,12 @@ def night_rows(spent: Sequence[Spent], frames: int, processes: int, seed: int) -
     alone = [one.processor for one in spent if one.processor is not None]
     if len(alone) == len(spent):
         others.append(row("no other work on the machine", "reckoned", alone, processes))
-    others.append(row("half the steps", "reckoned", [one.total - one.search / 2 for one in spent], processes))
+    others.append(row("half the --steps", "reckoned", [one.total - one.search / 2 for one in spent], processes))
     without = [one.total - one.derender for one in spent]
-    others.append(row("frames taken apart before", "reckoned", without, processes))
+    others.append(row("frames taken apart before, in --cache", "reckoned", without, processes))
+    if any(one.certify for one in spent):
+        ungraded = [one.total - one.certify for one in spent]
+        others.append(row("no grades, --nuisances off --no-confirm", "reckoned", ungraded, processes))
     cores = os.cpu_count() or 1
     if cores > processes:
         others.append(row("--workers", "reckoned", [one.total for one in spent], cores))

@@ -25,7 +25,7 @@ COLUMNS: Columns = {
     "scale": ("scale", "scale"), "pixels": ("pixels of the cars", None),
     "forward_ms": ("forward, ms", "forward ms"), "forward_iqr": ("IQR", None),
     "backward_ms": ("backward, ms", "backward"), "backward_iqr": ("IQR", None),
-    "forward_backward_ms": ("both, ms", "both"),
+    "forward_backward_ms": ("both, ms", "both"), "both_cpu_ms": ("both, processor ms", "cpu"),
 }  # fmt: skip
 VERB_COLUMNS: Columns = {
     "verb": ("verb", "verb"), "backend": ("backend", "backend"), "cars": ("cars", "cars"),
@@ -37,8 +37,9 @@ METHOD = (
     "The whole picture is re-rendered (texture from the photograph, completion, halo, shadows, blending) with "
     "every car moved, turned and bent a little. forward_ms: no gradients recorded; backward_ms: from a random "
     "gradient of the picture to the cars' parameters; forward_backward_ms: recorded forward and backward "
-    "together. Medians after a warm-up. scale: pixels along an axis, as a multiple of 1242x375; pixels: hits of "
-    "the meshes, car by car."
+    "together; processor ms: the same by the processor's time, all threads together, which other work on the "
+    "machine lengthens less than the clock's. Medians after a warm-up. scale: pixels along an axis, as a multiple "
+    "of 1242x375; pixels: hits of the meshes, car by car."
 )
 BACKENDS: tuple[verbs.Backend, ...] = ("warp", "reference")
 _FEWEST, _MOST = 2, 60
@@ -69,6 +70,7 @@ class RenderRow:
     forward_ms: float
     backward_ms: float
     forward_backward_ms: float
+    both_cpu_ms: float
     forward_iqr: float
     backward_iqr: float
 
@@ -89,11 +91,14 @@ class VerbRow:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Of forward without gradients, of backward, and of both together; ms, None where there is no backward."""
+    """Of forward without gradients, of backward, and of both together; ms, None where there is no backward. spent:
+    the processor's, of both, or of forward where that is all.
+    """
 
     forward: Spread
     backward: Spread | None
     both: Spread | None
+    spent: Spread
 
 
 def sizes(cars: Sequence[int], triangles: Sequence[int]) -> list[SceneSize]:
@@ -199,6 +204,7 @@ def _picture_row(
         forward_ms=rounded(times.forward),
         backward_ms=rounded(times.backward),
         forward_backward_ms=rounded(times.both),
+        both_cpu_ms=rounded(times.spent),
         forward_iqr=round(times.forward.iqr, 3),
         backward_iqr=round(times.backward.iqr, 3),
     )
@@ -211,6 +217,7 @@ def timed(
     alone: list[float] = []
     back: list[float] = []
     both: list[float] = []
+    spent: list[float] = []
     kept: list[Any] = []
 
     def keep() -> None:
@@ -218,20 +225,25 @@ def timed(
 
     def once() -> None:
         with torch.no_grad():
-            alone.append(clock.ms(keep))
-        if backward is not None:
-            first = clock.ms(keep)
-            back.append(clock.ms(partial(backward, kept[0])))
-            both.append(first + back[-1])
+            taken = clock.taken(keep)
+        alone.append(taken.ms)
+        if backward is None:
+            spent.append(taken.cpu_ms)
+            return
+        first, last = clock.taken(keep), clock.taken(partial(backward, kept[0]))
+        back.append(last.ms)
+        both.append(first.ms + last.ms)
+        spent.append(first.cpu_ms + last.cpu_ms)
 
     start = time.perf_counter()
     once()
     if time.perf_counter() - start < _SLOW_S:  # what is slow shows how slow it is at once
-        for times in (alone, back, both):
+        for times in (alone, back, both, spent):
             times.clear()
     for _ in rounds(seconds - (time.perf_counter() - start), 1 if alone else _FEWEST, _MOST):
         once()
-    return Times(Spread.of(alone), Spread.of(back) if back else None, Spread.of(both) if both else None)
+    of_both = Spread.of(both) if both else None
+    return Times(Spread.of(alone), Spread.of(back) if back else None, of_both, Spread.of(spent))
 
 
 def rounded(spread: Spread) -> float:

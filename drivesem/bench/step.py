@@ -17,7 +17,7 @@ from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace, combo
 from drivesem.bench.scenes import BenchScene, bench_scene
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Budget, Clock, Spread, rounds
+from drivesem.bench.timing import Budget, Clock, Spread, Taken, rounds
 from drivesem.settings.blocks import KEEP_MB
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -30,7 +30,9 @@ TITLE, BESIDE_TITLE = (
 COLUMNS: Columns = {
     "cars": ("cars", "cars"), "triangles": ("triangles a car", "triangles"), "params": ("parameters", None),
     "lod": ("level of detail", "detail"), "ratio": ("ratio", "ratio"), "ratio_iqr": ("IQR", "IQR"),
+    "cpu_ratio": ("of processor time", "cpu ratio"),
     "step_ms": ("step, ms", "step ms"), "detector_ms": ("detector, ms", "detector"),
+    "step_cpu_ms": ("step, processor ms", None), "detector_cpu_ms": ("detector, processor ms", None),
     "render_forward_ms": ("render forward, ms", "forward"),
     "render_backward_ms": ("render backward, ms", "backward"), "labels_ms": ("labels, ms", "labels"),
     "project_ms": ("projection, ms", "project"), "pixels": ("pixels of the cars", None),
@@ -46,8 +48,9 @@ METHOD = (
     "one process after a warm-up, the order swapped every time; ratio is the median of the paired ratios, "
     "ratio_iqr the distance of their quartiles, the milliseconds are medians. render_forward_ms (scene at "
     "theta and render, recorded for gradients), render_backward_ms, labels_ms and project_ms are medians of "
-    "the parts on their own. pixels: crop_pixels of the rectangles around the meshes, hit_pixels of the "
-    "meshes."
+    "the parts on their own. Of processor time: the same pairs by the processor's time, all threads together, "
+    "which other work on the machine lengthens less than the clock's. pixels: crop_pixels of the rectangles "
+    "around the meshes, hit_pixels of the meshes."
 )
 _TERM = "objectness"
 _START_STEPS = 10
@@ -82,8 +85,11 @@ class StepRow:
     lod: bool
     ratio: float
     ratio_iqr: float
+    cpu_ratio: float
     step_ms: float
     detector_ms: float
+    step_cpu_ms: float
+    detector_cpu_ms: float
     render_forward_ms: float
     render_backward_ms: float
     labels_ms: float
@@ -134,19 +140,14 @@ def measure(
 def _row(
     case: StepCase, bench: BenchScene, step: Stepping, alone: Callable[[], None], clock: Clock, seconds: float
 ) -> StepRow:
-    pairs: list[tuple[float, float]] = []
+    pairs: list[tuple[Taken, Taken]] = []
     parts: list[tuple[float, ...]] = []
     # On a machine so busy that the seconds are gone, one pair a row has to do.
     for i in rounds(seconds, _FEWEST if seconds > 0 else 1, _MOST):
-        if i % 2:
-            whole = clock.ms(step)
-            pairs.append((whole, clock.ms(alone)))
-        else:
-            single = clock.ms(alone)
-            pairs.append((clock.ms(step), single))
+        pairs.append(pair(clock, step, alone, swapped=bool(i % 2)))
         if i % 2 == 0:
             parts.append(step.parts(clock))
-    ratio = Spread.of([whole / single for whole, single in pairs])
+    ratio = Spread.of([whole.ms / single.ms for whole, single in pairs])
     medians = [Spread.of(part).median for part in zip(*parts, strict=True)]
     return StepRow(
         cars=case.cars,
@@ -156,8 +157,11 @@ def _row(
         lod=case.lod,
         ratio=round(ratio.median, 4),
         ratio_iqr=round(ratio.iqr, 4),
-        step_ms=round(Spread.of([p[0] for p in pairs]).median, 3),
-        detector_ms=round(Spread.of([p[1] for p in pairs]).median, 3),
+        cpu_ratio=round(Spread.of([whole.cpu_ms / single.cpu_ms for whole, single in pairs]).median, 4),
+        step_ms=round(Spread.of([whole.ms for whole, _ in pairs]).median, 3),
+        detector_ms=round(Spread.of([single.ms for _, single in pairs]).median, 3),
+        step_cpu_ms=round(Spread.of([whole.cpu_ms for whole, _ in pairs]).median, 3),
+        detector_cpu_ms=round(Spread.of([single.cpu_ms for _, single in pairs]).median, 3),
         render_forward_ms=round(medians[0], 3),
         render_backward_ms=round(medians[1], 3),
         labels_ms=round(medians[2], 3),
@@ -167,6 +171,15 @@ def _row(
         box_pixels=bench.box_pixels,
         repetitions=len(pairs),
     )
+
+
+def pair(clock: Clock, step: Callable[[], None], alone: Callable[[], None], swapped: bool) -> tuple[Taken, Taken]:
+    """A step and the detector alone, measured one after the other. swapped: the step first."""
+    if swapped:
+        whole = clock.taken(step)
+        return whole, clock.taken(alone)
+    single = clock.taken(alone)
+    return clock.taken(step), single
 
 
 class Stepping:

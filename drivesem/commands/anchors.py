@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Anchors
 from drivesem.training.anchors import fitted_anchors
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.report.answer import print_json
 from drivesem.report.grading import KINDS, NO_KIND
+from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_run
 from drivesem.run.results import RunSummary
 from drivesem.settings.commands import Attack

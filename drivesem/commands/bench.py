@@ -9,16 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.attack.space import parse_params
 from drivesem.bench import boxes, climb, detector, memory, night, render, scale, step
-from drivesem.bench.planted import summary, yardstick
+from drivesem.bench.planted import across, across_names, summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import open_source
@@ -136,6 +135,45 @@ def _climb(config: Bench, console: Console) -> Measured:
 
 
 def _planted(config: Bench, console: Console) -> Measured:
+    return _planted_in_frames(config, console) if config.across is None else _planted_across(config, console)
+
+
+def _planted_across(config: Bench, console: Console) -> Measured:
+    config = replace(config, limit=config.limit or _PLANTED_FRAMES)
+    first = across.Across.of(config)
+    names, _, failed = select_frames(first.source, config)
+    pooling = ask(names, first.pool, partial(across.pool_of, config), config, Bar("states", remaining=True))
+    pools = [pooling.results[name] for name in names if name in pooling.results]
+    kinds = across.KINDS[1::8] if config.quick else across.KINDS
+    kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
+    planted = [across.plant_across(pools, kind, config.seed, nth) for kind, nth in kinds]
+    faults = [one for one in planted if one is not None]
+    console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
+    texts = tuple(one.fault.text for one in faults)
+    second, frames = across.Across.of(config, texts), list(enumerate(pool.frame for pool in pools))
+    frames = frames[: config.searched]
+    build = partial(across.judge_of, config, texts)
+    asked = ask(frames, second.judge, build, config, Bar("searches", remaining=True), lambda job: job[1])
+    judged = [asked.results[job] for job in frames if job in asked.results]
+    rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
+    told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
+    summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
+    return Measured(
+        {
+            "rows": told,
+            "summary": summed,
+            "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
+            "failed": failed | pooling.failed | asked.failed,
+            "method": across_names.METHOD,
+        },
+        [
+            Section(across_names.TITLE, across_names.COLUMNS, told),
+            Section(across_names.SUMMARY_TITLE, across_names.SUMMARY_COLUMNS, summed),
+        ],
+    )
+
+
+def _planted_in_frames(config: Bench, console: Console) -> Measured:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
     judge = yardstick.Yardstick.of(config)
     names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)

@@ -6,13 +6,14 @@ import re
 from dataclasses import asdict
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Check
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
@@ -56,7 +57,7 @@ def _print(report: Report, config: Check, console: Console) -> None:
         table.add_column(heading)
     for finding in report.findings:
         style = _STYLES[finding.verdict]
-        table.add_row(finding.name, f"[{style}]{finding.verdict}[/]", finding.said.replace("[", r"\["))
+        table.add_row(finding.name, Text(finding.verdict, style), finding.said)
     console.print(table)
     tried = sum(finding.verdict != "not tried" for finding in report.findings)
     console.print(f"{tried - len(report.failed)} of {tried} kept, {len(report.failed)} broken", soft_wrap=True)

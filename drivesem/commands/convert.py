@@ -11,6 +11,7 @@ from pathlib import Path
 from drivesem.data.label_table import Written
 from drivesem.report.answer import print_json
 from drivesem.run.conversion import Conversion, convert
+from drivesem.run.labels import layout_of
 from drivesem.settings.commands import Convert
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import class_map
@@ -26,19 +27,23 @@ def run(config: Convert) -> int:
             raise UsageError("--out", "a new file", config.out)
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("--out", "a new or empty folder", config.out)
+    source = Path(config.source)
+    layout = layout_of(source) if config.from_format == "auto" else config.from_format
     conversion = Conversion(
         to_format=config.to_format,
-        from_format=None if config.from_format == "auto" else config.from_format,
+        from_format=layout,
         scores=config.scores,
         size_wh=_size(config.image_size),
         images=None if config.images is None else Path(config.images),
         copy_images=config.copy_images,
         mapping=class_map("--map", config.map),
     )
-    written = convert(Path(config.source), out, conversion)
+    written = convert(source, out, conversion)
     if config.json:
         print_json({"out": config.out, **asdict(written)})
-    sys.stderr.write(f"{_sentence(written)}\n")
+    sys.stderr.write(f"{sentence(written)}\n")
+    if layout == "run" and config.to_format == "coco" and not config.copy_images and not config.scores:
+        sys.stderr.write(f"file names of images are below {source / 'frames'} (--copy-images copies them)\n")
     return 0
 
 
@@ -51,7 +56,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def _sentence(written: Written) -> str:
+def sentence(written: Written) -> str:
     """What is lost and what was assumed, on one line."""
 
     def listed(counts: Mapping[str, int]) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_run
-from drivesem.scenes.sources import PlainPhotograph, SceneSource
+from drivesem.scenes.sources import Photographs, SceneSource
 from drivesem.settings.commands import Derender
 
 
@@ -32,8 +31,8 @@ def run(config: Derender) -> int:
 
 def _begin(source: SceneSource, config: Derender, console: Console) -> None:
     """Say what is known before the first frame."""
-    if isinstance(source, PlainPhotograph):
-        focal = source.focal
+    if isinstance(source, Photographs) and config.photo is not None:
+        focal = source.focal(next(source.identifiers()))
         console.print(f"camera: focal length {focal.length_px:.0f} px ({focal.source})", soft_wrap=True)
     if config.meshes is not None:
         from drivesem.synth.assets import unreadable_in

@@ -7,11 +7,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from drivesem.attack.scene_edits import edited
 from drivesem.commands.render import picture_path
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.scenes.scene import Scene, free_folder
 from drivesem.settings.commands import Edit
 from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit

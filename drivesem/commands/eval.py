@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.questions.evaluate.figures import evaluate_files
 from drivesem.questions.evaluate.report import print_result
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Eval
-from drivesem.settings.devices import check_device
 
 _FILE_WIDTH = 120
 """Characters a line of the tables where they go to a file and not to a terminal."""
@@ -19,6 +17,7 @@ def run(config: Eval) -> int:
     console = Console(stderr=True)
     if config.detector is not None:
         from drivesem.questions.evaluate.detector import evaluate_detector, print_figures
+        from drivesem.settings.devices import check_device
 
         check_device(config.device)
         figures = evaluate_detector(config)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.questions.gate.asking import gate_run
+from drivesem.report.terminal import Console
 from drivesem.run.ask import say
 from drivesem.settings.commands import Gate
 from drivesem.settings.devices import check_device

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from detectors.base import DetectorError
@@ -36,6 +35,7 @@ from drivesem.bench.reach.agreement import rows_of as rows_of_reach
 from drivesem.bench.reach.frames import ReachWorker, measure_of
 from drivesem.bench.reach.report import answer_of as reach_answer
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask, say_end
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import SceneSource, open_source

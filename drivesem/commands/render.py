@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.scenes.scene import load_scene
 from drivesem.settings.commands import Render
 from drivesem.settings.errors import UsageError

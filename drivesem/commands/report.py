@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.page import report_runs
 from drivesem.settings.commands import Report
 

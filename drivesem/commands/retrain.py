@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich.console import Console
 from rich.table import Table
 
 from drivesem.report.answer import print_json
 from drivesem.report.tables import percent
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Retrain
 from drivesem.settings.devices import check_device
 from drivesem.training.retrain import RetrainRow, retrain_run

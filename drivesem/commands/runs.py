@@ -9,10 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from drivesem.commands.attack import told_grades
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, attack_of, settings_of
 from drivesem.run.frame import RESULT

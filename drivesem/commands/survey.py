@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.questions.survey.page import (
     CHANGED,
     KEY,
@@ -15,6 +13,7 @@ from drivesem.questions.survey.page import (
     write_key,
 )
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Survey

@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
 from drivesem.run.workers import mapping

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivesem.report.answer import print_json
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Train
 from drivesem.training.train import train_run
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.console import Console
-
 from drivesem.questions.verify.asking import verify_run
 from drivesem.report.answer import print_json
 from drivesem.report.grading import UNKNOWN
 from drivesem.report.tables import Sheet
+from drivesem.report.terminal import Console
 from drivesem.run.ask import say_end
 from drivesem.settings.commands import Verify
 from drivesem.settings.devices import check_device

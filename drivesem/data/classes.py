@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -39,6 +39,15 @@ class ClassMap:
             return None
         raise FormatError("type", f"one of {', '.join((*self.classes, *self.ignored))}", kind)
 
+    def known(self, labels: Labels) -> Labels:
+        """The labels without objects of types in neither table: they are background."""
+        rows = [i for i, kind in enumerate(labels.kind) if kind in self.classes or kind in self.ignored]
+        if len(rows) == len(labels.kind):
+            return labels
+        columns = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
+        chosen = {name: getattr(labels, name)[rows] for name in columns}
+        return replace(labels, kind=tuple(labels.kind[i] for i in rows), **chosen)
+
     def targets(self, labels: Labels) -> Targets:
         """What a detector is trained on and judged by.
 
@@ -68,10 +77,27 @@ KITTI = ClassMap(
 """KITTI's types. Vans count as cars and sitting people are ignored; trams and the miscellaneous look like nothing
 the detectors know."""
 
+COCO_ROAD_USERS = ClassMap(
+    classes={"car": "Car", "truck": "Truck", "person": "Pedestrian"},
+    ignored={"bus": None, "train": None, "bicycle": "Cyclist", "motorcycle": "Cyclist"},
+)
+"""The classes of COCO 2017 that are on the road. A KITTI cyclist includes the bicycle, so that a bicycle alone is
+neither; buses and trains look like nothing the detectors know."""
+ROAD_USERS = ClassMap(
+    classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
+)
+"""KITTI's types and COCO's classes: they differ in letter case at least."""
+
 VEHICLES: Mapping[str, Category] = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
 """Types that are de-rendered into objects that can be moved."""
 
 
+def as_kitti(labels: Labels) -> Labels:
+    """The labels with COCO's classes by the names of KITTI's types; those that are ignored keep their own."""
+    names = COCO_ROAD_USERS.classes
+    return replace(labels, kind=tuple(names.get(kind, kind) for kind in labels.kind))
+
+
 def vehicle_count(labels: Labels | None) -> int:
     """How many objects of a frame can be moved."""
-    return 0 if labels is None else sum(kind in VEHICLES for kind in labels.kind)
+    return 0 if labels is None else sum(kind in VEHICLES for kind in as_kitti(labels).kind)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera, Labels
 
@@ -58,13 +59,8 @@ def images_of(folder: Path) -> list[Path]:
 
 def size_of_image(path: Path) -> tuple[int, int]:
     """Width and height of an image, from its header. FormatError."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error
+    with files.opened_image(path) as image:
+        return image.size
 
 
 def as_photograph(image: np.ndarray) -> Tensor:

@@ -13,14 +13,12 @@ scene needs more, which `read_labels` says. Errors name the file, the line or ke
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.data.frames import (
@@ -32,6 +30,7 @@ from drivesem.data.frames import (
     images_of,
     in_front,
 )
+from drivesem.data.kitti_labels import TYPES, UNKNOWN_POSE, UNKNOWN_POSITION, UNKNOWN_SIZE, Lines, finite_number
 from drivesem.data.label_table import (
     REGION,
     UNKNOWN_OCCLUSION,
@@ -48,17 +47,10 @@ from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.types import FOCAL_PX, Camera, Frame, Labels
 
-TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
-"""What KITTI labels."""
-FIELDS = (
-    *("type", "truncated", "occluded", "alpha", "left", "top", "right", "bottom"),
-    *("height", "width", "length", "x", "y", "z", "rotation_y", "score"),
-)
-UNKNOWN_SIZE, UNKNOWN_POSITION, UNKNOWN_ANGLE = -1.0, -1000.0, -10.0
-"""What the development kit writes where a value is not known."""
-_UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 DEPTH_SCALE = 256
 """Values a metre in `depth_2`."""
+_MOST_LINES = 10_000
+"""Of one frame: KITTI's have at most some 30."""
 INSTANCES = 256
 """Values a semantic id in `instance_2`: the lower byte is the instance."""
 SEMANTIC_NAMES = (
@@ -74,123 +66,6 @@ _MERGED = {"tree": "vegetation", "van": "car", "cyclist": "rider", "tram": "trai
 """What Cityscapes has no id for, and what it is there."""
 
 
-def finite_number(where: str, text: str) -> float:
-    """A finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise FormatError(where, "a number", repr(text)) from None
-    if not math.isfinite(value):
-        raise FormatError(where, "a finite number", text)
-    return value
-
-
-class _Lines:
-    """The label lines of files, in columns. kinds (N,): types as written; values (N, 14), with a score 15: the
-    other fields; counts: lines of each file.
-
-    names, texts: of the files; scored: whether a line must have a score. FormatError naming file, line and field:
-    a wrong field count, a value that is no finite number, a box that ends before it begins.
-    """
-
-    def __init__(self, names: Sequence[str], texts: Sequence[str], scored: bool) -> None:
-        self._names, self._texts = names, texts
-        of_files = [[line for line in text.splitlines() if line and not line.isspace()] for text in texts]
-        self.counts = np.array([len(lines) for lines in of_files], np.int64)
-        words = [line.split() for lines in of_files for line in lines]
-        self.kinds = [parts[0] for parts in words]
-        fields = 16 if scored else 15
-        values = _numbers(words, fields)
-        self.values = self._one_by_one(words, fields) if values is None else values
-        for low, high in ((3, 5), (4, 6)):
-            for row in np.flatnonzero(self.values[:, high] < self.values[:, low])[:1].tolist():
-                first, last = self.values[row, [low, high]].tolist()
-                raise FormatError(self.where(row, FIELDS[high + 1]), f"at least {first:g}", f"{last:g}")
-
-    def where(self, row: int, field: str = "") -> str:
-        """File and line of a row, and the field; blank lines are counted too."""
-        ends = np.cumsum(self.counts)
-        i = int(np.searchsorted(ends, row, side="right"))
-        numbers = [n for n, line in enumerate(self._texts[i].splitlines(), start=1) if line.strip()]
-        line = f"{self._names[i]}:{numbers[row - int(ends[i] - self.counts[i])]}"
-        return f"{line}: {field}" if field else line
-
-    def _one_by_one(self, words: Sequence[Sequence[str]], fields: int) -> NDArray[np.float64]:
-        """The numbers of lines of which some have a score and some have none, or of which one is wrong."""
-        rows: list[list[float]] = []
-        for row, parts in enumerate(words):
-            if len(parts) not in {fields, 16}:
-                expected = "16 fields (with a score)" if fields == 16 else "15 or 16 fields"
-                raise FormatError(self.where(row), expected, len(parts))
-            named = zip(FIELDS[1:], parts[1:], strict=False)
-            rows.append([finite_number(self.where(row, name), part) for name, part in named][: fields - 1])
-        return np.array(rows, np.float64).reshape(-1, fields - 1)
-
-    def check_scene(self, scored: bool) -> None:
-        """FormatError for what a scene cannot use: see `read_labels`."""
-        for row, (kind, values) in enumerate(zip(self.kinds, self.values.tolist(), strict=True)):
-
-            def require(good: bool, field: str, expected: str, found: str, row: int = row) -> None:
-                if not good:
-                    raise FormatError(self.where(row, field), expected, found)
-
-            require(kind in TYPES, "type", f"one of {', '.join(TYPES)}", repr(kind))
-            if kind == "DontCare":
-                continue
-            truncated, occluded, _, _, _, _, _, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
-            unknown = (-1.0,) if scored else ()
-            good = 0 <= truncated <= 1 or truncated in unknown
-            require(good, "truncated", "[0, 1]", f"{truncated:g}")
-            require(occluded in (0, 1, 2, 3, *unknown), "occluded", "0, 1, 2 or 3", f"{occluded:g}")
-            if {h, w, l} == {UNKNOWN_SIZE} and {x, y, z} == {UNKNOWN_POSITION}:
-                continue
-            for name, size in zip(("height", "width", "length"), (h, w, l), strict=True):
-                require(size > 0, name, "positive metres", f"{size:g}")
-            require(abs(yaw) <= 2 * math.pi + 0.01, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
-            behind = f"{z:g} m, wholly behind it"
-            require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
-
-    def check_sizes(self) -> None:
-        """FormatError for a size below 0 that is not the mark of what is unknown."""
-        for column in (7, 8, 9):
-            sizes = self.values[:, column]
-            for row in np.flatnonzero((sizes < 0) & (sizes != UNKNOWN_SIZE))[:1].tolist():
-                raise FormatError(self.where(row, FIELDS[column + 1]), "metres, or -1", f"{sizes[row]:g}")
-
-    def table(self, frames: Sequence[str], scored: bool) -> LabelTable:
-        """The lines as a table of `frames`, one a file. A 3D box that is marked as unknown is NaN."""
-        values = self.values
-        kinds = sorted({name for name in self.kinds if name.lower() != "dontcare"})
-        number = {name: i for i, name in enumerate(kinds)}
-        size, position = values[:, [9, 7, 8]], values[:, 10:14]
-        known = (size > 0).all(axis=1) & (position[:, :3] != UNKNOWN_POSITION).any(axis=1)
-        return LabelTable.of(
-            frames,
-            kinds,
-            np.repeat(np.arange(len(frames)), self.counts),
-            [number.get(name, REGION) for name in self.kinds],
-            values[:, 3:7].copy(),
-            "xyxy",
-            score=values[:, 14].copy() if scored else np.full(len(values), np.nan),
-            truncation=values[:, 0].copy(),
-            occlusion=values[:, 1].astype(np.int64),
-            alpha=np.where(values[:, 2] == UNKNOWN_ANGLE, np.nan, values[:, 2]),
-            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan),
-        )
-
-
-def _numbers(words: Sequence[Sequence[str]], fields: int) -> NDArray[np.float64] | None:
-    """The numbers (N, 14 or 15) of lines that all have as many fields; None where a look at each is needed."""
-    lengths = {len(word) for word in words}
-    if len(lengths) != 1 or not lengths <= {fields, 16}:
-        return None
-    try:
-        values = np.array([text for word in words for text in word[1:]], dtype=np.float64)
-    except ValueError:
-        return None
-    return values.reshape(len(words), -1) if np.isfinite(values).all() else None
-
-
 def read_labels(path: Path, scored: bool = False) -> Labels:
     """The labels of one frame, or a detector's results where `scored`. An empty file is a frame without objects.
 
@@ -203,36 +78,36 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
 
 
 def _scene_labels(name: str, text: str, scored: bool) -> Labels:
-    lines = _Lines([name], [text], scored)
-    lines.check_scene(scored)
+    if text.count("\n") > _MOST_LINES:
+        raise FormatError(name, f"at most {_MOST_LINES:,} lines", f"{text.count(chr(10)):,}")
+    lines = Lines([name], [text], scored)
+    _check_scene(lines, scored)
     return lines.table([name], scored).labels()
 
 
-def label_folder(path: Path) -> Path | None:
-    """The folder of label files that a path means: itself, or `label_2`, `training/label_2`, `data` below it."""
-    for folder in (path / "training" / "label_2", path / "label_2", path / "data", path):
-        if folder.is_dir() and any(folder.glob("[!.]*.txt")):
-            return folder
-    return None
+def _check_scene(lines: Lines, scored: bool) -> None:
+    """FormatError for what a scene cannot use: see `read_labels`."""
+    for row, (kind, values) in enumerate(zip(lines.kinds, lines.values.tolist(), strict=True)):
 
+        def require(good: bool, field: str, expected: str, found: str, row: int = row) -> None:
+            if not good:
+                raise FormatError(lines.where(row, field), expected, found)
 
-def text_files(folder: Path) -> list[Path]:
-    """The text files of a folder, sorted by name: of tens of thousands, paths would take seconds to sort."""
-    return [folder / name for name in sorted(os.listdir(folder)) if name.endswith(".txt") and name[0] != "."]
-
-
-def read_table(path: Path, scored: bool) -> LabelTable:
-    """The labels, or detections where `scored`, of a folder: see `label_folder`. FormatError as `_Lines`."""
-    folder = label_folder(path) if path.is_dir() else None
-    if folder is None:
-        raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
-    paths = text_files(folder)
-    lines = _Lines([str(file) for file in paths], [files.read_text(file) for file in paths], scored)
-    if not scored:
-        lines.check_sizes()
-    if scored and not lines.kinds:
-        raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    return lines.table([file.stem for file in paths], scored)
+        require(kind in TYPES, "type", f"one of {', '.join(TYPES)}", repr(kind))
+        if kind == "DontCare":
+            continue
+        truncated, occluded, _, _, _, _, _, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
+        unknown = (-1.0,) if scored else ()
+        good = 0 <= truncated <= 1 or truncated in unknown
+        require(good, "truncated", "[0, 1]", f"{truncated:g}")
+        require(occluded in (0, 1, 2, 3, *unknown), "occluded", "0, 1, 2 or 3", f"{occluded:g}")
+        if {h, w, l} == {UNKNOWN_SIZE} and {x, y, z} == {UNKNOWN_POSITION}:
+            continue
+        for name, size in zip(("height", "width", "length"), (h, w, l), strict=True):
+            require(size > 0, name, "positive metres", f"{size:g}")
+        require(abs(yaw) <= 2 * math.pi + 0.01, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
+        behind = f"{z:g} m, wholly behind it"
+        require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
 
 
 def _line(
@@ -248,7 +123,7 @@ def _line(
     fields = [kind, number_text(truncation) if truncation >= 0 else "-1", str(occlusion)]
     fields += ["-10" if math.isnan(alpha) else number_text(alpha), *map(number_text, box)]
     if pose is None:
-        fields += _UNKNOWN_POSE
+        fields += UNKNOWN_POSE
     else:
         length, height, width, *rest = pose
         fields += map(number_text, (height, width, length, *rest))

@@ -14,14 +14,17 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from scene_ir.errors import FormatError
-from scene_ir.types import Labels
+
+if TYPE_CHECKING:  # torch takes a second to load, and most of what reads label files needs none
+    from torch import Tensor
+
+    from scene_ir.types import Labels
 
 Edges = Literal["xyxy", "xywh"]
 """How boxes are held: left, top, right, bottom where pixel centres are whole numbers (KITTI), or left, top, width,
@@ -58,8 +61,11 @@ class LabelTable:
     DontCare. boxes (N, 4) float64 px in `edges`; ignore (N,): crowds and regions. score (N,), NaN for labels;
     truncation (N,), -1 where unknown; occlusion (N,) 0 to 3, -1 where unknown; alpha (N,) rad, NaN where unknown;
     pose (N, 7): length, height, width, x, y, z m, yaw rad, NaN where unknown; area (N,) px^2, NaN where unknown.
-    sizes_wh (F, 2) px, 0 where unknown; image_ids (F,), box_ids (N,), kind_ids: COCO's numbers, where known.
-    extra: further columns (N) by name, None where a box has none; cameras: by frame, COCO's "camera" entries.
+    sizes_wh (F, 2) px, 0 where unknown; image_ids (F,), box_ids (N,), kind_ids: COCO's ids, where known, of images
+    also texts.
+    extra: further columns (N) by name, None where a box has none; cameras: by frame, COCO's "camera" entries;
+    image_files: by frame, where its image lies if it is not named after the frame; told: by frame, what else is
+    known of it, as JSON.
     """
 
     frames: tuple[str, ...]
@@ -76,11 +82,13 @@ class LabelTable:
     pose: NDArray[np.float64]
     area: NDArray[np.float64]
     sizes_wh: NDArray[np.int64]
-    image_ids: NDArray[np.int64] | None = None
+    image_ids: NDArray[np.int64] | NDArray[np.str_] | None = None
     box_ids: NDArray[np.int64] | None = None
     kind_ids: NDArray[np.int64] | None = None
     extra: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     cameras: Mapping[int, Any] = field(default_factory=dict)
+    image_files: Mapping[int, str] = field(default_factory=dict)
+    told: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -144,7 +152,7 @@ class LabelTable:
         sizes[new[old]] = self.sizes_wh[old]
         ids = None
         if self.image_ids is not None and len(old) == len(frames):
-            ids = np.zeros(len(frames), np.int64)
+            ids = np.zeros(len(frames), self.image_ids.dtype)
             ids[new[old]] = self.image_ids[old]
         return replace(
             kept,
@@ -153,12 +161,18 @@ class LabelTable:
             sizes_wh=sizes,
             image_ids=ids,
             cameras={int(new[i]): camera for i, camera in self.cameras.items() if new[i] >= 0},
+            image_files={int(new[i]): name for i, name in self.image_files.items() if new[i] >= 0},
+            told={int(new[i]): words for i, words in self.told.items() if new[i] >= 0},
         )
 
     def labels(self) -> Labels:
         """All boxes as a scene takes them, float32: objects in file order, and what is ignored as regions. Unknown
         are NaN, and an occlusion of 3.
         """
+        import torch
+
+        from scene_ir.types import Labels
+
         boxes = torch.from_numpy(self.boxes if self.edges == "xyxy" else from_coco(self.boxes)).float()
         objects = ~self.ignore
         pose = torch.from_numpy(self.pose[objects]).float()
@@ -266,23 +280,29 @@ def positional(value: float) -> str:
 
 
 def matrix_of(camera: Any) -> NDArray[np.float64]:
-    """The projection (3, 4) px of a COCO "camera" entry of this project."""
-    if "projection" in camera:
-        return np.array(camera["projection"], np.float64).reshape(3, 4)
-    fx, fy, cx, cy = (float(camera[k]) for k in ("fx", "fy", "cx", "cy"))
-    return np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]], np.float64)
+    """The projection (3, 4) px of a COCO "camera" entry of this project. FormatError for another's."""
+    told = camera if isinstance(camera, dict) else {}
+    if "projection" in told:
+        values = told["projection"]
+    else:
+        fx, fy, cx, cy = (told.get(k) for k in ("fx", "fy", "cx", "cy"))
+        values = [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
+    good = isinstance(values, list) and all(type(v) in (int, float) and math.isfinite(v) for v in values)
+    if not good or len(values) != 12:
+        raise FormatError("camera", "projection (12 numbers), or fx, fy, cx, cy", repr(camera))
+    return np.array(values, np.float64).reshape(3, 4)
 
 
-def camera_entry(projection: torch.Tensor) -> dict[str, Any]:
+def camera_entry(projection: Tensor) -> dict[str, Any]:
     """COCO's "camera" entry of a projection (3, 4) px."""
     values = shortest(projection)
     places = {"fx": 0, "fy": 5, "cx": 2, "cy": 6}
     return {**{name: values[i] for name, i in places.items()}, "projection": values}
 
 
-def shortest(values: torch.Tensor) -> list[float]:
+def shortest(values: Tensor) -> list[float]:
     """float32 values as the shortest decimals that read back as the same float32."""
-    return [float(str(v)) for v in values.to(torch.float32).flatten().numpy()]
+    return [float(str(v)) for v in values.float().flatten().numpy()]
 
 
 def known_pose(pose: Sequence[float]) -> bool:

@@ -99,6 +99,7 @@ def _decode(path: Path, data: bytes, size_hw: tuple[int, int]) -> np.ndarray:
         raise FormatError(str(path), "a PNG", f"{len(data)} bytes of another kind")
     for _ in _chunks(path, data):  # the decoder fills what is missing with zeros, without a word
         pass
+    files.check_pixels(path, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

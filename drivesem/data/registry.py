@@ -1,4 +1,4 @@
-"""Layouts by name: who reads and writes their data sets and their labels, and which one lies at a path."""
+"""Layouts by name: who reads and writes their data sets, and who writes their labels."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.data import coco, kitti, vkitti1, vkitti2, yolo
+from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
 from drivesem.data.label_table import LabelTable, Written
+from drivesem.data.layouts import LAYOUTS, layout_of
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.virtual import VirtualDataset
 from drivesem.store import place
-from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
 
@@ -67,19 +67,21 @@ WRITERS: dict[str, Callable[[Path], Writer]] = {
 """Writers by the name of their layout."""
 
 
-_TABLE_WRITERS: Mapping[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+_TABLE_WRITERS: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
     "kitti": kitti.write_table,
     "coco": coco.write_table,
     "yolo": yolo.write_table,
     "vkitti1": vkitti1.write_table,
     "vkitti2": vkitti2.write_table,
 }
-LAYOUTS = tuple(_TABLE_WRITERS)
+_WRITTEN_ONLY: dict[str, Callable[[LabelTable, Path, Mapping[str, Path]], Written]] = {
+    "fiftyone": fiftyone.write_table
+}
 
 
-def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Dataset:
+def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_px: float | None = None) -> Dataset:
     """The data set `name` under `root`, a folder or its URL. with_points: read laser points too, which only KITTI
-    has.
+    has. focal_px: of photographs in COCO's and YOLO's layouts that tell no camera.
 
     RangeError for an unknown name, or one without points; FormatError for a bad folder; UsageError for a URL that
     cannot be read.
@@ -90,53 +92,36 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False) -> Data
         if name != "kitti":
             raise RangeError("dataset with points", "kitti", name)
         return kitti.KittiDataset(place(root), with_points=True)
-    return DATASETS[name](place(root))
+    folder = place(root)
+    if not folder.exists():
+        raise FormatError(str(root), f"the folder of a data set ({name}: {_HOLDS[name]})", "nothing there")
+    try:
+        if name in ("coco", "yolo"):
+            return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(folder, focal_px=focal_px)
+        return DATASETS[name](folder)
+    except FormatError as error:
+        other = _looks_like(folder)
+        if other in (None, name):
+            raise
+        found = f"{error.actual}; it looks like {other} (--dataset {other})"
+        raise FormatError(error.field, error.expected, found) from error
 
 
-def layout_of(path: Path) -> str | None:
-    """One of LAYOUTS by what lies there; None for a folder of none. FormatError for a file of none, or nothing."""
-    if path.is_file():
-        if path.suffix.lower() == ".json":
-            return "coco"
-        if path.suffix.lower() in (".yaml", ".yml"):
-            return "yolo"
-        raise FormatError(str(path), "a .json or .yaml file, or a folder of labels", f"a {path.suffix or 'file'}")
-    if not path.is_dir():
-        raise FormatError(str(path), "a file or folder of labels", "nothing there")
-    if (path / "data.yaml").is_file():
-        return "yolo"
-    if any((path / "annotations").glob("instances_*.json")):
-        return "coco"
-    if (path / "vkitti_1.3.1_rgb").is_dir():
-        return "vkitti1"
-    if any(p.is_dir() for pattern in ("Scene[0-9]*", "vkitti_2*") for p in path.glob(pattern)):
-        return "vkitti2"
-    folder = kitti.label_folder(path)
-    if folder is None:
+_HOLDS = {
+    "coco": "annotations/instances_*.json, or such a file itself",
+    "kitti": "training/image_2, label_2 and calib",
+    "vkitti1": "vkitti_1.3.1_rgb and its kin",
+    "vkitti2": "Scene01 and its kin",
+    "yolo": "data.yaml, or such a file itself",
+}
+"""What lies in a data set's folder."""
+
+
+def _looks_like(folder: Path) -> str | None:
+    try:
+        return layout_of(folder)
+    except FormatError:
         return None
-    # YOLO's lines begin with a class number, KITTI's with a name
-    begins = (files.read_text(file).split(None, 1)[:1] for file in kitti.text_files(folder))
-    first = next((words[0] for words in begins if words), "")
-    return "yolo" if first.isdecimal() else "kitti"
-
-
-def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
-    """The labels, or detections where `scored`, of a path. truth: the labels beside which detections are read, for
-    COCO's ids, YOLO's classes and image sizes. FormatError naming file, line or entry, and field.
-    """
-    if not path.exists():
-        raise FormatError(str(path), "a file or folder of labels", "nothing there")
-    if layout == "kitti":
-        return kitti.read_table(path, scored)
-    if layout in ("coco", "yolo"):
-        return (coco if layout == "coco" else yolo).read_table(path, scored, truth)
-    if layout not in LAYOUTS:
-        raise RangeError("layout", f"one of {', '.join(LAYOUTS)}", layout)
-    if scored:
-        raise FormatError(str(path), "detections with scores", "Virtual KITTI, which holds labels only")
-    dataset = DATASETS[layout](path)
-    assert isinstance(dataset, VirtualDataset)
-    return dataset.table()
 
 
 def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, Path]) -> Written:
@@ -145,7 +130,7 @@ def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, 
     out: a folder, or a .json file for COCO. Numbers are written so that they read back as they were; sums of
     decimals are rounded to 1e-9 px. FormatError for what the layout cannot do without.
     """
-    return _TABLE_WRITERS[layout](table, out, images)
+    return (_TABLE_WRITERS | _WRITTEN_ONLY)[layout](table, out, images)
 
 
 def images_beside(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:

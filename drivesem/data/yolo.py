@@ -31,6 +31,7 @@ from drivesem.data.frames import (
 )
 from drivesem.data.kitti import finite_number, format_calib, read_calib
 from drivesem.data.label_table import REGION, LabelTable, Written, copy_images, matrix_of, positional, to_coco
+from drivesem.data.photographs import focal_of, read_pixels
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
@@ -42,6 +43,8 @@ TABLE_DECIMALS = 15
 """Of a table's shares, all that float64 has: in 4000 px that is 4e-12 px, far below other files' decimals."""
 PARTS = ("train", "val", "test")
 """Keys of `data.yaml` that name images."""
+_DIGITS = 18
+"""Of a class number: Python makes no number of thousands."""
 EDGE = 1e-4
 """How far beyond the image a share may reach: rounding."""
 
@@ -142,9 +145,10 @@ def _read_text(path: Path, kinds: Mapping[int, str], size_wh: tuple[int, int], s
         if len(parts) != 5 + scored:
             expected = "6 fields: class cx cy w h score" if scored else "5 fields: class cx cy w h"
             raise FormatError(where, expected, len(parts))
-        if not parts[0].isdecimal() or int(parts[0]) not in kinds:
-            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(parts[0]))
-        told.kinds.append(int(parts[0]))
+        number_text = parts[0]
+        if not (number_text.isdecimal() and len(number_text) <= _DIGITS and int(number_text) in kinds):
+            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(number_text))
+        told.kinds.append(int(number_text))
         cx, cy, w, h = (_share(f"{where}: {name}", part) for name, part in zip(_SHARES, parts[1:5], strict=True))
         width, height = size_wh
         told.boxes.append([(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height])
@@ -211,8 +215,9 @@ class YoloDataset(Frames[Path]):
     """The frames of a YOLO data set, all its parts together.
 
     root: the folder that holds `data.yaml`, or another YAML file like it. focal_px: the focal length of images
-    without a file in `calib`. The labels of `.../images/NAME.png` are `.../labels/NAME.txt`; an image without such
-    a file has no objects, as YOLO has it. A frame's identifier is its file name without suffix.
+    without a file in `calib`, by default EXIF's, or a usual one. The labels of `.../images/NAME.png` are
+    `.../labels/NAME.txt`; an image without such a file has no objects, as YOLO has it. A frame's identifier is its
+    file name without suffix.
 
     Truncation and 3D boxes are NaN, occlusion is 3, as what is unknown in KITTI. Raises FormatError naming file
     and field; a frame's own faults are raised by `labels` and `frame`, so that the other frames can be used.
@@ -225,7 +230,7 @@ class YoloDataset(Frames[Path]):
         path = root / "data.yaml" if root.is_dir() else root
         content = _mapping(path)
         self.class_names = _names(path, content)
-        base = path.parent / str(content.get("path") or ".")
+        base = path.parent / _inside(path, "path", str(content.get("path") or "."))
         folders = list(dict.fromkeys(folder for part in PARTS for folder in _folders(path, content, part)))
         if not folders:
             raise FormatError(f"{path}: train", "a folder of images", "none")
@@ -259,26 +264,26 @@ class YoloDataset(Frames[Path]):
     def frame(self, identifier: str) -> Frame:
         """One frame: photograph, camera, labels.
 
-        Raises FormatError naming the file: an image that does not decode, or that has neither a calibration nor
-        focal_px.
+        Raises FormatError naming the file: an image that does not decode, or a calibration that is none.
         """
         image_path = self._entry(identifier)
-        image = files.read_image(image_path)
+        image = read_pixels(image_path)
         height, width = image.shape[:2]
+        told = {"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name}
         calib_path = _beside(image_path, "calib")
         if calib_path.exists():
             projection = read_calib(calib_path).projection
             camera = Camera(projection[:, :3].clone(), height, width, projection)
-        elif self.focal_px is not None:
-            camera = pinhole(height, width, self.focal_px)
         else:
-            raise FormatError(str(image_path), "a calibration, or a focal length (focal_px)", "neither")
+            focal = focal_of(image_path, self.focal_px)
+            camera = pinhole(height, width, focal.length_px)
+            told["focal"] = str(focal)
         return Frame(
             identifier=identifier,
             photograph=as_photograph(image),
             camera=camera,
             labels=self.labels(identifier),
-            provenance={"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name},
+            provenance=told,
         )
 
 
@@ -302,7 +307,14 @@ def _folders(path: Path, content: Mapping[str, Any], part: str) -> list[str]:
     folders = [value] if isinstance(value, str) else value
     if not isinstance(folders, list) or any(not isinstance(f, str) or f.endswith(".txt") for f in folders):
         raise FormatError(f"{path}: {part}", "a folder of images, or a list of folders", repr(value)[:60])
-    return folders
+    return [_inside(path, part, folder) for folder in folders]
+
+
+def _inside(path: Path, key: str, folder: str) -> str:
+    """A folder that a YAML file names, if its name stays below that file's own. FormatError."""
+    if Path(folder).is_absolute() or ".." in Path(folder).parts or "\0" in folder:
+        raise FormatError(f"{path}: {key}", f"a folder in {path.parent}", repr(folder))
+    return folder
 
 
 def _beside(image: Path, folder: str) -> Path:

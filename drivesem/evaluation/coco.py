@@ -7,12 +7,14 @@ import importlib.util
 import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from detectors.types import Detections, Targets
 from drivesem.evaluation.instances import EVERY_CLASS, Found, Integers, Truths
+
+if TYPE_CHECKING:
+    from detectors.types import Detections, Targets
 
 Engine = Literal["pycocotools", "ultrafast-pycocotools"]
 STATS = ("AP", "AP50", "AP75", "APs", "APm", "APl", "AR1", "AR10", "AR100", "ARs", "ARm", "ARl")
@@ -122,7 +124,37 @@ def twelve_numbers(
             strict=True,
         )
     ]
-    detected = [
+    if engine == "pycocotools":
+        from pycocotools.coco import COCO
+        from pycocotools.cocoeval import COCOeval as Evaluator
+    else:
+        from ultrafast_pycocotools import COCO  # pyright: ignore[reportMissingImports]
+        from ultrafast_pycocotools import COCOeval as Evaluator  # pyright: ignore[reportMissingImports]
+    with contextlib.redirect_stdout(io.StringIO()):
+        shared: dict[str, Any] = {
+            "images": [{"id": i} for i in range(truths.frames)],
+            "categories": [{"id": k, "name": str(k)} for k in range(classes)],
+        }
+        dataset: Any = COCO()
+        dataset.dataset = shared | {"annotations": truth}
+        dataset.createIndex()
+        detected: Any = COCO()
+        if engine == "pycocotools" or not len(found):
+            detected.dataset = shared | {"annotations": _detected(found)}
+            detected.createIndex()
+        else:  # as an array it needs no dictionary a detection, which take as long as all the rest
+            columns = [found.frame, found.boxes[:, [0, 1, 4, 5]], found.score, found.label]
+            detected = dataset.loadRes(np.column_stack(columns))
+        evaluator: Any = Evaluator(dataset, detected, iouType="bbox")
+        evaluator.evaluate()
+        evaluator.accumulate()
+        evaluator.summarize()
+    return [float(value) for value in evaluator.stats[: len(STATS)]]
+
+
+def _detected(found: Found) -> list[dict[str, Any]]:
+    """Detections as pycocotools' annotations."""
+    return [
         {"id": i, "image_id": f, "category_id": k, "bbox": box, "area": box[2] * box[3], "iscrowd": 0, "score": s}
         for i, (f, k, box, s) in enumerate(
             zip(
@@ -135,28 +167,6 @@ def twelve_numbers(
             start=1,
         )
     ]
-    if engine == "pycocotools":
-        from pycocotools.coco import COCO
-        from pycocotools.cocoeval import COCOeval as Evaluator
-    else:
-        from ultrafast_pycocotools import COCO  # pyright: ignore[reportMissingImports]
-        from ultrafast_pycocotools import COCOeval as Evaluator  # pyright: ignore[reportMissingImports]
-    with contextlib.redirect_stdout(io.StringIO()):
-        datasets = []
-        for annotations in (truth, detected):
-            dataset: Any = COCO()
-            dataset.dataset = {
-                "images": [{"id": i} for i in range(truths.frames)],
-                "categories": [{"id": k, "name": str(k)} for k in range(classes)],
-                "annotations": annotations,
-            }
-            dataset.createIndex()
-            datasets.append(dataset)
-        evaluator: Any = Evaluator(*datasets, iouType="bbox")
-        evaluator.evaluate()
-        evaluator.accumulate()
-        evaluator.summarize()
-    return [float(value) for value in evaluator.stats[: len(STATS)]]
 
 
 def _run(targets: Sequence[Targets], detections: Sequence[Detections], classes: Sequence[str]) -> Any:

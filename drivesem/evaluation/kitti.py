@@ -167,6 +167,7 @@ class _Matching:
         self.pairs, self.cluster = pairs.rows(order), cluster[order]
         self.single = np.ones(len(found), np.bool_)
         self.single[pairs.found] = False
+        self.replays = _replays(self.pairs, self.cluster)
 
     def curve(self, name: str, difficulty: str, counted: Booleans, ignored: Booleans, excused: Booleans) -> Curve:
         """counted (M,): truths that must be found; ignored, excused (N,): detections that are too small, or on a
@@ -184,7 +185,7 @@ class _Matching:
         collected = [np.flatnonzero(hit)]
         if len(self.cluster):
             collected.append(_threshold_pass(self.pairs, self.cluster, found.score, counted, ignored))
-            for replay in _replays(self.pairs, self.cluster):
+            for replay in self.replays:
                 rows, gained, wrong = replay.steps(found.score, counted, ignored, excused)
                 scores.append(found.score[rows])
                 frames.append(found.frame[rows])
@@ -227,10 +228,17 @@ def _threshold_pass(
     return np.flatnonzero(collected)
 
 
+def _members(cluster: Integers, found: Integers) -> tuple[Integers, Integers]:
+    """Each pair of a cluster and a detection once, ascending."""
+    count = int(found.max(initial=0)) + 1
+    member = np.unique(cluster * count + found)
+    return member // count, member % count
+
+
 def _replays(pairs: Pairs, cluster: Integers) -> list[_Replay]:
     """The clusters in chunks that fit into memory."""
     sizes = np.bincount(cluster)
-    members = np.bincount(np.unique(np.stack([cluster, pairs.found]), axis=1)[0], minlength=len(sizes))
+    members = np.bincount(_members(cluster, pairs.found)[0], minlength=len(sizes))
     cost = np.cumsum(members * (sizes + members))
     parts, first = [], 0
     while first < len(sizes):
@@ -248,7 +256,7 @@ class _Replay:
     def __init__(self, pairs: Pairs, cluster: Integers) -> None:
         count = np.bincount(cluster)
         # members: the detections of each cluster, in file order
-        member_cluster, self.members = np.unique(np.stack([cluster, pairs.found]), axis=1)
+        member_cluster, self.members = _members(cluster, pairs.found)
         sizes = np.bincount(member_cluster, minlength=len(count))
         starts = np.cumsum(sizes) - sizes
         local = np.arange(len(self.members)) - starts[member_cluster]

@@ -8,6 +8,7 @@ that finds none is excused where it meets an ignored object, by the share of its
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Match:
     excused: Booleans
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Candidates:
     """Pairs of one class or of an ignored region, down to a least overlap, for several thresholds. judged (N,):
     detections among the best of their image and class.
@@ -70,29 +71,54 @@ class Candidates:
             pairs = pairs.rows(judged[pairs.found])
         return cls(truths, found, pairs, judged)
 
-    def coco(self, least: float) -> Match:
-        """COCO's matching at one IoU threshold."""
-        pairs = self.pairs.rows(self.pairs.overlap >= min(least, _NEARLY_ONE))
-        ignored = self.truths.ignore | (self.truths.label == EVERY_CLASS)
-        excused = ~self.judged
-        excused[pairs.found[ignored[pairs.truth]]] = True
-        pairs = pairs.rows(~ignored[pairs.truth])
-        truth = np.full(len(self.found), NOTHING)
-        alone = (np.bincount(pairs.truth, minlength=len(self.truths))[pairs.truth] == 1) & (
-            np.bincount(pairs.found, minlength=len(self.found))[pairs.found] == 1
-        )
-        truth[pairs.found[alone]] = pairs.truth[alone]
-        self._compete(pairs.rows(~alone), truth)
-        return Match(truth, excused & (truth == NOTHING))
+    @cached_property
+    def _ignored(self) -> Booleans:
+        """Objects (M,) that are neither missed nor a hit."""
+        return self.truths.ignore | (self.truths.label == EVERY_CLASS)
 
-    def _compete(self, pairs: Pairs, truth: Integers) -> None:
-        """Fill in `truth` (N,) for pairs that share objects or detections."""
-        if not len(pairs.truth):
-            return
+    @cached_property
+    def _by_score(self) -> Integers:
+        """Detections (N,) by descending score, in file order where scores are equal."""
+        return np.argsort(-self.found.score, kind="stable")
+
+    @cached_property
+    def _contest(self) -> tuple[Pairs, Integers]:
+        """Pairs that share objects or detections, as they are looked at in turn, and the cluster of each.
+
+        A higher threshold leaves fewer pairs, and what shares nothing stays apart: one order serves them all.
+        """
+        pairs = self.pairs.rows(~self._ignored[self.pairs.truth])
+        pairs = pairs.rows(~self._alone(pairs))
         cluster = clusters(pairs, len(self.truths), len(self.found))
         # by score within a cluster, in file order where scores are equal; of equal overlaps the last object wins
         order = np.lexsort((-pairs.truth, pairs.found, -self.found.score[pairs.found], cluster))
-        pairs, cluster = pairs.rows(order), cluster[order]
+        return pairs.rows(order), cluster[order]
+
+    def _alone(self, pairs: Pairs) -> Booleans:
+        """Which pairs share neither object nor detection with another one."""
+        return (np.bincount(pairs.truth, minlength=len(self.truths))[pairs.truth] == 1) & (
+            np.bincount(pairs.found, minlength=len(self.found))[pairs.found] == 1
+        )
+
+    def coco(self, least: float) -> Match:
+        """COCO's matching at one IoU threshold."""
+        threshold = min(least, _NEARLY_ONE)
+        pairs = self.pairs.rows(self.pairs.overlap >= threshold)
+        excused = ~self.judged
+        ignored = self._ignored[pairs.truth]
+        excused[pairs.found[ignored]] = True
+        pairs = pairs.rows(~ignored)
+        truth = np.full(len(self.found), NOTHING)
+        alone = self._alone(pairs)
+        truth[pairs.found[alone]] = pairs.truth[alone]
+        if not alone.all():
+            pairs, cluster = self._contest
+            kept = pairs.overlap >= threshold
+            self._compete(pairs.rows(kept), cluster[kept], truth)
+        return Match(truth, excused & (truth == NOTHING))
+
+    def _compete(self, pairs: Pairs, cluster: Integers, truth: Integers) -> None:
+        """Fill in `truth` (N,) for pairs that share objects or detections, as `_contest` has them."""
         rank = rank_in_cluster(cluster, pairs.found)
         by_rank = np.argsort(rank, kind="stable")
         free = np.ones(len(self.truths), np.bool_)
@@ -105,12 +131,11 @@ class Candidates:
 
     def voc(self, least: float) -> Match:
         """VOC's matching at one IoU threshold; it excuses detections on difficult objects."""
-        whole = self.truths.label == EVERY_CLASS
         near = self.pairs.rows(self.pairs.overlap >= least)
         excused = np.zeros(len(self.found), np.bool_)
-        ignored = self.truths.ignore | whole
-        excused[near.found[ignored[near.truth]]] = True
-        pairs = near.rows(~ignored[near.truth])
+        ignored = self._ignored[near.truth]
+        excused[near.found[ignored]] = True
+        pairs = near.rows(~ignored)
         truth = np.full(len(self.found), NOTHING)
         wrong = np.zeros(len(self.found), np.bool_)
         if len(pairs.truth):
@@ -129,18 +154,17 @@ class Candidates:
         wanted = (truths.label == label) & ~truths.ignore
         if counted is not None:
             wanted &= counted
-        rows = np.flatnonzero(found.label == label)
+        rows = self._by_score[found.label[self._by_score] == label]
         matched = match.truth[rows]
         hit = np.append(wanted, False)[matched]  # NOTHING is the last
         misfire = (matched == NOTHING) & ~match.excused[rows]
         kept = hit | misfire
-        rows, hit, misfire = rows[kept], hit[kept], misfire[kept]
-        order = np.argsort(-found.score[rows], kind="stable")
+        rows = rows[kept]
         return Tally(
-            score=found.score[rows][order],
-            frame=found.frame[rows][order],
-            hits=hit[order].astype(np.float64),
-            misfires=misfire[order].astype(np.float64),
+            score=found.score[rows],
+            frame=found.frame[rows],
+            hits=hit[kept].astype(np.float64),
+            misfires=misfire[kept].astype(np.float64),
             objects=np.bincount(truths.frame[wanted], minlength=truths.frames).astype(np.float64),
         )
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from drivesem.report.tables import Sheet, csv_text
+from drivesem.report.terminal import Console
 from scene_ir import files
 
 

@@ -8,12 +8,12 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivesem.report import grading
 from drivesem.report.page import ShownRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
+from scene_ir import files
 from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:
@@ -562,18 +562,11 @@ def _near(xyxy: tuple[float, float, float, float], marks: Sequence[Mark]) -> tup
 
 
 def _opened(one: Outcome, name: str) -> Image:
-    from PIL import Image
-
     path = one.run.folder / "frames" / one.result.identifier / name
-    try:
-        with Image.open(path) as picture:
-            return picture.convert("RGB")
-    except OSError as error:
-        raise FormatError(str(path), "a picture of the run", _reason(path, error)) from error
-
-
-def _reason(path: Path, error: OSError) -> str:
-    return str(error) if path.is_file() else "none"
+    if not path.is_file():
+        raise FormatError(str(path), "a picture of the run", "none")
+    with files.opened_image(path) as picture:
+        return picture.convert("RGB")
 
 
 def _cut(picture: Image, view: tuple[float, float, float, float]) -> str:

@@ -18,6 +18,7 @@ from drivesem.report import grading
 from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
 from drivesem.report.page import Page, ShownRun
+from drivesem.report.policy import script_hash
 from drivesem.run.results import RunSummary
 from drivesem.truth.grades import Grade
 
@@ -68,7 +69,8 @@ def render_report(page: Page, at: Path) -> str:
     first = runs[0]
     return template.render(
         style=Markup(_part("style.css")),
-        script=Markup(_part("page.js")),
+        script=Markup(script := _part("page.js")),
+        script_hash=Markup(script_hash(script)),
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,
@@ -184,9 +186,27 @@ def _comparison(runs: Sequence[ShownRun]) -> str:
         sure, failures = (surest.summary.grades[str(g)] for g in (Grade.CERTAIN, Grade.THRESHOLD))
         if not sure:
             return f"{head}: no certain failure in any"
+        tie = _tie(runs, [run.summary.grades[str(Grade.CERTAIN)] for run in runs], "certain failures")
+        if tie:
+            return f"{head}: {tie}"
         return f"{head}: {surest.name} has most certain failures, {sure} of {failures} by threshold"
-    most = max(runs, key=lambda run: run.summary.successes_moved)
+    counts = [run.summary.successes_moved for run in runs]
+    tie = _tie(runs, counts, "broken frames by threshold")
+    if tie:
+        return f"{head}: {tie}"
+    most = runs[counts.index(max(counts))]
     return f"{head}: {most.name} breaks most by threshold, {most.summary.successes_moved}"
+
+
+def _tie(runs: Sequence[ShownRun], counts: Sequence[int], what: str) -> str:
+    """Who shares the first place, in words; nothing where one run has it alone."""
+    most = max(counts)
+    names = [run.name for run, count in zip(runs, counts, strict=True) if count == most]
+    if len(names) == 1:
+        return ""
+    if len(names) == len(runs):
+        return f"{'both' if len(runs) == 2 else 'all'} have as many {what}, {most} each"
+    return f"{', '.join(names[:-1])} and {names[-1]} have most {what}, {most} each"
 
 
 def _notes(runs: Sequence[ShownRun]) -> list[str]:

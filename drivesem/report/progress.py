@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -13,12 +12,18 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from drivesem.report.terminal import Console
+
 
 def progress_bar(
     console: Console, *, stays: bool = True, elapsed: bool = True, remaining: bool = False, hidden: bool = False
 ) -> Progress:
     """A bar with a description and a count. stays: at the end too; elapsed, remaining: the times that it shows."""
-    columns: list[ProgressColumn] = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+    ]
     columns += [TimeElapsedColumn()] if elapsed else []
     columns += [TimeRemainingColumn()] if remaining else []
     return Progress(*columns, console=console, transient=not stays, disable=hidden)

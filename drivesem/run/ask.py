@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from rich.console import Console
-
 from drivesem.report.answer import Answer, print_json
 from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.run.finished import Run
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT

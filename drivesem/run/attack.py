@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -59,6 +60,9 @@ from scene_ir.types import SceneIR
 
 PEERS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures: what is confirmed of one is shown to another."""
+WITHOUT_GRADIENT = "climb"
+"""The method for detectors that have no gradient, where nobody asked for one: of those that need none, it finds
+most failures that hold."""
 _AROUND = 3
 """Passes of a frame in which no method has a say."""
 WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
@@ -72,10 +76,17 @@ def attack_run(config: Attack) -> RunSummary:
     config = _settled(config)
     aim_of(config)
     check_device(config.device)
-    worker = Worker.of(config)
+    detector = _load(config)
+    suited = _suited(config, detector)
+    worker = Worker.of(suited, detector)
+    if suited.method != config.method:
+        told = f"--method {suited.method} takes the place of {config.method}"
+        sys.stderr.write(f"{config.detector} has no gradient: {told}\n")
+    config = suited
     out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
     claim(out, config, WRITTEN)
     names, without, failed = select_frames(worker.source, config)
+    _check_any(config, names, without, failed)
     return _attacked(worker, (_of_part(names, config.part), without, failed), out, start, must_find=True)
 
 
@@ -105,10 +116,12 @@ def _attacked(
     if todo and config.backend == "warp" and config.device == "cpu":
         make_ready(config)
     work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
-    answers = ask(todo, work, build, config, Bar("attacking frames"))
+    answers = ask(todo, work, build, config, Bar("attacking frames", remaining=True))
     failed = failed | answers.failed
     empty = {name for name, usable in answers.results.items() if not usable}
     done = [name for name in names if name not in failed and name not in empty]
+    if names and not done and config.part is None:
+        _check_any(config, done, without_vehicles + len(empty), failed)
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
     if must_find:
         _check_sight(worker, results)
@@ -119,6 +132,19 @@ def _attacked(
         seconds=round(time.perf_counter() - start, 3),
     )
     return conclude(out, config, summary, results)
+
+
+def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mapping[str, str]) -> None:
+    """UsageError where no frame can be attacked: figures of none would say nothing."""
+    if names:
+        return
+    found = [f"{without} frames without"] if without else []
+    if failed:
+        found.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
+    expected = "frames with cars, vans or trucks to attack (drivesem derender --sheet draws what it makes of one)"
+    raise UsageError(
+        f"--root {config.root}" if config.root else "--dataset", expected, "; ".join(found) or "no frame"
+    )
 
 
 def conclude(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
@@ -360,6 +386,15 @@ def _load(config: Attack) -> Predictor:
         return load_detector(config.detector, config.device, getattr(torch, config.precision))
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
+
+
+def _suited(config: Attack, detector: Predictor) -> Attack:
+    """The settings with a method that needs no gradient, where the detector has none and nobody asked for one."""
+    if isinstance(detector, Detector) or config.method != Attack().method:
+        return config
+    suited = replace(config, method=WITHOUT_GRADIENT)
+    suited.check()
+    return suited
 
 
 def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -> None:

@@ -1,19 +1,22 @@
-"""Labels from one layout into another."""
+"""Labels from one layout into another, of data sets and of runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivesem.data.frames import images_in, size_of_image
-from drivesem.data.kitti import label_folder, read_calib
+from drivesem.data.kitti import read_calib
+from drivesem.data.kitti_labels import label_folder
 from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
 from drivesem.data.registry import images_beside, write_table
 from drivesem.run.labels import layout_of, read
+from drivesem.run.training_data import labels_of_run, pictures
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 
@@ -22,7 +25,7 @@ from scene_ir.errors import FormatError
 class Conversion:
     """to_format, from_format: layouts, None to look; scores: of detections, not labels. size_wh: of all images,
     px, instead of a look at them in `images` or where the source has them; copy_images: into the new layout.
-    mapping: classes by name, None leaves one out.
+    mapping: classes by name, None leaves one out. frames: of a run, these only.
     """
 
     to_format: str
@@ -32,6 +35,7 @@ class Conversion:
     images: Path | None = None
     copy_images: bool = False
     mapping: Mapping[str, str | None] = field(default_factory=dict)
+    frames: Sequence[str] | None = None
 
 
 def convert(source: Path, out: Path, how: Conversion) -> Written:
@@ -41,7 +45,10 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
     to be copied and are not there.
     """
     layout = how.from_format or layout_of(source)
-    table = read(source, layout, scored=how.scores)
+    if layout == "run" and not how.scores:
+        table = labels_of_run(source, how.frames)
+    else:
+        table = read(source, layout, scored=how.scores)
     odd = table.truncation[(table.truncation > 1) | ((table.truncation < 0) & (table.truncation != -1))]
     if len(odd):
         raise FormatError(f"{source}: truncation", "[0, 1], or -1 where it is not known", f"{odd[0]:g}")
@@ -49,10 +56,11 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
         table = renamed(table, how.mapping)
     found = images_in([how.images], table.frames) if how.images is not None else {}
     if how.images is None and (how.copy_images or (not table.sizes_wh.all() and how.size_wh is None)):
-        found = images_beside(source, layout, table.frames)
+        beside = pictures if layout == "run" else partial(images_beside, layout=layout)
+        found = beside(source, frames=table.frames)
     if how.size_wh is not None:
         table = replace(table, sizes_wh=np.tile(np.array(how.size_wh, np.int64), (len(table.frames), 1)))
-    elif not table.sizes_wh.all() and how.to_format in ("coco", "yolo"):
+    elif not table.sizes_wh.all() and how.to_format in ("coco", "yolo", "fiftyone"):
         sizes = table.sizes_wh.copy()
         for i, name in enumerate(table.frames):
             if not sizes[i].all() and name in found:

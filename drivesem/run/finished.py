@@ -10,6 +10,7 @@ from typing import Any
 
 from drivesem.run.folder import CONFIG
 from drivesem.run.frame import RESULT
+from drivesem.run.lock import held_elsewhere
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.run.tally import graded
@@ -126,10 +127,14 @@ def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "
 def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     if not (folder / CONFIG).is_file():
         raise UsageError(setting, "a folder of drivesem attack", folder)
+    for file in (CONFIG, METRICS, MANIFEST):
+        files.below(folder, file)
     settings = files.read_yaml(folder / CONFIG)
     if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
     if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
+        if held_elsewhere(folder):
+            raise UsageError(setting, "a finished run", f"{folder}, into which an attack is still writing")
         raise UsageError(
             setting, "a finished run (the same command finishes it)", f"{folder}, which stopped early"
         )
@@ -153,7 +158,8 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
 
 
 def _frame(folder: Path) -> Frame:
-    pictures = {name: files.below(folder, file) for name, file in PICTURES.items()}
+    files.check_links(folder)
+    pictures = {name: folder / file for name, file in PICTURES.items()}
     for path in pictures.values():
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivesem.data import registry
+from drivesem.data import layouts
 from drivesem.data.label_table import LabelTable
 from drivesem.run.results import BoxRecord, load_frame
 from scene_ir.errors import FormatError, RangeError
@@ -19,12 +19,12 @@ RESULT = "result.json"
 
 
 def layout_of(path: Path) -> str:
-    """ "run", or one of `registry.LAYOUTS`, by what lies there. FormatError where it is none."""
+    """ "run", or one of `layouts.LAYOUTS`, by what lies there. FormatError where it is none."""
     if any((path / "frames").glob(f"*/{RESULT}")):
         return "run"
-    layout = registry.layout_of(path)
+    layout = layouts.layout_of(path)
     if layout is None:
-        expected = f"labels as one of {', '.join((*registry.LAYOUTS, 'run'))}"
+        expected = f"labels as one of {', '.join((*layouts.LAYOUTS, 'run'))}"
         raise FormatError(str(path), expected, "no label file (an empty folder?)")
     return layout
 
@@ -32,8 +32,8 @@ def layout_of(path: Path) -> str:
 def read(
     path: Path, layout: str, scored: bool = False, stage: str = STAGES[0], truth: LabelTable | None = None
 ) -> LabelTable:
-    """The table of a path: see `registry.read_table`. stage: of a run."""
-    return _of_run(path, scored, stage) if layout == "run" else registry.read_table(path, layout, scored, truth)
+    """The table of a path: see `layouts.read_table`. stage: of a run."""
+    return _of_run(path, scored, stage) if layout == "run" else layouts.read_table(path, layout, scored, truth)
 
 
 def _of_run(path: Path, scored: bool, stage: str) -> LabelTable:

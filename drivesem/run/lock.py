@@ -41,6 +41,22 @@ def hold(folder: Path) -> None:
     _held[path] = lock
 
 
+def held_elsewhere(folder: Path) -> bool:
+    """Whether another process writes into the folder now."""
+    from filelock import FileLock, Timeout
+
+    path = folder.resolve() / LOCK
+    if path in _held or not path.is_file():
+        return False
+    try:
+        with FileLock(path, blocking=False):
+            return False
+    except Timeout:
+        return True
+    except OSError:  # a folder that may only be read tells nothing
+        return False
+
+
 @contextmanager
 def let_go() -> Iterator[None]:
     """What is held inside is free at the end."""

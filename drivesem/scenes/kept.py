@@ -46,13 +46,15 @@ class KeptScenes:
         scene = make()
         with files.whole_folder(path) as part:
             save_scene(scene, part)
-        self._make_room(path)
+        self.make_room(path)
         return scene
 
-    def _make_room(self, newest: Path) -> None:
-        """Several processes may do so at once: what is gone already is no error."""
+    def make_room(self, newest: Path | None = None) -> None:
+        """Remove what is beyond the limit, but for the `newest` scene. Several processes may do so at once: what
+        is gone already is no error.
+        """
         sizes: list[tuple[float, float, Path]] = []
-        for path in self.folder.iterdir():
+        for path in self.folder.iterdir() if self.folder.is_dir() else ():
             with contextlib.suppress(OSError):
                 size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
                 sizes.append((path.stat().st_mtime, size, path))

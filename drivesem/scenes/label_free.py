@@ -1,46 +1,35 @@
-"""A plain photograph as a frame with labels that nobody wrote: vehicles found, and placed on the ground.
+"""A photograph without 3D boxes as a frame with them: vehicles found, or labelled in 2D, and placed on the ground.
 
-The shipped detector finds vehicles, `scene_ir.derender.pose` places them. What comes out is what a data set's
-reader gives, so that `scene_ir.derender.derender` takes it.
+A detector or a data set's labels say where vehicles are in the picture, `scene_ir.derender.pose` places them. What
+comes out is what a reader of 3D boxes gives, so that `scene_ir.derender.derender` takes it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from detectors.base import Detector
+from detectors.base import Predictor, predict
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections
-from drivesem.data.frames import pinhole
+from drivesem.attack.judging import t_star_of
+from drivesem.data.classes import VEHICLES, as_kitti
+from drivesem.data.label_table import UNKNOWN_OCCLUSION
 from drivesem.data.truth import occlusion_of
-from scene_ir import files
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
 from scene_ir.derender.silhouette import FitSettings
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
-from scene_ir.io import to_tensor
 from scene_ir.types import Camera, Frame, Labels
 
-DEFAULT_FOCAL = 0.58
-"""Focal length in image widths where nothing tells it: KITTI's 721 px of 1242, a view 81 degrees wide."""
-FILM_MM = 36.0
-"""Width of the film that EXIF's "focal length in 35 mm film" speaks of; its longer side."""
-_EXIF, _FOCAL, _FOCAL_35 = 0x8769, 0x920A, 0xA405
-_PLANE_X, _PLANE_Y, _PLANE_UNIT, _ORIENTATION = 0xA20E, 0xA20F, 0xA210, 0x0112
-"""Tags of EXIF 2.32: its own directory, focal length in mm and in 35 mm film, pixels a unit on the sensor."""
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
-_TURNED = {1: 0, 3: 2, 6: 3, 8: 1}
-"""EXIF's orientations without mirroring, and quarter turns to the left that put them upright."""
 _DETECTOR_FOCAL_PX = 721.0
 """Of the pictures that the detector was trained on: others are resized so that cars are as large."""
 _SAME_SCALE = 1.3
@@ -63,101 +52,23 @@ heading above all. Outlines hardly tell distances: more shift made those no bett
 own, they are the estimate's."""
 
 
+LABELLED = replace(FITTING, box=FitSettings().box)
+"""The same where a data set says the boxes: these do say something of the outline."""
+
+
 def settings_for(settings: DerenderSettings) -> DerenderSettings:
-    """The settings for poses that were estimated instead of labelled."""
+    """The settings for poses that were estimated from a detector's boxes."""
     return replace(settings, fitting=FITTING)
 
 
-@dataclass(frozen=True, slots=True)
-class Focal:
-    """A focal length, px, and where it is from: "given", "EXIF" or "default"."""
-
-    length_px: float
-    source: str
-
-
-def camera_of(image_path: Path, focal_px: float | None = None) -> Camera:
-    """The camera of a photograph: its axis through the middle, focal length as `focal_of` has it."""
-    _, width, height = _header(image_path)
-    return pinhole(height, width, focal_of(image_path, focal_px).length_px)
-
-
-def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
-    """The focal length of a photograph: `focal_px`, otherwise EXIF's, otherwise 0.58 of the image's longer side.
-
-    RangeError for a focal_px that is no positive number, FormatError naming a file that is no image.
-    """
-    exif, width, height = _header(image_path)
-    if focal_px is not None:
-        return Focal(_checked(focal_px), "given")
-    longer = max(width, height)
-    told = exif.get_ifd(_EXIF)
-    film = _positive(told.get(_FOCAL_35))
-    if film:
-        return Focal(film / FILM_MM * longer, "EXIF")
-    unit = _UNIT_MM.get(int(told.get(_PLANE_UNIT, 2)))
-    length, density = _positive(told.get(_FOCAL)), _positive(told.get(_PLANE_X)) or _positive(told.get(_PLANE_Y))
-    if unit and length and density:
-        return Focal(length / unit * density, "EXIF")
-    return Focal(DEFAULT_FOCAL * longer, "default")
-
-
-def camera_for(height: int, width: int, focal_px: float | None = None) -> Camera:
-    """The camera of pixels that nothing is told of: 0.58 of the longer side where no focal length is given."""
-    focal = DEFAULT_FOCAL * max(width, height) if focal_px is None else _checked(focal_px)
-    return pinhole(height, width, focal)
-
-
-def _checked(focal_px: float) -> float:
-    if not (math.isfinite(focal_px) and focal_px > 0):
-        raise RangeError("focal", "positive px", focal_px)
-    return float(focal_px)
-
-
-def _positive(value: Any) -> float:
-    """A value of EXIF as a positive number; 0 where it is none: cameras write 0 for what they do not know."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return 0.0
-    return number if math.isfinite(number) and number > 0 else 0.0
-
-
-def _header(path: Path) -> tuple[Any, int, int]:
-    """EXIF, width and height, as seen upright. FormatError."""
-    from PIL import Image, UnidentifiedImageError
-
-    files.read_bytes(path)
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            width, height = image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise FormatError(str(path), "an image", str(error).splitlines()[0]) from error
-    return (exif, height, width) if _turns(exif) % 2 else (exif, width, height)
-
-
-def _turns(exif: Any) -> int:
-    return _TURNED.get(int(exif.get(_ORIENTATION, 1)), 0)
-
-
-def photograph(path: Path, focal_px: float | None = None) -> Frame:
-    """A photograph, upright, with its camera, without labels. FormatError naming the file; RangeError."""
-    focal = focal_of(path, focal_px)
-    pixels = np.rot90(files.read_image(path), _turns(_header(path)[0]))
-    image = to_tensor(pixels)
-    told = f"{focal.length_px:.1f} px, {focal.source}"
-    provenance = {"dataset": "photograph", "image": path.name, "focal": told}
-    return Frame(path.stem, image, pinhole(image.shape[1], image.shape[2], focal.length_px), provenance=provenance)
-
-
 @torch.no_grad()
-def detect(frame: Frame, detector: Detector | None = None) -> Detections:
+def detect(frame: Frame, detector: Predictor | None = None) -> Detections:
     """What a detector finds from its t* on, the shipped one by default; a vehicle that is both car and truck once.
 
     Pictures of much longer or shorter focal length than the detector knows are resized for it.
     """
     detector = detector or load_detector("squeezedet")
+    t_star = t_star_of(detector)
     image = frame.photograph[None].float()
     scale = _DETECTOR_FOCAL_PX / float(frame.camera.intrinsics[0, 0])
     if 1 / _SAME_SCALE < scale < _SAME_SCALE:
@@ -165,7 +76,7 @@ def detect(frame: Frame, detector: Detector | None = None) -> Detections:
     else:
         size = [max(round(scale * side), 32) for side in image.shape[2:]]
         image = torch.nn.functional.interpolate(image, size, mode="bilinear", antialias=True, align_corners=False)
-    found = detector.decode(detector(image))[0]
+    found = predict(detector, image)[0]
     # pixel centres at integers: column j of the resized image is column (j + 1/2) / scale - 1/2
     ratio = torch.tensor([image.shape[3] / frame.camera.width, image.shape[2] / frame.camera.height]).repeat(2)
     boxes = (found.boxes_xyxy + 0.5) / ratio - 0.5
@@ -175,7 +86,7 @@ def detect(frame: Frame, detector: Detector | None = None) -> Detections:
     overlap = iou_matrix(boxes, boxes)
     for i in range(len(found)):  # best first
         sides = boxes[i, 2:] - boxes[i, :2]
-        if float(found.scores[i]) < detector.t_star or float(sides.min()) < 2:
+        if float(found.scores[i]) < t_star or float(sides.min()) < 2:
             continue
         if not any(vehicle[i] and vehicle[j] and float(overlap[i, j]) > _TWICE_IOU for j in keep):
             keep.append(i)
@@ -195,31 +106,19 @@ def label_free(
     """
     names = [_class_name(int(label), classes) for label in detections.labels]
     boxes = detections.boxes_xyxy.float()
-    vehicles = [i for i, name in enumerate(names) if name in VEHICLE_CLASSES]
-    people = [i for i, name in enumerate(names) if name in _PEOPLE_LHW]
-    kinds = [names[i] for i in vehicles]
-    poses = estimate(frame.photograph, boxes[vehicles], kinds, frame.camera, ground, looks=DETECTOR_LOOKS)
-    places = _people(boxes[people], [names[i] for i in people], frame.camera, poses)
-    translation, yaw, size = (torch.full((len(names), *s), math.nan) for s in ((3,), (), (3,)))
-    translation[vehicles], yaw[vehicles], size[vehicles] = poses.translation, poses.yaw, poses.size_lhw
-    if people:
-        translation[people], size[people] = places, torch.tensor([_PEOPLE_LHW[names[i]] for i in people])
-        yaw[people] = 0.0
-    full = project_boxes(size, yaw, translation, frame.camera.matrix.float())
-    inside = clip_boxes(full, frame.camera.height, frame.camera.width)
+    placed = _place(frame, boxes, names, detections.scores, ground, DETECTOR_LOOKS)
+    vehicles, poses = placed.vehicles, placed.poses
     boxes = boxes.clone()
-    boxes[vehicles] = inside[vehicles]
-    seen = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
-    seen[vehicles] &= _possible(poses, detections.scores[vehicles])
-    kept = [i for i in sorted(vehicles + people) if bool(seen[i])]
+    boxes[vehicles] = placed.inside[vehicles]
+    kept = [i for i, possible in enumerate(placed.possible.tolist()) if possible]
     labels = Labels(
         kind=tuple(names[i] for i in kept),
         boxes_xyxy=boxes[kept],
-        truncation=_truncation(full[kept], inside[kept]),
-        occlusion=_occlusion(boxes[kept], translation[kept, 2]),
-        translation=translation[kept],
-        yaw=yaw[kept],
-        size_lhw=size[kept],
+        truncation=_truncation(placed.full[kept], placed.inside[kept]),
+        occlusion=_occlusion(boxes[kept], placed.translation[kept, 2]),
+        translation=placed.translation[kept],
+        yaw=placed.yaw[kept],
+        size_lhw=placed.size_lhw[kept],
         ignore_xyxy=torch.zeros(0, 4),
     )
     row = {i: n for n, i in enumerate(vehicles)}
@@ -230,6 +129,79 @@ def label_free(
             told[f"labels[{n}].depth_sigma"] = f"{float(poses.log_depth_sigma[row[i]]):.3f}"
             told[f"labels[{n}].facing"] = f"{float(poses.facing[row[i]]):.3f}"
     return replace(frame, labels=labels, provenance={**frame.provenance, **told})
+
+
+def has_places(labels: Labels) -> bool:
+    """Whether a data set says where any of the vehicles stands."""
+    return any(math.isfinite(float(z)) for z in labels.translation[:, 2])
+
+
+def placed_by_boxes(frame: Frame) -> Frame:
+    """The frame with the places of vehicles and people estimated from the 2D boxes of its labels, which stay as
+    they are, with masks; types are KITTI's. Occlusion and truncation are estimated where the labels do not say.
+
+    A vehicle that would float above the ground, or stand where a larger one does, has no place: it stays in the
+    picture, and is neither missed nor a hit.
+    """
+    assert frame.labels is not None
+    labels = as_kitti(frame.labels)
+    boxes = labels.boxes_xyxy.float()
+    flat = (boxes[:, 2:] <= boxes[:, :2]).any(1).tolist()
+    names = ["" if thin else name for name, thin in zip(labels.kind, flat, strict=True)]
+    # nearer vehicles, which are higher in the picture, are surer
+    placed = _place(frame, boxes, names, boxes[:, 3] - boxes[:, 1], None, looks=1)
+    gone = ~placed.possible
+    depth = torch.where(gone, math.inf, placed.translation[:, 2])
+    unknown = labels.occlusion == UNKNOWN_OCCLUSION
+    told = torch.isfinite(labels.truncation)
+    estimated = _truncation(placed.full, placed.inside)
+    labels = replace(
+        labels,
+        translation=placed.translation.masked_fill(gone[:, None], math.nan),
+        yaw=placed.yaw.masked_fill(gone, math.nan),
+        size_lhw=placed.size_lhw.masked_fill(gone[:, None], math.nan),
+        occlusion=torch.where(unknown & ~gone, _occlusion(boxes, depth), labels.occlusion),
+        truncation=torch.where(~told & ~gone, estimated, labels.truncation),
+    )
+    return replace(frame, labels=labels, provenance={**frame.provenance, "places": "estimated"})
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """N boxes and what stands in them. vehicles: their places among the boxes, one a row of poses. translation
+    (N, 3) m, yaw (N,) rad, size_lhw (N, 3) m: NaN for what is neither vehicle nor person; full, inside (N, 4) px:
+    around the 3D box, and as much of that as the image has. possible (N,): stands on the ground, and shows.
+    """
+
+    vehicles: list[int]
+    poses: Poses
+    translation: Tensor
+    yaw: Tensor
+    size_lhw: Tensor
+    full: Tensor
+    inside: Tensor
+    possible: Tensor
+
+
+def _place(
+    frame: Frame, boxes: Tensor, names: Sequence[str], scores: Tensor, ground: Tensor | None, looks: int
+) -> _Placed:
+    """names: KITTI's types; scores (N,): of two vehicles in one place the higher stays."""
+    vehicles = [i for i, name in enumerate(names) if name in VEHICLES]
+    people = [i for i, name in enumerate(names) if name in _PEOPLE_LHW]
+    kinds = [names[i] for i in vehicles]
+    poses = estimate(frame.photograph, boxes[vehicles], kinds, frame.camera, ground, looks=looks)
+    places = _people(boxes[people], [names[i] for i in people], frame.camera, poses)
+    translation, yaw, size = (torch.full((len(names), *s), math.nan) for s in ((3,), (), (3,)))
+    translation[vehicles], yaw[vehicles], size[vehicles] = poses.translation, poses.yaw, poses.size_lhw
+    if people:
+        translation[people], size[people] = places, torch.tensor([_PEOPLE_LHW[names[i]] for i in people])
+        yaw[people] = 0.0
+    full = project_boxes(size, yaw, translation, frame.camera.matrix.float())
+    inside = clip_boxes(full, frame.camera.height, frame.camera.width)
+    seen = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
+    seen[vehicles] &= _possible(poses, scores[vehicles])
+    return _Placed(vehicles, poses, translation, yaw, size, full, inside, seen)
 
 
 def _class_name(label: int, classes: tuple[str, ...]) -> str:

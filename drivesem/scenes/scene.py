@@ -24,10 +24,11 @@ from torch import Tensor
 
 from drivesem.attack.scene_edits import edited
 from drivesem.data import kitti, registry
-from drivesem.scenes.sources import derender_settings
+from drivesem.data.photographs import camera_for, photograph, read_pixels
+from drivesem.scenes.sources import derender_settings, placed
 from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting
 from drivesem.settings.errors import UsageError
-from scene_ir import files, io
+from scene_ir import io
 from scene_ir.io import to_tensor, to_uint8
 from scene_ir.render.compositor import render
 from scene_ir.types import Camera, Category, Frame, Labels, SceneIR
@@ -215,25 +216,24 @@ def derender(
         from drivesem.scenes.label_free import detect, label_free, settings_for
 
         frame, settings = label_free(frame, detect(frame)), settings_for(settings)
+    frame, settings = placed(frame, settings)
     return Scene(taken_apart(frame, settings), frame.identifier)
 
 
 def _frame(photo: Photo, labels: str | Path | Labels | None, calib: Calib | None, focal: float | None) -> Frame:
     """A photograph with its camera, and with labels where they are given."""
-    from drivesem.scenes import label_free
-
     if isinstance(photo, str | Path):
         if calib is None:
-            return label_free.photograph(Path(photo), focal)
+            return photograph(Path(photo), focal)
         path = Path(photo)
-        image = to_tensor(files.read_image(path))
+        image = to_tensor(read_pixels(path))
         name = path.stem
         provenance = {"dataset": "photograph", "image": path.name}
     else:
         path, name, provenance = Path("photo"), "photo", {"dataset": "photograph"}
         image = image_of(photo)
     height, width = image.shape[1:]
-    camera = label_free.camera_for(height, width, focal) if calib is None else _camera(calib, height, width)
+    camera = camera_for(height, width, focal) if calib is None else _camera(calib, height, width)
     given = labels if labels is None or isinstance(labels, Labels) else kitti.read_labels(Path(labels))
     kitti.check_size(path, camera, given)
     return Frame(name, image, camera, given, provenance=provenance)

@@ -29,6 +29,8 @@ CITYSCAPES = (
 """Cordts et al., CVPR 2016: the classes that are judged, in the order of their training numbers."""
 _MULTIPLE = 32
 """Sides that networks with a free input size can halve five times."""
+_MOST_SIDE = 8192
+"""px of a fixed input: far above any, so that none takes all memory."""
 _SUM_ERROR = 0.01
 """Of probabilities; what misses 1 by more is logits."""
 
@@ -52,20 +54,22 @@ class OnnxSegmenter:
             self._session: Any = onnxruntime.InferenceSession(
                 files.read_bytes(path), options, providers=["CPUExecutionProvider"]
             )
+            inputs = [(one.name, list(one.shape), one.type) for one in self._session.get_inputs()]
+            told = dict(self._session.get_modelmeta().custom_metadata_map)
         except FormatError:
             raise
         except Exception as error:  # onnxruntime's own classes derive from nothing narrower
             raise FormatError(self._path, "an ONNX network", _line(error)) from error
-        inputs = self._session.get_inputs()
-        shape = list(inputs[0].shape) if inputs else []
+        shape = inputs[0][1] if inputs else []
         if len(inputs) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3):
-            found = ", ".join(f"{i.name} {i.shape}" for i in inputs)
+            found = ", ".join(f"{name} {sides}" for name, sides, _ in inputs)
             raise FormatError(f"{self._path}: inputs", "one of shape (1, 3, H, W)", found or "none")
-        if inputs[0].type != "tensor(float)":
-            raise FormatError(f"{self._path}: input {inputs[0].name}", "float32", inputs[0].type)
-        self._input = inputs[0].name
+        self._input, _, kind = inputs[0]
+        if kind != "tensor(float)":
+            raise FormatError(f"{self._path}: input {self._input}", "float32", kind)
         self._sides = tuple(side if isinstance(side, int) and side > 0 else None for side in shape[2:])
-        told = dict(self._session.get_modelmeta().custom_metadata_map)
+        if max((side for side in self._sides if side is not None), default=0) > _MOST_SIDE:
+            raise FormatError(f"{self._path}: input {self._input}", f"at most {_MOST_SIDE} px a side", shape)
         self._mean, self._std = (self._three(told, key, usual) for key, usual in (("mean", 0.0), ("std", 1.0)))
         if (self._std <= 0).any():
             raise FormatError(f"{self._path}: metadata std", "positive numbers", self._std.tolist())

@@ -8,16 +8,22 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from drivesem.settings.blocks import DEMO, Scenes
+from drivesem.settings.blocks import DEMO, PHOTOGRAPHS, SCENES, Scenes
 from drivesem.settings.commands import Derender
-from scene_ir.errors import SceneError
+from drivesem.settings.errors import UsageError
+from drivesem.store import place
+from scene_ir.errors import FormatError, SceneError
 from scene_ir.types import Frame, SceneIR
 
 if TYPE_CHECKING:
+    from detectors.base import Predictor
+    from drivesem.data.photographs import Focal
     from drivesem.scenes.kept import KeptScenes
     from scene_ir.derender.derender import DerenderSettings
 
 DEMO_SCENES = 10
+_RECORD, _BEFORE = "scene.json", "before"
+"""What every scene's folder has, and some hold."""
 _MOST_FACES = 5000
 """Of a user's mesh, as of the heaviest template: more show in no photograph, and cost time in every fit."""
 
@@ -62,13 +68,15 @@ class DemoSource:
 
 
 class PhotographSource:
-    """Frames of a labelled data set of photographs, de-rendered by their labels."""
+    """Frames of a labelled data set of photographs, de-rendered by their labels. Where these have no 3D boxes, the
+    shipped network places the vehicles of the 2D boxes.
+    """
 
     def __init__(self, config: Scenes) -> None:
         from drivesem.data.registry import open_dataset
 
         points = isinstance(config, Derender) and config.velodyne
-        self._dataset = open_dataset(config.dataset, config.root or "", with_points=points)
+        self._dataset = open_dataset(config.dataset, config.root or "", with_points=points, focal_px=config.focal)
         self._settings = _settings(config)
         self._kept = _kept_scenes(config)
 
@@ -81,41 +89,128 @@ class PhotographSource:
         return vehicle_count(self._dataset.labels(identifier)) > 0
 
     def scene(self, identifier: str) -> SceneIR:
-        from scene_ir.derender.derender import derender
-
-        frame = self._dataset.frame(identifier)
-        make = partial(derender, frame, self._settings)
-        return make() if self._kept is None else self._kept.scene((frame, self._settings), make)
+        frame, settings = placed(self._dataset.frame(identifier), self._settings)
+        return _taken_apart(frame, settings, self._kept)
 
 
-class PlainPhotograph:
-    """One photograph without labels: vehicles are found and placed by the shipped networks."""
+class Photographs:
+    """Photographs without labels, one file or a folder of them: vehicles are found by a detector and placed by the
+    shipped network. Raises FormatError for a folder without images, UsageError for a detector that is none.
+    """
 
-    def __init__(self, path: Path, config: Derender) -> None:
-        from drivesem.scenes.label_free import focal_of, settings_for
+    def __init__(self, path: Path, config: Scenes) -> None:
+        from drivesem.data.frames import images_of
+        from drivesem.scenes.label_free import settings_for
 
-        self._path = path
-        self.focal = focal_of(path, config.focal)
+        files = images_of(path) if path.is_dir() else [path]
+        if not files:
+            raise FormatError(str(path), "photographs (.png, .jpg)", "none")
+        self._paths = {file.stem: file for file in files}
+        if len(self._paths) < len(files):
+            raise FormatError(str(path), "photographs with names of their own", "two that differ in their suffix")
+        self._focal_px = config.focal
+        self.focal(files[0].stem)  # what is no image is told before anything is written
+        self._finder = _finder(config)
         self._settings = settings_for(_settings(config))
+        self._kept = _kept_scenes(config)
+
+    def focal(self, identifier: str) -> Focal:
+        """The focal length of a photograph, and where it is from."""
+        from drivesem.data.photographs import focal_of
+
+        return focal_of(self._paths[identifier], self._focal_px)
 
     def identifiers(self) -> Iterator[str]:
-        return iter([self._path.stem])
+        return iter(self._paths)
 
     def has_vehicles(self, identifier: str) -> bool:
-        from drivesem.data.classes import vehicle_count
+        from drivesem.scenes.label_free import VEHICLE_CLASSES, detect
 
-        return vehicle_count(self._frame().labels) > 0
+        found = detect(self._frame(identifier), self._finder)
+        return any(self._finder.classes[int(label)] in VEHICLE_CLASSES for label in found.labels)
 
     def scene(self, identifier: str) -> SceneIR:
-        from scene_ir.derender.derender import derender
+        from drivesem.scenes.label_free import detect, label_free
 
-        return derender(self._frame(), self._settings)
+        frame = self._frame(identifier)
+        frame = label_free(frame, detect(frame, self._finder), self._finder.classes)
+        return _taken_apart(frame, self._settings, self._kept)
 
-    def _frame(self) -> Frame:
-        from drivesem.scenes.label_free import detect, label_free, photograph
+    def _frame(self, identifier: str) -> Frame:
+        from drivesem.data.photographs import photograph
 
-        frame = photograph(self._path, self.focal.length_px if self.focal.source == "given" else None)
-        return label_free(frame, detect(frame))
+        return photograph(self._paths[identifier], self._focal_px)
+
+
+class SceneFolders:
+    """Scenes that were taken apart before, one folder or all below one, as they were photographed. Raises
+    FormatError where there is none.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._folders = scene_folders(root)
+
+    def identifiers(self) -> Iterator[str]:
+        return iter(self._folders)
+
+    def has_vehicles(self, identifier: str) -> bool:
+        from scene_ir.io import count_objects
+
+        return count_objects(self._folders[identifier]) > 0
+
+    def scene(self, identifier: str) -> SceneIR:
+        from scene_ir.io import load_scene
+
+        return load_scene(self._folders[identifier]).as_photographed()
+
+
+def scene_folders(root: Path) -> dict[str, Path]:
+    """The scenes that a folder is or holds, by name. FormatError where there is none."""
+    records = [root / _RECORD] if (root / _RECORD).is_file() else sorted(root.rglob(_RECORD))
+    # a scene whose vehicles were exchanged holds the one before
+    records = [record for record in records if record.parent.name != _BEFORE]
+    if not records:
+        raise FormatError(str(root), f"a scene of drivesem derender ({_RECORD}), or folders of some", "none")
+    folders = {_named(record.parent, root): record.parent for record in records}
+    if len(folders) < len(records):
+        raise FormatError(str(root), "scenes with names of their own", "two alike")
+    return folders
+
+
+def _named(folder: Path, root: Path) -> str:
+    """What a scene is called: its folder's name, as far as it says something."""
+    parts = [part for part in folder.relative_to(root).parts if part not in ("frames", "scene")]
+    return "_".join(parts) or folder.resolve().name
+
+
+def placed(frame: Frame, settings: DerenderSettings) -> tuple[Frame, DerenderSettings]:
+    """A labelled frame as it can be taken apart, and how: its vehicles are placed where only their 2D boxes are
+    known.
+    """
+    from drivesem.data.classes import vehicle_count
+    from drivesem.scenes.label_free import LABELLED, has_places, placed_by_boxes
+
+    if frame.labels is None or has_places(frame.labels) or not vehicle_count(frame.labels):
+        return frame, settings
+    return placed_by_boxes(frame), replace(settings, fitting=LABELLED)
+
+
+def _taken_apart(frame: Frame, settings: DerenderSettings, kept: KeptScenes | None) -> SceneIR:
+    from scene_ir.derender.derender import derender
+
+    make = partial(derender, frame, settings)
+    return make() if kept is None else kept.scene((frame, settings), make)
+
+
+def _finder(config: Scenes) -> Predictor:
+    """What finds vehicles in photographs without labels."""
+    from detectors.base import DetectorError
+    from detectors.registry import load_predictor
+
+    try:
+        return load_predictor(config.finder)
+    except DetectorError as error:
+        raise UsageError("--finder", "a detector", error) from error
 
 
 def derender_settings(
@@ -127,7 +222,7 @@ def derender_settings(
     from scene_ir.derender.derender import DerenderSettings
     from scene_ir.derender.silhouette import OwnMesh
 
-    settings = DerenderSettings(fit=fit)
+    settings = DerenderSettings() if fit else DerenderSettings.fast()
     if segmenter is not None:
         from drivesem.scenes.segmenter import OnnxSegmenter
 
@@ -152,15 +247,21 @@ def _kept_scenes(config: Scenes) -> KeptScenes | None:
         return None
     from drivesem.scenes.kept import KeptScenes
 
-    return KeptScenes(Path(config.cache), config.cache_gb)
+    kept = KeptScenes(Path(config.cache), config.cache_gb)
+    kept.make_room()  # the limit may be lower than the last command's, and this one may add nothing
+    return kept
 
 
 def open_source(config: Scenes) -> SceneSource:
     """The source that the configuration names. Raises SceneError for an unknown or unreadable data set."""
     if isinstance(config, Derender) and config.photo is not None:
-        return PlainPhotograph(Path(config.photo), config)
+        return Photographs(Path(config.photo), config)
     if config.dataset == DEMO:
         return DemoSource(config.seed, config.limit or DEMO_SCENES)
+    if config.dataset == PHOTOGRAPHS:
+        return Photographs(place(config.root or ""), config)
+    if config.dataset == SCENES:
+        return SceneFolders(place(config.root or ""))
     return PhotographSource(config)
 
 

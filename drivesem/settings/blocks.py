@@ -44,9 +44,14 @@ LabelMode = Literal["moved", "paper"]
 DEMO = "demo"
 DATASETS = ("kitti", "vkitti1", "vkitti2", "coco", "yolo")
 """The readers of `drivesem.data.registry`."""
-SOURCES = (DEMO, *DATASETS)
-"""What --dataset takes: the embedded scenes, and the readers."""
+PHOTOGRAPHS, SCENES = "photographs", "scenes"
+SOURCES = (DEMO, *DATASETS, PHOTOGRAPHS, SCENES)
+"""What --dataset takes: the embedded scenes, the readers, photographs without labels, and scenes' folders."""
+NO_CAMERA = ("coco", "yolo", PHOTOGRAPHS)
+"""Where photographs need not tell their cameras."""
 
+FINDER = "squeezedet"
+"""Who finds vehicles in photographs without labels."""
 CERTIFYING_DRAWS = 16
 """What the rule of certificates needs at least (`truth.certificate`)."""
 KEEP_MB = 800.0
@@ -174,9 +179,11 @@ class DataSource(Seed, Limit):
     """Frames: the embedded scenes, or a data set's."""
 
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo."""
+    """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo; photographs (without labels);
+    scenes (of drivesem derender)."""
     root: Place = None
-    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib, or its URL."""
+    """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib, or its URL; one photograph
+    or a folder of them; one scene or a folder of them."""
 
     def check(self) -> None:
         super().check()
@@ -196,11 +203,25 @@ class Scenes(DataSource):
     """A folder that keeps photographs as they were taken apart, for the next attack on them."""
     cache_gb: Annotated[float, Within(0, ends="()", expected="a number above 0")] = 4.0
     """How large --cache may grow; what was not asked for longest goes first."""
+    focal: Annotated[float, Within(0, ends="()", expected="positive px")] | None = None
+    """Focal length, px, of photographs that do not tell their camera (photographs, coco, yolo); by default EXIF's,
+    or 0.58 of the longer side."""
+    finder: str = FINDER
+    """Of --dataset photographs: the detector that finds the vehicles, shipped or a file."""
 
     def check(self) -> None:
         super().check()
-        useless = self.cache is not None and self.dataset == DEMO
-        refuse(useless, "--cache", "a --dataset of photographs beside it", f"--dataset {DEMO}")
+        beside = f"--dataset {self.dataset}"
+        useless = self.cache is not None and self.dataset in (DEMO, SCENES)
+        refuse(useless, "--cache", "a --dataset of photographs beside it", beside)
+        self._check_photographs(beside)
+
+    def _check_photographs(self, beside: str) -> None:
+        known = self.focal is not None and self.dataset not in NO_CAMERA
+        refuse(known, "--focal", f"--dataset {', '.join(NO_CAMERA)}", beside)
+        refuse(
+            self.finder != FINDER and self.dataset != PHOTOGRAPHS, "--finder", f"--dataset {PHOTOGRAPHS}", beside
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,8 @@ from drivesem.settings.blocks import (
     CERTIFYING_DRAWS,
     DATASETS,
     DEMO,
+    FINDER,
+    SCENES,
     Asking,
     Attacking,
     Bootstrap,
@@ -231,9 +233,10 @@ class Derender(Scenes, FrameCommand):
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
-    """A photograph without labels: vehicles are found by the shipped detector and placed by a small network."""
-    focal: Annotated[float, Within(0, ends="()", expected="positive px")] | None = None
-    """Focal length of PHOTO in px; by default EXIF's, or 0.58 of its longer side."""
+    """A photograph without labels, or a folder of them: vehicles are found by a detector and placed by a small
+    network."""
+    finder: Annotated[str, tyro.conf.arg(aliases=["--detector"])] = FINDER
+    """Of PHOTO, and of --dataset photographs: the detector that finds the vehicles, shipped or a file."""
     velodyne: Flag = False
     """Read the laser's points too (KITTI, where a frame has them)."""
     fit: bool = True
@@ -253,13 +256,17 @@ class Derender(Scenes, FrameCommand):
         alone, beside = self.photo is None, f"--dataset {self.dataset}"
         demo = self.dataset == DEMO
         refuse(not alone and not demo, "PHOTO", "no --dataset beside it", beside)
-        refuse(self.focal is not None and alone, "--focal", "a PHOTO beside it", "none")
         photographs = "a PHOTO or a --dataset of photographs beside it"
         refuse(self.meshes is not None and alone and demo, "--meshes", photographs, beside)
         refuse(self.segmenter is not None and alone and demo, "--segmenter", photographs, beside)
         refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti beside it", beside)
         refuse(self.device != "cpu", "--device", "cpu", self.device)
         refuse(self.cache is not None, "--cache", "none: scenes are what is written", self.cache)
+        refuse(self.dataset == SCENES, "--dataset", "photographs to take apart", beside)
+
+    def _check_photographs(self, beside: str) -> None:
+        if self.photo is None:
+            super()._check_photographs(beside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,6 +319,8 @@ class Holes(Trust, FrameCommand):
     """States around each failure, within what the run could change; each is seen once, with nuisances."""
     fresh: Count = 32
     """Further ones inside of the rule that was found, which it is held against."""
+    contrast: NotNegative = 4
+    """States of every frame in which all objects change: they say where none is lost, for rules of many."""
     recheck: Count | None = None
     """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
     reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
@@ -598,6 +607,15 @@ class Bench(Regions, Scenes, FrameCommand):
     """Climb and planted: what attacks may move, with commas."""
     faults: Count | None = None
     """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    budget: str = "paper"
+    """Planted: how far attacks may go (drivesem attack --budget)."""
+    across: Count | None = None
+    """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
+    many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    each: Count = 1
+    """Planted, with --across: so many faults of each kind."""
+    searched: NotNegative | None = None
+    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
     naming: str | None = None
     """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
     whether that is the fault; the same of the detector without a fault."""
@@ -612,6 +630,12 @@ class Bench(Regions, Scenes, FrameCommand):
     def check(self) -> None:
         super().check()
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
+        refuse(
+            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
+        )
+        refuse(
+            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
+        )
         only = "--dataset demo, but for bench planted and bench night"
         refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)
 
@@ -753,13 +777,16 @@ class Check(Tiles, Device, Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Command):
-    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, and say what is lost."""
+    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, or to FiftyOne, and say what is lost."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file."""
+    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or
+    the counterexamples of a run of drivesem attack."""
     out: Annotated[str, tyro.conf.arg(aliases=["-o"])]
     """Folder to write, new or empty; or a .json file for COCO."""
-    to_format: Annotated[Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2"], tyro.conf.arg(aliases=["--to"])]
+    to_format: Annotated[
+        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone"], tyro.conf.arg(aliases=["--to"])
+    ]
     """Layout to write."""
     from_format: Annotated[
         Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"], tyro.conf.arg(aliases=["--from"])
@@ -772,9 +799,30 @@ class Convert(Command):
     image_size: str | None = None
     """WIDTHxHEIGHT of all images, px, instead of looking at them."""
     copy_images: Flag = False
-    """Also copy the images into the new layout (KITTI, COCO and YOLO)."""
+    """Also copy the images into the new layout."""
     map: Annotated[str, Parsed(class_map)] | None = None
     """Classes by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Hand a run's counterexamples on: as training data with moved labels, as tables, or as 3D files."""
+
+    run: Run = None
+    """Folder of a run of drivesem attack; for gltf also a scene of drivesem derender, or a folder of some."""
+    out: Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])] = None
+    """Folder to write, new or empty."""
+    to_format: Annotated[
+        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone", "tables", "gltf"],
+        tyro.conf.arg(aliases=["--to"]),
+    ]
+    """kitti, coco, yolo, vkitti1, vkitti2, fiftyone: a data set with its images, and where each is from; coco also
+    holds what the detector found. tables: frames, failures and parameters as CSV, and as Parquet where pyarrow is
+    there. gltf: vehicles and surroundings in 3D, textured by the photograph."""
+    grade: Literal["all", "threshold", "certain", "confirmed", "shared"] = "threshold"
+    """Frames with a failure of at least this grade (docs/grades.md); all: also those that withstood."""
+    map: Annotated[str, Parsed(class_map)] | None = None
+    """Classes by name, with commas: Car=car,Truck=truck; Truck=- leaves a class out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -956,6 +1004,16 @@ class Classify(FrameCommand):
         refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Command):
+    """Say what is installed, which optional parts work, what each missing one would give, and how to get it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Presets(Command):
+    """List the presets that --config takes by name."""
+
+
 _ALL: tuple[type[Command], ...] = (
     *(
         Attack,
@@ -974,7 +1032,8 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Check, Anchors, Train, Retrain, Classify),
+    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
+    *(Classify, Doctor, Presets),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""

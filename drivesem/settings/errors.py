@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from scene_ir.errors import shown
+
 
 class UsageError(ValueError):
     """A setting that cannot be. The message is one line: setting, expected, found."""
@@ -10,7 +12,7 @@ class UsageError(ValueError):
         self.field = field
         self.expected = expected
         self.actual = str(actual)
-        super().__init__(f"{field}: expected {expected}, found {actual}")
+        super().__init__(f"{shown(field)}: expected {shown(expected)}, found {shown(actual)}")
 
     def __reduce__(self) -> tuple[type[UsageError], tuple[str, str, str]]:
         """As processes hand errors to one another."""

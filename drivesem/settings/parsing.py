@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import tyro
 
@@ -19,11 +19,14 @@ from drivesem import __version__
 from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
+from drivesem.settings.help import command_help, overview
+from drivesem.settings.presets import preset_path, presets
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
-_ANY = f"one of {', '.join(COMMANDS)}"
+_ANY = f"one of {', '.join(COMMANDS)} (drivesem alone says what each does)"
+_HELP = ("--help", "-h")
 _FOR = "for"
 """Key of a preset: the commands that it is for. A setting that only some of them have is left out for others."""
 
@@ -31,10 +34,14 @@ _FOR = "for"
 def parse(argv: Sequence[str]) -> Command:
     """The settings that `argv` asks for. Raises UsageError; SystemExit(0) after `--help` and `--version`."""
     words = list(argv)
-    if not words:
-        raise UsageError("command", _ANY, "none; drivesem --help says what each does")
+    if not words or words[0] in _HELP:
+        sys.stdout.write(overview())
+        raise SystemExit(0)
     if words[0] == "--version":
         sys.stdout.write(f"drivesem {__version__}\n")
+        raise SystemExit(0)
+    if words[0] in COMMANDS and any(word in _HELP for word in words[1:]):
+        sys.stdout.write(command_help(words[0]))
         raise SystemExit(0)
     if words[0] in COMMANDS:
         words = [words[0], *_with_presets(words[0], _with_run(words[0], words[1:]))]
@@ -62,11 +69,19 @@ def _refuse_unknown(words: Sequence[str]) -> None:
     settings = fields(COMMANDS[words[0]])
     known = {"--help", *(option(field.name) for field in settings)}
     known |= {option(f"no-{field.name}") for field in settings if str(field.type) == "bool"}
+    known |= _aliases(words[0])
     for word in words[1:]:
         name = word.partition("=")[0]
         if name.startswith("--") and name.replace("_", "-") not in known:
             expected = f"an option of drivesem {words[0]} (its --help lists them)"
             raise UsageError("command line", expected, _meant(name, known))
+
+
+def _aliases(command: str) -> set[str]:
+    """Other names of a command's options."""
+    kinds = get_type_hints(COMMANDS[command], include_extras=True).values()
+    markers = (marker for kind in kinds for marker in getattr(kind, "__metadata__", ()))
+    return {name for marker in markers for name in getattr(marker, "aliases", None) or ()}
 
 
 def _refused(command: str, text: str) -> UsageError:
@@ -97,16 +112,18 @@ def _with_run(command: str, words: list[str]) -> list[str]:
 
 def _with_presets(command: str, words: list[str]) -> list[str]:
     """Replace `--config FILE` by the file's settings, in front, so that the command line wins."""
-    presets: list[str] = []
+    named: list[str] = []
     rest: list[str] = []
     left = list(words)
     while left:
         word, equals, path = left.pop(0).partition("=")
         if word == "--config" and (equals or left):
-            presets += preset_words(path or left.pop(0), command)
+            named += preset_words(path or left.pop(0), command)
+        elif word == "--config":
+            raise UsageError("--config", _presets_for(command), "nothing")
         else:
             rest.append(f"{word}{equals}{path}")
-    return presets + rest
+    return named + rest
 
 
 def _unboxed(text: str) -> str:
@@ -122,6 +139,9 @@ def preset_words(path: str, command: str) -> list[str]:
 
     Raises UsageError naming the file, and the key where there is one.
     """
+    given, path = path, preset_path(path)
+    if not Path(path).is_file():
+        raise UsageError("--config", _presets_for(command), given)
     loaded = _mapping(path)
     wanted = loaded.pop(_FOR, command)
     commands = wanted if isinstance(wanted, list) else [wanted]
@@ -139,6 +159,18 @@ def preset_words(path: str, command: str) -> list[str]:
         if name in own:
             words += _words(path, own[name], value)
     return words
+
+
+def commands_of(path: str) -> list[str]:
+    """The commands that a preset is for; none where it does not say. Raises UsageError where it cannot be read."""
+    wanted = _mapping(path).get(_FOR, [])
+    return [str(name) for name in wanted] if isinstance(wanted, list) else [str(wanted)]
+
+
+def _presets_for(command: str) -> str:
+    """What --config takes."""
+    names = [name for name, path in presets().items() if command in commands_of(str(path))]
+    return "a YAML file" + (f", or a preset: {', '.join(names)}" if names else "")
 
 
 def _mapping(path: str) -> dict[Any, Any]:

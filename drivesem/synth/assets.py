@@ -503,13 +503,10 @@ def skies_in(folder: str | Path) -> tuple[Sky, ...]:
 def _skies(found: tuple[tuple[Path, int], ...]) -> tuple[Sky, ...]:
     skies = []
     for path, _ in found:
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                pixels = arrays["pixels"].astype(np.float32)
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise FormatError(str(path), "a sky with `pixels`", reason) from None
-        skies.append(measured(path.stem, pixels))
+        arrays = files.read_npz(path)
+        if "pixels" not in arrays or arrays["pixels"].dtype.kind not in "fiu":
+            raise FormatError(str(path), "a sky with `pixels`", ", ".join(arrays) or "nothing")
+        skies.append(measured(path.stem, arrays["pixels"].astype(np.float32)))
     return tuple(skies)
 
 

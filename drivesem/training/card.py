@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from detectors.base import Detector
 from drivesem.attack.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores
 from drivesem.training.judging import Marks
 from drivesem.training.targets import TRAINED
+from scene_ir import files
 
 _CARD = """# {title}
 
 - Architecture: {name}, {parameters:,} parameters; classes {classes}.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project.
+  SHA-256: `{sha256}`
 - Start: {start}
 - Data: {data}
   Vans count as Car. Objects lower than {minimum:g} px or of unknown occlusion were ignored.
@@ -57,19 +60,22 @@ class Recipe:
 def card(
     detector: Detector,
     recipe: Recipe,
-    file: str,
+    weights: Path,
     done: tuple[int, float],
     held_out: tuple[int, Marks] | None,
     also: tuple[int, ClassScores] | None,
 ) -> str:
-    """The card as Markdown. done: steps and seconds; held_out, also: how many frames, and their figures."""
+    """The card as Markdown. weights: their file, written; done: steps and seconds; held_out, also: how many
+    frames, and their figures.
+    """
     step, seconds = done
     return _CARD.format(
         title=f"{detector.name}: weights and how they were made",
         name=detector.name,
         parameters=sum(p.numel() for p in detector.parameters()),
         classes=", ".join(detector.classes),
-        file=file,
+        file=weights.name,
+        sha256=files.digest(weights),
         start=recipe.start,
         data=recipe.data,
         minimum=TRAINED.min_height_px,

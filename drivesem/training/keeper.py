@@ -98,7 +98,7 @@ class Keeper:
         told = None if marks is None else (len(self.wanted), marks)
         files.write_text(
             self.weights.with_suffix(".md"),
-            card(detector, self.recipe, self.weights.name, (step, seconds), told, also),
+            card(detector, self.recipe, self.weights, (step, seconds), told, also),
         )
         self.tell(f"step {step}: wrote {self.weights}")
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from detectors.base import Detector
 from detectors.registry import save_detector
@@ -19,6 +18,7 @@ from drivesem.attack.labels import LabelMode
 from drivesem.data.registry import open_dataset
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
 from drivesem.report.tables import Sheet, csv_text, percent
+from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker, attack_frames
 from drivesem.run.folder import SHARING, claim, trusted_attack
 from drivesem.run.frame import as_targets

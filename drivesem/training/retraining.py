@@ -6,8 +6,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from detectors.augment import AugmentSettings
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
@@ -16,6 +14,7 @@ from detectors.training import Sample, TrainingSettings, train
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
 from drivesem.report.progress import training_bar
+from drivesem.report.terminal import Console
 from drivesem.settings.commands import Retrain
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import interval, size_hw

@@ -9,14 +9,8 @@ import torch
 
 from detectors.types import CLASSES, Targets
 from drivesem.attack.labels import Difficulty
-from drivesem.data.classes import KITTI, ClassMap
-from drivesem.data.coco import COCO_ROAD_USERS
+from drivesem.data.classes import ROAD_USERS
 from scene_ir.types import Labels
-
-ROAD_USERS = ClassMap(
-    classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
-)
-"""KITTI's types and COCO's classes: they differ in letter case at least."""
 
 OCCLUSION_UNKNOWN = 3
 """KITTI's code for it."""
@@ -33,7 +27,10 @@ def suited(difficulty: Difficulty, labels: Iterable[Labels]) -> Difficulty:
 
 
 def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
-    """Targets among `classes`; too hard objects and regions are ignored, objects of other classes left out."""
+    """Targets among `classes`; too hard objects and regions are ignored, objects of other classes left out.
+    So are types that are no road users: they are background.
+    """
+    labels = ROAD_USERS.known(labels)
     targets = ROAD_USERS.targets(labels)
     ignore = targets.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
@@ -44,8 +41,9 @@ def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[s
 
 def judged_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
     """What is judged, with labels among `classes`. Too hard objects, those of other classes, and regions are
-    ignored, for each of the classes.
+    ignored, for each of the classes. Types that are no road users are background.
     """
+    labels = ROAD_USERS.known(labels)
     named = ROAD_USERS.targets(labels)
     ignore = named.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)

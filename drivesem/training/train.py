@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from torch import distributed
 
 from detectors.augment import AugmentSettings
@@ -22,6 +21,7 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
 from drivesem.report.progress import training_bar
+from drivesem.report.terminal import Console
 from drivesem.run.folder import SHARING, claim
 from drivesem.run.workers import mapping
 from drivesem.settings.commands import SYNTH, Train
@@ -186,6 +186,7 @@ def _data(
     if rank > 0:
         distributed.barrier()
     name, root, held_out = _folders(config, out, rank, console)
+    _warn_of_shared(config, console)
     frames = _store(config, name, root, out / CACHES / "train", detector, console)
     if frames.objects() == 0:
         raise UsageError(str(root), f"frames with objects of {', '.join(detector.classes)}", "none")
@@ -199,6 +200,15 @@ def _data(
     if rank == 0 and distributed.is_initialized():
         distributed.barrier()
     return frames, judged
+
+
+def _warn_of_shared(config: Train, console: Console) -> None:
+    """Say where frames to judge by are among those that are trained on."""
+    trained = {Path(part).resolve() for part in (config.root or "").split(",") if part}
+    judged = [part for part in (config.held_out or "").split(",") if part and Path(part).resolve() in trained]
+    for part in judged:
+        told = f"--held-out: {part} is trained on too: its figures, and t*, say nothing of other pictures"
+        console.print(told, soft_wrap=True, markup=False, highlight=False)
 
 
 def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:

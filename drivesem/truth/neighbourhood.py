@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,12 +18,16 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.unit_box import UnitBox
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import SPECS, Parameter
-from drivesem.truth.certificate import Camera, Exposure, margin_of
+from drivesem.truth.certificate import Camera, Exposure, Look, margin_of
 from drivesem.truth.kinds import Fault, Kind
 from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.redraw.compositor import CompositorDraw
 from drivesem.truth.rules import Floats
+from drivesem.truth.views import DrawnViews
 from scene_ir.types import SceneIR
+
+if TYPE_CHECKING:
+    from scipy.stats.qmc import QMCEngine
 
 SEEN: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast")
 """Features of the object's label and of the picture in it, see `detectors.planted.FEATURES`."""
@@ -66,11 +72,7 @@ class Neighbourhood:
         self._span = reach * (objective.space.upper - objective.space.lower)
         renderer = CompositorDraw(objective.compositor, objective.labeller)
         self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"hole:{name}")
-        from scipy.stats import qmc  # on use: it takes a third of a second to load
-
-        self._sequence = qmc.Halton(
-            len(self._own), scramble=True, rng=np.random.default_rng(zlib.crc32(name.encode()))
-        )
+        self._sequence = _halton(len(self._own), name)
         self._places: list[Floats] = []
 
     def sample(self, number: int, part: float = 1.0) -> Sample | None:
@@ -84,13 +86,11 @@ class Neighbourhood:
         exposure = self._camera.expose(scene, draw, ignore)
         if bool(exposure.targets.ignore[self.index]):
             return None
-        return Sample(exposure, self._features(scene, exposure))
+        return Sample(exposure, described(self._objective, scene, exposure, self.index))
 
     def place(self, number: int) -> Floats:
         """Of the number-th state, (d,) in the unit cube: Halton's."""
-        while len(self._places) <= number:
-            self._places.append(self._sequence.random(1)[0])
-        return self._places[number]
+        return _nth(self._places, self._sequence, number)
 
     def theta(self, number: int, part: float = 1.0) -> Tensor:
         """Of the number-th state (D,), feasible. part: of the reach, in which states lie closer together."""
@@ -110,39 +110,102 @@ class Neighbourhood:
         """Another detector in the place of the objective's, which sees the same pictures."""
         return replace(self._camera, detector=detector, t_star=t_star)
 
+    def look(self, sample: Sample, camera: Camera | None = None) -> Look:
+        """What the objective's detector, or another camera's, makes of a sample. Costs a pass."""
+        return (camera or self._camera).see(sample.exposure)
+
     def fails(self, sample: Sample, camera: Camera | None = None) -> bool:
-        """Whether the object is not found, by the objective's detector, or another camera's. Costs a pass."""
-        camera = camera or self._camera
-        return not bool(camera.see(sample.exposure).judged.found[self.index])
+        """Whether the object is not found, by either. Costs a pass."""
+        return not bool(self.look(sample, camera).judged.found[self.index])
 
     def margin(self, sample: Sample) -> float:
         """How far the object is from being lost, in logits beyond t*: below 0 where it is. Costs a pass."""
-        look = self._camera.see(sample.exposure)
-        beyond = margin_of(Fault(Kind.MISSED, self.index, -1), torch.zeros(4), look)
-        assert beyond is not None
-        # A detection that meets two objects is one's alone: then what is best placed is not what is found.
-        return max(beyond, _LEAST) if bool(look.judged.found[self.index]) else min(beyond, -_LEAST)
+        return margin_in(self._camera.see(sample.exposure), self.index)
 
-    def _features(self, scene: SceneIR, exposure: Exposure) -> dict[str, float]:
-        i, objects, environment = self.index, scene.objects, scene.environment
-        box = exposure.targets.boxes_xyxy[None, i : i + 1]
-        seen = features_of(exposure.picture[None], box.to(exposure.picture), SEEN)[:, 0, 0].tolist()
-        found: dict[str, float] = dict(zip(SEEN, seen, strict=True))
-        found["distance_m"] = float(objects.translation[i, 2])
-        found["yaw_deg"] = math.degrees(math.remainder(float(objects.yaw[i]), 2 * math.pi))
-        codes = {
-            Parameter.COLOR: objects.texture_code[i],
-            Parameter.WEATHER: environment.weather,
-            Parameter.FOLIAGE: environment.foliage,
-            Parameter.SUN: environment.light,
-        }
-        for parameter, values in codes.items():
-            if parameter in self._objective.space.params:
-                found |= dict(zip(SPECS[parameter].names, values.tolist(), strict=True))
-        if Parameter.TRANSLATE in self._objective.space.params:
-            still = self._objective.space.scene.objects.translation[i]
-            found["moved_m"] = float((objects.translation[i] - still).norm())
-        if Parameter.SIZE in self._objective.space.params:
-            still = self._objective.space.scene.objects.size_lhw[i]
-            found["grown_percent"] = 100 * float((objects.size_lhw[i] / still).mean() - 1)
-        return found
+
+class Everywhere:
+    """All objects of a scene, each anywhere within the bounds: one pass tells of all of them.
+
+    name: of the states and their draws, which follow from it and their number alone. judged: objects found as
+    photographed, whose losses count.
+    """
+
+    def __init__(self, objective: Objective, feasible: FeasibleSet, nuisances: Nuisances, name: str) -> None:
+        self._objective, self._feasible = objective, feasible
+        self._box = UnitBox(objective.problem(feasible), objective.space.theta0)
+        renderer = CompositorDraw(objective.compositor, objective.labeller)
+        self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"everywhere:{name}")
+        self.judged = DrawnViews.of(objective, nuisances, name).judged.nonzero()[:, 0].tolist()
+        self._sequence = _halton(len(self._box.owner), name)
+        self._places: list[Floats] = []
+
+    def theta(self, number: int) -> Tensor:
+        """Of the number-th state (D,), feasible."""
+        place = torch.from_numpy(_nth(self._places, self._sequence, number))
+        return self._feasible.project(self._box.theta(place.to(self._box.start))).theta
+
+    def sample(self, number: int) -> dict[int, Sample]:
+        """The number-th state, by those judged objects that count there. No detector is asked."""
+        return self.sample_of(self.theta(number), number)
+
+    def sample_of(self, theta: Tensor, draw: int) -> dict[int, Sample]:
+        """The same of a feasible theta (D,), in a draw by its number."""
+        scene = self._objective.space.apply(self._objective.space.scene, theta)
+        exposure = self._camera.expose(scene, draw, torch.zeros(len(scene.objects), dtype=torch.bool))
+        counts = [index for index in self.judged if not bool(exposure.targets.ignore[index])]
+        return {index: Sample(exposure, described(self._objective, scene, exposure, index)) for index in counts}
+
+    def margins(self, samples: Mapping[int, Sample]) -> dict[int, float]:
+        """How far each object of one state is from being lost, see `Neighbourhood.margin`. Costs a pass, if there
+        is an object.
+        """
+        if not samples:
+            return {}
+        look = self._camera.see(next(iter(samples.values())).exposure)
+        return {index: margin_in(look, index) for index in samples}
+
+
+def margin_in(look: Look, index: int) -> float:
+    """How far an object is from being lost in a look, in logits beyond t*: below 0 where it is not found."""
+    beyond = margin_of(Fault(Kind.MISSED, index, -1), torch.zeros(4), look)
+    assert beyond is not None
+    # A detection that meets two objects is one's alone: then what is best placed is not what is found.
+    return max(beyond, _LEAST) if bool(look.judged.found[index]) else min(beyond, -_LEAST)
+
+
+def described(objective: Objective, scene: SceneIR, exposure: Exposure, index: int) -> dict[str, float]:
+    """Features by name of an object of a scene, of which a picture was taken."""
+    objects, environment, space = scene.objects, scene.environment, objective.space
+    box = exposure.targets.boxes_xyxy[None, index : index + 1]
+    seen = features_of(exposure.picture[None], box.to(exposure.picture), SEEN)[:, 0, 0].tolist()
+    found: dict[str, float] = dict(zip(SEEN, seen, strict=True))
+    found["distance_m"] = float(objects.translation[index, 2])
+    found["yaw_deg"] = math.degrees(math.remainder(float(objects.yaw[index]), 2 * math.pi))
+    codes = {
+        Parameter.COLOR: objects.texture_code[index],
+        Parameter.WEATHER: environment.weather,
+        Parameter.FOLIAGE: environment.foliage,
+        Parameter.SUN: environment.light,
+    }
+    for parameter, values in codes.items():
+        if parameter in space.params:
+            found |= dict(zip(SPECS[parameter].names, values.tolist(), strict=True))
+    if Parameter.TRANSLATE in space.params:
+        found["moved_m"] = float((objects.translation[index] - space.scene.objects.translation[index]).norm())
+    if Parameter.SIZE in space.params:
+        still = space.scene.objects.size_lhw[index]
+        found["grown_percent"] = 100 * float((objects.size_lhw[index] / still).mean() - 1)
+    return found
+
+
+def _halton(dimensions: int, name: str) -> QMCEngine:
+    from scipy.stats import qmc  # on use: it takes a third of a second to load
+
+    return qmc.Halton(dimensions, scramble=True, rng=np.random.default_rng(zlib.crc32(name.encode())))
+
+
+def _nth(known: list[Floats], sequence: QMCEngine, number: int) -> Floats:
+    """The number-th place of a sequence, of which some are known."""
+    while len(known) <= number:
+        known.append(sequence.random(1)[0])
+    return known[number]

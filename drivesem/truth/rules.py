@@ -11,13 +11,23 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Where = dict[str, tuple[float, float]]
+"""Intervals by feature."""
 
 MOST = 2
 """Features of a rule: of three, no person keeps track."""
-_CUTS = 48
-"""Ends of intervals that are tried, at most: quantiles of the samples."""
-_SUPPORT, _FEWEST = 0.05, 5
-"""Of the samples, so large a share, and so many, lie inside an interval and outside of it."""
+SUPPORT = 0.05
+"""Of the samples around one failure, so large a share lies inside an interval and outside of it."""
+_CUTS, _FEWEST = 48, 5
+"""Ends of intervals that are tried, at most, half of them quantiles of the samples that fail; samples inside of an
+interval and outside of it, at least."""
+_FOLDS, _OBJECTS = 5, 3
+"""Of a pooled rule: parts of the objects, each of which is told by the rule of the others; objects, at least,
+whose failures lie inside."""
+_BEYOND_CHANCE = 1.0
+"""Standard errors, over objects, by which such a rule tells failures of objects that it was not made of."""
+_RULES = 8
+"""Pooled rules, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +36,7 @@ class Rule:
     the samples inside; fails_outside, count_outside: of the others.
     """
 
-    where: dict[str, tuple[float, float]]
+    where: Where
     fails: int
     count: int
     fails_outside: int = 0
@@ -46,29 +56,118 @@ def in_words(where: Mapping[str, tuple[float, float]]) -> str:
     return ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in where.items()) or "anywhere"
 
 
-def fit(features: Mapping[str, Floats], fails: Flags, most: int = MOST, only: Sequence[str] | None = None) -> Rule:
-    """The rule with the highest likelihood, of two shares of failures, one inside and one outside. features: (n,)
-    by name; fails: (n,). only: features that it may ask for.
+def fit(
+    features: Mapping[str, Floats],
+    fails: Flags,
+    most: int = MOST,
+    only: Sequence[str] | None = None,
+    support: float = SUPPORT,
+) -> Rule:
+    """The rule with the shortest description, of two shares of failures, one inside and one outside. features:
+    (n,) by name; fails: (n,). only: features that it may ask for; support: share of the samples inside, at least.
 
     An interval must be worth what it takes to write it down (minimum description length): half a logarithm of the
-    samples for its share, one for each bound, which may lie at any of them, and the choice among features.
+    samples for its share, the choice among the ends that are tried for each bound, and that among features. Each
+    feature is tried as the first.
     """
     names = [name for name in (features if only is None else only) if float(np.ptp(features[name])) > 0]
-    where: dict[str, tuple[float, float]] = {}
+    best: Where = {}
+    least = description(best, features, fails)
+    for first in names:
+        where = _grown(features, fails, first, names, most, support)
+        length = description(where, features, fails) + len(where) * math.log(len(names))
+        if where and length < least:
+            best, least = where, length
+    return counted(best, features, fails)
+
+
+def _grown(
+    features: Mapping[str, Floats], fails: Flags, first: str, names: Sequence[str], most: int, support: float
+) -> Where:
+    """The best rule that begins with a feature; empty where none of its intervals tells anything."""
+    everything = np.ones(len(fails), np.bool_)
+    found = _best(features, fails, [first], everything, support)
+    if found is None:
+        return {}
+    where: Where = dict([found])
     while len(where) < most:
-        inside = contains(where, features, len(fails))
         left = [name for name in names if name not in where]
-        found = _best(features, fails, left, inside)
+        found = _best(features, fails, left, contains(where, features, len(fails)), support, len(names))
         if found is None:
             break
         where[found[0]] = found[1]
-        if len(where) > 1:  # the first, in the light of the second
-            first = next(iter(where))
-            rest = {name: where[name] for name in where if name != first}
-            again = _best(features, fails, [first], contains(rest, features, len(fails)))
-            if again is not None:
-                where[first] = again[1]
-    return counted(where, features, fails)
+        rest = {name: where[name] for name in where if name != first}  # the first, in the light of the second
+        again = _best(features, fails, [first], contains(rest, features, len(fails)), support)
+        if again is not None:
+            where[first] = again[1]
+    return where
+
+
+def description(
+    where: Mapping[str, tuple[float, float]],
+    features: Mapping[str, Floats],
+    fails: Flags,
+    bounds: int | None = None,
+) -> float:
+    """What it takes to say which samples fail, given a rule, and the rule's shares and bounds, in nats. bounds:
+    how many there are to write, by default all but those at the ends of all samples.
+    """
+    rule, n = counted(where, features, fails), len(fails)
+    inside, outside = (rule.fails, rule.count), (rule.fails_outside, rule.count_outside)
+    told = sum(float(_likelihood(*side)) for side in (inside, outside))
+    shares = 0.5 * sum(count > 0 for _, count in (inside, outside))
+    if bounds is None:
+        bounds = sum(
+            int(low > features[name].min()) + int(high < features[name].max())
+            for name, (low, high) in where.items()
+        )
+    return shares * math.log(max(n, 2)) + bounds * _bound(n) - told
+
+
+def cover(features: Mapping[str, Floats], fails: Flags, objects: NDArray[np.int64]) -> list[Rule]:
+    """Rules of samples of many objects, the one that tells most first; each is made of what those before it leave.
+
+    objects: (n,), of which each sample is. A rule must cover failures of several objects, and tell those of
+    objects that it was not made of better than no rule does: samples of one object are much alike, and by them
+    alone anything may seem to tell.
+    """
+    left = np.ones(len(fails), np.bool_)
+    rules: list[Rule] = []
+    while len(rules) < _RULES and bool(fails[left].any()):
+        some = {name: values[left] for name, values in features.items()}
+        rule = fit(some, fails[left], support=0.0)
+        inside = contains(rule.where, some, int(left.sum()))
+        covered = len(np.unique(objects[left][inside & fails[left]]))
+        if not rule.where or covered < _OBJECTS or not _tells_others(some, fails[left], objects[left]):
+            break
+        rules.append(rule)
+        left &= ~contains(rule.where, features, len(fails))
+    return rules
+
+
+def _tells_others(features: Mapping[str, Floats], fails: Flags, objects: NDArray[np.int64]) -> bool:
+    """Whether rules of some objects tell failures of the others, beyond chance."""
+    known, numbers = np.unique(objects, return_inverse=True)
+    parts = np.random.default_rng(len(known)).permutation(len(known)) % _FOLDS
+    gains = np.zeros(len(known))
+    for part in range(_FOLDS):
+        held = parts[numbers] == part
+        if held.all() or not held.any():
+            return False
+        made = {name: values[~held] for name, values in features.items()}
+        rule = fit(made, fails[~held], support=0.0)
+        inside = contains(rule.where, features, len(fails))[held]
+        share = np.where(
+            inside,
+            (rule.fails + 0.5) / (rule.count + 1),
+            (rule.fails_outside + 0.5) / (rule.count_outside + 1),
+        )
+        plain = (rule.fails + rule.fails_outside + 0.5) / (len(made[next(iter(made))]) + 1)
+        lost = fails[held]
+        gain = np.where(lost, np.log(share / plain), np.log((1 - share) / (1 - plain)))
+        np.add.at(gains, numbers[held], gain)
+    error = float(gains.std(ddof=1)) * math.sqrt(len(gains)) if len(gains) > 1 else 0.0
+    return float(gains.sum()) > _BEYOND_CHANCE * error
 
 
 def counted(where: Mapping[str, tuple[float, float]], features: Mapping[str, Floats], fails: Flags) -> Rule:
@@ -79,32 +178,40 @@ def counted(where: Mapping[str, tuple[float, float]], features: Mapping[str, Flo
 
 
 def _best(
-    features: Mapping[str, Floats], fails: Flags, names: Sequence[str], inside: Flags
+    features: Mapping[str, Floats],
+    fails: Flags,
+    names: Sequence[str],
+    inside: Flags,
+    support: float,
+    among: int = 1,
 ) -> tuple[str, tuple[float, float]] | None:
-    """The feature and interval that tell most among the samples inside; None where none is worth its numbers."""
+    """The feature and interval that tell most among the samples inside; None where none is worth its numbers.
+    among: so many features it is chosen of.
+    """
     best: tuple[float, str, tuple[float, float]] | None = None
     for name in names:
-        found = _interval(features[name][inside], fails[inside])
+        found = _interval(features[name][inside], fails[inside], support)
         if found is not None and (best is None or found[0] > best[0]):
             best = (found[0], name, found[1])
-    if best is None or best[0] <= math.log(max(len(names), 1)):
+    if best is None or best[0] <= math.log(max(among, 1)):
         return None
     return best[1], best[2]
 
 
-def _interval(values: Floats, fails: Flags) -> tuple[float, tuple[float, float]] | None:
+def _interval(values: Floats, fails: Flags, support: float) -> tuple[float, tuple[float, float]] | None:
     """What an interval gains in log-likelihood, less the price of its numbers; and the interval."""
     n, total = len(values), int(fails.sum())
-    least = max(_FEWEST, math.ceil(_SUPPORT * n))
+    least = max(_FEWEST, math.ceil(support * n))
     if n < 2 * least or total in (0, n):
         return None
     order = np.argsort(values, kind="stable")
-    ranked, hits = values[order], np.concatenate([[0], np.cumsum(fails[order])])
-    # Places between two different values, where an interval may end; the ends of all are no bounds.
+    ranked, failing = values[order], fails[order]
+    hits = np.concatenate([[0], np.cumsum(failing)])
+    # Places between two different values, where an interval may end; the ends of all are no bounds. Ends beside
+    # samples that fail matter most, and may be few.
     between = np.flatnonzero(np.diff(ranked) > 0) + 1
-    if len(between) > _CUTS:
-        between = between[np.linspace(0, len(between) - 1, _CUTS).round().astype(int)]
-    ends = np.concatenate([[0], between, [n]])
+    beside = between[failing[between] != failing[between - 1]]
+    ends = np.unique(np.concatenate([[0], _spread(between), _spread(beside), [n]]))
     start, stop = np.meshgrid(ends, ends, indexing="ij")
     count = stop - start
     inner = hits[stop] - hits[start]
@@ -114,11 +221,16 @@ def _interval(values: Floats, fails: Flags) -> tuple[float, tuple[float, float]]
         return None
     gain = _likelihood(inner, count) + _likelihood(total - inner, n - count) - _likelihood(total, n)
     bounds = (start > 0).astype(int) + (stop < n)
-    gain = np.where(usable, gain - (0.5 + bounds) * math.log(n), -np.inf)
+    gain = np.where(usable, gain - 0.5 * math.log(n) - bounds * _bound(n), -np.inf)
     a, b = np.unravel_index(int(gain.argmax()), gain.shape)
     if not gain[a, b] > 0:
         return None
     return float(gain[a, b]), (_end(ranked, int(ends[a])), _end(ranked, int(ends[b])))
+
+
+def _bound(n: int) -> float:
+    """What it takes to write down a bound: which of the ends that are tried it is, of n samples."""
+    return math.log(max(min(n, _CUTS), 2))
 
 
 def _end(ranked: Floats, place: int) -> float:
@@ -126,6 +238,13 @@ def _end(ranked: Floats, place: int) -> float:
     if place in (0, len(ranked)):
         return float(ranked[min(place, len(ranked) - 1)])
     return float(ranked[place - 1] + ranked[place]) / 2
+
+
+def _spread(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Half as many as `_CUTS` of them, evenly, at most."""
+    if len(places) <= _CUTS // 2:
+        return places
+    return places[np.linspace(0, len(places) - 1, _CUTS // 2).round().astype(int)]
 
 
 def _likelihood(hits: NDArray[np.int64] | int, count: NDArray[np.int64] | int) -> Floats:

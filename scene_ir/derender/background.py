@@ -8,7 +8,7 @@ is numpy: the same input and seed give the same bytes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -53,6 +53,17 @@ class FillSettings:
     settle_px: float = 6.0
     grain_px: float = 1.5
     keep: float = 0.85
+
+    def smaller(self, shrink: int) -> FillSettings:
+        """For a photograph at one over `shrink` of its size: the same lengths of what is to be seen."""
+        coarse, fine = self.search_px
+        return replace(
+            self,
+            confidence_px=self.confidence_px / shrink,
+            search_px=(coarse / shrink, fine / shrink),
+            guide_px=self.guide_px / shrink,
+            settle_px=self.settle_px / shrink,
+        )
 
 
 @dataclass(frozen=True, slots=True)

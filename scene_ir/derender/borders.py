@@ -71,12 +71,6 @@ def follow(
     hit = (face >= 0).numpy()
     kind = np.where(hit, part[face.clamp(min=0)].numpy(), -1)
     near = np.where(hit, depth.numpy(), np.inf)
-    smooth = np.zeros((2, *kind.shape), np.float32)
-    for value in np.unique(kind):
-        mine = kind == value
-        blurred = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), 1.5)
-        for axis, order in enumerate(((1, 0), (0, 1))):
-            smooth[axis][mine] = cv2.Sobel(blurred, cv2.CV_32F, *order)[mine]
     rows, columns, offsets = [], [], []
     for dy, dx in ((0, 1), (1, 0)):
         first = (slice(0, kind.shape[0] - dy), slice(0, kind.shape[1] - dx))
@@ -91,7 +85,13 @@ def follow(
     y, x, offset = np.concatenate(rows), np.concatenate(columns), np.concatenate(offsets)
     chosen = np.linspace(0, len(y) - 1, min(len(y), _MOST_POINTS)).astype(int)
     y, x, offset = y[chosen], x[chosen], offset[chosen]
-    angle = np.arctan2(smooth[1, y, x], smooth[0, y, x])
+    smooth, of_point = np.zeros((2, len(y)), np.float32), kind[y, x]
+    for value in np.unique(of_point):
+        blurred = cv2.GaussianBlur((kind == value).astype(np.float32), (0, 0), 1.5)
+        mine = of_point == value
+        for axis, order in enumerate(((1, 0), (0, 1))):
+            smooth[axis, mine] = cv2.Sobel(blurred, cv2.CV_32F, *order)[y[mine], x[mine]]
+    angle = np.arctan2(smooth[1], smooth[0])
     channel = np.rint(angle / np.pi * _CHANNELS).astype(np.int64) % _CHANNELS
     vertex = faces[face[torch.from_numpy(y), torch.from_numpy(x)]]
     corners = clip.detach()[vertex].double().transpose(1, 2)

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir.derender import background as fills
 from scene_ir.derender import cutout as cutouts
 from scene_ir.derender import depth as depths
-from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand, street, upright
+from scene_ir.derender import front, icp, maps, paint, segment, shadow, silhouette, stand
 from scene_ir.derender import widen as wide
+from scene_ir.derender.behind import Behind, Surroundings
 from scene_ir.derender.colours import largest
 from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.matte import opacity_of
@@ -56,19 +56,6 @@ _SAME_PX, _SAME_SHARE = 1.0, 0.015
 _EDGES = 0.3
 """Weight in the choice of a template of its edges' distance from the photograph's, against its mask's agreement:
 among the templates of one car the former varies about three times as much."""
-_STOOD_M = 0.3
-"""How far around a vehicle's footprint there is ground."""
-_SURELY = 0.8
-"""How much a pixel must look like an unlabelled person not to be copied."""
-_CERTAINLY, _LEAST_CORE_PX, _AROUND_CORE_PX = 0.97, 150, 150
-"""How much the core of an unlabelled vehicle must look like one, its least area, and how far its less certain rest
-reaches."""
-_LEAST_REST = 0.05
-"""Less than that for all but vehicles says nothing of the rest."""
-_BORDER_PX = 5
-"""So near to vehicles and their shadows colours are mixed, and masks may err: not copied."""
-_LARGE_HOLE_PX = 60_000
-"""Holes beyond are not searched at full size: a third of the time less, hardly to be seen."""
 _UNDERBODY = 0.3
 """Lower part of a car, as a fraction of its height, in which what lies outside the mesh is ground."""
 
@@ -78,9 +65,10 @@ class DerenderSettings:
     """fit: move templates until their outlines meet the masks. min_height_px: smaller vehicles stay background.
     min_iou: below this agreement of mask and template the template's outline is the mask. max_inflation: of the
     halo that carries the matte, as a fraction of the car's height. min_reach_px: how far it reaches at least.
-    seed: of the fill's random search. backend: of the renderer. meshes: a user's, to choose from beside the
-    templates. segmenter: a user's, instead of the shipped network. withheld: for each label a kind of template
-    that it may not be, "" for none; empty: none for all.
+    seed: of the fill's random search. shrink: fill what vehicles hid at one over so much of the photograph's size.
+    backend: of the renderer. meshes: a user's, to choose from beside the templates. segmenter: a user's, instead
+    of the shipped network. withheld: for each label a kind of template that it may not be, "" for none; empty:
+    none for all.
     """
 
     fit: bool = True
@@ -89,11 +77,17 @@ class DerenderSettings:
     max_inflation: float = 0.12
     min_reach_px: float = 4.0
     seed: int = 0
+    shrink: int = 1
     backend: verbs.Backend = "warp"
     fitting: silhouette.FitSettings = field(default_factory=silhouette.FitSettings)
     meshes: tuple[silhouette.OwnMesh, ...] = ()
     segmenter: segment.Segmenter | None = None
     withheld: tuple[str, ...] = ()
+
+    @classmethod
+    def fast(cls) -> DerenderSettings:
+        """No fit, and fills with half of the detail: what costs much and shows little."""
+        return cls(fit=False, shrink=2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,19 +195,6 @@ def _pixels(seen: Cutout, hidden: Mask) -> Mask:
     return (seen.whole("visible", hidden.shape) >= 0.5) & ~hidden
 
 
-@dataclass(frozen=True, slots=True)
-class _Surroundings:
-    """horizon: its row, px; ground (4,): the plane; others (H, W): labelled things that are no vehicles; front
-    (H, W): how much of each pixel shows things in front of vehicles; seen: the photograph's maps."""
-
-    horizon: float
-    ground: torch.Tensor
-    camera: Camera
-    others: Mask
-    front: Array
-    seen: segment.Segmentation
-
-
 _LEAST_SIDE = 16
 """Of a photograph, px: maps are made at an eighth of its size."""
 _MOST_LABELS = 500
@@ -261,7 +242,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         views,
         vehicles,
         road,
-        _Surroundings(
+        Surroundings(
             horizon,
             ground,
             camera,
@@ -269,11 +250,11 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
             sum(opacities, np.zeros(image.shape[:2], np.float32)),
             seen,
         ),
-        settings.seed,
+        settings,
     )
     if cuts:
         # What stands behind the vehicles no classes tell.
-        behind = segment.segment(background, ground, camera, settings.segmenter)
+        behind = segment.segment(background, ground, camera, settings.segmenter, shrink=settings.shrink)
         seen = segment.of_frame(frame, behind).within((largest(np.abs(background - image)) > 0), behind)
     stood = maps.footprints(labels, _posed_rows(labels), ground, camera)
     ties = depths.Ties(seen.sky, seen.ground, stood, _behind_m(cuts, camera))
@@ -531,23 +512,23 @@ def _layers(
     views: list[shadow.GroundView],
     vehicles: Mask,
     road: Array,
-    surroundings: _Surroundings,
-    seed: int,
+    surroundings: Surroundings,
+    settings: DerenderSettings,
 ) -> tuple[Array, list[Array], list[Array], torch.Tensor]:
     """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (H, W, 3), sun."""
     if not cuts:
         return image, [], [], maps.sun_direction()
     near = np.stack([view.distance for view in views]).min(0)
     in_front = surroundings.front > 0
-    plane = street.plane_view(surroundings.ground, surroundings.camera)
-    lighting = shadow.light(
-        image, road, vehicles, views, behind=lambda zone: _continued(image, zone, near, surroundings, plane).image
-    )
+    behind = lit = Behind(image, near, surroundings, settings.shrink)
+    if settings.shrink > 1:  # light is smooth
+        lit = Behind(image, near, surroundings, 2 * settings.shrink)
+    lighting = shadow.light(image, road, vehicles, views, behind=lit.continued)
     sun, shaded = _shaded(lighting, cuts, views, vehicles, in_front)
     hole = vehicles.copy()
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= silhouette.grow(region, 2.5) | silhouette.grow(cut.mask, 4) | (view.distance < 0.2)
-    filled = _filled(image, hole, near, surroundings, plane, seed)
+    filled = behind.filled(hole, settings.seed)
     mattes = [opacity_of(cut.seen, cut.mask, cut.unknown) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
@@ -591,53 +572,6 @@ def _shaded(
             break
     assert best is not None
     return best[1], best[2]
-
-
-def _filled(
-    image: Array, hole: Mask, near: Array, surroundings: _Surroundings, plane: street.Plane, seed: int
-) -> Array:
-    """The image (H, W, 3) without what is in the hole. near (H, W) m: distance from the cars' footprints."""
-    guide = _continued(image, silhouette.grow(hole, 2), near, surroundings, plane)
-    forbidden = silhouette.grow(hole, _BORDER_PX) | _not_copied(surroundings, hole)
-    seen = surroundings.seen
-    like = np.where(forbidden, 0, np.where(guide.ground, _ground_share(seen), seen.ground)).astype(np.float32)
-    standing = upright.copied(image, hole, forbidden | (like > 0.5), guide, surroundings.horizon)
-    rest, forbidden = hole & ~standing.done, forbidden & ~standing.done
-    ground = fills.Ground((near < _STOOD_M) | guide.ground, like)
-    quick = fills.FillSettings(iterations=(8, 0))
-    settings = quick if np.count_nonzero(rest) > _LARGE_HOLE_PX else fills.FillSettings()
-    return fills.fill(standing.image, rest, forbidden, surroundings.horizon, ground, seed, settings, guide.image)
-
-
-def _continued(
-    image: Array, unknown: Mask, near: Array, surroundings: _Surroundings, plane: street.Plane
-) -> street.Continued:
-    """The street behind unknown pixels. near (H, W) m: distance from the cars' footprints."""
-    seen = surroundings.seen
-    unknown = unknown | _not_copied(surroundings, unknown)
-    shares = street.Shares(seen.ground, seen.sky, unknown & (near < _STOOD_M), _ground_share(seen))
-    return street.continued(image, unknown, shares, plane, surroundings.horizon)
-
-
-def _ground_share(seen: segment.Segmentation) -> Array:
-    """How much each pixel (H, W) looks like ground, given that it shows no vehicle: where these are is known."""
-    return np.clip(seen.ground / np.maximum(1 - seen.vehicle, _LEAST_REST), 0, 1).astype(np.float32)
-
-
-def _not_copied(surroundings: _Surroundings, unknown: Mask) -> Mask:
-    """Pixels (H, W) outside the unknown ones that show no street: people and vehicles, also those that nobody
-    labelled."""
-    seen = surroundings.seen
-    # Light walls and cobbles look somewhat like cars: only what has a large, certain core is one.
-    certain = ((seen.vehicle > _CERTAINLY) & ~unknown).astype(np.uint8)
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(certain)
-    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= _LEAST_CORE_PX]
-    core = np.isin(parts, large)
-    vehicle = core
-    if large:
-        rest = (seen.vehicle > 0.5) & (_ground_share(seen) < 0.5)
-        vehicle = core | (silhouette.grow(core, _AROUND_CORE_PX) & rest)
-    return surroundings.others | silhouette.grow(vehicle, _BORDER_PX) | (seen.person > _SURELY)
 
 
 def _environment(

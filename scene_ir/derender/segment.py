@@ -139,13 +139,14 @@ def segment(
     camera: Camera,
     segmenter: Segmenter | None = None,
     network: SegmentNet | None = None,
+    shrink: int = 1,
 ) -> Segmentation:
     """The maps of a photograph (H, W, 3) RGB float32 in [0, 1].
 
     ground: (4,) plane n.x + d = 0, n up: no sky lies below its horizon, no ground above. segmenter: instead of
     the shipped network; network: likewise. Borders are laid along the photograph's edges (guided filter, He et
-    al., TPAMI 2013). Raises RangeError for a segmenter without classes for sky, foliage or road, ShapeError for
-    shares of another number.
+    al., TPAMI 2013); shrink: with that at one over so much of the size. Raises RangeError for a segmenter without
+    classes for sky, foliage or road, ShapeError for shares of another number.
     """
     if segmenter is None:
         shares, names = from_network(image, ground, camera, network), tuple(kind.name for kind in Class)
@@ -160,7 +161,9 @@ def segment(
     coarse = np.stack([shares[_members(names, f.name)].sum(0) for f in fields(Segmentation)], -1)
     large = cv2.resize(coarse.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     radius = max(2, round(_RADIUS * float(camera.intrinsics[0, 0])))
-    soft = cv2.ximgproc.guidedFilter(image * _LEVELS, large, radius, _FLATNESS * _LEVELS**2, scale=_SUBSAMPLING)
+    soft = cv2.ximgproc.guidedFilter(
+        image * _LEVELS, large, radius, _FLATNESS * _LEVELS**2, scale=_SUBSAMPLING / shrink
+    )
     soft = np.clip((soft - _LEAST) / (_MOST - _LEAST), 0, 1)
     found = Segmentation(*(np.ascontiguousarray(m) for m in np.moveaxis(soft, -1, 0)))
     looks = elevation(ground, camera, coarse.shape[:2])

@@ -67,13 +67,15 @@ _SURE_PX = 8
 class StreetSettings:
     """far_m: ground beyond is not told apart from what stands on it; vote_m: edges nearer than this vote for the
     road's course; robust: difference of colour from the profile at which a pixel counts half; marking: difference
-    from the ground around it at which a pixel of the ground counts half when colours are continued sideways.
+    from the ground around it at which a pixel of the ground counts half when colours are continued sideways;
+    coarse: times as large cells of the profile, and times as few edges that vote, the latter squared.
     """
 
     far_m: float = 90.0
     vote_m: float = 45.0
     robust: float = 0.04
     marking: float = 0.08
+    coarse: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,8 @@ def continued(
     settings = settings or StreetSettings()
     rows = np.arange(image.shape[0])[:, None]
     seen = ~unknown & (share.ground > 0.5)
-    heading, bend = course(image, seen & (plane.along < settings.vote_m), plane)
+    coarse = settings.coarse
+    heading, bend = course(image, seen & (plane.along < settings.vote_m), plane, _VOTERS // coarse**2)
     level = np.where(share.stood, 1, share.ground).astype(np.float32)
     foot = foot_rows(level, unknown & ~share.stood, plane, horizon, _column_ahead(plane, heading))
     below = rows >= foot[None]
@@ -154,11 +157,12 @@ def continued(
     clear = np.where(unknown, sky, share.sky > 0.5)
     along = np.where(flat, plane.along, 1.0)
     straight = plane.across - heading * along - bend * along**2 / 2
-    column = np.rint(straight / _ACROSS_M).astype(np.int64) + _COLUMNS // 2
-    row = np.rint(np.log(np.maximum(along, 1.0)) / _ALONG).astype(np.int64)
-    laid_out = flat & (column >= 0) & (column < _COLUMNS) & (row < _ROWS)
-    cell = np.where(laid_out, row * _COLUMNS + column, 0)
-    local, profile = _profile(image, cell, laid_out & ~unknown, settings.robust)
+    rows, columns = _ROWS // coarse, _COLUMNS // coarse
+    column = np.rint(straight / (coarse * _ACROSS_M)).astype(np.int64) + columns // 2
+    row = np.rint(np.log(np.maximum(along, 1.0)) / (coarse * _ALONG)).astype(np.int64)
+    laid_out = flat & (column >= 0) & (column < columns) & (row < rows)
+    cell = np.where(laid_out, row * columns + column, 0)
+    local, profile = _profile(image, cell, laid_out & ~unknown, settings)
     local = np.where(laid_out[..., None], local.reshape(-1, 3)[cell], 0)
     profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
     rest = (image - profile).astype(np.float32)
@@ -276,9 +280,9 @@ def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float
     return good.argmax(0).astype(float), (height - good[::-1].argmax(0)).astype(float)
 
 
-def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
-    """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow; 0, 0
-    where there are too few."""
+def course(image: Image, known: Mask, plane: Plane, voters: int = _VOTERS) -> tuple[float, float]:
+    """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow, of
+    some `voters`; 0, 0 where there are too few."""
     smooth: Any = cv2.GaussianBlur(grey(image), (0, 0), 1.0)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
     strength = np.hypot(gx, gy)
@@ -287,7 +291,7 @@ def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
     rows, columns = np.nonzero(inside & (strength > _EDGE))
     if rows.size < 50:
         return 0.0, 0.0
-    every = rows.size // _VOTERS + 1
+    every = rows.size // voters + 1
     rows, columns = rows[::every], columns[::every]
     tangent_u, tangent_v = -gy[rows, columns], gx[rows, columns]
 
@@ -310,19 +314,20 @@ def course(image: Image, known: Mask, plane: Plane) -> tuple[float, float]:
     return best[1], best[2]
 
 
-def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) -> tuple[Image, Image]:
+def _profile(image: Image, cell: NDArray[np.int64], known: Mask, settings: StreetSettings) -> tuple[Image, Image]:
     """The ground's colour around each cell, and how much what runs along the road differs from the street's, both
     (rows, columns, 3) of the straightened ground."""
-    shape = (_ROWS, _COLUMNS)
-    where, size = cell[known], _ROWS * _COLUMNS
+    shape = (_ROWS // settings.coarse, _COLUMNS // settings.coarse)
+    where, size = cell[known], shape[0] * shape[1]
     count = np.bincount(where, minlength=size).reshape(shape)
     colour = np.stack([np.bincount(where, image[..., c][known], size) for c in range(3)], -1).reshape(*shape, 3)
     colour = (colour / np.maximum(count, 1)[..., None]).astype(np.float32)
     filled = known_cells = (count > 0).astype(np.float32)
 
     def mean(values: Image, weight: NDArray[np.float32], sigma: tuple[float, float]) -> tuple[Image, Image]:
-        total = cv2.GaussianBlur(weight, (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
-        blurred = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
+        down, across = sigma[0] / settings.coarse, sigma[1] / settings.coarse
+        total = cv2.GaussianBlur(weight, (0, 0), sigmaX=across, sigmaY=down)
+        blurred = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigmaX=across, sigmaY=down)
         return (blurred / np.maximum(total, 1e-4)[..., None]).astype(np.float32), np.asarray(total, np.float32)
 
     street, _ = mean(colour, filled, (1.5, 40.0))
@@ -334,7 +339,7 @@ def _profile(image: Image, cell: NDArray[np.int64], known: Mask, robust: float) 
     line, total = mean(difference, weight, (10.0, 0.5))
     for _ in range(3):
         # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
-        weight = np.asarray(filled / (1 + (largest(np.abs(difference - line)) / robust) ** 2), np.float32)
+        weight = np.asarray(filled / (1 + (largest(np.abs(difference - line)) / settings.robust) ** 2), np.float32)
         line, total = mean(difference, weight, (10.0, 0.5))
     local, _ = mean(colour, known_cells, (1.5, _AROUND))
     return local, line * np.clip(total * 10, 0, 1)[..., None]

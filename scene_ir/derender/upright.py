@@ -9,7 +9,7 @@ to others. Copies grow and shrink with their foot's distance from the horizon, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -55,6 +55,18 @@ class UprightSettings:
     least_px: int = 36
     settle: float = 0.75
     settle_px: float = 10.0
+
+    def smaller(self, shrink: int) -> UprightSettings:
+        """For a photograph at one over `shrink` of its size: the same lengths of what is to be seen."""
+        return replace(
+            self,
+            reach_px=self.reach_px // shrink,
+            step_px=max(self.step_px // shrink, 1),
+            ring_px=-(-self.ring_px // shrink),
+            guess_px=self.guess_px / shrink,
+            least_px=self.least_px // shrink,
+            settle_px=self.settle_px / shrink,
+        )
 
 
 _LEAST_SHIFT_PX = 4

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -21,6 +24,18 @@ _VERSION = 1
 _KEY = "drivesem_mesh"
 """Key of the GLB mesh's `extras` that marks files of `save_mesh`."""
 _SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif")
+_MOST_BYTES = 1 << 27
+"""Of a file: text takes ten times as much room in memory."""
+_MOST_FACES = 2_000_000
+"""Of all that a file places: vehicles made by hand have some thousand, scans some hundred thousand."""
+_MOST_CLAIMED = 20_000_000
+"""Of all that a header says there is: a face may have vertices, normals and more of its own."""
+_MOST_NODES = 10_000
+_MOST_TEXELS = 1 << 26
+_PLY_HEAD = 1 << 16
+_DIGITS = 18
+"""Python makes no number of thousands."""
 _AXES = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -147,18 +162,45 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     files.write_bytes(file, content)
 
 
-class _Beside(trimesh.resolvers.Resolver):
-    """Files that a mesh file names, such as materials and textures: regular ones below `root`, of `most` bytes."""
+def read_scene(file: Path, root: Path | None = None, most: int = _MOST_BYTES) -> trimesh.Scene:
+    """The scene in a mesh file. root: the folder below which materials and textures may lie, the file's own where
+    none is given; most: bytes of any file. Raises FormatError for a file that is missing, too large, or no mesh.
+    """
+    if file.suffix.lower() not in _SUFFIXES:
+        raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
+    if not file.is_file():
+        raise FormatError(str(file), "a mesh file", "no such file")
+    data, kind = files.read_bytes(file, most), file.suffix.lower().removeprefix(".")
+    _check_claims(file, kind, data)
+    beside = _Beside(file.parent, root or file.parent, most)
+    try:
+        return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=beside, process=False)
+    except FormatError:
+        raise
+    except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
+        reason = next(iter(f"{type(error).__name__}: {error}".splitlines()))
+        raise FormatError(str(file), "a readable mesh", reason) from None
+
+
+class _Beside(Resolver):
+    """Files that a mesh file names, such as materials and textures: regular ones below `root`, of `most` bytes,
+    and images that fit. A name that leads elsewhere is looked for in `folder` by its last part, as packs need it.
+    """
 
     def __init__(self, folder: Path, root: Path, most: int) -> None:
         self._folder, self._root, self._most = folder, root, most
 
-    def get(self, name: str) -> bytes:
-        """What is in the file. Raises FormatError."""
-        path = self._folder / name.strip().replace("\\", "/")
-        if not path.resolve().is_relative_to(self._root.resolve()):
-            raise FormatError(str(path), f"a file in {self._root}", "one elsewhere")
-        return files.read_bytes(path, self._most)
+    def get(self, key: str) -> bytes:
+        """What is in the file. Raises FormatError, and FileNotFoundError where there is none."""
+        name = key.strip().replace("\\", "/")
+        for candidate in (name, name.rpartition("/")[2]):
+            path = self._folder / candidate
+            if path.resolve().is_relative_to(self._root.resolve()) and path.is_file():
+                data = files.read_bytes(path, self._most)
+                if path.suffix.lower() in _IMAGES:
+                    files.check_pixels(path, data)
+                return data
+        raise FileNotFoundError(key)
 
     def keys(self) -> list[str]:
         """No names: files are asked for one by one."""
@@ -173,20 +215,35 @@ class _Beside(trimesh.resolvers.Resolver):
         raise FormatError(str(self._folder / name), "a mesh that is read", "one that is written")
 
 
-def read_scene(file: Path, root: Path | None = None, most: int = _MOST_BYTES) -> trimesh.Scene:
-    """The scene in a mesh file. root: the folder below which materials and textures may lie, the file's own where
-    none is given; most: bytes of any file. Raises FormatError for a file that is missing, too large, or no mesh.
+def _check_claims(file: Path, kind: str, data: bytes) -> None:
+    """FormatError for a file that says that it holds more than a vehicle has: what it says is believed before what
+    it holds is looked at.
     """
-    if file.suffix.lower() not in _SUFFIXES:
-        raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
-    if not file.is_file():
-        raise FormatError(str(file), "a mesh file", "no such file")
-    files.check_regular(file, most)
-    try:
-        return trimesh.load_scene(file, process=False, resolver=_Beside(file.parent, root or file.parent, most))
-    except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
-        reason = next(iter(f"{type(error).__name__}: {error}".splitlines()))
-        raise FormatError(str(file), "a readable mesh", reason) from None
+    claims: list[Any] = []
+    if kind in ("glb", "gltf"):
+        if kind == "glb":
+            length = int.from_bytes(data[12:16], "little")
+            data = data[20 : 20 + length]
+        try:
+            told = files.parse_json(data.decode("utf-8"), str(file))
+        except (UnicodeDecodeError, FormatError) as error:
+            found = error.actual if isinstance(error, FormatError) else "bytes that are no text"
+            raise FormatError(str(file), "a readable mesh", found) from error
+        lists = told if isinstance(told, dict) else {}
+        accessors, nodes = (
+            lists[key] if isinstance(lists.get(key), list) else [] for key in ("accessors", "nodes")
+        )
+        claims = [one.get("count", 0) for one in accessors if isinstance(one, dict)]
+        if len(nodes) > _MOST_NODES:
+            raise FormatError(f"{file}: nodes", f"at most {_MOST_NODES:,}", f"{len(nodes):,}")
+    elif kind == "ply":
+        head = data[:_PLY_HEAD].partition(b"end_header")[0].decode("latin-1")
+        claims = [int(count[:_DIGITS]) for count in re.findall(r"element\s+\S+\s+(\d+)", head)]
+    whole = [count for count in claims if type(count) is int]
+    if sum(whole) > _MOST_CLAIMED:
+        raise FormatError(
+            str(file), f"at most {_MOST_CLAIMED:,} vertices, faces and their values", f"{sum(whole):,}"
+        )
 
 
 def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
@@ -199,7 +256,9 @@ def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
         raise FormatError(f"{file}: {_KEY}", f"version {_VERSION}", shape.metadata[_KEY])
     part = shape.metadata.get("part")
     if not isinstance(part, list) or len(part) != len(shape.faces):
-        raise FormatError(f"{file}: part", f"{len(shape.faces)} entries", "none" if part is None else len(part))
+        raise FormatError(
+            f"{file}: part", f"{len(shape.faces)} entries", len(part) if isinstance(part, list) else "none"
+        )
     if not all(type(one) is int for one in part):
         raise FormatError(f"{file}: part", "whole numbers", "others")
     rgb, uv = shape.vertex_attributes.get("_rgb"), shape.vertex_attributes.get("_uv")
@@ -230,21 +289,26 @@ class _Soup:
 
 def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
     vertices, faces, names, colours, uvs, sides = [], [], [], [], [], []
-    start = 0
+    start = total = 0
     for node in sorted(scene.graph.nodes_geometry):
         transform, geometry_name = scene.graph[node]
         shape = scene.geometry[geometry_name]
         if not isinstance(shape, trimesh.Trimesh) or len(shape.faces) == 0:
             continue
+        total += len(shape.faces)
+        if total > _MOST_FACES:
+            raise FormatError(f"{file}: faces", f"at most {_MOST_FACES:,}", "more")
         placed = trimesh.transform_points(shape.vertices, transform)
         index = np.asarray(shape.faces, dtype=np.int64)
+        if index.min() < 0 or index.max() >= len(placed):
+            raise FormatError(f"{file}: faces", f"indices of {len(placed)} vertices", int(index.max()))
         if np.linalg.det(transform[:3, :3]) < 0:
             index = index[:, ::-1]
         material = getattr(shape.visual, "material", None)
         names.append((f"{getattr(material, 'name', '') or ''}", f"{node} {geometry_name}", len(index)))
         vertices.append(placed)
         faces.append(index + start)
-        colours.append(_vertex_colours(shape))
+        colours.append(_vertex_colours(shape, file))
         uv = getattr(shape.visual, "uv", None)
         uvs.append(None if uv is None or len(uv) != len(placed) else np.asarray(uv)[:, :2])
         label = node.lower()
@@ -277,8 +341,10 @@ def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
     return np.repeat([int(unnamed if p is None else p) for p in found], counts).astype(np.int64)
 
 
-def _vertex_colours(shape: trimesh.Trimesh) -> NDArray[np.float64]:
-    """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order."""
+def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
+    """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order. FormatError for a texture
+    that does not decode, or is too large.
+    """
     count = len(shape.vertices)
     visual = shape.visual
     if isinstance(visual, ColorVisuals):
@@ -297,11 +363,17 @@ def _vertex_colours(shape: trimesh.Trimesh) -> NDArray[np.float64]:
             tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0
     if image is None or uv is None or len(uv) != count:
         return _plain(count) if tint is None else np.tile(tint, (count, 1))
-    pixels = np.asarray(image.convert("RGB"), dtype=float) / 255.0
-    height, width = pixels.shape[:2]
-    columns = np.floor(np.mod(uv[:, 0], 1.0) * width).astype(int).clip(0, width - 1)
-    rows = np.floor(np.mod(1.0 - uv[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
-    return pixels[rows, columns] * (1.0 if tint is None else tint)
+    width, height = image.size
+    if width * height > _MOST_TEXELS:
+        raise FormatError(f"{file}: texture", f"at most {_MOST_TEXELS:,} px", f"{width}x{height}")
+    try:
+        pixels = np.asarray(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow reads pixels only now
+        raise FormatError(f"{file}: texture", "an image", str(error)) from error
+    places = np.mod(np.nan_to_num(uv[:, :2]), 1.0)
+    columns = np.floor(places[:, 0] * width).astype(int).clip(0, width - 1)
+    rows = np.floor(np.mod(1.0 - places[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
+    return pixels[rows, columns] / 255.0 * (1.0 if tint is None else tint)
 
 
 def _plain(count: int) -> NDArray[np.float64]:

@@ -13,12 +13,14 @@ for the outlines only those are cut with rows and columns that have a hit pixel 
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.raster.launch import array, halves, launch, start_warp, threads
 from scene_ir.raster.layout import Fragments, Layout, Plan, version_of
 from scene_ir.raster.plan import gpu_lanes, int32_faces, outline_cuts, parts_on_gpu, share_on_cpu
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
@@ -1049,14 +1051,14 @@ def rasterize(
     if size:
         inputs = [
             plan.lanes,
-            wp.from_torch(plan.parts),
+            array(plan.parts),
             *_corners(clip, faces),
             _boxes(plan),
             near,
-            wp.from_torch(keys),
+            array(keys),
         ]
-        launch(rasterize_kernel, plan.cuts, inputs)
-        launch(unpack_kernel, halves(size), [wp.from_torch(keys), wp.from_torch(face), wp.from_torch(depth)])
+        launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
+        launch(unpack_kernel, halves(size), [array(keys), array(face), array(depth)], (), clip.device)
     return face, depth, plan
 
 
@@ -1091,9 +1093,9 @@ class _Interpolate(torch.autograd.Function):
         ctx.save_for_backward(fragments.face, clip, faces, attributes)
         ctx.layout = fragments.layout
         out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
-        hits = [wp.from_torch(fragments.face), *_layout(fragments.layout)]
-        inputs = [*hits, *_corners(clip, faces), _floats(attributes), wp.from_torch(out)]
-        launch(interpolate_kernel, halves(out.shape[0] if out.numel() else 0), inputs)
+        hits = [array(fragments.face), *_layout(fragments.layout)]
+        inputs = [*hits, *_corners(clip, faces), _floats(attributes), array(out)]
+        launch(interpolate_kernel, halves(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1104,11 +1106,12 @@ class _Interpolate(torch.autograd.Function):
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         grad_attributes = torch.zeros_like(attributes, memory_format=torch.contiguous_format)
         inputs = [
-            *(wp.from_torch(face), *_layout(ctx.layout), *_corners(clip, faces)),
+            *(array(face), *_layout(ctx.layout), *_corners(clip, faces)),
             *(_floats(attributes), _floats(grad_out), with_clip, with_attributes),
-            *(wp.from_torch(grad_clip, dtype=wp.vec3d), wp.from_torch(grad_attributes)),
+            *(array(grad_clip, wp.vec3d), array(grad_attributes)),
         ]
-        launch(interpolate_backward_kernel, _one(face.shape[0] if grad_out.numel() else 0), inputs)
+        count = face.shape[0] if grad_out.numel() else 0
+        launch(interpolate_backward_kernel, _one(count), inputs, (), clip.device)
         to_clip = grad_clip.to(clip.dtype) if with_clip else None
         return None, to_clip, None, grad_attributes if with_attributes else None
 
@@ -1119,8 +1122,8 @@ class _Texture(torch.autograd.Function):
         ctx.save_for_backward(texels, *crops, offsets, uv)
         ctx.strides, ctx.clamp = strides, clamp
         out = uv.new_zeros(uv.shape[0], strides[0])
-        inputs = [*_sampling(texels, strides, crops, offsets, uv), clamp, wp.from_torch(out)]
-        launch(texture_kernel, halves(out.shape[0] if out.numel() else 0), inputs)
+        inputs = [*_sampling(texels, strides, crops, offsets, uv), clamp, array(out)]
+        launch(texture_kernel, halves(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1133,10 +1136,11 @@ class _Texture(torch.autograd.Function):
         inputs = [
             *_sampling(texels, ctx.strides, (crop_rects, crop_offsets), offsets, uv),
             *(ctx.clamp, _floats(grad_out), with_uv, with_texels),
-            *(wp.from_torch(grad_uv, dtype=wp.vec2f), wp.from_torch(grad_texels.view(-1))),
+            *(array(grad_uv, wp.vec2f), array(grad_texels.view(-1))),
         ]
         count = uv.shape[0] if grad_out.numel() else 0
-        launch(texture_backward_kernel, _one(count) if with_texels else halves(count), inputs)
+        edges = _one(count) if with_texels else halves(count)
+        launch(texture_backward_kernel, edges, inputs, (), uv.device)
         return grad_texels if with_texels else None, None, None, None, grad_uv if with_uv else None, None
 
 
@@ -1152,15 +1156,15 @@ class _Antialias(torch.autograd.Function):
         marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is only looked at
         keys, choice = like.new_empty((2, size), dtype=torch.int64), like.new_empty(size, dtype=torch.int64)
         if size:
-            parts, mesh, face = wp.from_torch(plan.parts), _corners(clip, faces), wp.from_torch(like)
-            hits, beside, right, below, either = (wp.from_torch(m, dtype=wp.uint64) for m in marks)
-            found, seen, edges = wp.from_torch(keys), wp.from_torch(coverage), _words(size)
-            launch(hit_kernel, edges, [face, hits, seen])
-            launch(mark_kernel, edges, [parts, hits, beside, right, below, either, found])
+            parts, mesh, face = array(plan.parts), _corners(clip, faces), array(like)
+            hits, beside, right, below, either = (array(m, wp.uint64) for m in marks)
+            found, seen, edges = array(keys), array(coverage), _words(size)
+            launch(hit_kernel, edges, [face, hits, seen], (), like.device)
+            launch(mark_kernel, edges, [parts, hits, beside, right, below, either, found], (), like.device)
             inputs = [plan.lanes, parts, *mesh, _boxes(plan), fragments.near, face, right, below, either, found]
-            launch(outline_kernel, plan.outline_cuts, inputs)
-            inputs = [parts, *mesh, face, beside, right, below, found, wp.from_torch(choice), seen]
-            launch(coverage_kernel, edges, inputs)
+            launch(outline_kernel, plan.outline_cuts, inputs, (), like.device)
+            inputs = [parts, *mesh, face, beside, right, below, found, array(choice), seen]
+            launch(coverage_kernel, edges, inputs, (), like.device)
         ctx.save_for_backward(like, clip, faces, marks[1], choice)
         ctx.plan = plan
         return coverage
@@ -1172,11 +1176,11 @@ class _Antialias(torch.autograd.Function):
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         if face.shape[0]:
             inputs = [
-                *(wp.from_torch(ctx.plan.parts), *_corners(clip, faces), wp.from_torch(face)),
-                *(wp.from_torch(beside, dtype=wp.uint64), wp.from_torch(choice)),
-                *(_floats(grad_out), wp.from_torch(grad_clip, dtype=wp.vec3d)),
+                *(array(ctx.plan.parts), *_corners(clip, faces), array(face)),
+                *(array(beside, wp.uint64), array(choice)),
+                *(_floats(grad_out), array(grad_clip, wp.vec3d)),
             ]
-            launch(coverage_backward_kernel, _one(beside.shape[0] - 1), inputs)
+            launch(coverage_backward_kernel, _one(beside.shape[0] - 1), inputs, (), face.device)
         return None, grad_clip.to(clip.dtype), None
 
 
@@ -1202,30 +1206,29 @@ def _plan(
         parts, lanes = parts_on_gpu(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
         cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
-    vertices = wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f)
-    launch(corner_kernel, halves(clip.shape[0]), [vertices, near, wp.from_torch(boxes, dtype=wp.vec4i)])
+    inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
+    launch(corner_kernel, halves(clip.shape[0]), inputs, (), clip.device)
     return Plan(parts, lanes, cuts, outlines, boxes, clip.detach(), version_of(clip))
 
 
-def _corners(clip: Tensor, faces: Tensor) -> list[wp.array]:
+def _corners(clip: Tensor, faces: Tensor) -> list[Any]:
     """Vertices, and the three of each face."""
-    vertices = wp.from_torch(clip.detach().contiguous(), dtype=wp.vec3f)
-    return [vertices, wp.from_torch(int32_faces(faces), dtype=wp.vec3i)]
+    return [array(clip.contiguous(), wp.vec3f), array(int32_faces(faces), wp.vec3i)]
 
 
-def _boxes(plan: Plan) -> wp.array:
-    return wp.from_torch(plan.boxes, dtype=wp.vec4i)
+def _boxes(plan: Plan) -> Any:
+    return array(plan.boxes, wp.vec4i)
 
 
-def _layout(layout: Layout) -> list[wp.array]:
-    return [wp.from_torch(layout.rects.contiguous()), wp.from_torch(layout.offsets.contiguous())]
+def _layout(layout: Layout) -> list[Any]:
+    return [array(layout.rects.contiguous()), array(layout.offsets.contiguous())]
 
 
-def _floats(values: Tensor) -> wp.array:
-    return wp.from_torch(values.detach().contiguous())
+def _floats(values: Tensor) -> Any:
+    return array(values.contiguous())
 
 
 def _sampling(texels: Tensor, strides, crops, offsets: Tensor, uv: Tensor) -> list:
-    flat = wp.from_torch(texels.detach().contiguous().view(-1))
-    places = [wp.from_torch(t.contiguous()) for t in (*crops, offsets)]
-    return [flat, *strides, *places, wp.from_torch(uv.detach().contiguous(), dtype=wp.vec2f)]
+    flat = array(texels.contiguous().view(-1))
+    places = [array(t.contiguous()) for t in (*crops, offsets)]
+    return [flat, *strides, *places, array(uv.contiguous(), wp.vec2f)]

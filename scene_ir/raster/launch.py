@@ -133,8 +133,29 @@ def _run(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any
 
 
 def array(values: Tensor, dtype: Any = None) -> Any:
-    """A tensor as an array for a kernel, in the form that is made fastest."""
-    return wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    """A tensor as an array for a kernel, in the form that is made fastest; it keeps the tensor.
+
+    A picture hands some two hundred tensors over. Warp looks each over, which takes longer than some kernels: here
+    it does so once for a dtype and shape, but for the number of rows, and then the result is copied.
+    """
+    key = values.dtype, dtype, values.shape[1:]
+    seen = _seen.get(key)
+    if seen is not None and values.is_contiguous():
+        kind, head = seen
+        made = kind.from_buffer_copy(head)
+        made.data = values.data_ptr()
+        made.shape[0] = values.shape[0]
+        made._ref = values
+        return made
+    made = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    # Of a single vector Warp makes an array of one: only where the first side is the rows' can it be replaced.
+    if seen is None and values.ndim and values.is_contiguous() and made.shape[0] == values.shape[0] > 1:
+        _seen[key] = type(made), bytes(made)
+    return made
+
+
+_seen: dict[tuple[torch.dtype, Any, torch.Size], tuple[Any, bytes]] = {}
+"""Arrays as Warp made them, by the dtypes of tensor and kernel, and the shape of a row."""
 
 
 class Filled:

@@ -129,19 +129,21 @@ def composite(
 
 
 def shown_rects(layout: Layout, shown: Tensor) -> Tensor:
-    """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where `shown` (T,) is true, and of one
-    more around them, which the smallest change may show. Empty where nothing is.
+    """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where any of `shown` (T, C) is true,
+    and of one more around them, which the smallest change may show. Empty where nothing is.
     """
-    rects = torch.zeros(len(layout.rects), 4, dtype=torch.int64)
-    packed = shown.cpu().numpy()
-    for i, ((part, size), whole) in enumerate(zip(layout.spans(), layout.rects.tolist(), strict=True)):
-        pixels = packed[part].reshape(size)
-        columns, rows = (np.flatnonzero(pixels.any(axis)) for axis in (0, 1))
-        if len(columns):
-            x0, y0 = whole[0] + int(columns[0]) - 1, whole[1] + int(rows[0]) - 1
-            x1, y1 = whole[0] + int(columns[-1]) + 2, whole[1] + int(rows[-1]) + 2
-            rects[i] = torch.tensor([max(x0, whole[0]), max(y0, whole[1]), min(x1, whole[2]), min(y1, whole[3])])
-    return rects
+    rects: list[list[int]] = []
+    packed, channels = shown.cpu().numpy(), shown.shape[1]
+    for (part, size), whole in zip(layout.spans(), layout.rects.tolist(), strict=True):
+        pixels = packed[part].reshape(size[0], size[1] * channels)
+        columns, rows = np.flatnonzero(pixels.any(0)) // channels, np.flatnonzero(pixels.any(1))
+        if not len(columns):
+            rects.append([0, 0, 0, 0])
+            continue
+        x0, y0 = whole[0] + int(columns[0]) - 1, whole[1] + int(rows[0]) - 1
+        x1, y1 = whole[0] + int(columns[-1]) + 2, whole[1] + int(rows[-1]) + 2
+        rects.append([max(x0, whole[0]), max(y0, whole[1]), min(x1, whole[2]), min(y1, whole[3])])
+    return torch.tensor(rects, dtype=torch.int64).reshape(-1, 4)
 
 
 def _stack(layout: Layout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:

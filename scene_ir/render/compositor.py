@@ -102,8 +102,8 @@ class Compositor(Prepared):
             )
             if drawn is not None:
                 with torch.no_grad():
-                    shown = blend.shown_rects(layers.layout, layers.opacity != 0)[: len(objects)]
-                    shaded = blend.shown_rects(layers.shadow_layout, (layers.shadow != 1).any(1))
+                    shown = blend.shown_rects(layers.layout, layers.opacity[:, None] != 0)[: len(objects)]
+                    shaded = blend.shown_rects(layers.shadow_layout, layers.shadow != 1)
                 drawn = torch.cat([shown, shaded])
             plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)

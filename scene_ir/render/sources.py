@@ -168,10 +168,13 @@ def _solve(
         coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
         foreground = _foreground(mattes[i], image, canvas, nearer, coverage)
         source = replace(blank[i], foreground=foreground, shadow=lit[i])
+        solved[i] = source
+        rect = drawn.mesh.layout.rects[i].tolist()
+        if not any(_meet(rect, mattes[j]) for j in order[place + 1 :]):
+            continue  # nothing is solved against what it shows
         one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), front=())
         alone = Compositor(one, RenderSettings(settings.backend), hidden=[behind_nearer[i]])
         canvas = _with_layer(alone)
-        solved[i] = source
     sources = tuple(solved[i] for i in range(count))
     return replace(scene, background=background, objects=replace(objects, source=sources), front=tuple(front))
 
@@ -228,6 +231,13 @@ def _window(frame: Tensor, crop: Crop) -> Tensor:
     """The view of a frame (C, H, W) that a crop lies on."""
     h, w = crop.values.shape[1:]
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
+
+
+def _meet(rect: Sequence[int], matte: Crop) -> bool:
+    """Whether a matte has pixels in a rectangle x0, y0, x1, y1, half-open, or right beside it."""
+    h, w = matte.values.shape[1:]
+    across = matte.x0 <= rect[2] and rect[0] <= matte.x0 + w
+    return bool(h and w) and across and matte.y0 <= rect[3] and rect[1] <= matte.y0 + h
 
 
 def _cut(alpha: Crop, drawn: Drawn, nearest: Tensor, index: int, like: Tensor) -> Crop:

@@ -258,8 +258,9 @@ class Rig:
         edges = [0]
         for rig in rigs:
             edges += [edges[-1] + e for e in rig.edges[1:]]
-        plain = ("unit", "normal", "paint", "ffd", "bent", "lit", "sunlight", "matrix", "centre")
+        plain = ("unit", "normal", "paint", "ffd", "lit", "sunlight", "matrix", "centre")
         return cls(
+            bent=torch.cat([r.bent for r in rigs], 1),
             weights=tuple(w for r in rigs for w in r.weights),
             owner=torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
             edges=edges,
@@ -278,7 +279,7 @@ class Rig:
             owner=fleet.owner.to(torch.int32),
             paint=fleet.paint,
             ffd=base.ffd.new_full((), torch.nan),
-            bent=torch.zeros_like(like),
+            bent=torch.zeros_like(like.T),
             lit=like.new_zeros(len(like)),
             sunlight=sunlight,
             matrix=camera.matrix.to(like).expand(count, 3, 4).contiguous(),
@@ -291,13 +292,17 @@ class Rig:
         return replace(rig, lit=placed(rig, *poses, lights)[3]) if count else rig
 
     def bend(self, ffd: Tensor) -> Tensor:
-        """What offsets (N, P, 3) are at the vertices (V, 3), as fractions of the unit box."""
+        """What offsets (N, P, 3) are at the vertices, as fractions of the unit box: rows x, y, z (3, V), which a
+        product with three rows gives three times as fast as one with three columns.
+        """
         if torch.equal(ffd, self.ffd):
             return self.bent
-        return torch.cat([weights @ own for own, weights in zip(ffd, self.weights, strict=True)])
+        linear = torch.nn.functional.linear
+        parts = [linear(own.T.contiguous(), weights) for own, weights in zip(ffd, self.weights, strict=True)]
+        return torch.cat(parts, 1)
 
     def unbend(self, to_bent: Tensor) -> Tensor:
-        """A gradient to that, its rows as columns (3, V), as one to offsets (N, P, 3)."""
+        """A gradient to that (3, V), as one to offsets (N, P, 3)."""
         parts = [
             (to_bent[:, a:b].contiguous() @ w).T
             for (a, b), w in zip(itertools.pairwise(self.edges), self.weights, strict=True)
@@ -535,11 +540,11 @@ def nearest_hits(
         if end == start:
             continue
         x0, y0, x1, y1 = rects[i]
-        hit = (fragments.face[start:end].cpu().numpy() >= 0).reshape(y1 - y0, x1 - x0)
-        if not hit.any():
+        beside = (fragments.face[start:end].cpu().numpy() < 0).reshape(y1 - y0, x1 - x0)
+        if beside.all():
             nearest[start:end] = -1
             continue
-        distance, index = nearest_true(hit)
+        distance, index = nearest_true(~beside)
         index += start
         index[distance > reach_px[i]] = -1
         nearest[start:end].copy_(torch.from_numpy(index.reshape(-1)))
@@ -553,9 +558,8 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
     where = np.flatnonzero(mask)
     pixel_of = np.zeros(len(where) + 1, dtype=np.int64)
-    numbers = np.asarray(labels, dtype=np.int64)
-    pixel_of[numbers[mask]] = where
-    return np.asarray(distance), pixel_of[numbers]
+    pixel_of[labels.reshape(-1)[where]] = where
+    return np.asarray(distance), pixel_of.take(labels)
 
 
 def weights_at(corners: Tensor, xy: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
     *("pyproject.toml", "constraints.txt", "README.md", "CHANGELOG.md", "LICENSE", "NOTICE"),
+    *("CONTRIBUTING.md", "CITATION.cff"),
 }
 HEAVY = ("torch", "cv2", "open3d", "pyrender", "warp")
 LOADED_WHERE_USED = (
@@ -321,6 +322,23 @@ def test_an_attack_starts_without_statistics() -> None:
     code = "import sys, drivesem.commands.attack; print('scipy.stats' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["False"]
+
+
+@pytest.mark.parametrize("protocol", ["coco", "kitti", "voc"])
+def test_files_of_labels_are_evaluated_without_torch(protocol: str, tmp_path: Path) -> None:
+    line = "Car 0.00 0 -10 10 10 60 60 -1 -1 -1 -1000 -1000 -1000 -10"
+    for folder, text in (("truth", line), ("found", f"{line} 0.9")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "000000.txt").write_text(text)
+    words = ["eval", "--gt", str(tmp_path / "truth"), "--pred", str(tmp_path / "found"), "--protocol", protocol]
+    code = (
+        "import sys\n"
+        "from drivesem.cli import main\n"
+        f"code = main({words!r})\n"
+        f"print(code, *sorted(set({HEAVY!r}) & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0"]
 
 
 def test_help_loads_nothing_heavy() -> None:

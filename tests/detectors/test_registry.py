@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
+import resource
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -9,6 +13,7 @@ import torch
 from safetensors.torch import save_file
 
 from detectors.base import DetectorError
+from detectors.reading import read_state
 from detectors.registry import SHIPPED, load_detector, read_weights, save_detector, write_weights
 from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet, SqueezeDetPlus
 
@@ -132,3 +137,65 @@ def test_the_same_weights_give_the_same_bytes(tmp_path: Path) -> None:
     found, read = read_weights(tmp_path / "0.safetensors")
     assert found == facts
     assert all(torch.equal(read[name], tensor) for name, tensor in tensors.items())
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_weights_are_those_of_their_card(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, card = SHIPPED[name].read_bytes(), SHIPPED[name].with_suffix(".md").read_text()
+    path = tmp_path / "own.safetensors"
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    path.with_suffix(".md").write_text(card)
+    monkeypatch.setitem(SHIPPED, name, path)
+    with pytest.raises(
+        DetectorError, match=r"own\.safetensors: expected the SHA-256 of own\.md, [0-9a-f]{64}, found"
+    ):
+        load_detector(name)
+    path.write_bytes(data)
+    load_detector(name)
+    path.with_suffix(".md").write_text("# nothing\n")
+    with pytest.raises(DetectorError, match="which names none"):
+        load_detector(name)
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"classes": json.dumps(["a"] * 10_001)}, "classes: expected 1 to 10000, found 10001"),
+        ({"classes": "[]"}, "classes: expected 1 to 10000, found 0"),
+        ({"classes": "[1, 2]"}, "classes: expected a list of names"),
+        ({"classes": '{"a": 1}'}, "classes: expected a list of names"),
+        ({"classes": json.dumps([f"c{i}" for i in range(10_000)])}, "convdet.bias: expected shape (10005000,)"),
+    ],
+)
+def test_weights_that_claim_much(facts: dict[str, str], message: str, weights: Path) -> None:
+    """Nothing is made of what they say before it is known that the file fills it: the last would take 277 GB."""
+    metadata, tensors = read_weights(weights)
+    rewrite(weights, tensors, metadata | facts | {"anchors": json.dumps([[10, 10]] * 1000)})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(DetectorError, match=re.escape(message)):
+        load_detector(weights)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
+
+
+def test_a_state_is_read_without_code_and_without_bombs(tmp_path: Path) -> None:
+    path = tmp_path / "a.pth"
+    torch.save({"weight": torch.ones(4)}, path)
+    assert torch.equal(read_state(path, "weights")["weight"], torch.ones(4))
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, bytes(64 << 20) if "/data/" in name else data)
+    with pytest.raises(
+        DetectorError, match=r"a\.pth: expected weights, found parts of 67,\d+,\d+ bytes in a file of"
+    ):
+        read_state(path, "weights")
+    torch.save({"weight": Path("a")}, path)
+    with pytest.raises(DetectorError, match=r"a\.pth: expected weights, found Weights only load failed"):
+        read_state(path, "weights")
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(DetectorError, match=r"a\.pth: expected weights, found no regular file"):
+        read_state(path, "weights")

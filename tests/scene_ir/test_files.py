@@ -109,3 +109,16 @@ def test_errors_of_reading_inside_stay_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), files.whole_folder(tmp_path / "frame"):
         (tmp_path / "gone").read_bytes()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("number", [(1 << 63) - 1, -(1 << 63) + 1, 10**18, 12])
+def test_the_largest_integers_are_read(number: int, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(f'{{"n": [{number}, 0.{"1" * 30}]}}')
+    assert files.read_json(tmp_path / "a.json") == {"n": [number, 1 / 9]}
+
+
+def test_a_file_that_is_longer_than_it_says_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_bytes(b"0123456789")
+    monkeypatch.setattr(files, "_READ_AT_ONCE", 3)
+    monkeypatch.setattr(files, "check_regular", lambda path, most: 4)
+    assert files.read_bytes(tmp_path / "a") == b"0123456789"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import struct
+import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -14,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scene_ir import files
-from scene_ir.errors import FormatError
+from scene_ir import files, weights
+from scene_ir.errors import FormatError, shown
 
 
 def png(width: int, height: int) -> bytes:
@@ -191,3 +193,89 @@ def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: i
     path.write_bytes(data)
     with pytest.raises(FormatError, match=rf"a\.npz: expected .*{said}"):
         files.read_npz(path)
+
+
+def test_a_header_that_python_cannot_take_apart(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz(npy("(1,), (")))
+    with pytest.raises(FormatError, match=r"a\.npz: expected an NPZ archive of arrays"):
+        files.read_npz(path)
+
+
+def test_no_more_is_unpacked_than_the_archive_says(tmp_path: Path) -> None:
+    """A directory that tells of 1,000 bytes, before 200 MB of zeros."""
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz(bytes(200 << 20), said=1000))
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match=r"a\.npz: expected an NPZ archive of arrays"):
+            files.read_npz(path)
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        png(4, 4)[:30],
+        png(4, 4)[:33] + b"\0\0\0\4\xfa(\xc9|abcd" + b"\0\0\0\0",
+        b"\xff\xd8\xff\xe1\0\x10Exif\0\0MM\0*\xff\xff",
+        b"GIF89a",
+        b"",
+    ],
+)
+def test_headers_of_pictures_that_pillow_stumbles_over(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    for read in (lambda: files.check_pixels(path, data), lambda: files.read_image(path)):
+        with pytest.raises(FormatError, match=r"a\.png: expected an image"):
+            read()
+    with pytest.raises(FormatError, match=r"a\.png: expected an image"):
+        load(path)
+
+
+def load(path: Path) -> None:
+    """EXIF and pixels, as Pillow reads them."""
+    with files.opened_image(path) as image:
+        image.getexif()
+        image.load()
+
+
+def test_a_folder_of_links(tmp_path: Path) -> None:
+    folder = tmp_path / "frame"
+    (folder / "scene").mkdir(parents=True)
+    (folder / "a").write_text("")
+    (folder / "scene" / "same").symlink_to(folder / "a")
+    files.check_links(folder)
+    (folder / "scene" / "out").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FormatError, match=r"scene/out: expected a file in .*frame, found a link to .*elsewhere"):
+        files.check_links(folder)
+
+
+def test_weights_are_held_to_their_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in sorted(weights.SHIPPED.glob("*.safetensors")):
+        weights.read_weights(path)
+    data = next(weights.SHIPPED.glob("depth.safetensors")).read_bytes()
+    path, card = tmp_path / "a.safetensors", tmp_path / "a.md"
+    path.write_bytes(data)
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path)
+    card.write_text("# nothing\n")
+    with pytest.raises(FormatError, match=r"a\.safetensors: expected the SHA-256 of a\.md, which has none, found"):
+        weights.read_weights(path)
+    card.write_text(f"SHA-256: `{hashlib.sha256(data).hexdigest()}`\n")
+    weights.read_weights(path)
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(FormatError, match="expected the SHA-256 of"):
+        weights.read_weights(path)
+
+
+def test_what_a_terminal_would_obey_is_written_out() -> None:
+    assert shown("\x1b]0;title\x07 \u202e ü \ud800") == "\\x1b]0;title\\x07 \\u202e ü \\ud800"
+    assert shown("x" * 500) == "x" * 500
+    assert len(shown("x" * 10**6)) < 600
+    assert "(1,000,000 characters)" in shown("x" * 10**6)
+    error = FormatError("f" * 9000, "e" * 9000, "\x1b" * 9000)
+    assert len(str(error)) < 4000
+    assert str(error).isprintable()
+    assert error.actual == "\x1b" * 9000

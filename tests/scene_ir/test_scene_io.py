@@ -365,3 +365,19 @@ def test_json_refuses_what_json_cannot_say(tmp_path: Path) -> None:
 def test_png_refuses_floats(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="uint8 or uint16"):
         files.write_png(tmp_path / "a.png", np.zeros((2, 2, 3), np.float32))
+
+
+def test_the_scene_before_another_is_read_once(tmp_path: Path) -> None:
+    """A link to itself, or a scene in a scene in a scene."""
+    folder = tmp_path / "scene"
+    save_scene(rich_scene(), folder)
+    edit("before", value=True)(folder)
+    (folder / "before").symlink_to(folder)
+    with pytest.raises(
+        FormatError, match=r"before/scene\.json: before: expected false, in the scene before another"
+    ):
+        load_scene(folder)
+    (folder / "before").unlink()
+    (folder / "before").symlink_to(tmp_path)
+    with pytest.raises(FormatError, match=r"scene/before: expected a file in .*scene, found a link to"):
+        load_scene(folder)

@@ -23,8 +23,21 @@ from drivesem.bench.tables import Section
 from drivesem.run.allocation import keep_freed
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import numbers
+from scene_ir.derender.derender import DerenderSettings
 from scene_ir.errors import SceneError
-from tools.bench import depth, derender, evaluation, found, label_free, moves, redraw, rivals, synth, weather
+from tools.bench import (
+    depth,
+    derender,
+    evaluation,
+    found,
+    label_free,
+    moves,
+    parts,
+    redraw,
+    rivals,
+    synth,
+    weather,
+)
 from tools.bench.settings import BenchTool
 
 _PROGRAM = "python -m tools.bench"
@@ -49,6 +62,7 @@ def run(config: BenchTool) -> int:
     config.check()
     measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
         "derender": _derender,
+        "parts": _parts,
         "depth": _depth,
         "found": _found,
         "label-free": _label_free,
@@ -65,10 +79,17 @@ def run(config: BenchTool) -> int:
 def _derender(config: BenchTool, console: Console) -> Measured:
     _on_cpu(config)
     frames = _frames(config, derender)
-    measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config))
+    settings = DerenderSettings.fast() if config.fast else DerenderSettings()
+    measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config), settings)
     rows = list(watched(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)
+
+
+def _parts(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    rows = list(watched(parts.measure(config), len(label_free.names(config)), console))
+    return _measured(parts, {"rows": [asdict(row) for row in rows], "summary": parts.summary(rows)})
 
 
 def _depth(config: BenchTool, console: Console) -> Measured:

@@ -194,18 +194,25 @@ class DerenderRow:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One frame to measure. sheets: folder for its sheet, or None."""
+    """One frame to measure. sheets: folder for its sheet, or None; settings: how it is taken apart."""
 
     seed: int
     index: int
     ablate: bool = False
     sheets: Path | None = None
+    settings: DerenderSettings = field(default_factory=DerenderSettings)
 
 
 def measure(
-    frames: int, seed: int, workers: int, ablate: bool = False, sheets: Path | None = None
+    frames: int,
+    seed: int,
+    workers: int,
+    ablate: bool = False,
+    sheets: Path | None = None,
+    settings: DerenderSettings | None = None,
 ) -> Iterator[DerenderRow]:
-    """One row a frame, in order. sheets: a folder that gets the worst and some typical frames as pictures.
+    """One row a frame, in order. sheets: a folder that gets the worst and some typical frames as pictures;
+    settings: how frames are taken apart.
 
     Raises RangeError for no frames or no processes.
     """
@@ -214,7 +221,8 @@ def measure(
             raise RangeError(f"--{name}", "at least 1", value)
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         folder = None if sheets is None else Path(name)
-        tasks = [Task(seed, index, ablate, folder) for index in range(frames)]
+        settings = settings or DerenderSettings()
+        tasks = [Task(seed, index, ablate, folder, settings) for index in range(frames)]
         found = []
         for row in _in_processes(tasks, min(workers, frames)):
             found.append(row)
@@ -250,24 +258,24 @@ def work(task: Task) -> DerenderRow:
     frame = photograph_of(case.before, labels)
     reset = _reset_peak()
     start, cpu = time.perf_counter(), time.process_time()
-    scene = derender(frame)
+    scene = derender(frame, task.settings)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     peak = _peak_mb() if reset else None
     tracks = tracks_of(scene, case.before)
     row, strips = judge(case, scene, tracks, labels, task.index)
     row = replace(row, derender_s=round(seconds, 3), cpu_s=round(cpu, 3), peak_mb=peak)
-    row = replace(row, withheld=_withheld(case, frame))
+    row = replace(row, withheld=_withheld(case, frame, task.settings))
     if task.ablate:
-        row = replace(row, ablations=_ablations(case, scene, tracks, frame))
+        row = replace(row, ablations=_ablations(case, scene, tracks, frame, task.settings))
     if task.sheets is not None:
         files.write_png(task.sheets / f"{task.index}.png", sheet(strips))
     return row
 
 
-def _withheld(case: Case, frame: Frame) -> tuple[Shape, ...]:
+def _withheld(case: Case, frame: Frame, settings: DerenderSettings) -> tuple[Shape, ...]:
     """The shapes of the frame taken apart with templates of other kinds than the vehicles are of."""
     kinds = tuple(t.actor.kind for t in case.before.truths if t.labelled)
-    scene = derender(frame, DerenderSettings(withheld=kinds))
+    scene = derender(frame, replace(settings, withheld=kinds))
     return tuple(silhouettes(case, Compositor(scene), tracks_of(scene, case.before), None))
 
 
@@ -708,7 +716,9 @@ def never_seen(case: Case) -> Mask:
     return unseen
 
 
-def _ablations(case: Case, scene: SceneIR, tracks: list[int], frame: Frame) -> dict[str, dict[str, float]]:
+def _ablations(
+    case: Case, scene: SceneIR, tracks: list[int], frame: Frame, settings: DerenderSettings
+) -> dict[str, dict[str, float]]:
     """Move and removal once more, each with a part of the answer given; nothing where a vehicle was not found."""
     before = case.before
     if not {t.actor.track for t in before.truths if eligible(t)} <= {*tracks}:
@@ -723,7 +733,7 @@ def _ablations(case: Case, scene: SceneIR, tracks: list[int], frame: Frame) -> d
     }
     empty = without(case, tracks)
     for name, better in given.items():
-        other = derender(better)
+        other = derender(better, settings)
         found[name] = _figures(case, other, tracks_of(other, before), empty)
     perfect = perfect_scene(before, empty, tracks)
     parts: dict[str, tuple[str, ...]] = {

@@ -102,19 +102,21 @@ class _LabelFreeJudge:
         self._config = config
 
     def frame(self, name: str) -> FrameRows:
-        frame = self._read(name)
+        frame = frame_of(self._config, name)
         return FrameRows(0, ()) if frame.labels is None else judge(frame, frame.labels)
 
-    def _read(self, name: str) -> Frame:
-        if self._config.dataset != DEMO:
-            from drivesem.data.registry import open_dataset
 
-            return open_dataset(self._config.dataset, Path(self._config.root or "")).frame(name)
-        from drivesem.synth.frames import generate_frame
+def frame_of(config: BenchTool, name: str) -> Frame:
+    """A frame of the data set, or a generated one by its number. Raises SceneError for one that cannot be read."""
+    if config.dataset != DEMO:
+        from drivesem.data.registry import open_dataset
 
-        made = generate_frame(self._config.seed, int(name), "heldout")
-        picture = torch.from_numpy(made.image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))
-        return Frame(name, picture, made.camera, made.labels)
+        return open_dataset(config.dataset, Path(config.root or "")).frame(name)
+    from drivesem.synth.frames import generate_frame
+
+    made = generate_frame(config.seed, int(name), "heldout")
+    picture = torch.from_numpy(made.image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))
+    return Frame(name, picture, made.camera, made.labels)
 
 
 def judge(frame: Frame, labels: Labels) -> FrameRows:

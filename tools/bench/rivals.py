@@ -26,16 +26,18 @@ COLUMNS: Columns = {
     "scale": ("scale", "scale"), "pixels": ("pixels of the cars", None),
     "forward_ms": ("forward, ms", "forward ms"), "forward_iqr": ("IQR", None),
     "backward_ms": ("backward, ms", "backward"), "backward_iqr": ("IQR", None),
-    "forward_backward_ms": ("both, ms", "both"), "visible_pixels": ("pixels it shows", None),
-    "shows": ("shows", None), "unavailable": ("not available", "not available"),
+    "forward_backward_ms": ("both, ms", "both"), "cpu_ms": ("processor ms", "cpu"),
+    "visible_pixels": ("pixels it shows", None), "shows": ("shows", None),
+    "unavailable": ("not available", "not available"),
 }  # fmt: skip
 METHOD = (
     "All draw the same meshes, whole frames (warp-verbs: the cars' rectangles), from vertices that are new in "
     "each call: see `shows`. What drivesem bench render measures is the whole picture: texture from the "
     "photograph, completion, halo, shadows, blending. forward_ms: no gradients recorded, where the backend can "
     "tell; backward_ms: from a random gradient of the picture to the vertices; forward_backward_ms: recorded "
-    "forward and backward together. Medians after a warm-up. scale: pixels along an axis, as a multiple of "
-    "1242x375; pixels: hits of the meshes, car by car; visible_pixels: pixels of the frame that show a car, as "
+    "forward and backward together; processor ms: of both, or of forward where there is no backward, by the "
+    "processor's time, all threads together. Medians after a warm-up. scale: pixels along an axis, as a multiple "
+    "of 1242x375; pixels: hits of the meshes, car by car; visible_pixels: pixels of the frame that show a car, as "
     "the backend itself counts them."
 )
 OWN = "warp-verbs"
@@ -58,6 +60,7 @@ class RivalRow:
     forward_ms: float | None = None
     backward_ms: float | None = None
     forward_backward_ms: float | None = None
+    cpu_ms: float | None = None
     forward_iqr: float | None = None
     backward_iqr: float | None = None
     visible_pixels: int | None = None
@@ -107,6 +110,7 @@ def _row(
         backward_ms=None if times.backward is None else rounded(times.backward),
         backward_iqr=None if times.backward is None else round(times.backward.iqr, 3),
         forward_backward_ms=None if times.both is None else rounded(times.both),
+        cpu_ms=rounded(times.spent),
         visible_pixels=visible,
     )
 

@@ -20,10 +20,21 @@ class BenchTool(Tiles, DataSource, FrameCommand):
 
     what: tyro.conf.Positional[
         Literal[
-            "derender", "depth", "found", "label-free", "moves", "redraw", "weather", "synth", "rivals", "eval"
+            "derender",
+            "parts",
+            "depth",
+            "found",
+            "label-free",
+            "moves",
+            "redraw",
+            "weather",
+            "synth",
+            "rivals",
+            "eval",
         ]
     ] = "derender"
-    """derender: de-rendered generated frames beside the generator's truth; depth: how far surroundings are, beside
+    """derender: de-rendered generated frames beside the generator's truth; parts: where the
+    time of that goes, with a fit and with --fast; depth: how far surroundings are, beside
     the generator's truth, a laser, and in fog; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
     those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
@@ -39,20 +50,22 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
     100, with --quick 12; that moves does, by default 80, with --quick 6; that depth does, by default 40, with
-    --quick 6; that weather does, by default 24, with --quick 4; that label-free looks at, by default 60,
+    --quick 6; that weather does, by default 24, with --quick 4; that label-free and parts look at, by default 60,
     with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
+    fast: Flag = False
+    """Of derender: as drivesem derender --fast does."""
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
     """Of found, moves, redraw and weather: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a
     detector that was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Of found, label-free, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1, vkitti2,
-    coco or yolo."""
+    """Of found, label-free, parts, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1,
+    vkitti2, coco or yolo."""
     root: str | None = None
-    """Of found, label-free, redraw and depth: the data set's folder, such as KITTI's with training/image_2,
+    """Of found, label-free, parts, redraw and depth: the data set's folder, such as KITTI's with training/image_2,
     label_2, calib."""
     scenes: str | None = None
     """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
@@ -65,5 +78,6 @@ class BenchTool(Tiles, DataSource, FrameCommand):
         fewest = 10 if self.what == "synth" else 1
         few = self.frames is not None and self.frames < fewest
         refuse(few, "--frames", f"at least {fewest}", self.frames)
+        refuse(self.fast and self.what != "derender", "--fast", "derender before it", self.what)
         both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
         refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")

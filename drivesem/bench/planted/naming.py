@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from detectors.planted import Band, PlantedFault
-from drivesem.questions.holes.frame import told_around
+from drivesem.questions.holes.frame import samples_around
+from drivesem.questions.holes.results import Samples
 from drivesem.run.frame import AttackedScene
 from drivesem.truth.neighbourhood import Neighbourhood
 from drivesem.truth.nuisances import Nuisances
-from drivesem.truth.rules import overlap
+from drivesem.truth.rules import fit, overlap
 
 ENOUGH = 0.5
 """Overlap of bands, their intersection by their hull, from which a band is the right one."""
@@ -19,11 +20,16 @@ Where = Mapping[str, tuple[float, float]]
 
 def told_of(attacked: AttackedScene, index: int, samples: int, seed: int) -> tuple[Where, int]:
     """A rule from so many samples around the failure of one object, and the passes that they took."""
+    around = looked_around(attacked, index, samples, seed)
+    return fit(around.columns(), around.failing).where if around.margins else {}, len(around.margins)
+
+
+def looked_around(attacked: AttackedScene, index: int, samples: int, seed: int) -> Samples:
+    """So many samples around the failure of one object, half of them close to it. Each costs a pass."""
     objective, nuisances = attacked.objective, Nuisances()
     name = f"{attacked.identifier}:{index}:{seed}"
     near = Neighbourhood(objective, objective.feasible_set(), attacked.search.theta, index, nuisances, name)
-    told = told_around(near, samples)
-    return told.where, len(told.asked.margins) + len(told.close.margins)
+    return samples_around(near, samples)
 
 
 def agrees(where: Where, fault: PlantedFault, bands: Sequence[Band]) -> tuple[bool, bool]:

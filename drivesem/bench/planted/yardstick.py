@@ -13,6 +13,7 @@ import numpy as np
 from detectors.base import Detector, DetectorError, predict
 from detectors.planted import PlantedDetector
 from detectors.registry import load_detector
+from drivesem.attack.budgets import budget_of
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.bench.planted.naming import agrees, told_of
@@ -105,6 +106,7 @@ def attack_settings(config: Bench, method: str) -> Attack:
         **shared(config, Scenes),
         method=method,  # pyright: ignore[reportArgumentType]
         params=config.params,
+        budget=config.budget,
         passes=config.passes,
         detector=config.detector,
         device=config.device,
@@ -146,7 +148,7 @@ class Yardstick:
     def judge(self, name: str) -> JudgedFrame:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
         asked = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
-        keys = ("methods", "passes", "params", "detector", "quick", "faults", "naming")
+        keys = ("methods", "passes", "params", "budget", "detector", "quick", "faults", "naming")
         asked |= {key: getattr(self.config, key) for key in keys}
         asked.pop("limit")
         path = None if self.kept is None else self.kept / f"{name}.json"
@@ -163,7 +165,7 @@ class Yardstick:
         scene = next(iter(self.workers.values())).source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
-        space = ParameterSpace(scene, parse_params(self.config.params))
+        space = ParameterSpace(scene, parse_params(self.config.params), budget_of(self.config.budget))
         objective = Objective(Compositor(scene), space, self.detector)
         survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
         attempts: list[Attempt] = []
@@ -200,8 +202,8 @@ class Yardstick:
     def _attempt(
         self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
     ) -> Attempt:
-        certain = _certain(attacked)
-        seen = _seen_without(self.detector, attacked) if certain else ()
+        certain = certain_of(attacked)
+        seen = seen_without(self.detector, attacked) if certain else ()
         found = [index for index in certain if index in seen]
         inside = survey.inside(planting.fault, attacked.search.theta) if found else None
         attempt = Attempt(
@@ -226,7 +228,7 @@ class Yardstick:
 
     def _control(self, name: str, method: str, attacked: AttackedScene) -> Attempt:
         """The same without a fault: what is named then is not planted."""
-        certain = _certain(attacked)
+        certain = certain_of(attacked)
         where, passes = told_of(attacked, certain[0], Holes.samples, self.config.seed) if certain else (None, 0)
         return Attempt(
             frame=name,
@@ -251,11 +253,12 @@ def judge_of(config: Bench) -> Callable[[str], JudgedFrame]:
     return Yardstick.of(config).judge
 
 
-def _certain(attacked: AttackedScene) -> list[int]:
+def certain_of(attacked: AttackedScene) -> list[int]:
+    """Objects that are lost for certain."""
     return [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
 
 
-def _seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
+def seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
     """Objects that a detector finds in an attacked scene's picture."""
     objective, rendered = attacked.objective, attacked.rendered
     detections = objective.judged.detections(predict(detector, rendered.render.image[None])[0])

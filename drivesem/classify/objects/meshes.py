@@ -107,9 +107,10 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
             rgb[:] = 1.0
     elif isinstance(material, SimpleMaterial):
         image = material.image
-        rgb[:] = np.asarray(material.diffuse, float)[:3] / 255.0 if image is None else 1.0
-        specular = float(np.asarray(material.specular, float)[:3].mean() / 255.0)
-        shininess = _number(material.glossiness, _PLAIN[2], _MOST_SHININESS)
+        said = material.kwargs  # as the MTL has it: what it leaves out, trimesh fills with grey
+        rgb[:] = _share(said.get("kd"), grey) if image is None else 1.0
+        specular = float(_share(said.get("ks"), specular).mean())
+        shininess = _number(said.get("ns"), shininess, _MOST_SHININESS)
     if image is not None and uv is not None and len(uv) == len(part.vertices):
         rgb = rgb * _texels(image, np.asarray(uv, float)[part.faces][..., :2], path)
     return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])
@@ -118,6 +119,13 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
 def _number(value: Any, other: float, most: float) -> float:
     """What a material says, between 0 and `most`; another number where it says nothing, or nonsense."""
     return min(max(float(value), 0.0), most) if isinstance(value, int | float) and value == value else other
+
+
+def _share(value: Any, other: float) -> Array:
+    """A colour (3,) in [0, 1] of an MTL; grey of another lightness where it has none, or nonsense."""
+    if not isinstance(value, list) or len(value) != 3 or not np.isfinite(value).all():
+        return np.full(3, other)
+    return np.array(value, float).clip(0, 1)
 
 
 def _texels(image: Any, uv: Array, path: Path) -> Array:

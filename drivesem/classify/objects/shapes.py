@@ -31,17 +31,17 @@ def _closed(vertices: Array, quads: NDArray[np.int64], *extra: NDArray[np.int64]
     return cleaned(vertices, faces, np.zeros(len(faces), np.int64))
 
 
-def moved(solid: Solid, offset: Sequence[float]) -> Solid:
+def moved(solid: Solid, offset: ArrayLike) -> Solid:
     """The solid elsewhere."""
     return replace(solid, vertices=solid.vertices + np.asarray(offset, float))
 
 
-def scaled(solid: Solid, factors: Sequence[float]) -> Solid:
+def scaled(solid: Solid, factors: ArrayLike) -> Solid:
     """The solid stretched along the axes by positive factors."""
     return replace(solid, vertices=solid.vertices * np.asarray(factors, float))
 
 
-def turned(solid: Solid, axis: Axis, angle: float, about: Sequence[float] = (0.0, 0.0, 0.0)) -> Solid:
+def turned(solid: Solid, axis: Axis, angle: float, about: ArrayLike = (0.0, 0.0, 0.0)) -> Solid:
     """The solid turned by `angle` rad about an axis through a point, right-handed."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -81,9 +81,7 @@ def slab(outer: ArrayLike, inner: ArrayLike) -> Solid:
     return _closed(np.concatenate([top.reshape(-1, 3), under.reshape(-1, 3)]), np.concatenate(quads))
 
 
-def lathe(
-    profile: ArrayLike, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: Axis = "y", sides: int = 16
-) -> Solid:
+def lathe(profile: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), axis: Axis = "y", sides: int = 16) -> Solid:
     """A solid of revolution: profile (K, 2) of radius and place along the axis through `centre`."""
     radius, along = np.asarray(profile, float).T
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
@@ -94,11 +92,11 @@ def lathe(
     return loft(ring[..., _ORDER[axis]] + np.asarray(centre, float))
 
 
-def ball(centre: Sequence[float], radii: Sequence[float] | float, sides: int = 12) -> Solid:
+def ball(centre: ArrayLike, radii: ArrayLike, sides: int = 12) -> Solid:
     """An ellipsoid."""
     angle = np.linspace(0, np.pi, sides // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], 1), sides=sides)
-    return moved(scaled(unit, np.broadcast_to(np.asarray(radii, float), 3).tolist()), centre)
+    return moved(scaled(unit, np.broadcast_to(np.asarray(radii, float), 3)), centre)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> Solid:
@@ -119,7 +117,7 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> Solid:
     return loft(rings)
 
 
-def torus(centre: Sequence[float], radius: float, thick: float, axis: Axis = "z", sides: int = 24) -> Solid:
+def torus(centre: ArrayLike, radius: float, thick: float, axis: Axis = "z", sides: int = 24) -> Solid:
     """A ring about an axis: a tyre, a rim, a hoop. thick: radius of its section."""
     angle, section = 2 * np.pi * np.arange(sides) / sides, 2 * np.pi * np.arange(8) / 8
     reach = radius + thick * np.cos(section)
@@ -129,12 +127,17 @@ def torus(centre: Sequence[float], radius: float, thick: float, axis: Axis = "z"
     return loft(ring[..., _ORDER[axis]] + np.asarray(centre, float), around=True)
 
 
-def box(low: Sequence[float], high: Sequence[float], bevel: float = 0.0) -> Solid:
+def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.0) -> Solid:
     """An upright box between two corners, its edges cut by `bevel`."""
-    if bevel:
-        return solids.box(low, high, solids.Material.PAINT, bevel=bevel)
     a, b = np.asarray(low, float), np.asarray(high, float)
+    if bevel:
+        return solids.box(a.tolist(), b.tolist(), solids.Material.PAINT, bevel=bevel)
     return boxes(((a + b) / 2)[None], (b - a)[None])
+
+
+def block(x: tuple[float, float], y: tuple[float, float], z: float, bevel: float = 0.0) -> Solid:
+    """A box from -z to z: what most things have across their middle."""
+    return box((x[0], y[0], -z), (x[1], y[1], z), bevel)
 
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -227,7 +230,7 @@ def body(stations: ArrayLike, sides: int = 14, square: float = 2.0) -> Solid:
     return loft(np.stack([np.broadcast_to(x, (len(x), sides)), y + height * up, width * side], -1))
 
 
-def dome(radii: Sequence[float], polar: ArrayLike, azimuth: ArrayLike, thick: float, out: float = 0.0) -> Solid:
+def dome(radii: ArrayLike, polar: ArrayLike, azimuth: ArrayLike, thick: float, out: ArrayLike = 0.0) -> Solid:
     """A piece of an ellipsoidal shell about the origin, `thick` to the inside of `out` beyond its radii.
 
     polar (A,) or (A, B): rad from the top; azimuth (B,): rad from forward to the right.
@@ -236,11 +239,11 @@ def dome(radii: Sequence[float], polar: ArrayLike, azimuth: ArrayLike, thick: fl
     theta = np.asarray(polar, float)
     theta = np.broadcast_to(theta[:, None] if theta.ndim == 1 else theta, (len(theta), len(phi)))
     direction = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
-    radius = np.asarray(radii, float) + out
+    radius = np.asarray(radii, float) + np.asarray(out, float)
     return slab(direction * radius, direction * (radius - thick))
 
 
-def bowl(radii: Sequence[float], rim: ArrayLike, thick: float, steps: int = 10) -> Solid:
+def bowl(radii: ArrayLike, rim: ArrayLike, thick: float, steps: int = 10) -> Solid:
     """An ellipsoidal shell about the origin from its top to the polar angle `rim` (B,), around from forward."""
     edge = np.asarray(rim, float)
     phi = 2 * np.pi * np.arange(len(edge)) / len(edge)

@@ -76,8 +76,13 @@ class Kit:
 
     def add(self, surface: Surface, *solids: Solid) -> None:
         """Solids of one surface."""
-        number = self._surfaces.setdefault(surface, len(self._surfaces))
-        self._solids += [Solid(s.vertices, s.faces, np.full(len(s.faces), number)) for s in solids]
+        for solid in solids:
+            self.painted([surface], Solid(solid.vertices, solid.faces, np.zeros(len(solid.faces), np.int64)))
+
+    def painted(self, surfaces: Sequence[Surface], solid: Solid) -> None:
+        """A solid whose materials are numbers of surfaces."""
+        numbers = np.array([self._surfaces.setdefault(s, len(self._surfaces)) for s in surfaces])
+        self._solids.append(Solid(solid.vertices, solid.faces, numbers[solid.material]))
 
     def both(self, surface: Surface, *solids: Solid) -> None:
         """Solids of one surface, and their twins on the other side of z = 0."""

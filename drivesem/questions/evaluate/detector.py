@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
 from detectors.base import DetectorError, Predictor
@@ -23,6 +22,7 @@ from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.mistakes import marked
 from drivesem.report.tables import percent
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.looking import detections_in
 from drivesem.settings.commands import Eval

@@ -6,12 +6,11 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.evaluation.coco import STATS
 from drivesem.evaluation.results import Result
 from drivesem.report.plots import write_bars, write_curves
 from drivesem.report.tables import Sheet, csv_table, percent
+from drivesem.report.terminal import Console
 from scene_ir import files
 
 _COCO_WORDS = (

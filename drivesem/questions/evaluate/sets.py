@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from detectors.types import CLASSES
-from drivesem.data import kitti as kitti_files
+from drivesem.data.kitti_labels import TYPES
 from drivesem.data.label_table import REGION, LabelTable
 from drivesem.evaluation import kitti
 from drivesem.evaluation.instances import Found, Truths, from_xywh, from_xyxy
@@ -21,7 +20,7 @@ from drivesem.store import place
 from scene_ir import files
 
 _SHOWN = 3
-_KITTI_TYPES = tuple(kind for kind in kitti_files.TYPES if kind != "DontCare")
+_KITTI_TYPES = tuple(kind for kind in TYPES if kind != "DontCare")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +80,12 @@ def open_sets(config: Eval) -> EvalSet:
 
 def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
     """Classes that a layout has names for, whether they occur or not."""
-    fixed = {"kitti": _KITTI_TYPES, "vkitti1": _KITTI_TYPES, "vkitti2": _KITTI_TYPES, "run": CLASSES}
-    return tuple(dict.fromkeys((*fixed.get(layout, ()), *truth.kinds)))
+    fixed: tuple[str, ...] = _KITTI_TYPES if layout in ("kitti", "vkitti1", "vkitti2") else ()
+    if layout == "run":
+        from detectors.types import CLASSES
+
+        fixed = CLASSES
+    return tuple(dict.fromkeys((*fixed, *truth.kinds)))
 
 
 def _wanted(config: Eval, truth: LabelTable) -> tuple[str, ...] | None:

@@ -83,13 +83,19 @@ def sheets(explanations: Sequence[Explanation], rows: Sequence[Mean]) -> list[Sh
     return [
         Sheet(
             f"by parameter, frames: {len(explanations)}",
-            ("parameter", "loss", "failing, %", "gradient, %", "alone", "without", "needed", "found", "enough"),
+            (
+                *("parameter", "adds to loss", "of failing, %", "of gradient, %", "fail by it alone"),
+                *("fail without it", "need it", "car moved by", "enough"),
+            ),
             by_parameter,
             _LOOKS,
         ),
         Sheet(
             "how little is enough",
-            ("frame", "loss", "fails", "signs", "size", "enough", "left, %", _NEEDED, "cars", "still", "most by"),
+            (
+                *("frame", "loss", "failures", "flips on the way", "size, steps", "enough, steps", "enough, %"),
+                *(_NEEDED, "cars", "still", "most loss by"),
+            ),
             by_frame,
             _LOOKS,
         ),
@@ -108,7 +114,10 @@ def what_if(explanation: Explanation) -> Sheet:
             loss, fails = f"{loss} ± {one.loss_error:.2f}", f"{fails} ± {100 * one.fails_error:.0f}"
         share = "-" if one.gradient_share is None else f"{100 * one.gradient_share:.0f}"
         rows.append((one.name, loss, fails, share, *_told(one.alone), *_told(one.without)))
-    columns = ("part", "loss", "failing, %", "gradient, %", "alone: loss", "fails", "without: loss", "fails")
+    columns = (
+        *("part", "adds to loss", "of failing, %", "of gradient, %"),
+        *("alone: loss", "alone: failures", "without: loss", "without: failures"),
+    )
     return Sheet(explanation.identifier, columns, tuple(rows))
 
 
@@ -116,14 +125,15 @@ def notes(draws: int) -> list[str]:
     """What the columns mean."""
     spread = f"; in brackets: 95 % of {draws} draws of frames" if draws else ""
     return [
-        "Loss, failing: mean Shapley values, which add up to the rise of the loss and to 100 %"
-        f"{spread}. Gradient: share of |gradient x change|, taken at the photograph. Alone, without: frames that "
-        "fail by this parameter's part of the change only, and by all but it. Needed: frames whose least failing "
-        "change has it. Found, enough: how far the car goes that goes farthest, in the counterexample and in the "
-        "least change where it is needed; medians over frames.",
-        "Fails: lost objects + phantoms. Signs: how often failing begins or ends between photograph and "
-        "counterexample. Size: of the change in sign steps; enough: of the least that still fails; left: its "
-        f"share; {_NEEDED}, cars: what it moves; still: how it fails. Most by: the car with most of the loss.",
+        "Adds to loss, of failing: mean Shapley values, which add up to the rise of the loss and to 100 %"
+        f"{spread}. Of gradient: share of |gradient x change|, taken at the photograph. Fail by it alone, without "
+        "it: frames that fail by this parameter's part of the change only, and by all but it. Need it: frames "
+        "whose least failing change has it. Car moved by, enough: how far the car goes that goes farthest, in the "
+        "counterexample and in the least change where it is needed; medians over frames.",
+        "Failures: lost objects + phantoms. Flips on the way: how often failing begins or ends between photograph "
+        "and counterexample. Size: of the change in sign steps; enough: of the least that still fails, and its "
+        "share; "
+        f"{_NEEDED}, cars: what it moves; still: how it fails. Most loss by: the car with most of the loss.",
     ]
 
 

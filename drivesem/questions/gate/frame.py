@@ -16,6 +16,7 @@ from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import Failure, load_frame
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Attack
+from drivesem.truth.certificate import Look
 from drivesem.truth.neighbourhood import NEAR, Neighbourhood
 from drivesem.truth.nuisances import Nuisances
 from scene_ir import files
@@ -56,16 +57,20 @@ def compare_frame(
 
 def _pair(failure: Failure, index: int, near: Neighbourhood, after: Predictor, samples: int) -> Pair:
     camera = near.camera_of(after, t_star_of(after))
-    outcomes: list[tuple[bool, bool]] = []
+    looks: list[tuple[Look, Look]] = []
     for number in range(samples):
         # One half near the failure: a hole may be small beside its neighbourhood.
         sample = near.sample(number, 1.0 if number % 2 == 0 else NEAR)
         if sample is not None:
-            outcomes.append((near.fails(sample), near.fails(sample, camera)))
+            looks.append((near.look(sample), near.look(sample, camera)))
+    lost = [tuple(not bool(look.judged.found[index]) for look in both) for both in looks]
+    phantoms = [tuple(bool(look.judged.background) for look in both) for both in looks]
     return Pair(
         index,
         failure.label,
         failure.error or "",
-        tuple(one for one, _ in outcomes),
-        tuple(other for _, other in outcomes),
+        tuple(one for one, _ in lost),
+        tuple(other for _, other in lost),
+        tuple(one for one, _ in phantoms),
+        tuple(other for _, other in phantoms),
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drivesem.questions.gate.rows import ALL, HOLE, GateRow
+from drivesem.questions.gate.rows import ALL, HOLE, PHANTOMS, GateRow
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
 from scene_ir import files
@@ -15,9 +15,11 @@ from scene_ir import files
 _SHOWN = 12
 """Holes in the table on a terminal; the files have all."""
 _NOTE = (
-    "Lost: share of samples around a certain failure in which a detector does not find the object; both see the "
-    "same pictures. In brackets: 95 % by paired bootstrap, over samples of a hole, and over holes for kinds and "
-    "for all. A row grew where the difference is above the tolerance and its interval above 0."
+    "Lost: share of samples around a certain failure in which a detector does not find the object; both see "
+    "the same pictures. Phantoms: share of these samples in which a detector reports something where nothing "
+    "is, anywhere in the picture. In brackets: 95 % by paired bootstrap, over samples of a hole, and over "
+    "holes for kinds, for all, and for phantoms. A row grew where the difference is above the tolerance and "
+    "its interval above 0."
 )
 _NONE = "No certain failure of an object in these runs: nothing to compare, so the gate is passed."
 
@@ -50,7 +52,8 @@ def junit(rows: Sequence[GateRow]) -> str:
     for row in rows:
         case = ET.SubElement(suite, "testcase", classname=f"drivesem.gate.{row.level}", name=row.hole)
         if row.grew:
-            told = f"lost {100 * row.before:.1f} % before, {100 * row.after:.1f} % after"
+            verb = "phantoms in" if row.level == PHANTOMS else "lost"
+            told = f"{verb} {100 * row.before:.1f} % before, {100 * row.after:.1f} % after"
             ET.SubElement(
                 case, "failure", message=told, type="grew"
             ).text = f"{told}; difference {_difference(row)}"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivesem.run.records import dump_record, load_record
 
-SCHEMA = 1
+SCHEMA = 2
 GATE = "gate.json"
 """The file that marks a frame as done."""
 
@@ -15,7 +15,8 @@ GATE = "gate.json"
 @dataclass(frozen=True, slots=True)
 class Pair:
     """One certain failure's neighbourhood. index: of the object; error: kind of the failure; before, after: by
-    sample, whether either detector does not find the object.
+    sample, whether either detector does not find the object; phantoms_before, phantoms_after: by sample, whether
+    it reports anything where nothing is, in the whole picture.
     """
 
     index: int
@@ -23,6 +24,8 @@ class Pair:
     error: str
     before: tuple[bool, ...]
     after: tuple[bool, ...]
+    phantoms_before: tuple[bool, ...]
+    phantoms_after: tuple[bool, ...]
 
 
 @dataclass(frozen=True, slots=True)

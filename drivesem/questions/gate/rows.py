@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,15 @@ import numpy as np
 from drivesem.evaluation.resampling import Difference, differences, rate
 from drivesem.questions.gate.results import Pair
 
-HOLE, KIND, ALL = "hole", "kind", "all"
+HOLE, KIND, ALL, PHANTOMS = "hole", "kind", "all", "phantoms"
 
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """level: HOLE, KIND or ALL; hole: its name. before, after: share of samples in which either detector does not
-    find the object; difference: after less before; low, high: its 95 % interval by paired bootstrap, over samples
-    of one hole and over holes else; samples, holes: how many. grew: by more than is tolerated, beyond chance.
+    """level: HOLE, KIND, ALL or PHANTOMS; hole: its name. before, after: share of samples in which either detector
+    does not find the object, of PHANTOMS in which it reports what is not there; difference: after less before;
+    low, high: its 95 % interval by paired bootstrap, over samples of one hole and over holes else;
+    samples, holes: how many. grew: by more than is tolerated, beyond chance.
     """
 
     level: str
@@ -40,8 +41,8 @@ class GateRow:
 
 
 def rows_of(found: Mapping[str, Sequence[Pair]], tolerance: float, draws: int, seed: int) -> list[GateRow]:
-    """Rows of pairs by frame: holes, those that grew most first; then kinds; then all of them. tolerance: by how
-    much a share may grow. A pair without samples has no row.
+    """Rows of pairs by frame: holes, those that grew most first; then kinds; then all of them; then phantoms in
+    their samples. tolerance: by how much a share may grow. A pair without samples has no row.
     """
     named = [(f"{frame}: objects[{p.index}]", p) for frame, pairs in found.items() for p in pairs if p.before]
     holes = [_row(HOLE, name, [pair], tolerance, draws, seed) for name, pair in named]
@@ -51,8 +52,11 @@ def rows_of(found: Mapping[str, Sequence[Pair]], tolerance: float, draws: int, s
         _row(KIND, kind, [pair for _, pair in named if pair.error == kind], tolerance, draws, seed)
         for kind in sorted(kinds)
     ]
-    whole = [_row(ALL, ALL, [pair for _, pair in named], tolerance, draws, seed)] if named else []
-    return [*holes, *others, *whole]
+    pairs = [pair for _, pair in named]
+    seen = [replace(pair, before=pair.phantoms_before, after=pair.phantoms_after) for pair in pairs]
+    whole = [_row(ALL, ALL, pairs, tolerance, draws, seed)] if named else []
+    phantoms = [_row(PHANTOMS, PHANTOMS, seen, tolerance, draws, seed)] if named else []
+    return [*holes, *others, *whole, *phantoms]
 
 
 def _row(level: str, name: str, pairs: Sequence[Pair], tolerance: float, draws: int, seed: int) -> GateRow:

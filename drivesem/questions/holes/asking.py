@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.attack.space import parse_params
-from drivesem.questions.holes.frame import Effort, look_again, look_around
-from drivesem.questions.holes.merged import merged
+from drivesem.questions.holes.frame import Effort, Further, look_around, look_inside
+from drivesem.questions.holes.merged import Explained, merged
+from drivesem.questions.holes.pooled import Key, Told, rules_of
 from drivesem.questions.holes.report import answer_of
 from drivesem.questions.holes.results import (
+    FRESH,
     HOLES,
     RECHECK,
-    Around,
     FrameHoles,
-    FrameRecheck,
+    FrameInside,
     Samples,
     load,
-    load_recheck,
+    load_inside,
 )
 from drivesem.report.answer import Answer
+from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, folder_of, trusted_attack
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Holes
+from drivesem.truth.rules import Where
 
-_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs", "rechecks")
+_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs", "fresh", "rechecks")
 _FREE = (*PRESENTATION, "runs", "recheck")
 
 
@@ -42,40 +45,53 @@ def holes_run(config: Holes) -> Answer:
         trusted_attack(run.folder, config.trust)  # before anything is written
     claim(out, config, _WRITTEN, _FREE)
     _tell_effort(runs, config)
-    found: dict[str, list[Around]] = {}
+    found: dict[str, FrameHoles] = {}
     failed: dict[str, str] = {}
-    results: list[FrameHoles | FrameRecheck] = []
-    again: dict[tuple[str, int], Samples] = {}
-    for place, run in enumerate(runs):
+    marks = [f"{run.name}/" if len(runs) > 1 else "" for run in runs]
+    for place, (run, mark) in enumerate(zip(runs, marks, strict=True)):
         below = out / "runs" / str(place)
         build = partial(HolesWorker, config, run, below)
-        names = _chosen(run)
+        names = [frame.result.identifier for frame in run.frames] if config.contrast else _chosen(run)
+        bar = Bar(f"looking around failures of {run.name}", remaining=True)
         kept, left = KeptFrames(run, below, HOLES, load).ask(
-            names, build(), build, config, Bar(f"looking around failures of {run.name}", remaining=True)
+            names if _chosen(run) else [], build(), build, config, bar
         )
-        mark = f"{run.name}/" if len(runs) > 1 else ""
-        found |= {mark + one.identifier: list(one.around) for one in kept}
+        found |= {mark + one.identifier: one for one in kept}
         failed |= {mark + name: reason for name, reason in left.items()}
-        results += kept
-        if config.recheck is not None:
-            beside = out / "rechecks" / str(config.recheck) / str(place)
-            checks, left = _rechecked(config, run, kept, below, beside)
+    told = rules_of(found)
+    inside: dict[str, dict[Key, Samples]] = {}
+    passes = sum(one.passes for one in found.values())
+    stages = {"fresh": Further.fresh(config.samples, config.fresh)}
+    if config.recheck is not None:
+        stages[f"rechecks/{config.recheck}"] = Further.again(config.recheck)
+    for folder, further in stages.items():
+        inside[further.file] = {}
+        for place, (run, mark) in enumerate(zip(runs, marks, strict=True)):
+            checks, left = _inside(
+                config, run, _of_run(told, found, run, mark), further, out / folder / str(place)
+            )
             for check in checks:
-                inside = zip(check.indices, check.inside, strict=True)
-                again |= {(mark + check.identifier, index): samples for index, samples in inside}
+                own = zip(check.indices, check.inside, strict=True)
+                inside[further.file] |= {(mark + check.identifier, index): samples for index, samples in own}
+                passes += check.passes
             failed |= {mark + name: reason for name, reason in left.items()}
-            results += checks
     facts = {
         "out": str(out),
         "runs": [str(run.folder) for run in runs],
         "detector": runs[0].detector,
         "params": runs[0].params,
         "frames": sum(len(run.frames) for run in runs),
-        "failures": sum(map(len, found.values())),
-        "passes": sum(one.passes for one in results),
+        "failures": len(told),
+        "passes": passes,
         "frames_failed": failed,
     }
-    answer = answer_of(out, merged(found, again), facts, failed)
+    nothing = Samples((), (), ())
+    explained = {
+        (frame, one.index): Explained(one, told[frame, one.index], inside[FRESH].get((frame, one.index), nothing))
+        for frame, holes in found.items()
+        for one in holes.around
+    }
+    answer = answer_of(out, merged(explained, inside.get(RECHECK, {})), facts, failed)
     answer.write()
     return answer
 
@@ -85,7 +101,7 @@ class HolesWorker:
 
     def __init__(self, config: Holes, run: Run, out: Path) -> None:
         self.run, self.out = run, out
-        self.effort = Effort(config.samples, config.fresh, config.reach, config.seed)
+        self.effort = Effort(config.samples, config.contrast, config.reach, config.seed)
         self.attack, self.params = trusted_attack(run.folder, config.trust), parse_params(run.params)
         self.detector = detector_of(self.attack, config.device)
 
@@ -95,28 +111,48 @@ class HolesWorker:
         look_around(folder, self.attack, self.params, self.detector, self.effort, self.out / FRAMES / name)
 
 
-class RecheckWorker(HolesWorker):
-    """The same for further samples. known: where rules are kept."""
+class InsideWorker(HolesWorker):
+    """The same for further samples. rules: by frame and object."""
 
-    def __init__(self, config: Holes, run: Run, known: Path, out: Path) -> None:
+    def __init__(
+        self, config: Holes, run: Run, rules: dict[str, dict[int, Where]], further: Further, out: Path
+    ) -> None:
         super().__init__(config, run, out)
-        self.known, self.draws = known, config.recheck or 0
+        self.rules, self.further = rules, further
 
     def __call__(self, name: str) -> None:
         """One frame, of which rules are known."""
-        folder, known = self.run.folder / FRAMES / name, load(self.known / FRAMES / name / HOLES)
-        out = self.out / FRAMES / name
-        look_again(folder, self.attack, self.params, self.detector, self.effort, known, self.draws, out)
+        folder, rules, out = self.run.folder / FRAMES / name, self.rules[name], self.out / FRAMES / name
+        look_inside(folder, self.attack, self.params, self.detector, self.effort, rules, self.further, out)
 
 
-def _rechecked(
-    config: Holes, run: Run, known: list[FrameHoles], below: Path, out: Path
-) -> tuple[list[FrameRecheck], dict[str, str]]:
-    """Further samples of the frames that are known, kept in `out`, and why there are none of others."""
-    build = partial(RecheckWorker, config, run, below, out)
-    names = [one.identifier for one in known]
+def _inside(
+    config: Holes, run: Run, rules: dict[str, dict[int, Where]], further: Further, out: Path
+) -> tuple[list[FrameInside], dict[str, str]]:
+    """Further samples inside of the rules of a run's failures, and why there are none of others. They are kept in
+    `out` by what the rules are: those of other rules say nothing of these.
+    """
+    below = out / hashlib.sha256(repr(sorted(rules.items())).encode()).hexdigest()[:12]
+    build = partial(InsideWorker, config, run, rules, further, below)
     bar = Bar(f"checking rules of {run.name}", remaining=True)
-    return KeptFrames(run, out, RECHECK, load_recheck).ask(names, build(), build, config, bar)
+    return KeptFrames(run, below, further.file, load_inside).ask(list(rules), build(), build, config, bar)
+
+
+def _of_run(
+    told: Mapping[Key, Told], found: Mapping[str, FrameHoles], run: Run, mark: str
+) -> dict[str, dict[int, Where]]:
+    """The rules of a run's failures, by frame and object, of those that have samples."""
+    rules: dict[str, dict[int, Where]] = {}
+    for frame in run.frames:
+        name = mark + frame.result.identifier
+        own = {
+            one.index: told[name, one.index].where
+            for one in (found[name].around if name in found else ())
+            if one.asked.margins
+        }
+        if own:
+            rules[frame.result.identifier] = own
+    return rules
 
 
 def _chosen(run: Run) -> list[str]:
@@ -129,6 +165,7 @@ def _tell_effort(runs: list[Run], config: Holes) -> None:
     results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
     seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
     wanted = count * (config.samples + config.fresh + (config.recheck or 0))
+    wanted += config.contrast * sum(len(run.frames) for run in runs) if count else 0
     minutes = wanted * seconds / passes / 60 if passes else None
     pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
     told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare or rules narrow"

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from drivesem.evaluation.resampling import newcombe, wilson
+from drivesem.questions.holes.pooled import Key, Told
 from drivesem.questions.holes.results import Around, Samples
 from drivesem.synth.compare import QUANTITIES, reference
 from drivesem.truth.rare import Share
-from drivesem.truth.rules import Rule, counted, in_words, overlap
+from drivesem.truth.rules import Rule, Where, counted, in_words, overlap
 
 ONE = 0.5
 """Overlap from which two rules of the same features are one hole."""
@@ -23,9 +24,17 @@ _OF_KITTI = {
 }
 """Features of which KITTI's distribution is known: its name there, and how many of its units one of ours is."""
 
-Where = dict[str, tuple[float, float]]
-Again = Mapping[tuple[str, int], Samples]
+Again = Mapping[Key, Samples]
 """Of a recheck: samples inside of the rule around a failure, by frame and object."""
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """A failure and its rule. fresh: further samples inside of the rule, which it is held against."""
+
+    around: Around
+    told: Told
+    fresh: Samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +83,8 @@ class Hole:
     label: class of the objects; probability, low, high: of failing in fresh samples inside, with Wilson's 95 %
     interval, of `count` samples; outside: share of failures outside of it; lost: how large it is, the
     share of the neighbourhoods in which the object is lost; kitti: share of KITTI's vehicles inside, by feature;
-    failures, frames: that led to it; recheck: None where none was asked for, or nothing is stated.
+    failures, frames: that led to it; pooled: whether the rule is of several failures' samples; recheck: None where
+    none was asked for, or nothing is stated.
     """
 
     where: Where
@@ -88,6 +98,7 @@ class Hole:
     kitti: dict[str, float]
     failures: tuple[str, ...]
     frames: tuple[str, ...]
+    pooled: bool
     recheck: Recheck | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -96,6 +107,7 @@ class Hole:
             "parameters": list(self.where),
             "where": {name: list(bounds) for name, bounds in self.where.items()},
             "class": self.label,
+            "pooled": self.pooled,
             "probability": self.probability,
             "interval": [self.low, self.high],
             "samples": self.count,
@@ -117,18 +129,18 @@ class Hole:
         return in_words(self.where)
 
 
-def merged(found: Mapping[str, Sequence[Around]], again: Again | None = None) -> list[Hole]:
-    """Holes of all frames, by name, largest first; what is told by the same features as a larger one comes after
-    those that are not. again: samples of a recheck.
+def merged(found: Mapping[Key, Explained], again: Again | None = None) -> list[Hole]:
+    """Holes of all failures, by frame and object, largest first; what is told by the same features as a larger one
+    comes after those that are not. again: samples of a recheck.
     """
-    groups: list[list[tuple[str, Around]]] = []
-    for frame, arounds in found.items():
-        for around in arounds:
-            like = next((group for group in groups if _alike(group[0][1], around)), None)
-            if like is None:
-                groups.append([(frame, around)])
-            else:
-                like.append((frame, around))
+    groups: list[list[tuple[Key, Explained]]] = []
+    # Rules of many failures first: others that are much like one join it.
+    for key, one in sorted(found.items(), key=lambda item: not item[1].told.pooled):
+        like = next((group for group in groups if _alike(group[0][1], one)), None)
+        if like is None:
+            groups.append([(key, one)])
+        else:
+            like.append((key, one))
     holes = sorted((_hole(group, again or {}) for group in groups), key=lambda hole: -hole.lost.probability)
     seen: set[tuple[str, ...]] = set()
     first: list[Hole] = []
@@ -140,39 +152,41 @@ def merged(found: Mapping[str, Sequence[Around]], again: Again | None = None) ->
     return first + copies
 
 
-def _alike(one: Around, other: Around) -> bool:
-    same = one.label == other.label and set(one.where) == set(other.where)
-    return same and overlap(one.where, other.where) >= ONE
+def _alike(one: Explained, other: Explained) -> bool:
+    same = one.around.label == other.around.label and set(one.told.where) == set(other.told.where)
+    return same and overlap(one.told.where, other.told.where) >= ONE
 
 
-def _hole(group: Sequence[tuple[str, Around]], again: Again) -> Hole:
-    members = [around for _, around in group]
+def _hole(group: Sequence[tuple[Key, Explained]], again: Again) -> Hole:
+    members, first = [one for _, one in group], group[0][1].told
     # Of bounds that differ a little from failure to failure, the ones in the middle.
     where: Where = {
         name: (
-            float(np.median([around.where[name][0] for around in members])),
-            float(np.median([around.where[name][1] for around in members])),
+            float(np.median([one.told.where[name][0] for one in members])),
+            float(np.median([one.told.where[name][1] for one in members])),
         )
-        for name in members[0].where
+        for name in first.where
     }
-    asked = [
-        counted(where, around.asked.columns(), around.asked.failing) for around in members if around.asked.margins
-    ]
-    fails, count = _inside(where, [around.fresh for around in members])
-    checked = _inside(where, [again[key] for frame, around in group if (key := (frame, around.index)) in again])
+    if first.pooled:
+        where = first.where
+    around = [one.around for one in members if one.around.asked.margins]
+    asked = [counted(where, one.asked.columns(), one.asked.failing) for one in around]
+    fails, count = _inside(where, [one.fresh for one in members])
+    checked = _inside(where, [again[key] for key, _ in group if key in again])
     low, high = wilson(fails, count) if count else (None, None)
     return Hole(
         where=where,
-        label=members[0].label,
+        label=members[0].around.label,
         probability=fails / count if count else None,
         low=low,
         high=high,
         count=count,
         outside=_share(asked),
-        lost=_mean([around.lost for around in members]),
+        lost=_mean([one.around.lost for one in members]),
         kitti=of_kitti(where),
-        failures=tuple(f"{frame}: objects[{around.index}]" for frame, around in group),
-        frames=tuple(dict.fromkeys(frame for frame, _ in group)),
+        failures=tuple(f"{frame}: objects[{index}]" for (frame, index), _ in group),
+        frames=tuple(dict.fromkeys(frame for (frame, _), _ in group)),
+        pooled=first.pooled,
         recheck=Recheck((fails, count), checked) if count and checked[1] else None,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +12,9 @@ from drivesem.run.records import dump_record, load_record
 from drivesem.truth.rare import Share
 from drivesem.truth.rules import Flags, Floats
 
-SCHEMA = 2
-HOLES, RECHECK = "holes.json", "recheck.json"
-"""The files that mark a frame as done: its rules, and further samples inside of them."""
+SCHEMA = 3
+HOLES, FRESH, RECHECK = "holes.json", "fresh.json", "recheck.json"
+"""The files that mark a frame as done: its samples, and further ones inside of rules."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +37,19 @@ class Samples:
         return np.array(self.margins, np.float64) < 0
 
 
+def joined(parts: Sequence[Samples]) -> Samples:
+    """All samples, of the same features."""
+    some = [part for part in parts if part.margins]
+    names = some[0].names if some else ()
+    values = tuple(row for part in some for row in part.values)
+    return Samples(names, values, tuple(margin for part in some for margin in part.margins))
+
+
 @dataclass(frozen=True, slots=True)
 class Around:
     """Around one certain failure. index: of the object; error, grade: of the failure; asked: samples of the whole
-    neighbourhood; near: of the part of it around the failure, as a hole may be small; where: the rule of both;
-    fresh: further ones of the whole, inside of the rule, which it is held against; lost: in how much of the whole
-    the object is lost.
+    neighbourhood; near: of the part of it around the failure, as a hole may be small; lost: in how much of the
+    whole the object is lost.
     """
 
     index: int
@@ -50,26 +58,47 @@ class Around:
     grade: str
     asked: Samples
     near: Samples
-    where: dict[str, tuple[float, float]]
-    fresh: Samples
     lost: Share
 
 
 @dataclass(frozen=True, slots=True)
+class Beside:
+    """Samples of all objects of a class, anywhere within the bounds, lost or not. objects: of each sample."""
+
+    label: str
+    objects: tuple[int, ...]
+    samples: Samples
+
+    def by_object(self) -> dict[int, Samples]:
+        """The samples of each."""
+        found: dict[int, Samples] = {}
+        for index in dict.fromkeys(self.objects):
+            rows = [row for row, of in enumerate(self.objects) if of == index]
+            values, margins = self.samples.values, self.samples.margins
+            found[index] = Samples(
+                self.samples.names, tuple(values[row] for row in rows), tuple(margins[row] for row in rows)
+            )
+        return found
+
+
+@dataclass(frozen=True, slots=True)
 class FrameHoles:
-    """One frame. source: digest of the run's result. `seconds` alone may differ between two calls."""
+    """One frame. source: digest of the run's result; beside: by class. `seconds` alone may differ between two
+    calls.
+    """
 
     identifier: str
     source: str
     around: tuple[Around, ...]
+    beside: tuple[Beside, ...]
     passes: int
     seconds: float
 
 
 @dataclass(frozen=True, slots=True)
-class FrameRecheck:
-    """Of one frame, samples inside of the rule around each of its failures, by seeds that neither the rule nor its
-    probability knew. source: digest of the run's result; indices: of the objects.
+class FrameInside:
+    """Of one frame, further samples inside of the rule of each of its failures. source: digest of the run's
+    result; indices: of the objects.
     """
 
     identifier: str
@@ -80,7 +109,7 @@ class FrameRecheck:
     seconds: float
 
 
-def dump(result: FrameHoles | FrameRecheck) -> str:
+def dump(result: FrameHoles | FrameInside) -> str:
     """JSON text."""
     return dump_record(result, SCHEMA)
 
@@ -90,6 +119,6 @@ def load(path: Path) -> FrameHoles:
     return load_record(path, FrameHoles, SCHEMA)
 
 
-def load_recheck(path: Path) -> FrameRecheck:
+def load_inside(path: Path) -> FrameInside:
     """The same of further samples."""
-    return load_record(path, FrameRecheck, SCHEMA)
+    return load_record(path, FrameInside, SCHEMA)

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import track
 
 from drivesem.evaluation.resampling import DRAWS
@@ -16,6 +15,7 @@ from drivesem.questions.realism.comparison import PAIRS, FrameParts, RealismRow,
 from drivesem.questions.realism.measures import METRICS, load, missing, psnr_db
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
+from drivesem.report.terminal import Console
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Realism

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib import resources
-from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from drivesem.questions.realism import networks
 from drivesem.questions.realism.networks import Trunk
+from scene_ir import files
 from scene_ir.errors import ShapeError
 
 TRUNKS: dict[str, Callable[[], Trunk]] = {
@@ -35,7 +35,8 @@ def published_heads(net: str) -> list[Tensor]:
     with resources.as_file(
         resources.files("drivesem.questions.realism") / "weights" / "lpips-0.1.safetensors"
     ) as path:
-        tensors = load_file(Path(path))
+        files.check_card(path, files.read_bytes(path))
+        tensors = load_file(path)
     return [tensors[f"{net}.lin{i}"] for i in range(len(TRUNKS[net]().taps))]
 
 

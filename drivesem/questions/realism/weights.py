@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import pickle
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +13,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from detectors.base import DetectorError
+from detectors.reading import read_state
 from scene_ir.errors import FormatError
 
 _COUNTER = "num_batches_tracked"
 """Files from before torch 0.4.1 lack it; nothing here uses it."""
-_UNREADABLE = (
-    *(OSError, RuntimeError, ValueError, EOFError, KeyError),
-    *(pickle.UnpicklingError, zipfile.BadZipFile, SafetensorError),
-)
-"""What readers of weights raise for a file that is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +91,10 @@ def _download(url: str, place: Path) -> Path:
 def read(path: Path) -> Mapping[str, Tensor]:
     """The tensors of a .pth, .pt or .safetensors file, by name. Raises FormatError naming the file."""
     try:
-        state = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
-    except _UNREADABLE as error:
+        state = load_file(path) if path.suffix == ".safetensors" else read_state(path, "a file of weights")
+    except DetectorError as error:
+        raise FormatError(str(path), "a file of weights", str(error).partition(", found ")[2]) from error
+    except (OSError, SafetensorError) as error:
         raise FormatError(str(path), "a file of weights", str(error).split("\n")[0].split(". ")[0]) from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise FormatError(str(path), "tensors by name", type(state).__name__)

@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.report import Confirmation
@@ -28,6 +26,7 @@ from drivesem.questions.study.success import against, curve_of
 from drivesem.questions.transfer.asking import DETECTIONS
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
+from drivesem.report.terminal import Console
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line

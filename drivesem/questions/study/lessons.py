@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 
 from detectors.registry import SHIPPED, save_detector
@@ -16,6 +15,7 @@ from drivesem.data.joined import open_folders
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.questions.study.arms import Arm, attack_of
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
+from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker
 from drivesem.run.protocol import follows_paper
 from drivesem.run.workers import mapping

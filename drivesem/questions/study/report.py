@@ -27,7 +27,7 @@ from drivesem.truth.grades import Grade, Kind
 
 OWN_PROTOCOL = (
     "Ours, own protocol: not comparable with the paper's figures, which stand beside its own protocol only "
-    "(--config configs/paper.yaml)."
+    "(--config paper)."
 )
 _ARM, _MEASURE, _CLASS = "arm", "figure", "class"
 _WORDS = (_ARM, _MEASURE, _CLASS)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from detectors.base import Detector
 from detectors.registry import load_detector, read_weights, save_detector
@@ -26,6 +25,7 @@ from drivesem.questions.study.running import ARMS, ArmRun, Ran, run_arms, worker
 from drivesem.questions.transfer.asking import detectors_of
 from drivesem.questions.transfer.asking import rows_of as transfer_rows
 from drivesem.questions.transfer.matrix import AP50, BROKEN, TransferRow, figures_of
+from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker, select_frames
 from drivesem.run.finished import load_runs
 from drivesem.run.frame import as_detections, detection_records

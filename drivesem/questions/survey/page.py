@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import jinja2
 import numpy as np
+from markupsafe import Markup
 
 from detectors.types import CLASSES
 from drivesem.evaluation.resampling import Figure, Interval, intervals
@@ -24,7 +25,9 @@ from drivesem.questions.realism.closeness import Picture
 from drivesem.questions.realism.comparison import vehicles
 from drivesem.questions.realism.frechet import Floats
 from drivesem.questions.survey.agreement import alpha, interval, nominal
+from drivesem.report.policy import script_hash
 from drivesem.run.finished import Frame, Run
+from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError, ShapeError
@@ -165,13 +168,18 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
         }
         for item, view in items
     ]
-    # "</" would end the script element.
-    data = json.dumps({"survey": survey_name([item for item, _ in items]), "items": shown}).replace("</", "<\\/")
+    # "</" would end the script element, and "<!--" hide its end.
+    told = {"survey": survey_name([item for item, _ in items]), "columns": COLUMNS, "items": shown}
+    data = json.dumps(told).replace("<", "\\u003c")
+    script = _part("survey.js")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(
-        resources.files("drivesem.questions.survey").joinpath("survey.html").read_text(encoding="utf-8")
-    )
-    return template.render(data=data, count=len(items), choices=CHOICES, least=LEAST, most=MOST, columns=COLUMNS)
+    template = environment.from_string(_part("survey.html"))
+    asked = {"count": len(items), "choices": CHOICES, "least": LEAST, "most": MOST}
+    return template.render(data=data, script=Markup(script), script_hash=Markup(script_hash(script)), **asked)
+
+
+def _part(name: str) -> str:
+    return resources.files("drivesem.questions.survey").joinpath(name).read_text(encoding="utf-8")
 
 
 def _jpeg(image: Picture) -> str:
@@ -187,10 +195,10 @@ def write_key(path: Path, items: Sequence[Item], facts: Mapping[str, Any]) -> No
 def read_key(path: Path) -> tuple[str, list[Item]]:
     """The survey's name and items. Raises FormatError where the file is no key."""
     data = files.read_json(path)
-    try:
-        return str(data["survey"]), [Item(**item) for item in data["items"]]
-    except (KeyError, TypeError) as error:
-        raise FormatError(str(path), "a key of drivesem survey", error) from error
+    if not isinstance(data, dict) or "items" not in data:
+        raise FormatError(str(path), "a key of drivesem survey", "something else")
+    items: tuple[Item, ...] = from_json(tuple[Item, ...], data["items"], f"{path}: items")
+    return from_json(str, data.get("survey"), f"{path}: survey"), list(items)
 
 
 def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Response]:
@@ -210,7 +218,7 @@ def read_answers(path: Path, survey: str, items: Sequence[Item]) -> list[Respons
         if line["named"] not in CHOICES:
             raise FormatError(f"{where}: named", f"one of {', '.join(CHOICES)}", repr(line["named"]))
         rating = line["realism"] or ""
-        if not (rating.isdecimal() and LEAST <= int(rating) <= MOST):
+        if rating not in map(str, range(LEAST, MOST + 1)):
             raise FormatError(f"{where}: realism", f"a whole number from {LEAST} to {MOST}", repr(line["realism"]))
         if not line["participant"]:
             raise FormatError(f"{where}: participant", "a name", "nothing")

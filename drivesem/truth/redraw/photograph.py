@@ -106,6 +106,17 @@ class PhotographRedraw:
             image, self._targets(changed, state), torch.from_numpy(_boxes(state.owner, len(self._shares)))
         )
 
+    def skinned(self, changed: SceneIR) -> list[tuple[Array, Skin]]:
+        """The vehicles of a state of the scene: triangles (F, 3, 3) m in the camera's own axes, and what is on
+        them.
+        """
+        poses = [Pose.of(changed.objects, i) for i in range(len(changed.objects))]
+        codes = numbers(changed.objects.texture_code)
+        return [
+            (vehicle.body.placed(pose, self._lens), Skin(vehicle.atlas.uv, _texture(vehicle, code)))
+            for vehicle, pose, code in zip(self._vehicles, poses, codes, strict=True)
+        ]
+
     def _vehicle(self, source: Source, i: int) -> _Vehicle:
         objects = self._still.objects
         body = Body(self._still.meshes[int(objects.mesh_index[i])])

@@ -135,7 +135,7 @@ class Photographed(torch.autograd.Function):
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
             launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
-            leaning[start] = lean = _leaning(s.fragments.face[first:last], coverage[first:last]) + first
+            leaning[start] = lean = _leaning(coverage[first:last]).add_(first)
             launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
             launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
             launch(shading.shade_kernel, [first, last], [pixels, photograph, looks, final, layers], (), device)
@@ -229,6 +229,6 @@ class Photographed(torch.autograd.Function):
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
 
 
-def _leaning(face: Tensor, coverage: Tensor) -> Tensor:
-    """Which pixels `shading.leans`."""
-    return ((coverage < 1) & ((face >= 0) | (coverage > 0))).nonzero()[:, 0]
+def _leaning(coverage: Tensor) -> Tensor:
+    """Which pixels `shading.leans`: of what is hit, at least half is covered."""
+    return coverage.frac().nonzero()[:, 0]

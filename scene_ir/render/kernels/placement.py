@@ -26,12 +26,12 @@ RELIT, RELIT_MORE = model.RELIT[0], model.RELIT[1] - model.RELIT[0]
 
 @wp.struct
 class Templates:
-    """Of vertices: where they are in the unit box, by how much they are bent there, their unit normals, their
-    objects, how much of them is paint, and how squarely the photograph's sun meets them.
+    """Of vertices: where they are in the unit box, by how much they are bent there (3, V), their unit normals,
+    their objects, how much of them is paint, and how squarely the photograph's sun meets them.
     """
 
     unit: wp.array(dtype=wp.vec3f)
-    bend: wp.array(dtype=wp.vec3f)
+    bend: wp.array2d(dtype=wp.float32)
     normal: wp.array(dtype=wp.vec3f)
     owner: wp.array(dtype=wp.int32)
     paint: wp.array(dtype=wp.float32)
@@ -84,7 +84,7 @@ def turned(v: wp.vec3f, turn: wp.vec2f):
 @wp.func
 def bent(templates: Templates, i: int):
     """A vertex in its unit box."""
-    return templates.unit[i] + templates.bend[i]
+    return templates.unit[i] + wp.vec3f(templates.bend[0, i], templates.bend[1, i], templates.bend[2, i])
 
 
 @wp.func

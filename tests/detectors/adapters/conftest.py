@@ -1,56 +1,18 @@
-"""ONNX files made by hand: a graph with one image input and constant outputs, as protocol buffers; and random
-networks that are fit to be tested."""
+"""ONNX files made by hand: a graph with one image input and constant outputs; random networks fit to be tested."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-
-def _number(value: int) -> bytes:
-    found = bytearray()
-    while value > 127:
-        found.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*found, value])
-
-
-def _field(number: int, value: int | bytes | str) -> bytes:
-    if isinstance(value, int):
-        return _number(number << 3) + _number(value)
-    data = value.encode() if isinstance(value, str) else value
-    return _number(number << 3 | 2) + _number(len(data)) + data
-
-
-def _value(name: str, shape: Sequence[int | str]) -> bytes:
-    """ValueInfoProto of a float tensor."""
-    sides = b"".join(_field(1, _field(1 if isinstance(side, int) else 2, side)) for side in shape)
-    return _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, sides)))
-
-
-def _constant(name: str, array: np.ndarray) -> bytes:
-    """NodeProto that gives an array."""
-    values = np.ascontiguousarray(array, np.float32)
-    tensor = b"".join(_field(1, side) for side in values.shape) + _field(2, 1) + _field(9, values.tobytes())
-    return (
-        _field(2, name) + _field(4, "Constant") + _field(5, _field(1, "value") + _field(5, tensor) + _field(20, 4))
-    )
-
-
-def _constant_graph(input_shape: Sequence[int | str], outputs: Mapping[str, np.ndarray]) -> bytes:
-    """A model that takes `image` and gives the same outputs whatever it shows (onnx.proto: ModelProto)."""
-    graph = b"".join(_field(1, _constant(name, array)) for name, array in outputs.items())
-    graph += _field(2, "test") + _field(11, _value("image", input_shape))
-    graph += b"".join(_field(12, _value(name, array.shape)) for name, array in outputs.items())
-    return _field(1, 7) + _field(8, _field(2, 13)) + _field(7, graph)
+from tools.onnx_graph import constant_graph as graph
 
 
 @pytest.fixture
 def constant_graph() -> Callable[..., bytes]:
     """The maker of such files."""
-    return _constant_graph
+    return graph
 
 
 @pytest.fixture

@@ -161,7 +161,7 @@ def test_a_yaml_file(tmp_path: Path) -> None:
     [
         ("[1, 2]", "expected a mapping of settings, found list"),
         ("sise: 3", "sise: expected one of .*, found an unknown key"),
-        ("size: [1, 2, 3]", r"size: expected a number of px, or \[height, width\], found \[1, 2, 3\]"),
+        ("size: [1, 2, 3]", r"size: expected a number of px up to 8192, or \[height, width\], found \[1, 2, 3\]"),
         ("size: 0", "size: expected a number of px"),
         ("std: 0", "std: expected a positive number, or three, found 0"),
         ("resize: crop", "resize: expected letterbox or stretch, found 'crop'"),
@@ -177,3 +177,29 @@ def test_yaml_files_that_are_wrong(text: str, message: str, tmp_path: Path) -> N
     path.write_text(text)
     with pytest.raises(DetectorError, match=rf"own\.yaml: {message}"):
         load_spec(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: &a [x]\nb: [*a, *a]", r"expected a YAML file, found an alias"),
+        ("[" * 20_000, r"expected a YAML file, found"),
+        (f"t_star: {'9' * 5000}", r"expected a YAML file, found Exceeds the limit"),
+        ("#" * (1 << 19), r"expected a YAML file of at most 262,144 bytes, found 524,288"),
+        ("2026-99-99", r"expected a YAML file, found month must be"),
+        ("size: 100000", r"size: expected a number of px up to 8192"),
+        ("multiple: 9000", r"multiple: expected a whole number up to 8192"),
+        ("size: .inf", r"size: expected"),
+    ],
+)
+def test_yaml_files_that_were_made_to_harm(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(DetectorError, match=rf"own\.yaml: {message}"):
+        load_spec(path)
+
+
+def test_a_yaml_file_that_never_ends(tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").symlink_to("/dev/zero")
+    with pytest.raises(DetectorError, match=r"own\.yaml: expected a YAML file, found no regular file"):
+        load_spec(tmp_path / "own.yaml")

@@ -124,3 +124,35 @@ def test_heads_agree_on_classes_and_there_is_one() -> None:
         parse("[net]\n[convolutional]\nfilters=4\nactivation=linear", "own.cfg")
     with pytest.raises(DetectorError, match=r"own\.cfg:1: expected \[net\] first, found no section"):
         parse("# nothing\n", "own.cfg")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("filters=16", "filters=1000000000", r"filters: expected at most 1048576, found 1000000000"),
+        ("filters=16", f"filters={'9' * 5000}", r"filters: expected integers"),
+        (
+            "filters=4",
+            "filters=2048",
+            r"filters, stride: expected .* numbers a pixel up to 256, 4096 in all, found 2",
+        ),
+        ("size=3", "size=65", r"size: expected at most 63, found 65"),
+        ("anchors = 6,6,", f"anchors = {'1,1,' * 998} 6,6,", r"anchors: expected at most 1000, found 1002"),
+    ],
+)
+def test_networks_that_would_take_all_memory(old: str, new: str, message: str, mini_text: str) -> None:
+    assert old in mini_text
+    with pytest.raises(DetectorError, match=rf"mini\.cfg:\d+: \[\w+\] {message}"):
+        parse(mini_text.replace(old, new), "mini.cfg")
+
+
+def test_strides_that_would_blow_a_picture_up() -> None:
+    layer = "[convolutional]\nfilters=1\nsize=1\nactivation=linear\nstride={}\n"
+    with pytest.raises(DetectorError, match=r"filters, stride: expected a stride up to 1024, .* found 2187"):
+        parse("[net]\n" + layer.format(3) * 7, "a.cfg")
+    head = "[yolo]\nclasses=1\nmask=0\nanchors=4,4\n"
+    branch = "[route]\nlayers=-{}\n"
+    text = "[net]\n" + layer.format(1) + layer.format(31) + branch.format(2) + layer.format(37)
+    text += "[convolutional]\nfilters=6\nsize=1\nactivation=linear\n" + head
+    with pytest.raises(DetectorError, match="expected strides with a multiple of at most 1024, found 1147"):
+        parse(text, "a.cfg")

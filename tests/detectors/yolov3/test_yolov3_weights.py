@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import struct
 from pathlib import Path
 
@@ -126,3 +127,21 @@ def test_coco_names_where_there_are_eighty(tmp_path: Path) -> None:
     assert detector.classes[:3] == ("person", "bicycle", "Car")
     (tmp_path / "coco.names").write_text("\n".join(["car", *map(str, range(79))]))
     assert load_detector(f"darknet:{path}").classes[:2] == ("Car", "0")
+
+
+def test_no_memory_before_the_file_is_known_to_fill_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.cfg"
+    wide = "[convolutional]\nfilters=256\nsize=63\npad=1\nactivation=linear\n"
+    path.write_text(TWO.replace("[net]\n", f"[net]\n{wide * 3}"))  # 2 GB
+    path.with_suffix(".names").write_text("Car\n")
+    path.with_suffix(".weights").write_bytes(bytes(200))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(
+        DetectorError, match=r"a\.weights: expected 523,\d+,\d+ numbers after the header, found 45"
+    ):
+        darknet.load(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
+    path.with_suffix(".weights").unlink()
+    path.with_suffix(".weights").symlink_to("/dev/zero")
+    with pytest.raises(DetectorError, match=r"a\.weights: expected Darknet weights, found no regular file"):
+        darknet.load(path)

@@ -30,14 +30,26 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
     assert first["low"] <= first["hours"] <= first["high"]
     hours = {row["how"]: row["hours"] * 3600 * 2 / 600 for row in others}
     assert hours == pytest.approx(
-        {"--no-fit": 10.0, "half the steps": 9.0, "frames taken apart before": 9.0, "--workers": 6.0}
+        {
+            "--no-fit": 10.0,
+            "no grades, --nuisances off --no-confirm": 10.0,
+            "half the --steps": 9.0,
+            "frames taken apart before, in --cache": 9.0,
+            "--workers": 6.0,
+        }
     )
     assert [row["hours"] for row in others] == sorted((row["hours"] for row in others), reverse=True)
 
 
 def test_frames_that_were_not_fitted_have_no_faster_way() -> None:
     rows = night.night_rows([Spent(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
-    assert [row["how"] for row in rows] == ["as asked", "half the steps", "frames taken apart before"]
+    ways = ["half the --steps", "frames taken apart before, in --cache", "no grades, --nuisances off --no-confirm"]
+    assert [row["how"] for row in rows] == ["as asked", *ways]
+
+
+def test_frames_that_were_not_graded_save_nothing_by_that() -> None:
+    rows = night.night_rows([Spent(1.0, 1.0, 0.0, 1.0, None)], 10, 99, 0)
+    assert not [row for row in rows if row["how"].startswith("no grades")]
 
 
 def test_beside_other_work_the_processors_seconds_tell() -> None:

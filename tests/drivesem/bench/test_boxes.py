@@ -78,3 +78,6 @@ def test_a_frame_is_measured(tmp_path: Path) -> None:
     assert min(cost.ratio, cost.first_ratio, cost.step_ms, cost.detector_ms) > 0
     row = boxes.BoxesRow.of([cost, cost])
     assert (row.frames, row.median_ratio, row.p90_ratio, row.worst_ratio) == (2, *(cost.ratio,) * 3)
+    assert cost.cpu_ratio > 0
+    assert (row.median_cpu_ratio, row.p90_cpu_ratio, row.worst_cpu_ratio) == (cost.cpu_ratio,) * 3
+    assert 0 < cost.step_cpu_ms < torch.get_num_threads() * 2 * cost.step_ms + 20

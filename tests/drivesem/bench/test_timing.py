@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from drivesem.bench.timing import Budget, Spread, machine, rounds, versions
+from drivesem.bench.timing import Budget, Clock, Spread, machine, rounds, versions
 
 
 def test_median_and_quartiles() -> None:
@@ -22,6 +22,14 @@ def test_what_one_row_saves_the_others_may_use() -> None:
     assert budget.share() == pytest.approx(10 / 3, abs=0.1)
     assert budget.share(preparation=1.0) == pytest.approx(4.5, abs=0.1)
     assert Budget(-1.0, 3).share() == 0
+
+
+def test_a_call_that_waits_takes_no_time_of_the_processor() -> None:
+    waited = Clock().taken(lambda: time.sleep(0.05))
+    assert waited.ms >= 50
+    assert waited.cpu_ms < 25
+    worked = Clock().taken(lambda: sum(range(300_000)))
+    assert worked.cpu_ms > 0.5
 
 
 @pytest.mark.parametrize(("seconds", "count"), [(0.0, 3), (100.0, 7)])

@@ -11,6 +11,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 import torch
 
+from detectors.incremental import reference
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
@@ -190,6 +191,32 @@ def test_searches_run_on_a_detector_without_gradient(
     assert ("cma" in json.loads((tmp_path / "manifest.json").read_text())["versions"]) == (method == "cma-es")
 
 
+def test_a_detector_without_gradient_gets_a_method_without(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blinking())
+    words = [
+        "attack",
+        "--detector",
+        "any",
+        "--limit",
+        "1",
+        "--workers",
+        "1",
+        "--params",
+        "rotate",
+        "--passes",
+        "24",
+    ]
+    words += ["--nuisances", "off", "--no-confirm", "--t-star", "0.2", "--out", str(tmp_path)]
+    assert main(words) == 0
+    said = "any has no gradient: --method climb takes the place of si-fgsm"
+    assert capsys.readouterr().err.splitlines()[0] == said
+    assert "method: climb" in (tmp_path / "config.yaml").read_text().splitlines()
+    assert main(words) == 0  # and goes on in the same folder
+    assert main([*words, "--method", "apgd"]) == 2
+
+
 MISSED, CLASS, PLACED, TWICE = 4, 3, 5, 2
 """Cars of the first embedded scene, and what becomes of them."""
 
@@ -280,9 +307,10 @@ def test_what_cannot_grade_is_refused(
     ("words", "message"),
     [
         (
-            [],
+            ["--method", "apgd"],
             "--method: expected one of random, halton, sobol, cma-es for any, which has no gradient",
         ),
+        (["--restarts", "2"], "--restarts: expected --method si-fgsm"),
         (["--method", "sobol", "--objective", "confidence"], "--objective: expected one of objectness, hide"),
         (["--queries", "3"], "--queries: expected --method random, halton"),
         (["--method", "fgsm", "--range", "steps"], "--range: expected a method without gradient"),
@@ -333,8 +361,8 @@ def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.Captu
         result = load_frame(folder / "result.json")
         assert all(failure.kind == "lost" and failure.index == 0 for failure in result.failures)
         assert result.success_moved == bool(result.failures)
-    beyond = attack([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")], capsys)
-    assert (beyond["frames"], beyond["frames_without_vehicles"]) == (0, 1)
+    assert main([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")]) == 2
+    assert "1 frames without" in capsys.readouterr().err
 
 
 def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
@@ -361,3 +389,30 @@ def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
     ((name, reason),) = told["frames_failed"].items()
     assert told["frames"] == 1
     assert reason.startswith(f"frame {name}: gradient of objects[0].yaw")
+
+
+def test_regions_that_disagree_are_told_in_one_line_and_passes_are_whole_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """No difference at all is small enough: as of a detector whose layers are not what its whole pass computes."""
+    words = [*WORDS, "--limit", "2", "--workers", "1"]
+    expected = attack([*words, "--whole", "--out", str(tmp_path / "whole")], capsys)
+    monkeypatch.setattr(reference, "AGREES", -1.0)
+    passes = []
+    changed = reference.Reference._changed
+    monkeypatch.setattr(
+        reference.Reference, "_changed", lambda self, *given: passes.append(0) or changed(self, *given)
+    )
+    assert main([*words, "--out", str(tmp_path / "regions")]) == 0
+    told = capsys.readouterr()
+    assert told.err.count("passes on changed regions differ") == 1
+    assert len(passes) == 1
+    (line,) = [line for line in told.err.splitlines() if "regions" in line and "differ" in line]
+    assert line.startswith("drivesem: detector squeezedet: ")
+    assert without_times(json.loads(told.out)) == without_times(expected)
+    for name in ("result.json", "theta.json"):
+        pairs = zip(
+            sorted((tmp_path / "whole").rglob(name)), sorted((tmp_path / "regions").rglob(name)), strict=True
+        )
+        for whole, regions in pairs:
+            assert without_times(json.loads(regions.read_text())) == without_times(json.loads(whole.read_text()))

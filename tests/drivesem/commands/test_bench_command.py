@@ -5,13 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from drivesem.attack.space import combo
 from drivesem.bench import climb, memory, render, step
-from drivesem.bench.planted import yardstick
+from drivesem.bench.planted import across, across_names, yardstick
+from drivesem.bench.planted.pool import FramePool, SeenCar
 from drivesem.bench.scenes import bench_scene
+from drivesem.bench.timing import Taken
 from drivesem.cli import main
 from drivesem.commands import bench
 
@@ -72,10 +75,11 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
         def __init__(self) -> None:
             self.calls = 0
 
-        def ms(self, call: Any) -> float:
+        def taken(self, call: Any) -> Taken:
             slow = 10 if self.calls in (2, 3) else 1
             self.calls += 1
-            return slow * (3.0 if call is stepping else 2.0)
+            ms = 3.0 if call is stepping else 2.0
+            return Taken(slow * ms, 2 * ms - 2.0)
 
     class Stepping:
         def __call__(self) -> None: ...
@@ -88,6 +92,7 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
     assert row.repetitions == 3
     assert (row.ratio, row.ratio_iqr) == (1.5, 0.0)
     assert (row.step_ms, row.detector_ms) == (3.0, 2.0)
+    assert (row.cpu_ratio, row.step_cpu_ms, row.detector_cpu_ms) == (2.0, 4.0, 2.0)
 
 
 def test_render_rows() -> None:
@@ -97,6 +102,7 @@ def test_render_rows() -> None:
         assert row.forward_ms > 0
         assert row.backward_ms > 0
         assert row.forward_backward_ms > row.backward_ms
+        assert row.both_cpu_ms > 0
     found = list(render.measure_verbs(render.SceneSize(1, 600), 0.0, 0, "cpu"))
     assert [(row.verb, row.backward_ms is None) for row in found[:4]] == [
         ("rasterize", True), ("interpolate", False), ("texture", False), ("antialias", False),
@@ -177,9 +183,73 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert "4 attacks of 90 passes" in capsys.readouterr().err
 
 
+def test_planted_across(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Faults of a detector in made-up frames: what is done is kept, and frames search for faults in turn."""
+    made: list[str] = []
+    searched: list[tuple[str, str]] = []
+    names = ("height_px", "lightness")
+
+    def pool(objective: Any, name: str, seed: int, states: int) -> FramePool:
+        made.append(name)
+        rng = np.random.default_rng(len(made))
+
+        def car(index: int) -> SeenCar:
+            height, shade = 20.0 + 8 * index + rng.uniform(-3, 3), rng.random()
+            return SeenCar(index, (height, shade), 2.0, ((0.9, height, 1.5, 0.5, shade, 0.2),))
+
+        rows = [tuple(car(index) for index in range(8)) for _ in range(4 + states)]
+        return FramePool(name, 0.545, names, tuple(rows[:4]), tuple(rows[4:]))
+
+    def attempt(
+        self: across.Across, name: str, scene: Any, fault: str, method: str, *_: Any
+    ) -> across.AcrossAttempt:
+        searched.append((name, fault))
+        return across.AcrossAttempt(name, fault, method, 0, 0, 24, ())
+
+    monkeypatch.setattr(FramePool, "make", pool)
+    monkeypatch.setattr(across.Across, "_attempt", attempt)
+    monkeypatch.setattr(across, "KINDS", (("height_px",), ("aspect",), ("lightness",)))
+    monkeypatch.setattr(across, "FRAMES", 2)
+    monkeypatch.setattr(across, "CARS", 3)
+    scene = bench_scene(1, 600).scene
+    monkeypatch.setattr(across.Across, "_scene", lambda *_: scene)
+    monkeypatch.setattr(across_names, "SHAMS", 2)
+    words = [
+        "bench",
+        "planted",
+        "--methods",
+        "climb",
+        "--limit",
+        "3",
+        "--workers",
+        "1",
+        "--json",
+        "--across",
+        "24",
+    ]
+    for _ in range(2):
+        assert main([*words, "--faults", "2", "--out", str(tmp_path)]) == 0
+        result = json.loads(capsys.readouterr().out)
+    assert (len(made), len(searched)) == (3, 6)
+    assert result["unplanted"] == ["aspect"], "all of one aspect"
+    planted = list(dict.fromkeys(row["fault"] for row in result["rows"] if row["fault"]))
+    assert [text.split("=")[0] for text in planted] == ["height_px", "lightness"]
+    in_turn = [*planted, ""]
+    assert [fault for _, fault in searched] == [in_turn[i % 3] for i in range(6)]
+    named = [row for row in result["rows"] if row["by"] == "halton's states, all" and row["fault"]]
+    assert all(row["named"] for row in named)
+    assert {row["by"]: row["faults"] for row in result["summary"]}["climb"] == 2
+    assert "faults of a detector" in (tmp_path / "planted.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["planted", "--across", "4", "--naming", "climb"], "--naming: expected no --across beside it"),
+        (["planted", "--searched", "4"], "--searched: expected --across beside it"),
+        (["planted", "--across", "4", "--budget", "mars"], "--budget: expected"),
         (["planted", "--methods", "halton,luck"], "--methods: expected names among"),
         (
             ["planted", "--methods", "halton,climb", "--naming", "corners"],

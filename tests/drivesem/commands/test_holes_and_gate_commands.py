@@ -21,7 +21,7 @@ from detectors.types import Detections
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
 from drivesem.questions.gate import asking as gate_asking
-from drivesem.questions.holes.results import load, load_recheck
+from drivesem.questions.holes.results import load, load_inside
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
@@ -68,6 +68,21 @@ class Blind:
                 Detections(seen, torch.zeros(len(seen), dtype=torch.int64), torch.full((len(seen),), 0.9))
             )
         return found
+
+
+class Imagining(Blind):
+    """The same, and a car in the sky."""
+
+    def decode(self, raw: Tensor) -> list[Detections]:
+        sky = Detections(torch.tensor([[10.0, 1.0, 40.0, 16.0]]), torch.tensor([0]), torch.tensor([0.95]))
+        return [
+            Detections(
+                torch.cat([sky.boxes_xyxy, found.boxes_xyxy]),
+                torch.cat([sky.labels, found.labels]),
+                torch.cat([sky.scores, found.scores]),
+            )
+            for found in super().decode(raw)
+        ]
 
 
 class Other(Blind):
@@ -169,19 +184,22 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     """After the holes, which are kept: of seeds that neither the rule nor its probability knew."""
     out, name = tmp_path / "holes", Path("0") / "frames" / "demo-000"
     shutil.copytree(looked, out)
-    kept, checked = out / "runs" / name / "holes.json", out / "rechecks" / "16" / name / "recheck.json"
+    kept = out / "runs" / name / "holes.json"
     written = kept.stat().st_mtime_ns
     words = [str(attacked), *HOLES, "--out", str(out)]
     found = holes([*words, "--recheck", "16"], capsys)
     assert kept.stat().st_mtime_ns == written
     assert (found["rechecked"], found["hold"]) == (len(found["holes"]), len(found["holes"]))
+    (checked,) = (out / "rechecks" / "16" / "0").glob("*/frames/demo-000/recheck.json")
+    (fresh,) = (out / "fresh" / "0").glob("*/frames/demo-000/fresh.json")
     again = found["holes"][0]["recheck"]
     assert again["draws"] == 16 * len(found["holes"][0]["failures"])
     assert again["probability"] >= 0.8
     assert again["interval"][0] <= again["probability"] <= again["interval"][1]
     assert again["holds"]
-    for around, inside in zip(load(kept).around, load_recheck(checked).inside, strict=True):
-        known = {*around.asked.values, *around.near.values, *around.fresh.values}
+    inside_first, inside_again = load_inside(fresh).inside, load_inside(checked).inside
+    for around, first, inside in zip(load(kept).around, inside_first, inside_again, strict=True):
+        known = {*around.asked.values, *around.near.values, *first.values}
         assert len(inside.values) == 16
         assert not known & set(inside.values)
     page, rows = (out / "holes.md").read_text(), (out / "holes.csv").read_text().splitlines()
@@ -193,6 +211,38 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert holes([*words, "--recheck", "16"], capsys) == found
     assert checked.stat().st_mtime_ns == checked_at
     assert holes(words, capsys)["holes"][0]["recheck"] is None
+
+
+def test_cars_beside_are_shown_too(looked: Path) -> None:
+    """By default four states of the frame, in which both cars change."""
+    kept = load(looked / "runs" / "0" / "frames" / "demo-000" / "holes.json")
+    (beside,) = kept.beside
+    assert (beside.label, len(beside.objects)) == ("Car", 8)
+    assert set(beside.by_object()) == {0, 1}
+    assert all(len(samples.margins) == 4 for samples in beside.by_object().values())
+
+
+def test_without_contrast_there_are_none(
+    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--contrast", "0"]
+    holes([*words, "--out", str(tmp_path / "out")], capsys)
+    assert load(tmp_path / "out" / "runs" / "0" / "frames" / "demo-000" / "holes.json").beside == ()
+
+
+def test_an_answer_of_an_older_version_is_refused_in_one_line(
+    attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "holes"
+    shutil.copytree(looked, out)
+    kept = out / "runs" / "0" / "frames" / "demo-000" / "holes.json"
+    old = json.loads(kept.read_text())
+    kept.write_text(json.dumps(old | {"schema": 2}))
+    capsys.readouterr()
+    assert main(["holes", str(attacked), *HOLES, "--out", str(out)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("drivesem: ")
+    assert "holes.json" in said
 
 
 def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,6 +281,7 @@ def gate(
         "better": Blind(blind.boxes, (2.0, 3.0)),
         "worse": Blind(blind.boxes, (low - 0.3, high)),
         "other": Other(blind.boxes, blind.band),
+        "seeing things": Imagining(blind.boxes, blind.band),
     }
     monkeypatch.setattr(gate_asking, "load_predictor", lambda name, *_: known[name])
 
@@ -262,7 +313,22 @@ def test_a_worse_one_does_not_and_a_better_one_does(
     assert int(suite.attrib["failures"]) == sum(row["grew"] for row in told["rows"]) > 0
     code, told = gate("better")
     assert (code, told["passed"]) == (0, True)
-    assert told["rows"][-1]["difference"] < -0.05
+    phantoms, whole = told["rows"][-1], told["rows"][-2]
+    assert (whole["level"], phantoms["level"]) == ("all", "phantoms")
+    assert whole["difference"] < -0.05
+    assert (phantoms["before"], phantoms["after"]) == (0, 0)
+
+
+def test_one_that_sees_what_is_not_there_does_not_pass(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
+) -> None:
+    """It loses no more objects."""
+    code, told = gate("seeing things")
+    assert (code, told["passed"]) == (1, False)
+    assert [row["hole"] for row in told["rows"] if row["grew"]] == ["phantoms"]
+    phantoms = told["rows"][-1]
+    assert (phantoms["before"], phantoms["after"]) == (0, 1)
+    assert "phantoms" in (tmp_path / "seeing things" / "gate.md").read_text()
 
 
 def test_other_classes_are_no_comparison(

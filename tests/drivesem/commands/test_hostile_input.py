@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from detectors.adapters import choose
 from detectors.registry import SHIPPED, read_weights, write_weights
 from detectors.types import CLASSES, Detections
+from drivesem import cli
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from scene_ir import files
@@ -297,3 +299,104 @@ def test_a_detector_that_finds_nothing_is_not_attacked(
     assert not (tmp_path / "run" / "metrics.json").exists()
     # One photograph in which nothing is found says nothing of the detector.
     assert main([*words, "--limit", "1", "--out", str(tmp_path / "one")]) == 0
+
+
+NAMES = ("[/red]", "[bold]", "\x1b]0;title\x07", "\x1b[31m", "<b>")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_that_a_terminal_or_a_table_would_obey(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = {
+        "images": [{"id": 1, "file_name": "a.png", "height": 96, "width": 320}],
+        "categories": [{"id": 1, "name": name}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 50, 40], "area": 2000}],
+    }
+    (tmp_path / "true.json").write_text(json.dumps(content))
+    found = [{"image_id": 1, "category_id": 1, "bbox": [10, 10, 50, 40], "score": 0.9}]
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    words = ["--gt", str(tmp_path / "true.json"), "--pred", str(tmp_path / "found.json"), "--classes", name]
+    assert main(["eval", *words]) == 0
+    told = capsys.readouterr()
+    said = told.out + told.err
+    assert said.replace("\n", "").isprintable()
+    assert name.encode("unicode_escape").decode() in said
+    assert main(["convert", str(tmp_path / "true.json"), "--to", "kitti", "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err[:-1].isprintable()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "Car 0 1e30 1.5 120 40 200 80 1.5 1.6 4 0 1.6 15 0 0.5",
+            "occluded: expected a flag, such as 0 to 3, found 1e+30",
+        ),
+        (f"Car 0 {'9' * 5000} 1.5 1 1 2 2 1 1 1 1 1 1 1 0.5", "occluded: expected a finite number"),
+    ],
+)
+def test_numbers_that_no_column_holds(
+    folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path, line: str, message: str
+) -> None:
+    files.write_text(tmp_path / "found" / "000000.txt", line + "\n")
+    told = said("eval", "--gt", folder(), "--pred", tmp_path / "found")
+    assert message in told
+    assert len(told) < 2000
+
+
+def test_a_frame_of_a_million_lines(folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path) -> None:
+    words = ("derender", "--dataset", "kitti", "--workers", "1", "--out", tmp_path / "out", "--root")
+    assert "000000.txt: expected at most 10,000 lines, found 1,000,000" in said(*words, folder(cars=10**6))
+
+
+def test_coco_s_cameras_of_other_projects(said: Callable[..., str], tmp_path: Path) -> None:
+    content: dict[str, Any] = {
+        "images": [
+            {"id": 1, "file_name": "a.png", "height": 96, "width": 320, "camera": {"projection": [[1], 2]}}
+        ],
+        "categories": [{"id": 1, "name": "Car"}],
+        "annotations": [],
+    }
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps(content))
+    message = "camera: expected projection (12 numbers), or fx, fy, cx, cy"
+    assert message in said("convert", path, "--to", "kitti", "--out", tmp_path / "out")
+
+
+def test_coco_s_own_keys_that_json_cannot_say(said: Callable[..., str], tmp_path: Path) -> None:
+    row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 5, 4], "area": 20, "mood": float("nan")}
+    image = {"id": 1, "file_name": "a.png", "height": 96, "width": 320}
+    content = {"images": [image], "categories": [{"id": 1, "name": "Car"}], "annotations": [row]}
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps(content))
+    message = "annotations[0]: expected finite numbers, found NaN or infinity"
+    assert message in said("convert", path, "--to", "coco", "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["result.json", "scene/depth.bin", "counterexample.png"])
+def test_links_of_a_run_stay_in_it(
+    write_run: Callable[..., Path], said: Callable[..., str], tmp_path: Path, name: str
+) -> None:
+    run = write_run(tmp_path / "run")
+    path = run / "frames" / "b" / name
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
+    (tmp_path / "secret").write_text("secret")
+    path.symlink_to(tmp_path / "secret")
+    line = said("worth", run, "--distance", "none")
+    assert f"{path}: expected a file in {run / 'frames' / 'b'}, found a link to" in line
+    (run / "metrics.json").unlink()
+    (run / "metrics.json").symlink_to("/etc/passwd")
+    assert "metrics.json: expected a file in" in said("worth", run, "--distance", "none")
+
+
+def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text("class A:\n    pass\n")
+    assert main(["check", "--detector", f"planted:height_px=30:38@module:{path}:A"]) == 2
+    first, _ = capsys.readouterr().err.splitlines()
+    assert first == f"drivesem: --detector: runs the code in {path}:A"
+    for kind in choose.KINDS:
+        said = cli._CODE.findall(f"squeezedet,{kind}:a.b")  # pyright: ignore[reportPrivateUsage]
+        assert said == (["a.b"] if kind in choose.RUNS_CODE else [])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import hashlib
 import json
 import re
 from collections.abc import Callable
@@ -41,6 +43,10 @@ def test_the_page_stands_alone_and_keeps_the_truth_to_itself(survey: Path) -> No
     page = (survey / "survey.html").read_text()
     assert not re.search(r"(src|href)=\"(?!data:)[^\"]+\"|https?://|@import|<link", page)
     assert page.count("data:image/jpeg;base64,") == 6
+    script = page.partition("<script>")[2].partition("</script>")[0]
+    known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{known}'" in page
+    assert page.count("<script") == 2  # and the pictures, which are data
     key = key_of(survey)
     assert [item["truth"] for item in key["items"]] == ["Car"] * 3
     assert sorted(item["kind"] for item in key["items"]) == ["counterexample", "counterexample", "unchanged"]

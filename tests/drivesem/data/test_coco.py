@@ -17,7 +17,8 @@ from pycocotools import mask as run_length
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from drivesem.data import coco
+from drivesem.data import coco, coco_labels
+from drivesem.data.classes import COCO_ROAD_USERS
 from drivesem.data.label_table import from_coco, shortest, to_coco
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
@@ -224,17 +225,56 @@ def test_a_file_from_elsewhere(tmp_path: Path) -> None:
         assert labels.occlusion.tolist() == [3, 3]
         assert bool(torch.isnan(torch.cat([labels.translation, labels.size_lhw], dim=1)).all())
         assert bool(torch.isnan(torch.stack([labels.truncation, labels.yaw])).all())
-    with pytest.raises(FormatError, match=r"val2017\.json: 000000000139\.png: camera: expected .*focal_px"):
-        coco.CocoDataset(tmp_path).frame("000000000139")
+    usual = coco.CocoDataset(tmp_path).frame("000000000139")
+    assert usual.camera.intrinsics[:2].tolist() == [
+        [pytest.approx(0.58 * 80), 0, 39.5],
+        [0, pytest.approx(0.58 * 80), 19.5],
+    ]
+    assert usual.provenance["focal"] == "46.4 px, default"
     frame = coco.CocoDataset(tmp_path, focal_px=70.0).frame("000000000139")
     assert frame.camera.intrinsics.tolist() == [[70, 0, 39.5], [0, 70, 19.5], [0, 0, 1]]
     assert frame.masks is None  # the chair has no outline
-    road = coco.CocoDataset(tmp_path, focal_px=70.0, kinds=coco.COCO_ROAD_USERS.classes).frame("000000000139")
+    road = coco.CocoDataset(tmp_path, focal_px=70.0, kinds=COCO_ROAD_USERS.classes).frame("000000000139")
     assert road.labels is not None
     assert road.labels.kind == ("car",)
     assert road.masks is not None
     assert 180 <= int(road.masks.sum()) <= 231
-    assert coco.COCO_ROAD_USERS.targets(road.labels).labels.tolist() == [Category.CAR, 0]
+    assert COCO_ROAD_USERS.targets(road.labels).labels.tolist() == [Category.CAR, 0]
+
+
+def texts(content: dict[str, Any]) -> dict[str, Any]:
+    """The same images with texts as ids."""
+    images = [row | {"id": f"cam-{row['id']}"} for row in content["images"]]
+    rows = [row | {"image_id": f"cam-{row['image_id']}"} for row in content["annotations"]]
+    return content | {"images": images, "annotations": rows}
+
+
+def test_ids_of_images_may_be_texts(tmp_path: Path) -> None:
+    path = foreign(tmp_path)
+    numbered = coco.CocoDataset(path).labels("000000000139")
+    files.write_json(path, texts(files.read_json(path)))
+    labels = coco.CocoDataset(path).labels("000000000139")
+    assert labels.kind == numbered.kind
+    assert torch.equal(labels.boxes_xyxy, numbered.boxes_xyxy)
+    table = coco_labels.read_table(path, False, None)
+    coco.write_table(table, tmp_path / "again.json", {})
+    again = files.read_json(tmp_path / "again.json")
+    assert [row["id"] for row in again["images"]] == ["cam-139"]
+    assert {row["image_id"] for row in again["annotations"]} == {"cam-139"}
+    found = [{"image_id": "cam-139", "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}]
+    files.write_json(tmp_path / "found.json", found)
+    assert len(coco_labels.read_table(tmp_path / "found.json", True, table)) == 1
+
+
+def test_ids_of_two_kinds_are_refused(tmp_path: Path) -> None:
+    path = foreign(tmp_path)
+    content = files.read_json(path)
+    files.write_json(path, content | {"images": texts(content)["images"]})
+    with pytest.raises(FormatError, match=r"annotations\[0\]\.image_id: expected texts, as the ids .*found 139"):
+        coco.CocoDataset(path)
+    files.write_json(path, content | {"images": [*content["images"], {"id": "a", "file_name": "b.png"}]})
+    with pytest.raises(FormatError, match=r"images\[1\]\.id: expected a whole number"):
+        coco.CocoDataset(path)
 
 
 def annotation(**changes: Any) -> dict[str, Any]:
@@ -330,7 +370,7 @@ def test_images_missing_or_of_another_size(tmp_path: Path) -> None:
 
 
 def test_bad_requests(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"annotations: expected instances_\*\.json, found none"):
+    with pytest.raises(FormatError, match=r"expected a COCO folder, with annotations.*found neither"):
         coco.CocoDataset(tmp_path)
     path = foreign(tmp_path)
     with pytest.raises(RangeError, match="expected one of 1 identifiers, found 'no'"):
@@ -346,3 +386,14 @@ def test_regions_are_of_the_object_they_lie_on(make_exposure: Callable[..., Expo
     things = make_exposure().objects
     assert coco._kinds_of_region([39.5, 9.5, 45.5, 12.5], things) == ("Truck",)
     assert coco._kinds_of_region([5, 12, 24, 23], things) == tuple(coco.CATEGORIES)  # the car has a label
+
+
+@given(st.text(st.sampled_from("ab. /\\:"), min_size=1, max_size=7))
+def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
+    try:
+        told = "_".join(Path(name).with_suffix("").parts)
+    except ValueError:
+        with pytest.raises(ValueError, match="empty name"):
+            coco_labels.identifier_of({"file_name": name})
+        return
+    assert coco_labels.identifier_of({"file_name": name}) == told

@@ -14,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.data import kitti
+from drivesem.data import kitti, kitti_labels
 from drivesem.data.classes import KITTI, VEHICLES, ClassMap, vehicle_count
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import SKY_CM, Exposure, Place
@@ -85,10 +85,42 @@ def test_a_16th_field_is_accepted_in_labels_and_needed_in_results(tmp_path: Path
     path.write_text(f"{CAR} 0.625\n")
     assert kitti.read_labels(path).kind == ("Car",)
     assert kitti.read_labels(path, scored=True).kind == ("Car",)
-    assert kitti.read_table(tmp_path, scored=True).score.tolist() == [0.625]
+    assert kitti_labels.read_table(tmp_path, scored=True).score.tolist() == [0.625]
     path.write_text(f"{CAR}\n")
     with pytest.raises(FormatError, match=r"a\.txt:1: expected 16 fields \(with a score\), found 15"):
         kitti.read_labels(path, scored=True)
+
+
+_FIELD = st.sampled_from(["0.5", "-1", "1e2", "-10", "-1000", "x", "nan", "", "1\t2", "3-4", "+7", "0x1", "1_0"])
+
+
+@given(st.data())
+def test_lines_read_together_are_as_read_one_by_one(data: st.DataObject) -> None:
+    scored = data.draw(st.booleans())
+    numbers = st.floats(-1000, 1000).map(repr)
+    lines: list[str] = []
+    for _ in range(data.draw(st.integers(1, 4))):
+        fields = data.draw(st.lists(numbers, min_size=14, max_size=15))
+        if data.draw(st.booleans()):
+            fields[7:14] = kitti_labels.UNKNOWN_POSE
+        line = " ".join([data.draw(st.sampled_from(["Car", "1", "a\tb", ""])), *fields])
+        if data.draw(st.integers(0, 3)) == 0:
+            at = data.draw(st.integers(0, len(fields)))
+            line = " ".join([*line.split(" ")[:at], data.draw(_FIELD), *line.split(" ")[at + 1 :]])
+        lines.append(line + data.draw(st.sampled_from(["", "", "", " ", "\t", "\n"])))
+    text = "\n".join(lines)
+
+    def read() -> tuple[list[str], list[list[float]], list[int]] | str:
+        try:
+            found = kitti_labels.Lines(["a"], [text], scored)
+        except FormatError as error:
+            return str(error)
+        return found.kinds, found.values.tolist(), found.counts.tolist()
+
+    together = read()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(kitti_labels, "_plain_columns", lambda lines, fields: None)
+        assert read() == together
 
 
 def test_results_of_a_2d_detector(tmp_path: Path) -> None:
@@ -109,7 +141,7 @@ def test_a_box_whose_centre_is_behind_but_whose_front_is_not_is_accepted(tmp_pat
 
 def with_field(name: str, value: str, line: str = CAR) -> str:
     parts = line.split()
-    parts[kitti.FIELDS.index(name)] = value
+    parts[kitti_labels.FIELDS.index(name)] = value
     return " ".join(parts)
 
 
@@ -183,7 +215,7 @@ def test_written_labels_read_back_to_half_a_hundredth(seed: int, as_results: boo
         ignore_xyxy=torch.cat([regions, regions + 1], dim=1),
     )
     scores = rand(count) if as_results else None
-    lines = kitti._Lines(["text"], [kitti.format_labels(labels, scores)], as_results)
+    lines = kitti_labels.Lines(["text"], [kitti.format_labels(labels, scores)], as_results)
     back = lines.table(["text"], as_results).labels()
     assert back.kind == labels.kind
     assert torch.equal(back.occlusion, labels.occlusion)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from detectors.types import Targets
-from drivesem.data import registry
+from drivesem.data import layouts, registry
 from drivesem.data.classes import KITTI
 from drivesem.data.label_table import LabelTable
 from scene_ir import files
@@ -61,11 +61,11 @@ LAYOUTS = {"kitti": _kitti, "coco": _coco, "yolo": _yolo, "vkitti1": _vkitti1, "
 
 def _both(layout: str, root: Path, right: float) -> tuple[Labels, LabelTable]:
     LAYOUTS[layout](root, right)
-    assert registry.layout_of(root / "training/label_2" if layout == "kitti" else root) == layout
+    assert layouts.layout_of(root / "training/label_2" if layout == "kitti" else root) == layout
     dataset = registry.open_dataset(layout, root)
     labels = dataset.labels(dataset.identifiers[0])
     assert labels is not None
-    return labels, registry.read_table(root, layout)
+    return labels, layouts.read_table(root, layout)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -94,10 +94,10 @@ def test_a_turned_box_is_refused_by_both(layout: str, tmp_path: Path) -> None:
     with pytest.raises(FormatError) as of_frame:
         dataset.labels(dataset.identifiers[0])
     with pytest.raises(FormatError) as of_table:
-        registry.read_table(tmp_path, layout)
+        layouts.read_table(tmp_path, layout)
     assert str(of_frame.value) == str(of_table.value)
 
 
 def test_a_layout_of_none() -> None:
     with pytest.raises(FormatError, match="expected a file or folder of labels, found nothing there"):
-        registry.layout_of(Path("/nowhere"))
+        layouts.layout_of(Path("/nowhere"))

@@ -95,10 +95,11 @@ def test_boxes_round_trip(
     assert told.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
 
 
-def test_without_a_calibration_a_focal_length_is_needed(folder: Path) -> None:
+def test_without_a_calibration_a_usual_focal_length_is_taken(folder: Path) -> None:
     (folder / "calib/train/000000.txt").unlink()
-    with pytest.raises(FormatError, match=r"images/train/000000\.png: expected a calibration, .*neither"):
-        yolo.YoloDataset(folder).frame("000000")
+    usual = yolo.YoloDataset(folder).frame("000000")
+    assert float(usual.camera.intrinsics[0, 0]) == pytest.approx(0.58 * 80)
+    assert usual.provenance["focal"] == "46.4 px, default"
     camera = yolo.YoloDataset(folder, focal_px=70.0).frame("000000").camera
     assert camera.intrinsics.tolist() == [[70, 0, 39.5], [0, 70, 19.5], [0, 0, 1]]
 
@@ -122,6 +123,7 @@ BAD_LINES = [
     (f"{GOOD} 0.9", "expected 5 fields: class cx cy w h, found 6"),
     ("8 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names, found '8'"),
     ("0.0 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names, found '0.0'"),
+    (f"{'1' * 5000} 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names"),
     ("-1 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names"),
     ("0 1.5 0.5 0.25 0.25", r"cx: expected a share of the image in \[0, 1\], found '1.5'"),
     ("0 0.5 nan 0.25 0.25", "cy: expected a share"),
@@ -150,6 +152,9 @@ def test_a_bad_line_is_named(line: str, message: str, folder: Path) -> None:
         ("names: [a]\ntrain: a.txt\n", r"data\.yaml: train: expected a folder of images, or a list"),
         ("names: [a]\ntrain: no\n", "no: expected a folder of images, found no such folder"),
         ("names: [a]\ntrain: calib/train\n", r"calib/train: expected at least one \.png or \.jpg, found none"),
+        ("names: [a]\ntrain: ../images\n", r"data\.yaml: train: expected a folder in .*, found '\.\./images'"),
+        ("names: [a]\ntrain: [/etc]\n", r"data\.yaml: train: expected a folder in .*, found '/etc'"),
+        ("names: [a]\npath: /etc\ntrain: a\n", r"data\.yaml: path: expected a folder in .*, found '/etc'"),
         ("names: {a: b}\ntrain: images/train\n", r"data\.yaml: names: expected .*found \{'a': 'b'\}"),
     ],
 )

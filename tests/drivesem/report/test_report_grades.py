@@ -175,6 +175,24 @@ def test_runs_side_by_side_have_grades(
     assert "grades unknown: run of an older version" in text
 
 
+def test_runs_that_break_as_much_are_told_alike(
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
+) -> None:
+    runs = [make_run(tmp_path / n, [graded(frame("a", lost=True), "certain"), frame("b")]) for n in ("one", "two")]
+    out = tmp_path / "page.html"
+
+    def told(*folders: Path) -> str:
+        assert main(["report", *map(str, folders), "--out", str(out)]) == 0
+        return " ".join(parse(out).text.split())
+
+    assert "2 runs on 2 frames: both have as many certain failures, 1 each" in told(*runs)
+    none = make_run(tmp_path / "none", [frame("a"), frame("b")])
+    assert "3 runs on 2 frames: one and two have most certain failures, 1 each" in told(*runs, none)
+    for run in runs:
+        older(run)
+    assert "2 runs on 2 frames: both have as many broken frames by threshold, 1 each" in told(*runs)
+
+
 @pytest.mark.parametrize(
     ("error", "count", "told"),
     [

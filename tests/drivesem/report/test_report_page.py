@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import re
@@ -49,7 +50,13 @@ def test_nothing_comes_from_outside(page: Path, parse: Callable[[Path], Any]) ->
     assert "@import" not in text
     assert not found.having("script", src="")
     (policy,) = (a["content"] for a in found.having("meta") if "http-equiv" in a)
-    assert "default-src 'none'" in policy
+    script = text.partition("<script>")[2].partition("</script>")[0]
+    assert policy == (
+        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src "
+        f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+    )
+    assert text.count("<script") == 1
+    assert script == resources.files("drivesem.report").joinpath("page.js").read_text(encoding="utf-8")
 
 
 def test_every_picture_has_a_text(page: Path, parse: Callable[[Path], Any]) -> None:

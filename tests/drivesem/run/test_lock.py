@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivesem.cli import main
-from drivesem.run.lock import LOCK, hold, let_go
+from drivesem.run.lock import LOCK, held_elsewhere, hold, let_go
 from drivesem.settings.errors import UsageError
 
 OTHER = """
@@ -41,6 +41,23 @@ def another_process(folder: Path) -> Iterator[Callable[[], None]]:
             yield kill
         finally:
             kill()
+
+
+def test_a_run_that_is_being_made_is_no_run_that_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("detector: squeezedet\nparams: rotate\ncombo: null\n")
+    with another_process(folder):
+        assert held_elsewhere(folder)
+        assert main(["explain", str(folder)]) == 2
+        assert f"found {folder}, into which an attack is still writing" in capsys.readouterr().err
+    assert not held_elsewhere(folder)
+    assert main(["explain", str(folder)]) == 2
+    assert f"found {folder}, which stopped early" in capsys.readouterr().err
+    hold(folder)  # by this process: nobody else
+    assert not held_elsewhere(folder)
 
 
 COMMANDS = {

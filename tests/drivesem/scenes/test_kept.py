@@ -12,7 +12,7 @@ import torch
 
 from drivesem.cli import main
 from drivesem.scenes.kept import KeptScenes, digest_of
-from drivesem.scenes.sources import PhotographSource
+from drivesem.scenes.sources import PhotographSource, _kept_scenes
 from drivesem.settings.commands import Attack
 from drivesem.synth.demo import demo_scene
 from scene_ir import files
@@ -97,6 +97,18 @@ def test_what_was_not_asked_for_longest_goes_first(scene: SceneIR, tmp_path: Pat
     assert len(list(tmp_path.iterdir())) == 2
     KeptScenes(tmp_path, 1e-9).scene("newest", make)
     assert len(list(tmp_path.iterdir())) == 1, "the newest stays, however large"
+
+
+def test_a_lower_limit_holds_for_a_command_that_adds_nothing(scene: SceneIR, tmp_path: Path) -> None:
+    make = Maker(scene)
+    for name in ("a", "b"):
+        KeptScenes(tmp_path / "kept", 1.0).scene(name, make)
+    config = Attack(dataset="kitti", root=str(tmp_path), cache=str(tmp_path / "kept"), cache_gb=1.0)
+    _kept_scenes(config)
+    assert len(list((tmp_path / "kept").iterdir())) == 2
+    _kept_scenes(replace(config, cache_gb=1e-9))
+    assert not list((tmp_path / "kept").iterdir())
+    assert _kept_scenes(replace(config, cache=str(tmp_path / "none"))) is not None
 
 
 def test_photographs_are_taken_apart_once(scene: SceneIR, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

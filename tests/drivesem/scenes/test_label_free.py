@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,91 +17,19 @@ from detectors.types import CLASSES, Detections
 from drivesem.cli import main
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.scenes.label_free import (
-    DEFAULT_FOCAL,
-    FITTING,
-    camera_of,
-    detect,
-    focal_of,
-    label_free,
-    photograph,
-    settings_for,
-)
+from drivesem.scenes.label_free import FITTING, detect, has_places, label_free, placed_by_boxes, settings_for
 from drivesem.synth.frames import SynthFrame, generate_frame
 from scene_ir.derender import pose
 from scene_ir.derender.derender import DerenderSettings
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.io import load_scene
-from scene_ir.types import Camera, Frame
+from scene_ir.types import Camera, Frame, Labels
 
 KITTI = Path(__file__).parents[3].parent / "shared" / "data" / "kitti"
 SEED, FRAMES = 2027, range(12)
 """Held-out streets that the network was neither trained nor judged on."""
 CAR, TRUCK, PEDESTRIAN = (CLASSES.index(name) for name in ("Car", "Truck", "Pedestrian"))
-
-
-def save(
-    path: Path, tags: dict[int, object], own: dict[int, object], size_wh: tuple[int, int] = (400, 300)
-) -> Path:
-    """A JPEG with these tags of EXIF, and of its own directory; its upper left quarter is red."""
-    pixels = np.full((size_wh[1], size_wh[0], 3), 128, np.uint8)
-    pixels[: size_wh[1] // 2, : size_wh[0] // 2] = (200, 20, 20)
-    image = Image.fromarray(pixels)
-    exif = Image.Exif()
-    for tag, value in tags.items():
-        exif[tag] = value
-    exif.get_ifd(0x8769).update(own)
-    image.save(path, exif=exif, quality=95)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("own", "expected"),
-    [
-        ({0xA405: 26}, (400 * 26 / 36, "EXIF")),
-        ({0x920A: 4.0, 0xA20E: 1000.0, 0xA210: 3}, (400.0, "EXIF")),
-        ({0x920A: 4.0, 0xA20E: 2540.0}, (400.0, "EXIF")),
-        ({0x920A: 4.0}, (DEFAULT_FOCAL * 400, "default")),
-        ({0xA405: 0}, (DEFAULT_FOCAL * 400, "default")),
-        ({}, (DEFAULT_FOCAL * 400, "default")),
-    ],
-)
-def test_focal_length_of_a_file(own: dict[int, object], expected: tuple[float, str], tmp_path: Path) -> None:
-    path = save(tmp_path / "a.jpg", {}, own)
-    found = focal_of(path)
-    assert (found.length_px, found.source) == (pytest.approx(expected[0], rel=1e-4), expected[1])
-    assert focal_of(path, 333.0).length_px == 333.0
-    camera = camera_of(path)
-    assert (camera.width, camera.height) == (400, 300)
-    assert camera.intrinsics[:2, 2].tolist() == [199.5, 149.5]
-    assert float(camera.intrinsics[0, 0]) == pytest.approx(expected[0], rel=1e-4)
-
-
-@pytest.mark.parametrize(("orientation", "red"), [(1, (0, 0)), (3, (-1, -1)), (6, (0, -1)), (8, (-1, 0))])
-def test_a_turned_photograph_is_put_upright(orientation: int, red: tuple[int, int], tmp_path: Path) -> None:
-    path = save(tmp_path / "a.jpg", {0x0112: orientation}, {0xA405: 36})
-    frame = photograph(path)
-    assert frame.photograph.shape[1:] == ((400, 300) if orientation in (6, 8) else (300, 400))
-    assert (camera_of(path).height, camera_of(path).width) == frame.photograph.shape[1:]
-    y, x = (5 if r == 0 else -5 for r in red)
-    assert float(frame.photograph[0, y, x]) > 0.7
-    assert float(frame.photograph[0, -y, -x]) < 0.6
-    assert float(frame.camera.intrinsics[0, 0]) == pytest.approx(400)  # of the longer side
-    assert frame.identifier == "a"
-    assert frame.provenance["focal"] == "400.0 px, EXIF"
-
-
-def test_what_is_no_photograph_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"no image")
-    for path in (tmp_path / "a.png", tmp_path / "none.png"):
-        for call in (camera_of, focal_of, photograph):
-            with pytest.raises(FormatError, match=path.name):
-                call(path)
-    path = save(tmp_path / "b.jpg", {}, {})
-    for focal in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(RangeError, match="focal"):
-            camera_of(path, focal)
 
 
 def frame_of(width: int = 1242, height: int = 375) -> Frame:
@@ -257,6 +186,62 @@ def test_a_larger_picture_of_the_same_street_gives_the_same_cars(streets: list[S
     assert float(apart) < 0.25 * float(sides.max())
 
 
+def boxed(frame: Frame, kind: tuple[str, ...], boxes: list[list[float]], **known: torch.Tensor) -> Frame:
+    """The frame with labels that say 2D boxes, and what else is `known`."""
+    count = len(kind)
+    labels = Labels(
+        kind=kind,
+        boxes_xyxy=torch.tensor(boxes),
+        truncation=known.get("truncation", torch.full((count,), math.nan)),
+        occlusion=known.get("occlusion", torch.full((count,), 3, dtype=torch.int64)),
+        translation=torch.full((count, 3), math.nan),
+        yaw=torch.full((count,), math.nan),
+        size_lhw=torch.full((count, 3), math.nan),
+        ignore_xyxy=torch.tensor([[1.0, 2.0, 30.0, 40.0]]),
+    )
+    return replace(frame, labels=labels)
+
+
+def test_labelled_boxes_are_placed_and_stay() -> None:
+    boxes = [
+        [600.0, 180.0, 700.0, 240.0],
+        [50.0, 150.0, 90.0, 260.0],
+        [300.0, 100.0, 300.0, 140.0],
+        [5.0, 5.0, 90.0, 60.0],
+    ]
+    frame = boxed(frame_of(), ("car", "person", "truck", "dog"), boxes)
+    assert frame.labels is not None
+    assert not has_places(frame.labels)
+    labels = placed_by_boxes(frame).labels
+    assert labels is not None
+    assert has_places(labels)
+    assert labels.kind == ("Car", "Pedestrian", "Truck", "dog")
+    assert torch.equal(labels.boxes_xyxy, frame.labels.boxes_xyxy)
+    assert torch.equal(labels.ignore_xyxy, frame.labels.ignore_xyxy)
+    known = torch.isfinite(labels.translation).all(1)
+    assert known.tolist()[2:] == [False, False]  # a box without area, and what is no road user
+    assert bool(known[0])
+    assert 5 < float(labels.translation[0, 2]) < 60
+    assert int(labels.occlusion[0]) == 0
+    assert 0 <= float(labels.truncation[0]) < 0.2
+    assert placed_by_boxes(frame).provenance["places"] == "estimated"
+
+
+def test_what_labels_say_is_not_estimated() -> None:
+    told = {"truncation": torch.tensor([0.4]), "occlusion": torch.tensor([1])}
+    labels = placed_by_boxes(boxed(frame_of(), ("Car",), [[600.0, 180.0, 700.0, 240.0]], **told)).labels
+    assert labels is not None
+    assert (float(labels.truncation[0]), int(labels.occlusion[0])) == (pytest.approx(0.4), 1)
+
+
+def test_of_two_cars_in_one_place_the_larger_stays() -> None:
+    boxes = [[602.0, 182.0, 698.0, 239.0], [600.0, 180.0, 700.0, 240.0]]
+    labels = placed_by_boxes(boxed(frame_of(), ("car", "car"), boxes)).labels
+    assert labels is not None
+    assert torch.isfinite(labels.translation[:, 2]).tolist() == [False, True]
+    assert bool(torch.isnan(labels.size_lhw[0]).all())
+
+
 def test_derender_takes_a_photograph(
     streets: list[SynthFrame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -281,7 +266,7 @@ def test_derender_takes_a_photograph(
         (["none.png"], "none.png: expected a readable file"),
         (["a.txt"], "a.txt: expected an image"),
         (["none.png", "--dataset", "kitti", "--root", "."], "PHOTO: expected no --dataset beside it"),
-        (["--focal", "700"], "--focal: expected a PHOTO"),
+        (["--focal", "700"], "--focal: expected --dataset coco, yolo, photographs"),
         (["none.png", "--focal", "-1"], "--focal: expected positive px"),
     ],
 )

@@ -69,7 +69,7 @@ def test_meshes_that_are_left_out_are_named(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     nothing = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-    monkeypatch.setattr(label_free, "detect", lambda _: nothing)
+    monkeypatch.setattr(label_free, "detect", lambda *_: nothing)
     shape = template("sedan")
     turned = shape.vertices.numpy() * np.array([4.5, -1.5, -1.8])
     trimesh.Trimesh(turned, shape.faces.numpy(), process=False).export(place / "bad" / "sedan.obj")

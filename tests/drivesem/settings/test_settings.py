@@ -22,7 +22,7 @@ from drivesem.settings.blocks import Command, Regions, constraints, option
 from drivesem.settings.commands import COMMANDS, Attack, Explain, Study, Synth
 from drivesem.settings.constraints import Anywhere, Constraint, Folder, Of, OneOf, Required, Within
 from drivesem.settings.errors import UsageError
-from drivesem.settings.parsing import parse, preset_words
+from drivesem.settings.parsing import commands_of, parse, preset_words
 from drivesem.settings.text import to_yaml
 
 ROOT = Path(__file__).parents[3]
@@ -50,6 +50,7 @@ def test_resolved_configuration_reads_back(tmp_path: Path) -> None:
 
 _NEEDED: dict[str, tuple[str, ...]] = {
     "study": ("single",),
+    "classify": ("attack",),
     "explain": ("--run", "run"),
     "confirm": ("--run", "run"),
     "plausibility": ("--run", "run"),
@@ -60,6 +61,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("render", "edit"), ("scene",)),
     "eval": ("--gt", "labels", "--pred", "results"),
     "convert": ("labels", "--to", "coco", "--out", "out"),
+    "export": ("--run", "run", "--to", "coco", "--out", "out"),
     "check": ("--detector", "squeezedet"),
     **dict.fromkeys(("anchors", "train"), ("--root", "frames")),
     "retrain": ("--run", "run"),
@@ -75,10 +77,13 @@ def default_of(name: str) -> Command:
 
 @pytest.mark.parametrize("preset", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_presets_parse(preset: Path) -> None:
-    command = preset.stem.split("-")[0]
-    command = command if command in COMMANDS else "attack"
-    for name in yaml.safe_load(preset.read_text()).get("for", [command]):
-        assert isinstance(parse([name, "--config", str(preset), *_NEEDED.get(name, ())]), COMMANDS[name])
+    names = commands_of(str(preset))
+    assert names
+    for name in names:
+        by_file = parse([name, "--config", str(preset), *_NEEDED.get(name, ())])
+        assert isinstance(by_file, COMMANDS[name])
+        for told in (preset.stem, f"configs/{preset.stem}.yaml"):
+            assert parse([name, "--config", told, *_NEEDED.get(name, ())]) == by_file
 
 
 def test_papers_preset_is_for_attacks_and_studies() -> None:
@@ -142,7 +147,6 @@ def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
         (["attack", "stray"], "expected options of drivesem attack (its --help lists them), found stray"),
         (["verify", "--limit", "2"], "--run: expected a folder of drivesem attack, found nothing"),
         (["verify", "nowhere"], "nowhere"),
-        ([], "command: expected one of attack, "),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -65,6 +65,18 @@ def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[
     assert (out / LOG).read_text() != before
 
 
+def test_frames_that_are_trained_on_and_judged_by_are_told(
+    tmp_path: Path, kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, other = kitti_folder(tmp_path / "train", 2), kitti_folder(tmp_path / "other", 2, seed=1)
+    words = ["train", "--root", f"{other},{folder}", *STEPS, "--steps", "1", "--held-out"]
+    assert main([*words, str(folder / ".." / "train"), "--out", str(tmp_path / "a")]) == 0
+    assert "is trained on too: its figures, and t*, say nothing of other pictures" in capsys.readouterr().err
+    apart = kitti_folder(tmp_path / "apart", 2, seed=2)
+    assert main([*words, str(apart), "--out", str(tmp_path / "b")]) == 0
+    assert "is trained on too" not in capsys.readouterr().err
+
+
 def test_it_starts_from_weights_and_checkpoints(tmp_path: Path, frames: list[str]) -> None:
     def trained(name: str, start: str) -> dict[str, torch.Tensor]:
         words = ["train", *frames, *STEPS, "--rate", "1e-12", "--start", start, "--out", str(tmp_path / name)]

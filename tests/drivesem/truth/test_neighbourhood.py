@@ -9,7 +9,7 @@ from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Budget, ParameterSpace
 from drivesem.synth.demo import demo_scene
-from drivesem.truth.neighbourhood import Neighbourhood
+from drivesem.truth.neighbourhood import Everywhere, Neighbourhood
 from drivesem.truth.nuisances import Nuisances
 from scene_ir.render.compositor import Compositor
 
@@ -101,3 +101,34 @@ def test_a_place_in_a_draw_is_a_sample(objective: Objective, theta: torch.Tensor
     assert moved is not None
     assert torch.equal(numbered.exposure.picture, placed.exposure.picture)
     assert not torch.equal(numbered.exposure.picture, moved.exposure.picture)
+
+
+def test_everywhere_tells_of_all_objects_at_once(objective: Objective) -> None:
+    def everywhere(name: str = "a") -> Everywhere:
+        return Everywhere(objective, objective.feasible_set(), Nuisances.of("off"), name)
+
+    whole, space = everywhere(), objective.space
+    assert len(whole.judged) > 2
+    thetas = [whole.theta(number) for number in range(3)]
+    for theta in thetas:
+        assert bool((theta >= space.lower - 1e-6).all() & (theta <= space.upper + 1e-6).all())
+        assert bool((theta[: space.dim // 2] != 0).any())
+    assert torch.equal(thetas[2], everywhere().theta(2))
+    assert not torch.equal(thetas[2], everywhere("b").theta(2))
+
+    samples = whole.sample(1)
+    assert set(samples) <= set(whole.judged)
+    assert len({id(sample.exposure) for sample in samples.values()}) == 1, "one picture"
+    margins = whole.margins(samples)
+    assert set(margins) == set(samples)
+    index = next(iter(samples))
+    _, y0, _, y1 = samples[index].exposure.targets.boxes_xyxy[index].tolist()
+    assert samples[index].features["height_px"] == pytest.approx(y1 - y0, rel=1e-4)
+    assert whole.margins({}) == {}
+
+
+def test_everywhere_at_theta0_all_judged_objects_are_found(objective: Objective) -> None:
+    whole = Everywhere(objective, objective.feasible_set(), Nuisances.of("off"), "a")
+    margins = whole.margins(whole.sample_of(objective.space.theta0, 0))
+    assert set(margins) == set(whole.judged)
+    assert all(margin > 0 for margin in margins.values())

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.truth.rules import Flags, Floats, contains, counted, fit, overlap
+from drivesem.truth.rules import Flags, Floats, contains, counted, cover, description, fit, overlap
 
 NAMES = ("height_px", "aspect", "across", "lightness", "distance_m", "yaw_deg")
 
@@ -86,3 +86,52 @@ def test_overlap_is_by_the_worst_feature() -> None:
     assert overlap(one, {"a": (0.5, 1.5), "b": (0.0, 1.0)}) == pytest.approx(0.5 / 1.5)
     assert overlap(one, {"a": (2.0, 3.0), "b": (0.0, 1.0)}) == 0
     assert overlap({}, {}) == 1
+
+
+def of_cars(cars: int, each: int, seed: int) -> tuple[dict[str, Floats], np.ndarray]:
+    """Samples of cars that differ more from each other than in their own: height and place are nearly theirs."""
+    rng = np.random.default_rng(seed)
+    objects = np.repeat(np.arange(cars), each)
+    own = {name: rng.random(cars)[objects] + 0.03 * rng.standard_normal(len(objects)) for name in NAMES[:3]}
+    return own | {name: rng.random(len(objects)) for name in NAMES[3:]}, objects
+
+
+def test_covering_finds_two_rules() -> None:
+    features, objects = of_cars(80, 16, 0)
+    first, second = {"height_px": (0.3, 0.6), "lightness": (0.1, 0.5)}, {"yaw_deg": (0.85, 1.0)}
+    inside = contains(first, features, len(objects)) | contains(second, features, len(objects))
+    rules = cover(features, failing(inside, 0, else_=0.01), objects)
+    assert [set(rule.where) for rule in rules] in ([set(first), set(second)], [set(second), set(first)])
+    for truth in (first, second):
+        (rule,) = [rule for rule in rules if set(rule.where) == set(truth)]
+        assert overlap(truth, rule.where) > 0.7
+
+
+@pytest.mark.parametrize("by_car", [True, False])
+def test_covering_tells_nothing_of_chance(by_car: bool) -> None:
+    """Nor of a few cars that fail for no reason: samples of one car are much alike, and would seem to tell it."""
+    told = 0
+    for seed in range(20):
+        features, objects = of_cars(40, 12, seed)
+        rng = np.random.default_rng(seed)
+        fails = rng.random(len(objects)) < 0.05
+        if by_car:
+            fails = np.isin(objects, rng.choice(40, 4, replace=False)) & (rng.random(len(objects)) < 0.5)
+        told += bool(cover(features, fails, objects))
+    assert told <= 1
+
+
+def test_what_fails_in_two_cars_alone_is_no_rule() -> None:
+    features, objects = of_cars(40, 12, 1)
+    assert cover(features, objects < 2, objects) == []
+
+
+def test_a_description_is_shorter_where_a_rule_tells() -> None:
+    features = samples(96, 0)
+    truth = {"aspect": (0.2, 0.5)}
+    fails = failing(contains(truth, features, 96), 0)
+    assert description(truth, features, fails) < description({}, features, fails)
+    assert description({"yaw_deg": (0.2, 0.5)}, features, fails) > description({}, features, fails)
+    # Two bounds, each one of the 48 ends that are tried.
+    more = description(truth, features, fails) - description(truth, features, fails, bounds=0)
+    assert more == pytest.approx(2 * np.log(48))

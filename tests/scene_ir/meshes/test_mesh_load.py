@@ -1,5 +1,6 @@
 """Mesh files: our GLB keeps every bit; foreign OBJ, GLB, PLY come into the unit box with colours and parts."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.meshes import load
 from scene_ir.meshes.load import import_mesh, load_mesh, save_mesh
 from scene_ir.meshes.templates import template
 from scene_ir.types import Mesh, Part
@@ -278,3 +280,68 @@ def test_only_full_meshes_are_saved_and_only_as_glb(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="faces"):
         save_mesh(replace(mesh, faces=mesh.faces[:0], part=mesh.part[:0]), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_texture_names_stay_in_the_folder(tmp_path: Path) -> None:
+    """A name that leads elsewhere is looked for by its last part, as packs need it."""
+    folder = tmp_path / "pack"
+    folder.mkdir()
+    faces = "f 1/1 2/2 3/1\nf 1/1 3/1 4/2\nf 1/1 4/2 2/2\nf 2/2 4/2 3/1\n"
+    points = "v 0 0 0\nv 4 0 0\nv 4 1 0\nv 0 0 2\nvt 0 0\nvt 1 0\n"
+    (folder / "a.obj").write_text(f"mtllib a.mtl\n{points}usemtl m\n{faces}")
+    (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd {tmp_path}/red.png\n")
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "red.png")
+    assert not (load_mesh(folder / "a.obj").colours == torch.tensor([1.0, 0, 0])).all()
+    Image.new("RGB", (2, 2), (0, 255, 0)).save(folder / "red.png")
+    assert (load_mesh(folder / "a.obj").colours == torch.tensor([0, 1.0, 0])).all()
+
+
+def claiming(path: Path, **changes: object) -> Path:
+    """A glTF of a box, with other values in its JSON."""
+    parts = trimesh.Scene(trimesh.creation.box()).export(file_type="gltf")
+    for name, content in parts.items():
+        (path.parent / name).write_bytes(content)
+    told = json.loads(parts["model.gltf"])
+    path.write_text(json.dumps(told | {key: change(told) for key, change in changes.items()}))
+    return path
+
+
+def test_files_that_claim_more_than_they_hold(tmp_path: Path) -> None:
+    path = tmp_path / "a.gltf"
+    big = claiming(path, accessors=lambda told: [told["accessors"][0] | {"count": 10**9}, *told["accessors"][1:]])
+    with pytest.raises(
+        FormatError, match=r"a\.gltf: expected at most 20,000,000 vertices, faces .*, found 1,000,000"
+    ):
+        load_mesh(big)
+    with pytest.raises(FormatError, match=r"a\.gltf: nodes: expected at most 10,000, found 20,000"):
+        load_mesh(claiming(path, nodes=lambda told: [told["nodes"][0]] * 20_000))
+    head = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    for form in ("ascii", "binary_little_endian"):
+        (tmp_path / "a.ply").write_text(head.format(form, 3) + "element face 1000000000\nend_header\n0 0 0\n")
+        with pytest.raises(FormatError, match=r"a\.ply: expected at most 20,000,000 .*, found 1,000,000,003"):
+            load_mesh(tmp_path / "a.ply")
+
+
+def test_many_places_of_one_mesh_and_faces_without_vertices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = trimesh.Scene()
+    for i in range(20):
+        scene.add_geometry(
+            trimesh.creation.box(), geom_name="one", transform=trimesh.transformations.scale_matrix(i + 1)
+        )
+    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
+    load_mesh(tmp_path / "a.glb")
+    monkeypatch.setattr(load, "_MOST_FACES", 12)
+    with pytest.raises(FormatError, match=r"a\.glb: faces: expected at most 12, found more"):
+        load_mesh(tmp_path / "a.glb")
+    monkeypatch.undo()
+    data = bytearray((tmp_path / "a.glb").read_bytes())
+    at = data.index(b"BIN\0") + 4
+    wide = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    faces = next(one for one in wide["accessors"] if one["type"] == "SCALAR")
+    at += wide["bufferViews"][faces["bufferView"]].get("byteOffset", 0)
+    data[at : at + 4] = (1 << 20).to_bytes(4, "little")
+    (tmp_path / "a.glb").write_bytes(data)
+    with pytest.raises(FormatError, match=r"a\.glb: faces: expected indices of \d+ vertices, found 1048576"):
+        load_mesh(tmp_path / "a.glb")

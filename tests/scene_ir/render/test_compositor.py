@@ -487,4 +487,8 @@ def test_what_shows_of_each_draw_has_a_rectangle_around_it() -> None:
     layout = Layout.of(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
     shown = torch.zeros(layout.size, dtype=torch.bool)
     shown[:36].view(6, 6)[2:4, 0:3] = True
-    assert blend.shown_rects(layout, shown).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert blend.shown_rects(layout, shown[:, None]).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
+    for channel in range(3):
+        several = torch.zeros(layout.size, 3, dtype=torch.bool)
+        several[:, channel] = shown
+        assert blend.shown_rects(layout, several).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivesem.classify.objects.shapes import ball, beams, body, box, boxes, lathe, patch, torus, tube, wing
+from drivesem.classify.objects.shapes import beams, body, box, boxes, lathe, patch, torus, tube, wing
 from drivesem.classify.objects.surfaces import (
     BLACK,
     GLASS,
     RUBBER,
     STEEL,
     WHITE,
-    WOODS,
     Kit,
     Surface,
     metal,
@@ -172,35 +171,4 @@ def fighter(kit: Kit) -> None:
         kit.add(BLACK, lathe([(0.45 * r, -0.42), (0.45 * r, 0.0)], (-half, 0, side), "x", 12))
 
 
-def biplane(kit: Kit) -> None:
-    """Two wings with struts between them, a round engine, an open cockpit."""
-    half, r = kit.between(3.4, 3.9), kit.between(0.50, 0.60)
-    skin, second, wood = kit.lacquer(), kit.lacquer(), paint(kit.tint(WOODS[:1]))
-    stations = [
-        [-half, 0.15, 0.12, 0.05], [-0.3 * half, 0.02, 0.7 * r, 0.5 * r],
-        [0.3 * half, 0, r, 0.9 * r], [0.78 * half, 0, r, r],
-    ]  # fmt: skip
-    kit.add(skin, body(stations, 14, 2.4))
-    cowl = [(1.12 * r, 0.70 * half), (1.2 * r, 0.85 * half), (0.8 * r, 0.95 * half)]
-    kit.add(STEEL, lathe(cowl, (0, 0, 0), "x", 18))
-    _propeller(kit, 0.95 * half, 0.0, kit.between(1.0, 1.2), 2, second)
-    kit.add(BLACK, lathe([(0.42 * r, 0.0), (0.36 * r, 0.15 * r)], (0.02, 0.93 * r, 0)))
-    kit.add(GLASS, box((0.13 * half, 0.9 * r, -0.25), (0.15 * half, 1.3 * r, 0.25)))
-    kit.add(wood, ball((-0.06 * half, 1.05 * r, 0), 0.2, 10))
-    span, chord, gap = half * kit.between(1.16, 1.36), kit.between(1.25, 1.5), kit.between(1.5, 1.8)
-    lead, low = 0.56 * half, -0.7 * r
-    for y, x, reach, cloth in ((low, lead - 0.25, 0.94 * span, skin), (low + gap, lead, span, second)):
-        out = (x, y + 0.05 * reach, 0.93 * reach, chord), (x - 0.3 * chord, y + 0.05 * reach, reach, 0.5 * chord)
-        kit.both(cloth, wing(0.10, (x, y, 0, chord), *out))
-    for z in (0.35, 0.72 * span):
-        foot, head = np.array([lead - 0.4, low, z]), np.array([lead - 0.2, low + gap + 0.02 * span, z])
-        back = np.array([-0.65 * chord, 0, 0])
-        kit.both(wood, beams([foot, foot + back], [head, head + back], 0.05, 0.09))
-        kit.both(STEEL, beams(foot, head + back, 0.018))
-    kit.add(second, wing(0.09, (0.95 - half, 0.15, 0, 0.95), (0.4 - half, 1.15, 0, 0.6), upright=True))
-    kit.both(skin, wing(0.09, (0.95 - half, 0.2, 0, 0.85), (0.75 - half, 0.2, 0.34 * half, 0.6)))
-    _gear(kit, 0.45 * half, 0.85, -0.6 * r, -r - 0.95, 0.32)
-    kit.add(STEEL, tube([(0.45 * half, -r - 0.63, -0.85), (0.45 * half, -r - 0.63, 0.85)], 0.03, 6))
-
-
-AIRPLANES = (airliner, light_plane, fighter, business_jet, biplane)
+AIRPLANES = (airliner, light_plane, fighter, business_jet)

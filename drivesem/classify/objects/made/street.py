@@ -9,6 +9,7 @@ from drivesem.classify.objects.shapes import (
     UP,
     ball,
     beams,
+    block,
     box,
     boxes,
     lathe,
@@ -44,7 +45,7 @@ def _slats(kit: Kit, wood: Surface, line: list[tuple[float, float]], length: flo
     """Boards along z at places (x, y) of a bench's section, each turned along the section."""
     places = np.array(line)
     for (x, y), way in zip(places, np.gradient(places, axis=0), strict=True):
-        board = box((-wide / 2, -0.016, -length / 2), (wide / 2, 0.016, length / 2), 0.008)
+        board = block((-wide / 2, wide / 2), (-0.016, 0.016), length / 2, 0.008)
         kit.add(wood, moved(turned(board, "z", float(np.arctan2(way[1], way[0]))), (x, y, 0)))
 
 
@@ -52,7 +53,7 @@ def _seat_line(kit: Kit, seats: int, backs: int) -> tuple[list[tuple[float, floa
     """Places of the boards of seat and back, front to rear."""
     lean = kit.between(0.15, 0.32)
     seat = [(0.22 - 0.44 * t, 0.45 - 0.02 * np.sin(np.pi * t)) for t in np.linspace(0, 1, seats)]
-    back = [(-0.27 - lean * h, 0.50 + h) for h in np.linspace(0.06, 0.40, backs)]
+    back = [(-0.27 - lean * h, 0.5 + h) for h in np.linspace(0.06, 0.4, backs)]
     return seat, back
 
 
@@ -60,29 +61,29 @@ def park_bench(kit: Kit) -> None:
     """Slats on cast iron ends with scrolled arms."""
     length, count = kit.between(1.3, 1.9), kit.count(5, 7)
     seat, back = _seat_line(kit, count, kit.count(3, 5))
-    wood, iron = dull(kit.tint(WOODS)), IRON if kit.chance(0.6) else metal((0.02, 0.10, 0.05))
+    wood, iron = dull(kit.tint(WOODS)), IRON if kit.chance(0.6) else metal((0.02, 0.1, 0.05))
     _slats(kit, wood, seat, length, 0.36 / count)
     _slats(kit, wood, back, length, 0.075)
     for z in (0.46 * length, 0.0) if length > 1.7 else (0.46 * length,):
-        foot = [(0.30, 0.0, z), (0.24, 0.20, z), (0.24, 0.42, z), (-0.24, 0.42, z), (back[-1][0] - 0.03, 0.92, z)]
-        rear = [(-0.40, 0.0, z), (-0.28, 0.20, z), (-0.24, 0.43, z)]
+        foot = [(0.3, 0.0, z), (0.24, 0.2, z), (0.24, 0.42, z), (-0.24, 0.42, z), (back[-1][0] - 0.03, 0.92, z)]
+        rear = [(-0.4, 0.0, z), (-0.28, 0.2, z), (-0.24, 0.43, z)]
         kit.both(iron, tube(foot, 0.022, 6), tube(rear, 0.022, 6))
-        arm = [(0.24, 0.42, z), (0.30, 0.60, z), (0.22, 0.68, z), (-0.05, 0.66, z), (-0.32, 0.70, z)]
+        arm = [(0.24, 0.42, z), (0.3, 0.6, z), (0.22, 0.68, z), (-0.05, 0.66, z), (-0.32, 0.7, z)]
         kit.both(iron, tube(arm, 0.02, 6), torus((0.22, 0.61, z), 0.05, 0.014, "z", 14))
-        kit.both(iron, torus((0.0, 0.30, z), 0.09, 0.014, "z", 16))
+        kit.both(iron, torus((0.0, 0.3, z), 0.09, 0.014, "z", 16))
 
 
 def garden_bench(kit: Kit) -> None:
     """All of wood: four legs, arms, a back of upright bars."""
-    half, wood = kit.between(0.60, 0.85), dull(kit.tint((*WOODS, (0.62, 0.62, 0.60), (0.10, 0.22, 0.28))))
+    half, wood = kit.between(0.6, 0.85), dull(kit.tint((*WOODS, (0.62, 0.62, 0.6), (0.1, 0.22, 0.28))))
     top = kit.between(0.86, 1.0)
     posts = [((0.24, z), 0.66) for z in (half, -half)] + [((-0.26, z), top) for z in (half, -half)]
     kit.add(wood, *(box((x - 0.035, 0, z - 0.035), (x + 0.035, h, z + 0.035), 0.008) for (x, z), h in posts))
     seats = kit.count(4, 6)
     for x in np.linspace(0.23, -0.2, seats):
-        kit.add(wood, box((x - 0.19 / seats, 0.43, -half), (x + 0.19 / seats, 0.455, half), 0.006))
-    kit.both(wood, box((-0.30, 0.64, half - 0.045), (0.31, 0.675, half + 0.045), 0.01))
-    kit.add(wood, box((0.215, 0.34, -half), (0.245, 0.42, half)), box((-0.28, 0.50, -half), (-0.24, 0.57, half)))
+        kit.add(wood, block((x - 0.19 / seats, x + 0.19 / seats), (0.43, 0.455), half, 0.006))
+    kit.both(wood, box((-0.3, 0.64, half - 0.045), (0.31, 0.675, half + 0.045), 0.01))
+    kit.add(wood, block((0.215, 0.245), (0.34, 0.42), half), block((-0.28, -0.24), (0.5, 0.57), half))
     rise = kit.between(0.0, 0.12)
     rail = [(-0.26, top - 0.06 + rise * (1 - (z / half) ** 2), z) for z in np.linspace(-half, half, 9)]
     kit.add(wood, tube(rail, 0.045, 4))
@@ -96,29 +97,27 @@ def garden_bench(kit: Kit) -> None:
 def stone_bench(kit: Kit) -> None:
     """A slab on two blocks, or with a backrest on them."""
     half, stone = kit.between(0.65, 0.95), dull(kit.tint(STONES))
-    thick, deep = kit.between(0.07, 0.13), kit.between(0.20, 0.26)
-    kit.add(stone, box((-deep, 0.45 - thick, -half), (deep, 0.45, half), 0.02))
+    thick, deep = kit.between(0.07, 0.13), kit.between(0.2, 0.26)
+    kit.add(stone, block((-deep, deep), (0.45 - thick, 0.45), half, 0.02))
     foot, width = kit.between(0.55, 0.8) * half, kit.between(0.06, 0.14)
     profile = [(1.0, 0.0), (1.0, 0.12), (0.72, 0.2), (0.72, 0.75), (1.0, 0.86), (1.0, 1.0)]
     leg = loft([rectangle((-0.8 * deep * s, 0.8 * deep * s), (0.45 - thick) * t, width * s) for s, t in profile])
     kit.add(stone, moved(leg, (0, 0, foot)), moved(leg, (0, 0, -foot)))
     wood = dull(kit.tint(WOODS))
-    for x in np.linspace(-0.8 * deep, 0.8 * deep, 5):
-        kit.add(wood, box((x - 0.036, 0.445, -0.96 * half), (x + 0.036, 0.475, 0.96 * half), 0.012))
+    for x in np.linspace(-0.82 * deep, 0.82 * deep, 7):
+        kit.add(wood, block((x - 0.11 * deep, x + 0.11 * deep), (0.445, 0.475), 0.96 * half, 0.012))
     if kit.chance(0.5):
-        kit.both(stone, box((-deep - 0.06, 0.40, foot - 0.08), (-deep + 0.04, 0.85, foot + 0.08), 0.015))
-        kit.add(wood, box((-deep, 0.58, -0.96 * half), (-deep + 0.05, 0.68, 0.96 * half), 0.012))
-        kit.add(wood, box((-deep, 0.73, -0.96 * half), (-deep + 0.05, 0.83, 0.96 * half), 0.012))
+        kit.both(stone, box((-deep - 0.06, 0.4, foot - 0.08), (-deep + 0.04, 0.85, foot + 0.08), 0.015))
+        kit.add(wood, block((-deep, -deep + 0.05), (0.58, 0.68), 0.96 * half, 0.012))
+        kit.add(wood, block((-deep, -deep + 0.05), (0.73, 0.83), 0.96 * half, 0.012))
 
 
 def steel_bench(kit: Kit) -> None:
     """One curved seat of bars on looped legs of steel."""
-    half, colour = kit.between(0.65, 0.95), metal(kit.tint((*PAINTS, (0.30, 0.31, 0.32)), 0.15))
+    half, colour = kit.between(0.65, 0.95), metal(kit.tint((*PAINTS, (0.3, 0.31, 0.32)), 0.15))
     high = kit.between(0.36, 0.46)
-    curve = [
-        (0.27, 0.40), (0.25, 0.44), (0.16, 0.45), (0.04, 0.43), (-0.10, 0.42), (-0.20, 0.44),
-        (-0.26, 0.52), (-0.29, 0.62), (-0.32, 0.72), (-0.36, 0.42 + high), (-0.41, 0.43 + high),
-    ]  # fmt: skip
+    curve = [(0.27, 0.4), (0.25, 0.44), (0.16, 0.45), (0.04, 0.43), (-0.1, 0.42), (-0.2, 0.44), (-0.26, 0.52),
+        (-0.29, 0.62), (-0.32, 0.72), (-0.36, 0.42 + high), (-0.41, 0.43 + high)]  # fmt: skip
     z = np.linspace(-half, half, kit.count(14, 22))
     for place in z:
         path = [(x, y, place) for x, y in curve]
@@ -126,7 +125,7 @@ def steel_bench(kit: Kit) -> None:
     for x, y in (curve[0], curve[3], curve[5], curve[-1]):
         kit.add(colour, tube([(x, y, -half - 0.02), (x, y, half + 0.02)], 0.018, 6))
     for side in (0.8 * half, -0.8 * half):
-        loop = [(0.20, 0.43, side), (0.24, 0.03, side), (0.15, 0.0, side), (-0.28, 0.0, side), (-0.32, 0.04, side)]
+        loop = [(0.2, 0.43, side), (0.24, 0.03, side), (0.15, 0.0, side), (-0.28, 0.0, side), (-0.32, 0.04, side)]
         kit.add(STEEL, tube([*loop, (-0.22, 0.43, side)], 0.025, 8))
 
 
@@ -139,39 +138,39 @@ def _round(profile: list[tuple[float, float]], *, sides: int = 24) -> Solid:
 
 def dustbin(kit: Kit) -> None:
     """A ribbed can of zinc with a lid and a handle on each side."""
-    r, h = kit.between(0.24, 0.30), kit.between(0.58, 0.76)
-    zinc = metal(kit.tint(((0.36, 0.38, 0.40), (0.30, 0.31, 0.32), (0.06, 0.14, 0.09))))
+    r, h = kit.between(0.24, 0.3), kit.between(0.58, 0.76)
+    zinc = metal(kit.tint(((0.36, 0.38, 0.4), (0.3, 0.31, 0.32), (0.06, 0.14, 0.09))))
     ribs, rows = kit.count(10, 16), [(1.0, 0.0), (0.86, 0.02)]
     for t in np.linspace(0.08, 0.95, ribs):
         rows += [(0.87 + 0.13 * t, t - 0.02), (0.91 + 0.13 * t, t)]
     kit.add(zinc, _round([(0.9 * r * a, h * t) for a, t in [*rows, (1.0, 0.97)]], sides=28))
     lid, grip = kit.between(0.06, 0.16), kit.between(0.05, 0.08)
-    dome = [(1.06, -0.06), (1.08, 0.02), (0.98, 0.16), (0.75, 0.55), (0.40, 0.9), (0.0, 1.0)]
+    dome = [(1.06, -0.06), (1.08, 0.02), (0.98, 0.16), (0.75, 0.55), (0.4, 0.9), (0.0, 1.0)]
     kit.add(zinc, moved(_round([(r * a, lid * t) for a, t in dome], sides=28), (0, h, 0)))
-    kit.add(zinc, tube([(0, h + 0.9 * lid, -grip), (0, h + lid + 0.06, -grip), (0, h + lid + 0.06, grip), (0,
-        h + 0.9 * lid, grip)], 0.012, 6))  # fmt: skip
+    kit.add(zinc, tube([(0, h + 0.9 * lid, -grip), (0, h + lid + 0.06, -grip), (0, h + lid + 0.06, grip),
+        (0, h + 0.9 * lid, grip)], 0.012, 6))  # fmt: skip
     side = [(-grip, 0.72 * h, r), (-grip, 0.72 * h, r + 0.05), (grip, 0.72 * h, r + 0.05), (grip, 0.72 * h, r)]
     kit.both(zinc, tube([(x, y, z * 0.97) for x, y, z in side], 0.012, 6))
 
 
 def wheeled_bin(kit: Kit) -> None:
     """A tapered bin with a sloping lid, a handle behind, two wheels."""
-    colour = kit.tint(((0.03, 0.16, 0.05), (0.03, 0.03, 0.032), (0.02, 0.07, 0.28), (0.45, 0.30, 0.01), (0.16,
-        0.08, 0.03)))  # fmt: skip
+    colour = kit.tint(((0.03, 0.16, 0.05), (0.03, 0.03, 0.032), (0.02, 0.07, 0.28), (0.45, 0.3, 0.01),
+        (0.16, 0.08, 0.03)))  # fmt: skip
     coat, lid = plastic(colour), plastic(colour if kit.chance(0.5) else kit.tint(PAINTS))
     w, h, d = kit.between(0.24, 0.32), kit.between(0.85, 1.0), kit.between(0.27, 0.33)
     low = rectangle((-0.72 * d, 0.66 * d), 0.06, 0.76 * w)
     kit.add(coat, prism(low, rectangle((-d, d), h, w)))
-    kit.add(coat, box((-1.04 * d, h - 0.10, -1.06 * w), (1.06 * d, h - 0.03, 1.06 * w), 0.02))
+    kit.add(coat, block((-1.04 * d, 1.06 * d), (h - 0.1, h - 0.03), 1.06 * w, 0.02))
     for y in (0.35 * h, 0.62 * h):
         s = 0.74 + 0.26 * y / h
         kit.add(coat, box((0.0, y - 0.01, -w * s - 0.012), (d * s + 0.008, y + 0.01, w * s + 0.012)))
-    front, rear = rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w), rectangle((-0.95 * d, 0.9 * d), h + 0.10,
-        0.92 * w)  # fmt: skip
+    front = rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w)
+    rear = rectangle((-0.95 * d, 0.9 * d), h + 0.1, 0.92 * w)
     front[[1, 2], 1] -= 0.02
     rear[[1, 2], 1] -= 0.05
     kit.add(lid, prism(front, rear))
-    kit.add(lid, box((1.0 * d, h - 0.01, -0.3 * w), (1.16 * d, h + 0.02, 0.3 * w), 0.01))
+    kit.add(lid, block((1.0 * d, 1.16 * d), (h - 0.01, h + 0.02), 0.3 * w, 0.01))
     bar = [(-0.98 * d, h - 0.02, 0.8 * w), (-1.3 * d, h + 0.02, 0.8 * w), (-1.3 * d, h + 0.02, -0.8 * w)]
     kit.add(coat, tube([*bar, (-0.98 * d, h - 0.02, -0.8 * w)], 0.016, 6))
     r = kit.between(0.09, 0.12)
@@ -179,31 +178,31 @@ def wheeled_bin(kit: Kit) -> None:
     kit.both(RUBBER, lathe(wheel, (-0.78 * d, r, w * 0.86), "z", 18))
     kit.both(STEEL, lathe([(0.5 * r, -0.035), (0.5 * r, 0.036)], (-0.78 * d, r, w * 0.86), "z", 12))
     kit.add(STEEL, tube([(-0.78 * d, r, -0.85 * w), (-0.78 * d, r, 0.85 * w)], 0.012, 6))
-    kit.add(WHITE, boxes([(0.90 * d, 0.72 * h, 0)], (0.04, 0.14, 0.2)))
+    kit.add(WHITE, boxes([(0.9 * d, 0.72 * h, 0)], (0.04, 0.14, 0.2)))
 
 
 def pedal_bin(kit: Kit) -> None:
     """A smooth cylinder with a domed lid and a pedal, or a flap that swings."""
-    r, h = kit.between(0.15, 0.20), kit.between(0.42, 0.66)
+    r, h = kit.between(0.15, 0.2), kit.between(0.42, 0.66)
     coat = CHROME if kit.chance(0.5) else kit.lacquer()
-    kit.add(BLACK, _round([(1.03 * r, 0.0), (1.03 * r, 0.05)], sides=28), _round([(1.02 * r, h), (1.02 * r,
-        h + 0.025)], sides=28))  # fmt: skip
+    kit.add(BLACK, _round([(1.03 * r, 0.0), (1.03 * r, 0.05)], sides=28),
+        _round([(1.02 * r, h), (1.02 * r, h + 0.025)], sides=28))  # fmt: skip
     kit.add(coat, _round([(r, 0.04), (r, h + 0.01)], sides=28))
     top = kit.between(0.05, 0.14)
     arc = [(np.cos(a), np.sin(a)) for a in np.linspace(0, np.pi / 2, 8)]
-    kit.add(coat if kit.chance(0.6) else BLACK, moved(_round([(r * c, top * s) for c, s in arc], sides=28), (0,
-        h + 0.025, 0)))  # fmt: skip
-    kit.add(BLACK, box((r - 0.03, 0.015, -0.05), (r + 0.085, 0.035, 0.05), 0.006))
-    kit.add(BLACK, box((-r - 0.05, h - 0.03, -0.04), (-r + 0.02, h + 0.06, 0.04), 0.01))
+    kit.add(coat if kit.chance(0.6) else BLACK, moved(_round([(r * c, top * s) for c, s in arc], sides=28),
+        (0, h + 0.025, 0)))  # fmt: skip
+    kit.add(BLACK, block((r - 0.03, r + 0.085), (0.015, 0.035), 0.05, 0.006))
+    kit.add(BLACK, block((-r - 0.05, -r + 0.02), (h - 0.03, h + 0.06), 0.04, 0.01))
 
 
 def slatted_bin(kit: Kit) -> None:
     """A park's bin: slats around a bucket, with a hood on posts or an open ring."""
-    r, h, n = kit.between(0.24, 0.32), kit.between(0.70, 0.9), kit.count(14, 22)
+    r, h, n = kit.between(0.24, 0.32), kit.between(0.7, 0.9), kit.count(14, 22)
     wood = dull(kit.tint(WOODS)) if kit.chance(0.6) else metal(kit.tint(PAINTS))
-    kit.add(BLACK, _round([(0.86 * r, 0.06), (0.86 * r, h - 0.10), (0.80 * r, h - 0.10), (0.80 * r, 0.1)]))
+    kit.add(BLACK, _round([(0.86 * r, 0.06), (0.86 * r, h - 0.1), (0.8 * r, h - 0.1), (0.8 * r, 0.1)]))
     for angle in 2 * np.pi * np.arange(n) / n:
-        slat = box((0.90 * r, 0.05, -0.36 * 2 * np.pi * r / n), (r, h, 0.36 * 2 * np.pi * r / n), 0.006)
+        slat = block((0.9 * r, r), (0.05, h), 0.36 * 2 * np.pi * r / n, 0.006)
         kit.add(wood, turned(slat, "y", float(angle)))
     hoops = (0.14 * h, 0.55 * h, 0.92 * h)
     kit.add(IRON, *(torus((0, y, 0), 0.985 * r, 0.022, "y", 28) for y in hoops))
@@ -212,45 +211,25 @@ def slatted_bin(kit: Kit) -> None:
         for angle in (0.5, 2.6, 3.7, 5.8):
             x, z = 0.9 * r * np.cos(angle), 0.9 * r * np.sin(angle)
             kit.add(IRON, tube([(x, h - 0.05, z), (x, h + 0.22, z)], 0.014, 6))
-        kit.add(IRON, moved(_round([(1.08 * r, 0.0), (1.06 * r, 0.03), (0.6 * r, 0.10), (0.0, 0.13)]), (0,
-            h + 0.21, 0)))  # fmt: skip
+        kit.add(IRON, moved(_round([(1.08 * r, 0.0), (1.06 * r, 0.03), (0.6 * r, 0.1), (0.0, 0.13)]),
+            (0, h + 0.21, 0)))  # fmt: skip
     else:
         kit.add(IRON, torus((0, h, 0), 0.9 * r, 0.035, "y", 28))
 
 
-def litter_box(kit: Kit) -> None:
-    """A square bin with a slot on each side under a sloping top, and an ashtray."""
-    w, h = kit.between(0.22, 0.30), kit.between(0.85, 1.05)
-    coat, second = kit.lacquer(), metal((0.25, 0.26, 0.27)) if kit.chance(0.5) else kit.lacquer()
-    kit.add(second, box((-1.02 * w, 0, -1.02 * w), (1.02 * w, 0.08, 1.02 * w), 0.01))
-    kit.add(coat, box((-w, 0.06, -w), (w, 0.70 * h, w), 0.03))
-    kit.add(BLACK, box((-0.85 * w, 0.68 * h, -0.85 * w), (0.85 * w, 0.92 * h, 0.85 * w)))
-    for x, z in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        kit.add(coat, box(*np.sort([(0.74 * w * x, 0.66 * h, 0.74 * w * z), (w * x, 0.90 * h, w * z)], axis=0),
-            0.02))  # fmt: skip
-    kit.add(second, loft([rectangle((-s * w, s * w), y * h, s * w) for s, y in ((1.1, 0.9), (1.1, 0.93), (0.75,
-        1.02), (0.3, 1.05))]))  # fmt: skip
-    for turn in np.arange(4) * np.pi / 2:
-        mark = boxes([(w, 0.42 * h, 0)], (0.02, 0.2 * h, 0.9 * w)), boxes([(w, 0.16 * h, 0)], (0.014, 0.02,
-            1.6 * w))  # fmt: skip
-        kit.add(WHITE if second != WHITE else BLACK, turned(mark[0], "y", float(turn)))
-        kit.add(second, turned(mark[1], "y", float(turn)))
-        kit.add(second, turned(boxes([(w, 0.62 * h, 0)], (0.014, 0.02, 1.6 * w)), "y", float(turn)))
-
-
-TRASHCANS = (wheeled_bin, dustbin, slatted_bin, pedal_bin, litter_box)
+TRASHCANS = (wheeled_bin, dustbin, slatted_bin, pedal_bin)
 
 
 def _tunnel(x: tuple[float, float], y: float, half: float, straight: float, flat: float = 1.0) -> Solid:
     """A box of rounded top along x: standing on y, straight sides, above them a half circle times `flat`."""
-    angle = np.linspace(0, np.pi, 13)
+    angle = np.linspace(0, np.pi, 21)
     top = np.stack([y + straight + flat * half * np.sin(angle), half * np.cos(angle)], 1)
     ring = np.concatenate([top, [(y, -half), (y, half)]])
     return loft([np.column_stack([np.full(len(ring), end), ring]) for end in x])
 
 
 def _flag(kit: Kit, x: float, y: float, z: float, size: float) -> None:
-    red = paint((0.60, 0.015, 0.015))
+    red = paint((0.6, 0.015, 0.015))
     kit.add(red, box((x - 0.1 * size, y, z), (x + 0.1 * size, y + size, z + 0.012)))
     kit.add(red, box((x - 0.1 * size, y + 0.62 * size, z), (x + 0.62 * size, y + size, z + 0.012)))
     kit.add(CHROME, lathe([(0.018, -0.02), (0.018, 0.02)], (x, y + 0.04, z), "z", 10))
@@ -258,65 +237,64 @@ def _flag(kit: Kit, x: float, y: float, z: float, size: float) -> None:
 
 def rural_mailbox(kit: Kit) -> None:
     """A tunnel of sheet metal with a door and a red flag, on a post."""
-    half, long, height = kit.between(0.10, 0.14), kit.between(0.44, 0.58), kit.between(0.40, 0.75)
+    half, long, height = kit.between(0.1, 0.14), kit.between(0.44, 0.58), kit.between(0.4, 0.75)
     coat = metal((0.42, 0.43, 0.45)) if kit.chance(0.35) else kit.lacquer()
     straight, x = kit.between(0.09, 0.14), (-0.4 * long, 0.6 * long)
     kit.add(coat, _tunnel(x, height, half, straight))
     kit.add(coat, _tunnel((x[1] - 0.005, x[1] + 0.018), height - 0.008, 1.06 * half, straight + 0.008))
     kit.add(coat, _tunnel((x[0] - 0.012, x[0] + 0.004), height - 0.006, 1.05 * half, straight + 0.006))
-    kit.add(CHROME, box((x[1] + 0.01, height + straight + 0.4 * half, -0.02), (x[1] + 0.05,
-        height + straight + 0.75 * half, 0.02), 0.006))  # fmt: skip
+    kit.add(CHROME, block((x[1] + 0.01, x[1] + 0.05), (height + straight + 0.4 * half,
+        height + straight + 0.75 * half), 0.02, 0.006))  # fmt: skip
     number = [(x[1] + 0.02, height + 0.6 * straight, z) for z in (-0.05, 0.0, 0.05)]
     kit.add(BLACK if coat.diffuse[1] > 0.25 else WHITE, boxes(number, (0.012, 0.06, 0.028)))
     _flag(kit, 0.25 * long, height + 0.5 * straight, half, kit.between(0.16, 0.22))
-    wood = dull(kit.tint((*WOODS, (0.60, 0.60, 0.58))))
+    wood = dull(kit.tint((*WOODS, (0.6, 0.6, 0.58))))
     if kit.chance(0.6):
         w = kit.between(0.04, 0.055)
-        kit.add(wood, box((-w, 0, -w), (w, height, w), 0.01), box((-0.35 * long, height - 0.03, -0.9 * half),
-            (0.55 * long, height, 0.9 * half), 0.006))  # fmt: skip
+        kit.add(wood, block((-w, w), (0, height), w, 0.01),
+            block((-0.35 * long, 0.55 * long), (height - 0.03, height), 0.9 * half, 0.006))  # fmt: skip
         kit.add(wood, beams((0, height - 0.26, 0), (0.42 * long, height - 0.02, 0), 0.05, 0.05))
     else:
-        kit.add(wood, box((-0.35, 0, -0.05), (-0.25, height + 0.42, 0.05), 0.012))
-        kit.add(wood, box((-0.45, height - 0.09, -0.04), (0.55 * long, height, 0.04), 0.01))
+        kit.add(wood, block((-0.35, -0.25), (0, height + 0.42), 0.05, 0.012))
+        kit.add(wood, block((-0.45, 0.55 * long), (height - 0.09, height), 0.04, 0.01))
         kit.add(wood, beams((-0.28, height - 0.35, 0), (0.05, height - 0.06, 0), 0.05, 0.05))
-        kit.add(wood, loft([rectangle((-0.3 - s, -0.3 + s), height + y, s) for s, y in ((0.07, 0.42), (0.07, 0.45),
-            (0.005, 0.53))]))  # fmt: skip
+        cap = ((0.07, 0.42), (0.07, 0.45), (0.005, 0.53))
+        kit.add(wood, loft([rectangle((-0.3 - s, -0.3 + s), height + y, s) for s, y in cap]))
 
 
 def collection_box(kit: Kit) -> None:
     """A street's collection box: a rounded top over a slot, on four legs."""
     half, deep, straight = kit.between(0.28, 0.34), kit.between(0.26, 0.32), kit.between(0.62, 0.8)
-    coat = paint(kit.tint(((0.015, 0.06, 0.28), (0.015, 0.06, 0.28), (0.62, 0.40, 0.01), (0.03, 0.18, 0.08))))
+    coat = paint(kit.tint(((0.015, 0.06, 0.28), (0.015, 0.06, 0.28), (0.62, 0.4, 0.01), (0.03, 0.18, 0.08))))
     barrel = turned(_tunnel((-half, half), 0.18, deep, straight), "y", np.pi / 2)
     kit.add(coat, barrel)
     end = turned(_tunnel((half - 0.01, half + 0.015), 0.17, 1.04 * deep, straight + 0.01), "y", np.pi / 2)
     kit.both(coat, end)
-    for x, z in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        kit.add(coat, box(*np.sort([((deep - 0.08) * x, 0, (half - 0.08) * z), (deep * x, 0.2, half * z)], axis=0),
-            0.01))  # fmt: skip
+    for x in (deep - 0.08, -deep):
+        kit.both(coat, box((x, 0, half - 0.08), (x + 0.08, 0.2, half), 0.01))
     slot = 0.18 + straight + 0.25 * deep
-    kit.add(BLACK, box((0.6 * deep, slot - 0.02, -0.7 * half), (1.01 * deep, slot + 0.06, 0.7 * half)))
-    kit.add(coat, box((0.7 * deep, slot - 0.06, -0.78 * half), (1.14 * deep, slot - 0.02, 0.78 * half), 0.012))
-    kit.add(CHROME, box((1.1 * deep, slot - 0.045, -0.2 * half), (1.17 * deep, slot - 0.03, 0.2 * half)))
+    kit.add(BLACK, block((0.6 * deep, 1.01 * deep), (slot - 0.02, slot + 0.06), 0.7 * half))
+    kit.add(coat, block((0.7 * deep, 1.14 * deep), (slot - 0.06, slot - 0.02), 0.78 * half, 0.012))
+    kit.add(CHROME, block((1.1 * deep, 1.17 * deep), (slot - 0.045, slot - 0.03), 0.2 * half))
     kit.add(WHITE, boxes([(deep, 0.18 + 0.62 * straight, 0)], (0.014, 0.16, 1.1 * half)))
     kit.add(paint((0.55, 0.02, 0.02)), boxes([(deep, 0.18 + 0.46 * straight, 0)], (0.014, 0.03, 1.1 * half)))
-    kit.add(coat, box((deep - 0.01, 0.22, -0.8 * half), (deep + 0.012, 0.18 + 0.38 * straight, 0.8 * half), 0.006))
+    kit.add(coat, block((deep - 0.01, deep + 0.012), (0.22, 0.18 + 0.38 * straight), 0.8 * half, 0.006))
     kit.add(CHROME, ball((deep + 0.01, 0.3, 0.6 * half), 0.02, 8))
 
 
 def pillar_box(kit: Kit) -> None:
     """A cast iron pillar with a cap, a slot and a notice."""
     r, h = kit.between(0.22, 0.27), kit.between(1.15, 1.4)
-    coat = paint(kit.tint(((0.50, 0.01, 0.01), (0.50, 0.01, 0.01), (0.02, 0.20, 0.07), (0.60, 0.38, 0.01)), 0.15))
-    kit.add(BLACK, _round([(1.12 * r, 0.0), (1.12 * r, 0.10), (1.05 * r, 0.14)], sides=28))
+    coat = paint(kit.tint(((0.5, 0.01, 0.01), (0.5, 0.01, 0.01), (0.02, 0.2, 0.07), (0.6, 0.38, 0.01)), 0.15))
+    kit.add(BLACK, _round([(1.12 * r, 0.0), (1.12 * r, 0.1), (1.05 * r, 0.14)], sides=28))
     kit.add(coat, _round([(r, 0.12), (r, h), (1.08 * r, h + 0.02), (1.08 * r, h + 0.05)], sides=28))
     cap = [(1.22, 0.0), (1.24, 0.05), (1.05, 0.11), (0.7, 0.18), (0.3, 0.22), (0.0, 0.23)]
     kit.add(coat, moved(_round([(r * a, 0.9 * b) for a, b in cap], sides=28), (0, h + 0.05, 0)))
     kit.add(coat, torus((0, 0.24 * h, 0), r, 0.012, "y", 28), torus((0, 0.93 * h, 0), r, 0.014, "y", 28))
-    kit.add(coat, box((0.8 * r, 0.80 * h, -0.62 * r), (1.10 * r, 0.90 * h, 0.62 * r), 0.015))
-    kit.add(BLACK, box((0.9 * r, 0.835 * h, -0.5 * r), (1.115 * r, 0.872 * h, 0.5 * r)))
-    kit.add(WHITE, box((0.85 * r, 0.62 * h, -0.32 * r), (1.035 * r, 0.74 * h, 0.32 * r)))
-    kit.add(coat, box((0.75 * r, 0.28 * h, -0.6 * r), (1.02 * r, 0.60 * h, 0.6 * r), 0.02))
+    kit.add(coat, block((0.8 * r, 1.1 * r), (0.8 * h, 0.9 * h), 0.62 * r, 0.015))
+    kit.add(BLACK, block((0.9 * r, 1.115 * r), (0.835 * h, 0.872 * h), 0.5 * r))
+    kit.add(WHITE, block((0.85 * r, 1.035 * r), (0.62 * h, 0.74 * h), 0.32 * r))
+    kit.add(coat, block((0.75 * r, 1.02 * r), (0.28 * h, 0.6 * h), 0.6 * r, 0.02))
     kit.add(CHROME, ball((1.02 * r, 0.44 * h, 0.45 * r), 0.02, 8))
 
 
@@ -324,31 +302,29 @@ def house_mailbox(kit: Kit) -> None:
     """A small house on a post: a pitched roof, a flap with a slot, a paper roll beneath."""
     half, deep, tall = kit.between(0.13, 0.19), kit.between(0.11, 0.16), kit.between(0.24, 0.34)
     foot, coat = kit.between(0.45, 0.8), kit.lacquer() if kit.chance(0.6) else dull(kit.tint(WOODS))
-    roof, pitch = dull(kit.tint((*WOODS, (0.05, 0.05, 0.055), (0.30, 0.05, 0.03)))), kit.between(0.5, 0.9) * half
-    kit.add(coat, box((-deep, foot, -half), (deep, foot + tall, half), 0.008))
+    roof, pitch = dull(kit.tint((*WOODS, (0.05, 0.05, 0.055), (0.3, 0.05, 0.03)))), kit.between(0.5, 0.9) * half
+    kit.add(coat, block((-deep, deep), (foot, foot + tall), half, 0.008))
     gable = np.array([[0, foot + tall, -half], [0, foot + tall, half], [0, foot + tall + pitch, 0.0]])
     kit.add(coat, prism(gable - deep * AHEAD, gable + deep * AHEAD))
     for side in (1, -1):
-        eave, ridge = np.array([0, foot + tall - 0.25 * pitch, 1.25 * half * side]), np.array([0,
-            foot + tall + pitch, 0])  # fmt: skip
+        eave = np.array([0, foot + tall - 0.25 * pitch, 1.25 * half * side])
+        ridge = np.array([0, foot + tall + pitch, 0])
         ring = np.array([eave, ridge, ridge + 0.025 * UP, eave + 0.025 * UP])
         kit.add(roof, prism(ring - 1.25 * deep * AHEAD, ring + 1.25 * deep * AHEAD))
     trim = CHROME if kit.chance(0.5) else BLACK
-    kit.add(BLACK, box((0.9 * deep, foot + 0.66 * tall, -0.72 * half), (deep + 0.006, foot + 0.80 * tall,
-        0.72 * half)))  # fmt: skip
-    flap = turned(box((0, -0.01, -0.78 * half), (0.014, 0.15 * tall, 0.78 * half), 0.004), "z", -0.5)
+    kit.add(BLACK, block((0.9 * deep, deep + 0.006), (foot + 0.66 * tall, foot + 0.8 * tall), 0.72 * half))
+    flap = turned(block((0, 0.014), (-0.01, 0.15 * tall), 0.78 * half, 0.004), "z", -0.5)
     kit.add(trim, moved(flap, (deep + 0.004, foot + 0.7 * tall, 0)))
-    kit.add(WHITE, box((0.9 * deep, foot + 0.22 * tall, -0.4 * half), (deep + 0.006, foot + 0.42 * tall,
-        0.4 * half)))  # fmt: skip
-    kit.add(trim, ball((deep + 0.01, foot + 0.32 * tall, 0.7 * half), 0.014, 8))
+    kit.add(WHITE, block((0.9 * deep, deep + 0.006), (foot + 0.22 * tall, foot + 0.42 * tall), 0.4 * half))
+    kit.add(trim, ball((deep + 0.01, foot + 0.32 * tall, 0.7 * half), 0.014, 10))
     if kit.chance(0.5):
         _flag(kit, -0.2 * deep, foot + 0.35 * tall, half, 0.17)
     kit.add(coat, lathe([(0.05, -deep), (0.05, deep), (0.04, deep), (0.04, -0.9 * deep)], (0, foot - 0.055, 0),
-        "x", 16))  # fmt: skip
+        "x", 24))  # fmt: skip
     post = dull(kit.tint(WOODS)) if kit.chance(0.5) else IRON
-    kit.add(post, box((-0.03, 0, -0.03), (0.03, foot, 0.03), 0.006))
-    kit.add(dull(kit.tint(STONES)), loft([rectangle((-s, s), y, s) for s, y in ((0.15, 0), (0.15, 0.05), (0.10,
-        0.07))]))  # fmt: skip
+    kit.add(post, block((-0.03, 0.03), (0, foot), 0.03, 0.006))
+    base = [rectangle((-s, s), y, s) for s, y in ((0.15, 0), (0.15, 0.05), (0.1, 0.07))]
+    kit.add(dull(kit.tint(STONES)), loft(base))
 
 
 MAILBOXES = (rural_mailbox, collection_box, house_mailbox, pillar_box)

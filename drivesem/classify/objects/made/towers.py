@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from drivesem.classify.objects.shapes import (
     UP,
     ball,
     beams,
+    block,
     box,
     boxes,
     lathe,
@@ -43,10 +44,8 @@ def _lattice(kit: Kit, surfaces: list[Surface], levels: np.ndarray, halves: np.n
     """A square trellis: half its width at each level, and its surfaces in turn, storey by storey."""
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     for i in range(len(levels) - 1):
-        low, high = (
-            np.column_stack([corners[:, 0] * halves[k], np.full(4, levels[k]), corners[:, 1] * halves[k]])
-            for k in (i, i + 1)
-        )
+        low, high = (np.column_stack([corners[:, 0] * halves[k], np.full(4, levels[k]), corners[:, 1] * halves[k]])
+            for k in (i, i + 1))  # fmt: skip
         following_low, following_high = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
         slim = 0.55 * thick
         kit.add(surfaces[i % len(surfaces)], beams(low, high, thick), beams(low, following_high, slim),
@@ -61,19 +60,18 @@ def _square(rows: list[tuple[float, float]]) -> np.ndarray:
 def lattice_tower(kit: Kit) -> None:
     """Four curved legs of iron that meet far up, platforms between, arches below."""
     height, foot = kit.between(0.9, 1.0), kit.between(0.17, 0.22)
-    iron = metal(kit.tint(((0.10, 0.06, 0.035), (0.05, 0.045, 0.04), (0.25, 0.05, 0.02)), 0.2))
-    first, second = 0.20 * height, 0.40 * height
+    iron = metal(kit.tint(((0.1, 0.06, 0.035), (0.05, 0.045, 0.04), (0.25, 0.05, 0.02)), 0.2))
+    first, second = kit.between(0.17, 0.23) * height, kit.between(0.36, 0.44) * height
     upper = np.linspace(second, 0.92 * height, 9)
-    halves = np.interp(upper, [second, 0.55 * height, 0.75 * height, 0.92 * height], [0.30 * foot, 0.20 * foot,
-        0.11 * foot, 0.05 * foot])  # fmt: skip
+    halves = np.interp(upper, [second, 0.55 * height, 0.75 * height, 0.92 * height],
+        [0.3 * foot, 0.2 * foot, 0.11 * foot, 0.05 * foot])  # fmt: skip
     _lattice(kit, [iron], upper, halves, 0.008)
     for x, z in ((1, 1), (1, -1), (-1, -1), (-1, 1)):
-        for rows in ([(1.0, 0.30, 0.0), (0.62, 0.24, first)], [(0.58, 0.22, first), (0.30, 0.14, second)]):
+        for rows in ([(1.0, 0.3, 0.0), (0.62, 0.24, first)], [(0.58, 0.22, first), (0.3, 0.14, second)]):
             (a, w, y0), (b, v, y1) = rows
             for dx, dz in ((1, 1), (1, 0), (0, 1), (0, 0)):
                 low = [x * foot * (a - w * (1 - dx)), y0, z * foot * (a - w * (1 - dz))]
-                kit.add(iron, beams(low, [x * foot * (b - v * (1 - dx)), y1, z * foot * (b - v * (1 - dz))],
-                    0.010))  # fmt: skip
+                kit.add(iron, beams(low, [x * foot * (b - v * (1 - dx)), y1, z * foot * (b - v * (1 - dz))], 0.01))
             steps = np.linspace(0, 1, 6)
             for p, q in pairwise(steps):
                 ends = [np.array([x * foot * (a + (b - a) * t - (w + (v - w) * t) * s), y0 + (y1 - y0) * t,
@@ -81,12 +79,12 @@ def lattice_tower(kit: Kit) -> None:
                 kit.add(iron, beams([ends[0], ends[2]], [ends[1], ends[3]], 0.006))
                 swap = [e[[2, 1, 0]] * [x * z, 1, x * z] for e in ends]
                 kit.add(iron, beams([swap[0], swap[2]], [swap[1], swap[3]], 0.006))
-    for y, half in ((first, 0.68 * foot), (second, 0.38 * foot), (0.92 * height, 0.10 * foot)):
+    for y, half in ((first, 0.68 * foot), (second, 0.38 * foot), (0.92 * height, 0.1 * foot)):
         kit.add(iron, loft(_square([(half, y - 0.008), (1.08 * half, y + 0.012), (half, y + 0.016)])))
-    arch = [(0.62 * foot * np.cos(a), 0.02 + 0.15 * height * np.sin(a), 0.90 * foot) for a in np.linspace(0, np.pi,
-        13)]  # fmt: skip
-    kit.add(iron, *(turned(tube([(x, y, z * (1 - 0.30 * y / first)) for x, y, z in arch], 0.007, 6), "y",
-        float(t)) for t in _QUARTERS))  # fmt: skip
+    arch = [(0.62 * foot * np.cos(a), 0.02 + 0.15 * height * np.sin(a), 0.9 * foot)
+        for a in np.linspace(0, np.pi, 13)]  # fmt: skip
+    kit.add(iron, *(turned(tube([(x, y, z * (1 - 0.3 * y / first)) for x, y, z in arch], 0.007, 6), "y", float(t))
+        for t in _QUARTERS))  # fmt: skip
     kit.add(iron, lathe([(0.05 * foot, 0.92 * height), (0.06 * foot, 0.945 * height), (0.012, 0.965 * height),
         (0.004, height + 0.05)], sides=10))  # fmt: skip
     kit.add(dull(kit.tint(STONES)), *(box((x * 0.86 * foot - 0.05, -0.01, z * 0.86 * foot - 0.05),
@@ -109,53 +107,55 @@ def radio_mast(kit: Kit) -> None:
         kit.add(WHITE, turned(dish, "y", turn))
         kit.add(STEEL, turned(beams((0, y, 0), (reach, y, 0), 0.008), "y", turn))
     for turn in 2 * np.pi * np.arange(3) / 3:
-        kit.add(WHITE, turned(box((0.03, 0.80, -0.008), (0.04, 0.87, 0.008)), "y", float(turn)))
+        kit.add(WHITE, turned(block((0.03, 0.04), (0.8, 0.87), 0.008), "y", float(turn)))
         kit.add(STEEL, turned(beams((0, 0.83, 0), (0.035, 0.83, 0), 0.006), "y", float(turn)))
     half = 1.25 * foot
-    kit.add(dull(kit.tint(STONES)), box((-half, -0.02, -half), (half, 0.008, half)))
+    kit.add(dull(kit.tint(STONES)), block((-half, half), (-0.02, 0.008), half))
     kit.add(WHITE, box((0.3 * foot, 0.0, 0.2 * foot), (1.3 * foot, 0.05, 1.2 * foot), 0.003))
 
 
 def water_tower(kit: Kit) -> None:
     """A tank high up, on braced legs or on one stem."""
-    coat, r = paint(kit.tint(((0.60, 0.62, 0.62), (0.30, 0.45, 0.55), (0.50, 0.45, 0.35), (0.45, 0.10,
-        0.05)))), kit.between(0.20, 0.28)  # fmt: skip
-    top, tall = kit.between(0.50, 0.62), kit.between(0.16, 0.26)
+    coat = paint(kit.tint(((0.6, 0.62, 0.62), (0.3, 0.45, 0.55), (0.5, 0.45, 0.35), (0.45, 0.1, 0.05))))
+    r = kit.between(0.2, 0.28)
+    top, tall = kit.between(0.5, 0.62), kit.between(0.16, 0.26)
     if kit.chance(0.6):
         flat = kit.chance(0.5)
         roof = [(1.06, tall), (0.0, tall + 0.55 * r)] if flat else [(0.95, tall + 0.12 * r), (0.6, tall + 0.3 * r),
             (0.0, tall + 0.38 * r)]  # fmt: skip
         base = [(0.9, -0.0)] if flat else [(0.2, -0.45 * r), (0.6, -0.3 * r), (0.9, -0.1 * r)]
-        kit.add(coat, moved(lathe([(a * r, y) for a, y in [*base, (1.0, 0.03), (1.0, tall), *roof]], sides=24), (0,
-            top, 0)))  # fmt: skip
-        kit.add(STEEL, torus((0, top + 0.02, 0), 1.06 * r, 0.008, "y", 24), torus((0, top + 0.07, 0), 1.08 * r,
-            0.004, "y", 24))  # fmt: skip
+        kit.add(coat, moved(lathe([(a * r, y) for a, y in [*base, (1.0, 0.03), (1.0, tall), *roof]], sides=24),
+            (0, top, 0)))  # fmt: skip
+        kit.add(STEEL, torus((0, top + 0.02, 0), 1.06 * r, 0.008, "y", 24),
+            torus((0, top + 0.07, 0), 1.08 * r, 0.004, "y", 24))  # fmt: skip
         legs = kit.count(4, 6)
         angle = 2 * np.pi * (np.arange(legs) + 0.5) / legs
-        rings = [np.column_stack([s * r * np.cos(angle), np.full(legs, y), s * r * np.sin(angle)]) for s,
-            y in ((1.25, 0), (1.08, 0.5 * top), (0.92, top + 0.02))]  # fmt: skip
+        places = ((1.25, 0), (1.08, 0.5 * top), (0.92, top + 0.02))
+        rings = [
+            np.column_stack([s * r * np.cos(angle), np.full(legs, y), s * r * np.sin(angle)]) for s, y in places
+        ]
         for low, high in pairwise(rings):
-            kit.add(STEEL, beams(low, high, 0.022), beams(high, np.roll(high, -1, 0), 0.012), beams(low,
-                np.roll(high, -1, 0), 0.007), beams(np.roll(low, -1, 0), high, 0.007))  # fmt: skip
+            kit.add(STEEL, beams(low, high, 0.022), beams(high, np.roll(high, -1, 0), 0.012),
+                beams(low, np.roll(high, -1, 0), 0.007), beams(np.roll(low, -1, 0), high, 0.007))  # fmt: skip
         kit.add(STEEL, tube([(0, 0, 0), (0, top, 0)], 0.025, 10))
     else:
         stem = kit.between(0.06, 0.09)
-        bulb = [(1.6 * stem, 0.0), (stem, 0.08), (stem, 0.8 * top), (1.5 * stem, top), (0.75 * r, top + 0.06), (r,
-            top + 0.15), (r, top + 0.2), (0.75 * r, top + 0.3), (0.35 * r, top + 0.36), (0,
-            top + 0.38)]  # fmt: skip
+        bulb = [(1.6 * stem, 0.0), (stem, 0.08), (stem, 0.8 * top), (1.5 * stem, top), (0.75 * r, top + 0.06),
+            (r, top + 0.15), (r, top + 0.2), (0.75 * r, top + 0.3), (0.35 * r, top + 0.36),
+            (0, top + 0.38)]  # fmt: skip
         kit.add(coat, lathe(bulb, sides=28))
-        kit.add(paint(kit.tint(((0.02, 0.06, 0.40), (0.5, 0.02, 0.02), (0.02, 0.2, 0.06)))), lathe([(1.005 * r,
-            top + 0.15), (1.01 * r, top + 0.2)], sides=28))  # fmt: skip
+        kit.add(paint(kit.tint(((0.02, 0.06, 0.4), (0.5, 0.02, 0.02), (0.02, 0.2, 0.06)))),
+            lathe([(1.005 * r, top + 0.15), (1.01 * r, top + 0.2)], sides=28))  # fmt: skip
         kit.add(STEEL, torus((0, top + 0.37, 0), 0.25 * r, 0.006, "y", 20))
-        kit.add(BLACK, box((1.1 * stem, 0.0, -0.02), (1.35 * stem, 0.07, 0.02)))
+        kit.add(BLACK, block((1.1 * stem, 1.35 * stem), (0.0, 0.07), 0.02))
     kit.add(STEEL, tube([(0, top + tall, 0), (0, top + tall + 0.6 * r + 0.05, 0)], 0.005, 6))
 
 
 def clock_tower(kit: Kit) -> None:
     """A square shaft of stone with a clock on each side beneath a steep roof."""
-    half, stone = kit.between(0.09, 0.125), dull(kit.tint((*STONES, (0.42, 0.20, 0.10))))
-    trim, roof = dull(kit.tint(STONES[:1])), dull(kit.tint(((0.05, 0.06, 0.07), (0.06, 0.20, 0.15), (0.25, 0.06,
-        0.03))))  # fmt: skip
+    half, stone = kit.between(0.09, 0.125), dull(kit.tint((*STONES, (0.42, 0.2, 0.1))))
+    trim = dull(kit.tint(STONES[:1]))
+    roof = dull(kit.tint(((0.05, 0.06, 0.07), (0.06, 0.2, 0.15), (0.25, 0.06, 0.03))))
     shaft, head = kit.between(0.46, 0.56), kit.between(0.13, 0.17)
     kit.add(stone, loft(_square([(1.12 * half, 0), (1.12 * half, 0.06), (half, 0.08), (half, shaft)])))
     kit.add(trim, loft(_square([(half, shaft - 0.02), (1.18 * half, shaft), (1.18 * half, shaft + 0.015)])))
@@ -165,12 +165,12 @@ def clock_tower(kit: Kit) -> None:
     top = shaft + head + 0.02
     peak = kit.between(0.22, 0.34)
     if kit.chance(0.5):
-        kit.add(roof, loft(_square([(1.2 * half, top), (0.75 * half, top + 0.3 * peak), (0.12 * half,
-            top + 0.9 * peak), (0.02 * half, top + peak)])))  # fmt: skip
+        kit.add(roof, loft(_square([(1.2 * half, top), (0.75 * half, top + 0.3 * peak),
+            (0.12 * half, top + 0.9 * peak), (0.02 * half, top + peak)])))  # fmt: skip
     else:
         kit.add(stone, loft(_square([(0.8 * half, top), (0.8 * half, top + 0.09)])))
-        kit.add(BLACK, *(turned(box((0.78 * half, top + 0.015, -0.35 * half), (0.82 * half, top + 0.075,
-            0.35 * half)), "y", float(t)) for t in _QUARTERS))  # fmt: skip
+        kit.add(BLACK, *(turned(block((0.78 * half, 0.82 * half), (top + 0.015, top + 0.075), 0.35 * half), "y",
+            float(t)) for t in _QUARTERS))  # fmt: skip
         kit.add(roof, loft(_square([(0.95 * half, top + 0.09), (0.55 * half, top + 0.09 + 0.3 * peak),
             (0.02 * half, top + 0.09 + 0.8 * peak)])))  # fmt: skip
     face, middle = min(0.78 * half, 0.42 * head), shaft + 0.5 * head
@@ -181,52 +181,27 @@ def clock_tower(kit: Kit) -> None:
         for size, angle in ((0.85, turn), (0.55, turn + 2.2)):
             tip = (1.08 * half + 0.018, middle + size * face * np.cos(angle), size * face * np.sin(angle))
             parts.append((BLACK, beams((1.08 * half + 0.018, middle, 0), tip, 0.007)))
-        rows = [(half, 0.14 + (shaft - 0.2) * k / panes, z) for k in range(panes) for z in (-0.4 * half,
-            0.4 * half)]  # fmt: skip
+        rows = [(half, 0.14 + (shaft - 0.2) * k / panes, z) for k in range(panes)
+            for z in (-0.4 * half, 0.4 * half)]  # fmt: skip
         parts.append((GLASS, boxes(rows, (0.012, 0.045, 0.26 * half))))
         corner = box((half - 0.02, 0.05, half - 0.02), (1.06 * half, shaft, 1.06 * half))
         parts.append((trim, corner))
         for surface, solid in parts:
             kit.add(surface, turned(solid, "y", float(quarter)))
-    kit.add(BLACK, box((1.05 * half, 0, -0.3 * half), (1.15 * half, 0.06, 0.3 * half)))
-
-
-def television_tower(kit: Kit) -> None:
-    """A concrete needle with one pod or two, and an antenna."""
-    foot, pod = kit.between(0.035, 0.055), kit.between(0.055, 0.085)
-    concrete, y = dull(kit.tint(STONES[:2])), kit.between(0.55, 0.66)
-    kit.add(concrete, lathe([(2.0 * foot, 0.0), (1.2 * foot, 0.06), (0.85 * foot, 0.2), (0.5 * foot, y),
-        (0.4 * foot, y + 0.14)], sides=20))  # fmt: skip
-    if kit.chance(0.5):
-        kit.add(STEEL, ball((0, y + 0.02, 0), (pod, 0.9 * pod, pod), 20))
-        kit.add(GLASS, lathe([(1.02 * pod, y + 0.01), (1.02 * pod, y + 0.03)], sides=28))
-    else:
-        shape = [(0.5 * foot, -0.05), (0.8 * pod, -0.02), (pod, 0.005), (pod, 0.03), (0.75 * pod, 0.05),
-            (0.5 * foot, 0.06)]  # fmt: skip
-        kit.add(WHITE, lathe([(r, y + h) for r, h in shape], sides=28))
-        kit.add(GLASS, lathe([(1.02 * pod, y + 0.008), (1.02 * pod, y + 0.026)], sides=28))
-    if kit.chance(0.5):
-        kit.add(WHITE, lathe([(0.3 * pod, y + 0.10), (0.55 * pod, y + 0.12), (0.55 * pod, y + 0.135), (0.3 * pod,
-            y + 0.15)], sides=20))  # fmt: skip
-    for i, low in enumerate(np.linspace(y + 0.12, 0.97, 7)):
-        kit.add((_RED, WHITE)[i % 2], lathe([((0.30 - 0.035 * i) * foot, low), ((0.28 - 0.035 * i) * foot,
-            low + 0.05)], sides=10))  # fmt: skip
-    for turn in 2 * np.pi * np.arange(3) / 3 if kit.chance(0.4) else ():
-        kit.add(concrete, turned(beams((0.13, 0, 0), (0.01, 0.42, 0), 0.018, 0.03), "y", float(turn)))
-    kit.add(concrete, lathe([(3.2 * foot, 0.0), (3.2 * foot, 0.025), (2.6 * foot, 0.03)], sides=24))
+    kit.add(BLACK, block((1.05 * half, 1.15 * half), (0, 0.06), 0.3 * half))
 
 
 def lighthouse(kit: Kit) -> None:
     """A tapered tower in bands, a gallery, a lantern."""
-    foot, head = kit.between(0.13, 0.17), kit.between(0.075, 0.10)
-    band = paint(kit.tint(((0.50, 0.015, 0.015), (0.02, 0.02, 0.022), (0.02, 0.08, 0.35)), 0.15))
+    foot, head = kit.between(0.13, 0.17), kit.between(0.075, 0.1)
+    band = paint(kit.tint(((0.5, 0.015, 0.015), (0.02, 0.02, 0.022), (0.02, 0.08, 0.35)), 0.15))
     rows, plain = kit.count(4, 7), kit.chance(0.25)
     edges = np.linspace(0, 0.72, rows + 1)
     for i in range(rows):
         radii = [float(np.interp(v, [0, 0.72], [foot, head])) for v in edges[i : i + 2]]
         kit.add(WHITE if plain or i % 2 else band, lathe([(radii[0], edges[i]), (radii[1], edges[i + 1])],
             sides=24))  # fmt: skip
-    kit.add(BLACK, lathe([(head, 0.70), (1.45 * head, 0.725), (1.45 * head, 0.74)], sides=24))
+    kit.add(BLACK, lathe([(head, 0.7), (1.45 * head, 0.725), (1.45 * head, 0.74)], sides=24))
     kit.add(BLACK, torus((0, 0.78, 0), 1.4 * head, 0.004, "y", 24))
     angle = 2 * np.pi * np.arange(12) / 12
     post = np.column_stack([1.4 * head * np.cos(angle), 0 * angle + 0.74, 1.4 * head * np.sin(angle)])
@@ -238,78 +213,79 @@ def lighthouse(kit: Kit) -> None:
         sides=20))  # fmt: skip
     for i, y in enumerate(np.linspace(0.16, 0.6, kit.count(2, 4))):
         r = float(np.interp(y, [0, 0.72], [foot, head]))
-        kit.add(GLASS, turned(box((r - 0.02, y, -0.014), (r + 0.004, y + 0.045, 0.014)), "y", 0.5 * (i % 3 - 1)))
-    kit.add(BLACK, box((foot - 0.03, 0, -0.025), (foot + 0.006, 0.08, 0.025)))
+        kit.add(GLASS, turned(block((r - 0.02, r + 0.004), (y, y + 0.045), 0.014), "y", 0.5 * (i % 3 - 1)))
+    kit.add(BLACK, block((foot - 0.03, foot + 0.006), (0, 0.08), 0.025))
     kit.add(dull(kit.tint(STONES)), lathe([(1.6 * foot, -0.05), (1.4 * foot, -0.01), (1.1 * foot, 0.012)],
         sides=14))  # fmt: skip
     if kit.chance(0.5):
         kit.add(WHITE, box((-0.1, -0.01, 0.9 * foot), (0.1, 0.08, foot + 0.13)))
-        kit.add(band, loft([np.array([[-0.12, 0.08, 0.8 * foot], [0.12, 0.08, 0.8 * foot], [0.12, 0.08,
-            foot + 0.15], [-0.12, 0.08, foot + 0.15]]), np.array([[-0.12, 0.14, 0.9 * foot + 0.06], [0.12, 0.14,
-            0.9 * foot + 0.06], [0.12, 0.14, 0.9 * foot + 0.07], [-0.12, 0.14, 0.9 * foot + 0.07]])]))  # fmt: skip
+        kit.add(band, loft([np.array([[-0.12, 0.08, 0.8 * foot], [0.12, 0.08, 0.8 * foot],
+            [0.12, 0.08, foot + 0.15], [-0.12, 0.08, foot + 0.15]]),
+            np.array([[-0.12, 0.14, 0.9 * foot + 0.06], [0.12, 0.14, 0.9 * foot + 0.06],
+            [0.12, 0.14, 0.9 * foot + 0.07], [-0.12, 0.14, 0.9 * foot + 0.07]])]))  # fmt: skip
 
 
 def castle_tower(kit: Kit) -> None:
     """A round or square keep with battlements, arrow slits, a gate, sometimes a cone for a roof."""
-    r, h, stone = kit.between(0.20, 0.27), kit.between(0.66, 0.8), dull(kit.tint(STONES))
+    r, h, stone = kit.between(0.2, 0.27), kit.between(0.66, 0.8), dull(kit.tint(STONES))
     square = kit.chance(0.4)
-    darker = dull(tuple(0.8 * c for c in stone.diffuse))
-    rows = [(1.25, 0.0), (1.08, 0.08), (1.0, 0.14), (1.0, h - 0.10), (1.2, h - 0.05), (1.2, h)]
+    darker = dull(kit.tint([stone.diffuse], 0.2))
+    rows = [(1.25, 0.0), (1.08, 0.08), (1.0, 0.14), (1.0, h - 0.1), (1.2, h - 0.05), (1.2, h)]
     kit.add(stone, loft(_square([(a * r, y) for a, y in rows])) if square else lathe([(a * r, y) for a, y in rows],
         sides=24))  # fmt: skip
     kit.add(darker, loft(_square([(1.02 * r, 0.3 * h), (1.02 * r, 0.315 * h)])) if square else torus((0, 0.3 * h,
         0), r, 0.012, "y", 24))  # fmt: skip
     if square:
-        for turn in _QUARTERS:
-            kit.add(stone, *(turned(box((1.08 * r, h - 0.005, z - 0.12 * r), (1.2 * r, h + 0.06, z + 0.12 * r)),
-                "y", float(turn)) for z in r * np.array([-1.08, -0.54, 0, 0.54])))  # fmt: skip
+        for turn, z in product(_QUARTERS, r * np.array([-1.08, -0.54, 0, 0.54])):
+            merlon = box((1.08 * r, h - 0.005, z - 0.12 * r), (1.2 * r, h + 0.06, z + 0.12 * r), 0.01)
+            kit.add(stone, turned(merlon, "y", float(turn)))
     else:
         n = kit.count(9, 13)
-        kit.add(stone, *(turned(box((1.06 * r, h - 0.005, -0.36 * 3.77 * r / n), (1.2 * r, h + 0.06,
-            0.36 * 3.77 * r / n)), "y", float(t)) for t in 2 * np.pi * np.arange(n) / n))  # fmt: skip
-    for y in (0.40 * h, 0.62 * h):
-        kit.add(BLACK, *(turned(box((0.9 * r, y, -0.012), (r + 0.004, y + 0.07, 0.012)), "y",
-            float(t)) for t in _QUARTERS + (0 if square else 0.4 * y)))  # fmt: skip
-    kit.add(BLACK, box((0.9 * r, 0.0, -0.055), (1.22 * r, 0.11, 0.055)), lathe([(0.055, 0.9 * r), (0.055,
-        1.14 * r)], (0, 0.11, 0), "x", 20))  # fmt: skip
+        kit.add(stone, *(turned(block((1.06 * r, 1.2 * r), (h - 0.005, h + 0.06), 0.36 * 3.77 * r / n), "y",
+            float(t)) for t in 2 * np.pi * np.arange(n) / n))  # fmt: skip
+    for y in (0.4 * h, 0.62 * h):
+        kit.add(BLACK, *(turned(block((0.9 * r, r + 0.004), (y, y + 0.07), 0.012), "y", float(t))
+            for t in _QUARTERS + (0 if square else 0.4 * y)))  # fmt: skip
+    kit.add(BLACK, block((0.9 * r, 1.22 * r), (0.0, 0.11), 0.055),
+        lathe([(0.055, 0.9 * r), (0.055, 1.14 * r)], (0, 0.11, 0), "x", 20))  # fmt: skip
     roof = kit.between(0.18, 0.3)
     if kit.chance(0.55):
-        slate = dull(kit.tint(((0.28, 0.06, 0.03), (0.05, 0.06, 0.08), (0.04, 0.10, 0.25))))
+        slate = dull(kit.tint(((0.28, 0.06, 0.03), (0.05, 0.06, 0.08), (0.04, 0.1, 0.25))))
         kit.add(stone, lathe([(0.85 * r, h - 0.02), (0.85 * r, h + 0.08)], sides=20))
         kit.add(slate, lathe([(1.02 * r, h + 0.07), (0.5 * r, h + 0.07 + 0.5 * roof), (0.0, h + 0.07 + roof)],
             sides=20))  # fmt: skip
         h += roof
     kit.add(IRON, tube([(0, h, 0), (0, h + 0.19, 0)], 0.006, 6))
-    kit.add(_RED, box((-0.09, h + 0.12, -0.002), (0.0, h + 0.18, 0.002)))
+    kit.add(_RED, block((-0.09, 0.0), (h + 0.12, h + 0.18), 0.002))
 
 
 def high_rise(kit: Kit) -> None:
     """Stepped storeys of glass, a crown, an antenna."""
-    half, steps = kit.between(0.11, 0.16), kit.count(2, 4)
-    frame = dull(kit.tint((*STONES[:3], (0.10, 0.11, 0.13))))
-    glass = Surface(kit.tint(((0.04, 0.10, 0.16), (0.02, 0.03, 0.04), (0.05, 0.14, 0.13))), 0.7, 80.0)
+    half, steps, shrink = kit.between(0.11, 0.16), kit.count(2, 4), kit.between(0.12, 0.26)
+    grow = kit.between(0.6, 1.1)
+    frame = dull(kit.tint((*STONES[:3], (0.1, 0.11, 0.13))))
+    glass = Surface(kit.tint(((0.04, 0.1, 0.16), (0.02, 0.03, 0.04), (0.05, 0.14, 0.13))), 0.7, 80.0)
     y, top = 0.0, kit.between(0.74, 0.82)
     for i in range(steps):
-        end = top * ((i + 1) / steps) ** 0.8
-        size = half * (1 - 0.22 * i)
-        kit.add(glass, box((-size, y, -size), (size, end, size)))
+        end = top * ((i + 1) / steps) ** grow
+        size = half * (1 - shrink * i)
+        kit.add(glass, block((-size, size), (y, end), size))
         mullions = np.linspace(-size, size, max(4, 8 - i))
         for turn in _QUARTERS:
-            kit.add(frame, turned(boxes([(size, (y + end) / 2, z) for z in mullions[:-1]], (0.014, end - y,
-                0.014)), "y", float(turn)))  # fmt: skip
+            kit.add(frame, turned(boxes([(size, (y + end) / 2, z) for z in mullions[:-1]],
+                (0.014, end - y, 0.014)), "y", float(turn)))  # fmt: skip
         floors = np.arange(y, end, 0.035)
-        kit.add(frame, boxes([(0, v, 0) for v in (*floors, end)], (2 * size + 0.008, 0.010, 2 * size + 0.008)))
+        kit.add(frame, boxes([(0, v, 0) for v in (*floors, end)], (2 * size + 0.008, 0.01, 2 * size + 0.008)))
         y = end
-    size = half * (1 - 0.22 * steps)
+    size = half * (1 - 0.24 * steps)
     if kit.chance(0.5):
-        kit.add(STEEL, loft(_square([(size, y), (0.75 * size, y + 0.05), (0.2 * size, y + 0.14), (0.05 * size,
-            y + 0.16)])))  # fmt: skip
+        kit.add(STEEL, loft(_square([(size, y), (0.75 * size, y + 0.05), (0.2 * size, y + 0.14),
+            (0.05 * size, y + 0.16)])))  # fmt: skip
     else:
-        kit.add(frame, box((-size, y, -size), (size, y + 0.04, size)))
-    kit.add(STEEL, tube([(0, y, 0), (0, y + 0.14, 0), (0, 1.05, 0)], [0.010, 0.008, 0.003], 8))
-    kit.add(BLACK, box((half, 0, -0.04), (half + 0.01, 0.035, 0.04)))
-    kit.add(frame, box((-1.25 * half, -0.012, -1.25 * half), (1.25 * half, 0.0, 1.25 * half)))
+        kit.add(frame, block((-size, size), (y, y + 0.04), size))
+    kit.add(STEEL, tube([(0, y, 0), (0, y + 0.14, 0), (0, 1.05, 0)], [0.01, 0.008, 0.003], 8))
+    kit.add(BLACK, block((half, half + 0.01), (0, 0.035), 0.04))
+    kit.add(frame, block((-1.25 * half, 1.25 * half), (-0.012, 0.0), 1.25 * half))
 
 
-TOWERS = (lattice_tower, clock_tower, water_tower, radio_mast, television_tower, castle_tower, lighthouse,
-    high_rise)  # fmt: skip
+TOWERS = (lattice_tower, clock_tower, water_tower, radio_mast, castle_tower, lighthouse, high_rise)

@@ -10,6 +10,7 @@ from drivesem.classify.objects.shapes import (
     AHEAD,
     ball,
     beams,
+    block,
     box,
     boxes,
     carriage,
@@ -38,23 +39,13 @@ from drivesem.classify.objects.surfaces import (
     paint,
     plastic,
 )
-from scene_ir.meshes.solids import COLOUR, Material, Solid, cleaned
+from scene_ir.meshes.solids import COLOUR, Material, cleaned
 from scene_ir.meshes.templates import template, typical_size_lhw
 
-_FITTINGS: dict[Material, Surface] = {
-    Material.GLASS: GLASS,
-    Material.TYRE: RUBBER,
-    Material.RIM: CHROME,
-    Material.RIM_GAP: BLACK,
-    Material.HEADLIGHT: LAMP,
-    Material.TAIL_LIGHT: TAIL_LAMP,
-    Material.INDICATOR: AMBER,
-    Material.PLATE: plastic((0.70, 0.70, 0.66)),
-    Material.TRIM: BLACK,
-    Material.UNDERBODY: RUBBER,
-    Material.CHROME: CHROME,
-    Material.CARGO: WHITE,
-}
+_FITTINGS: dict[Material, Surface] = {Material.GLASS: GLASS, Material.TYRE: RUBBER, Material.RIM: CHROME,
+    Material.RIM_GAP: BLACK, Material.HEADLIGHT: LAMP, Material.TAIL_LIGHT: TAIL_LAMP, Material.INDICATOR: AMBER,
+    Material.PLATE: plastic((0.7, 0.7, 0.66)), Material.TRIM: BLACK, Material.UNDERBODY: RUBBER,
+    Material.CHROME: CHROME, Material.CARGO: WHITE}  # fmt: skip
 _TABLE = np.array([COLOUR[material] for material in Material])
 
 
@@ -63,28 +54,25 @@ def _template(kit: Kit, kind: str, coat: Surface) -> tuple[float, float, float]:
     variant = kit.count(0, 1 << 20)
     mesh, size = template(kind, variant), typical_size_lhw(kind, variant)
     assert mesh.colours is not None
-    # the unit box points down: turned up, which is a reflection, so the winding turns with it
+    # the unit box's y points down: turned up, which is a reflection, so the winding turns with it
     vertices = mesh.vertices.double().numpy() * np.array([size[0], -size[1], size[2]])
     faces = mesh.faces.numpy()[:, ::-1]
     colours = mesh.colours.numpy()[faces[:, 0]]
     material = np.abs(colours[:, None] - _TABLE).sum(axis=2).argmin(axis=1)
-    whole = cleaned(vertices, faces, material)
-    for one in Material:
-        own = whole.faces[whole.material == one]
-        if len(own):
-            kit.add(coat if one == Material.PAINT else _FITTINGS[one], Solid(whole.vertices, own, own[:, 0]))
+    surfaces = [coat if one == Material.PAINT else _FITTINGS[one] for one in Material]
+    kit.painted(surfaces, cleaned(vertices, faces, material))
     return size
 
 
 def sedan(kit: Kit) -> None:
     """A saloon, at times a taxi or with a police's lights."""
     taxi, police = kit.chance(0.15), kit.chance(0.12)
-    coat = paint((0.62, 0.40, 0.01)) if taxi else kit.lacquer()
+    coat = paint((0.62, 0.4, 0.01)) if taxi else kit.lacquer()
     _, height, width = _template(kit, "sedan", coat)
     if taxi:
-        kit.add(plastic((0.75, 0.72, 0.55)), box((-0.15, height - 0.03, -0.3), (0.10, height + 0.12, 0.3), 0.03))
+        kit.add(plastic((0.75, 0.72, 0.55)), block((-0.15, 0.1), (height - 0.03, height + 0.12), 0.3, 0.03))
     elif police:
-        kit.add(BLACK, box((-0.2, height - 0.02, -0.32 * width), (0.05, height + 0.04, 0.32 * width), 0.02))
+        kit.add(BLACK, block((-0.2, 0.05), (height - 0.02, height + 0.04), 0.32 * width, 0.02))
         kit.add(paint((0.02, 0.05, 0.6)), box((-0.17, height + 0.03, 0.03), (0.02, height + 0.12, 0.31 * width),
             0.02))  # fmt: skip
         kit.add(paint((0.6, 0.02, 0.02)), box((-0.17, height + 0.03, -0.31 * width), (0.02, height + 0.12, -0.03),
@@ -96,17 +84,16 @@ def hatchback(kit: Kit) -> None:
     coat = kit.lacquer()
     length, height, width = _template(kit, "hatchback", coat)
     if kit.chance(0.4):
-        kit.add(coat, box((-0.44 * length, height - 0.07, -0.36 * width), (-0.36 * length, height - 0.02,
-            0.36 * width), 0.015))  # fmt: skip
+        kit.add(coat, block((-0.44 * length, -0.36 * length), (height - 0.07, height - 0.02), 0.36 * width, 0.015))
 
 
 def estate(kit: Kit) -> None:
     """A car with a long roof, at times with a box on it."""
     _, height, _ = _template(kit, "estate", kit.lacquer())
     if kit.chance(0.35):
-        kit.add(BLACK, box((-0.9, height + 0.04, -0.35), (0.5, height + 0.32, 0.35), 0.10))
-        kit.both(STEEL, box((-0.6, height - 0.04, -0.5), (-0.55, height + 0.05, 0.5)), box((0.2, height - 0.04,
-            -0.5), (0.25, height + 0.05, 0.5)))  # fmt: skip
+        kit.add(BLACK, block((-0.9, 0.5), (height + 0.04, height + 0.32), 0.35, 0.1))
+        kit.both(STEEL, block((-0.6, -0.55), (height - 0.04, height + 0.05), 0.5),
+            block((0.2, 0.25), (height - 0.04, height + 0.05), 0.5))  # fmt: skip
 
 
 def off_road(kit: Kit) -> None:
@@ -135,7 +122,7 @@ def _road_wheels(kit: Kit, places: Sequence[float], radius: float, half: float) 
     for x in places:
         tyre = [(0.72 * radius, -0.26), (radius, -0.24), (radius, -0.03), (0.72 * radius, 0.0)]
         kit.both(RUBBER, lathe(tyre, (x, radius, half + 0.01), "z", 22))
-        rim = [(0.70 * radius, -0.1), (0.66 * radius, 0.0), (0.25 * radius, -0.04), (0.2 * radius, 0.04)]
+        rim = [(0.7 * radius, -0.1), (0.66 * radius, 0.0), (0.25 * radius, -0.04), (0.2 * radius, 0.04)]
         kit.both(STEEL, lathe(rim, (x, radius, half + 0.015), "z", 16))
         kit.both(BLACK, lathe([(1.28 * radius, -0.4), (1.28 * radius, 0.008)], (x, radius, half), "z", 22))
 
@@ -155,22 +142,22 @@ def _band(kit: Kit, surface: Surface, x: tuple[float, float], y: tuple[float, fl
 
 def _bus_ends(kit: Kit, half: float, wide: float, low: float, sill: float, top: float, sign: float) -> None:
     """Screens, lamps, bumpers, the sign with the route, plates, mirrors."""
-    kit.add(GLASS, box((half - 0.05, sill, -0.92 * wide), (half + 0.02, top, 0.92 * wide), 0.02))
-    kit.add(GLASS, box((-half - 0.02, sill + 0.2, -0.8 * wide), (-half + 0.05, top, 0.8 * wide), 0.02))
-    kit.add(BLACK, box((half - 0.05, sign, -0.8 * wide), (half + 0.03, sign + 0.28, 0.8 * wide), 0.01))
+    kit.add(GLASS, block((half - 0.05, half + 0.02), (sill, top), 0.92 * wide, 0.02))
+    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (sill + 0.2, top), 0.8 * wide, 0.02))
+    kit.add(BLACK, block((half - 0.05, half + 0.03), (sign, sign + 0.28), 0.8 * wide, 0.01))
     kit.add(AMBER, boxes([(half + 0.03, sign + 0.14, z * wide) for z in (-0.45, -0.3, -0.1, 0.05, 0.2, 0.4)],
         (0.012, 0.15, 0.1 * wide)))  # fmt: skip
     for x, lamp, y in ((half, LAMP, low + 0.38), (-half, TAIL_LAMP, low + 0.55)):
         kit.both(lamp, box((x - 0.05, y, 0.58 * wide), (x + 0.05, y + 0.2, 0.88 * wide), 0.03))
-        kit.add(BLACK, box((x - 0.09, low, -0.98 * wide), (x + 0.09, low + 0.2, 0.98 * wide), 0.04))
-        kit.add(WHITE, box((x - 0.10, low + 0.05, -0.25), (x + 0.10, low + 0.16, 0.25)))
+        kit.add(BLACK, block((x - 0.09, x + 0.09), (low, low + 0.2), 0.98 * wide, 0.04))
+        kit.add(WHITE, block((x - 0.1, x + 0.1), (low + 0.05, low + 0.16), 0.25))
     kit.both(BLACK, tube([(half - 0.05, top - 0.1, wide), (half + 0.25, top - 0.15, wide + 0.12)], 0.03, 6))
     kit.both(BLACK, box((half + 0.18, top - 0.65, wide + 0.02), (half + 0.28, top - 0.15, wide + 0.24), 0.03))
 
 
 def _ends(half: float, roof: float, ease: float) -> list[list[float]]:
     """Stations of a body with rounded ends."""
-    rows = [[0.0, 0.5, 0.10, 0.30], [0.3, 0.16, 0.03, 0.08], [1.0, 0.0, 0.0, 0.0]]
+    rows = [[0.0, 0.5, 0.1, 0.3], [0.3, 0.16, 0.03, 0.08], [1.0, 0.0, 0.0, 0.0]]
     tail = [[-half + ease * x, roof * a, roof * b, roof * c] for x, a, b, c in rows]
     return tail + [[-x, a, b, c] for x, a, b, c in tail[::-1]]
 
@@ -180,30 +167,30 @@ def city_bus(kit: Kit) -> None:
     coat, second = kit.lacquer(), kit.lacquer()
     length, height, width = _template(kit, "bus", coat)
     side = width / 2 - 0.04
-    kit.both(second, box((-0.40 * length, 0.62, side - 0.05), (0.38 * length, kit.between(0.72, 0.95),
-        side + 0.006)))  # fmt: skip
-    kit.add(BLACK, box((length / 2 - 0.32, 0.83 * height, -0.36 * width), (length / 2 - 0.10, 0.92 * height,
-        0.36 * width), 0.02))  # fmt: skip
-    kit.add(AMBER, boxes([(length / 2 - 0.10, 0.875 * height, z) for z in (-0.5, -0.3, 0.0, 0.2, 0.45)], (0.02,
-        0.13, 0.12)))  # fmt: skip
+    kit.both(second, box((-0.4 * length, 0.62, side - 0.05),
+        (0.38 * length, kit.between(0.72, 0.95), side + 0.006)))  # fmt: skip
+    kit.add(BLACK, block((length / 2 - 0.32, length / 2 - 0.1), (0.83 * height, 0.92 * height), 0.36 * width,
+        0.02))  # fmt: skip
+    kit.add(AMBER, boxes([(length / 2 - 0.1, 0.875 * height, z) for z in (-0.5, -0.3, 0.0, 0.2, 0.45)],
+        (0.02, 0.13, 0.12)))  # fmt: skip
 
 
 def double_decker(kit: Kit) -> None:
     """Two rows of windows, one above the other."""
     length, wide, high = kit.between(8.8, 10.6), 1.25, kit.between(4.1, 4.4)
     half, low = length / 2, 0.32
-    coat = paint(kit.tint(((0.50, 0.012, 0.012), (0.50, 0.012, 0.012), (0.02, 0.20, 0.09), (0.02, 0.06, 0.35),
+    coat = paint(kit.tint(((0.5, 0.012, 0.012), (0.5, 0.012, 0.012), (0.02, 0.2, 0.09), (0.02, 0.06, 0.35),
         (0.6, 0.4, 0.02)), 0.15))  # fmt: skip
-    kit.add(coat, carriage(_ends(half, 0.12, 0.35), wide, low, high, 0.20))
+    kit.add(coat, carriage(_ends(half, 0.12, 0.35), wide, low, high, 0.2))
     lower, upper = (1.25, 2.0), (2.75, 3.55)
     _panes(kit, (-half + 0.6, half - 0.9), lower, wide, kit.count(5, 7), 0.09)
     _panes(kit, (-half + 0.35, half - 0.35), upper, wide, kit.count(6, 8), 0.09)
-    kit.add(GLASS, box((half - 0.05, upper[0], -0.9 * wide), (half + 0.02, upper[1], 0.9 * wide), 0.02))
-    kit.add(GLASS, box((-half - 0.02, upper[0], -0.8 * wide), (-half + 0.05, upper[1], 0.8 * wide), 0.02))
+    kit.add(GLASS, block((half - 0.05, half + 0.02), (upper[0], upper[1]), 0.9 * wide, 0.02))
+    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (upper[0], upper[1]), 0.8 * wide, 0.02))
     _bus_ends(kit, half, wide, low, 1.05, 2.05, 2.2)
-    _band(kit, WHITE if kit.chance(0.7) else kit.lacquer(), (-half + 0.3, half - 0.3), (2.25,
-        2.25 + kit.between(0.1, 0.35)), wide)  # fmt: skip
-    _road_wheels(kit, (half - 2.2, -half + 2.4), 0.50, wide)
+    _band(kit, WHITE if kit.chance(0.7) else kit.lacquer(), (-half + 0.3, half - 0.3),
+        (2.25, 2.25 + kit.between(0.1, 0.35)), wide)  # fmt: skip
+    _road_wheels(kit, (half - 2.2, -half + 2.4), 0.5, wide)
 
 
 def school_bus(kit: Kit) -> None:
@@ -212,28 +199,28 @@ def school_bus(kit: Kit) -> None:
     half, low, nose = length / 2, 0.55, kit.between(1.3, 1.6)
     coat = paint(kit.tint(((0.66, 0.34, 0.006),), 0.1))
     front = half - nose
-    kit.add(coat, moved(carriage(_ends((half + front) / 2, 0.15, 0.4), wide, low, high, 0.30), -nose / 2 * AHEAD))
-    bonnet = [(front - 0.1, 1.78, 0.98), (front + 0.5 * nose, 1.66, 0.95), (half - 0.05, 1.5, 0.86), (half, 1.35,
-        0.8)]  # fmt: skip
+    kit.add(coat, moved(carriage(_ends((half + front) / 2, 0.15, 0.4), wide, low, high, 0.3), -nose / 2 * AHEAD))
+    bonnet = [(front - 0.1, 1.78, 0.98), (front + 0.5 * nose, 1.66, 0.95), (half - 0.05, 1.5, 0.86),
+        (half, 1.35, 0.8)]  # fmt: skip
     rings = [np.column_stack([np.full(12, x), section(w, low, top, 0.22)]) for x, top, w in bonnet]
     kit.add(coat, loft(rings))
     kit.add(BLACK, boxes([(half, y, 0) for y in np.linspace(0.85, 1.25, 5)], (0.05, 0.05, 1.0)))
     kit.both(LAMP, lathe([(0.13, -0.03), (0.13, 0.04)], (half, 1.05, 0.64), "x", 16))
-    kit.add(BLACK, box((half - 0.05, 0.45, -wide), (half + 0.14, 0.68, wide), 0.04))
-    kit.add(GLASS, box((front - 0.05, 1.85, -0.92 * wide), (front + 0.02, 2.6, 0.92 * wide), 0.02))
+    kit.add(BLACK, block((half - 0.05, half + 0.14), (0.45, 0.68), wide, 0.04))
+    kit.add(GLASS, block((front - 0.05, front + 0.02), (1.85, 2.6), 0.92 * wide, 0.02))
     _panes(kit, (-half + 0.4, front - 0.25), (1.8, 2.4), wide, kit.count(7, 10), 0.14)
     for y in (1.0, 1.35, 1.65):
         _band(kit, BLACK, (-half + 0.15, front - 0.1), (y, y + 0.06), wide)
-    kit.add(BLACK, box((front - 0.05, 2.68, -0.75), (front + 0.03, 2.88, 0.75), 0.02), box((-half - 0.09, 0.45,
-        -wide), (-half + 0.09, 0.68, wide), 0.04))  # fmt: skip
-    kit.both(TAIL_LAMP, box((front - 0.05, 2.7, 0.8), (front + 0.06, 2.86, 1.0), 0.02), box((-half - 0.05, 1.3,
-        0.8), (-half + 0.05, 1.55, 1.05), 0.02))  # fmt: skip
-    kit.add(GLASS, box((-half - 0.02, 1.75, -0.8 * wide), (-half + 0.05, 2.4, 0.8 * wide), 0.02))
+    kit.add(BLACK, block((front - 0.05, front + 0.03), (2.68, 2.88), 0.75, 0.02),
+        block((-half - 0.09, -half + 0.09), (0.45, 0.68), wide, 0.04))  # fmt: skip
+    kit.both(TAIL_LAMP, box((front - 0.05, 2.7, 0.8), (front + 0.06, 2.86, 1.0), 0.02),
+        box((-half - 0.05, 1.3, 0.8), (-half + 0.05, 1.55, 1.05), 0.02))  # fmt: skip
+    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (1.75, 2.4), 0.8 * wide, 0.02))
     _road_wheels(kit, (half - 0.62 * nose, -half + 2.3), 0.48, 1.0)
-    kit.both(BLACK, tube([(front, 2.1, wide), (front + 0.35, 2.0, wide + 0.15)], 0.03, 6), box((front + 0.30, 1.6,
-        wide + 0.06), (front + 0.40, 2.05, wide + 0.28), 0.03))  # fmt: skip
+    kit.both(BLACK, tube([(front, 2.1, wide), (front + 0.35, 2.0, wide + 0.15)], 0.03, 6),
+        box((front + 0.3, 1.6, wide + 0.06), (front + 0.4, 2.05, wide + 0.28), 0.03))  # fmt: skip
     if kit.chance(0.5):
-        stop = lathe([(0.25, -0.01), (0.25, 0.01)], (0.25 * half, 1.55, -wide - 0.30), "x", 8)
+        stop = lathe([(0.25, -0.01), (0.25, 0.01)], (0.25 * half, 1.55, -wide - 0.3), "x", 8)
         kit.add(paint((0.6, 0.02, 0.02)), stop)
         kit.add(BLACK, beams((0.25 * half, 1.5, -wide), (0.25 * half, 1.5, -wide - 0.3), 0.04))
 
@@ -246,27 +233,27 @@ def coach(kit: Kit) -> None:
     tail = _ends(half, 0.15, 0.4)[:3]
     front = [[half - rake, 0.0, 0, 0], [half - 0.35 * rake, 0.12, 0.0, 0.03], [half, 0.75, 0.04, 0.08]]
     kit.add(coat if kit.chance(0.6) else WHITE, carriage(tail + front, wide, low, high, 0.28))
-    side = np.array([[half - 0.3, 1.2], [half + 0.03, 1.2], [half + 0.03, high - 0.75], [half - 0.30 * rake,
-        high - 0.16], [half - rake, high - 0.3]])  # fmt: skip
-    screen = [np.column_stack([side, np.full(5, z)]) for z in (-0.90 * wide, 0.90 * wide)]
+    side = np.array([[half - 0.3, 1.2], [half + 0.03, 1.2], [half + 0.03, high - 0.75],
+        [half - 0.3 * rake, high - 0.16], [half - rake, high - 0.3]])  # fmt: skip
+    screen = [np.column_stack([side, np.full(5, z)]) for z in (-0.9 * wide, 0.9 * wide)]
     kit.add(GLASS, prism(*screen))
     _panes(kit, (-half + 0.5, half - 0.5), (1.75, high - 0.55), wide, kit.count(6, 8), 0.05)
     _band(kit, second, (-half + 0.5, half - 0.6), (0.95, 0.95 + kit.between(0.15, 0.5)), wide)
     for x in np.linspace(-0.1 * length, 0.2 * length, 4):
         _band(kit, BLACK, (x, x + 0.03), (0.45, 0.9), wide)
-    kit.add(GLASS, box((-half - 0.02, 1.9, -0.8 * wide), (-half + 0.05, high - 0.5, 0.8 * wide), 0.02))
+    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (1.9, high - 0.5), 0.8 * wide, 0.02))
     for x, lamp in ((half, LAMP), (-half, TAIL_LAMP)):
         kit.both(lamp, box((x - 0.06, 0.75, 0.55 * wide), (x + 0.05, 0.95, 0.9 * wide), 0.03))
-        kit.add(BLACK, box((x - 0.1, low, -0.96 * wide), (x + 0.08, low + 0.2, 0.96 * wide), 0.04))
-    kit.add(second, box((half - 0.05, 0.62, -0.5 * wide), (half + 0.06, 1.05, 0.5 * wide), 0.05))
+        kit.add(BLACK, block((x - 0.1, x + 0.08), (low, low + 0.2), 0.96 * wide, 0.04))
+    kit.add(second, block((half - 0.05, half + 0.06), (0.62, 1.05), 0.5 * wide, 0.05))
     for side in (1, -1):
         arm = [(half - rake, high - 0.1, side * 0.9 * wide), (half + 0.35, high - 0.25, side * 1.05 * wide),
             (half + 0.4, high - 0.5, side * 1.08 * wide)]  # fmt: skip
-        kit.add(BLACK, tube(arm, 0.05, 6), box((half + 0.34, high - 1.1, side * 1.08 * wide - 0.12), (half + 0.44,
-            high - 0.5, side * 1.08 * wide + 0.12), 0.04))  # fmt: skip
+        kit.add(BLACK, tube(arm, 0.05, 6), box((half + 0.34, high - 1.1, side * 1.08 * wide - 0.12),
+            (half + 0.44, high - 0.5, side * 1.08 * wide + 0.12), 0.04))  # fmt: skip
     _road_wheels(kit, (half - 2.3, -half + 2.6, -half + 1.4) if kit.chance(0.4) else (half - 2.3, -half + 2.2),
-        0.50, wide)  # fmt: skip
-    kit.add(WHITE, box((-0.15 * length, high - 0.05, -0.7), (0.1 * length, high + 0.14, 0.7), 0.06))
+        0.5, wide)  # fmt: skip
+    kit.add(WHITE, block((-0.15 * length, 0.1 * length), (high - 0.05, high + 0.14), 0.7, 0.06))
 
 
 BUSES = (city_bus, double_decker, school_bus, coach)
@@ -274,17 +261,17 @@ BUSES = (city_bus, double_decker, school_bus, coach)
 
 def _bogies(kit: Kit, places: Sequence[float], radius: float) -> None:
     for x in places:
-        kit.add(BLACK, box((x - 1.5, 0.35, -1.0), (x + 1.5, 0.95, 1.0), 0.1))
+        kit.add(BLACK, block((x - 1.5, x + 1.5), (0.35, 0.95), 1.0, 0.1))
         for dx in (-0.95, 0.95):
-            kit.both(STEEL, lathe([(radius, -0.12), (radius, 0.0), (0.8 * radius, 0.04), (0.3 * radius, 0.10)],
-                (x + dx, radius, 0.95), "z", 18))  # fmt: skip
+            kit.both(STEEL, lathe([(radius, -0.12), (radius, 0.0), (0.8 * radius, 0.04), (0.3 * radius, 0.1)],
+                (x + dx, radius, 0.95), "z", 14))  # fmt: skip
 
 
 def _track(kit: Kit, rear: float, front: float) -> None:
     """Rails on sleepers beneath it all."""
     x = np.arange(rear, front, 0.75)
-    kit.add(paint((0.10, 0.065, 0.04)), boxes(np.stack([x, 0 * x - 0.22, 0 * x], 1), (0.28, 0.16, 2.5)))
-    kit.both(STEEL, box((rear - 0.2, -0.14, 0.70), (front + 0.2, 0.0, 0.80)))
+    kit.add(paint((0.1, 0.065, 0.04)), boxes(np.stack([x, 0 * x - 0.22, 0 * x], 1), (0.28, 0.16, 2.5)))
+    kit.both(STEEL, box((rear - 0.2, -0.14, 0.7), (front + 0.2, 0.0, 0.8)))
 
 
 def _wagon(kit: Kit, rear: float, front: float, coat: Surface, stripe: Surface) -> None:
@@ -296,31 +283,30 @@ def _wagon(kit: Kit, rear: float, front: float, coat: Surface, stripe: Surface) 
     for x in (rear + 0.65, front - 0.65):
         kit.both(stripe, box((x - 0.42, 1.0, 1.35), (x + 0.42, 3.0, 1.42)))
         kit.both(GLASS, box((x - 0.25, 2.1, 1.35), (x + 0.25, 2.8, 1.44)))
-    kit.add(BLACK, box((rear - 0.5, 1.2, -0.7), (rear + 0.1, 3.2, 0.7)))
+    kit.add(BLACK, block((rear - 0.5, rear + 0.1), (1.2, 3.2), 0.7))
     _bogies(kit, (rear + 2.0, front - 2.0), 0.42)
 
 
 def steam_train(kit: Kit) -> None:
     """A locomotive with boiler, chimney, cab, rods and cow catcher; its tender, a wagon."""
-    coat = paint(kit.tint(((0.02, 0.02, 0.022), (0.02, 0.12, 0.05), (0.30, 0.02, 0.02), (0.02, 0.05, 0.22))))
-    trim, red = metal((0.50, 0.33, 0.08)), paint((0.45, 0.02, 0.02))
+    coat = paint(kit.tint(((0.02, 0.02, 0.022), (0.02, 0.12, 0.05), (0.3, 0.02, 0.02), (0.02, 0.05, 0.22))))
+    trim, red = metal((0.5, 0.33, 0.08)), paint((0.45, 0.02, 0.02))
     r, y, long = kit.between(0.85, 1.0), 2.15, kit.between(5.2, 6.4)
     kit.add(coat, lathe([(r, 0.0), (r, long - 0.8)], (0, y, 0), "x", 22))
     kit.add(BLACK, lathe([(1.04 * r, 0.0), (1.04 * r, 0.9), (0.85 * r, 0.98)], (long - 0.9, y, 0), "x", 22))
-    kit.add(STEEL, lathe([(0.72 * r, 0.0), (0.70 * r, 0.08), (0.2 * r, 0.16)], (long + 0.05, y, 0), "x", 18))
+    kit.add(STEEL, lathe([(0.72 * r, 0.0), (0.7 * r, 0.08), (0.2 * r, 0.16)], (long + 0.05, y, 0), "x", 18))
     kit.add(trim, *(lathe([(1.02 * r, 0), (1.02 * r, 0.07)], (x, y, 0), "x", 22) for x in (0.9, 2.2, 3.5)))
-    kit.add(BLACK, lathe([(0.30, y + 0.8 * r), (0.26, y + r + 0.2), (0.28, y + r + 0.7),
+    kit.add(BLACK, lathe([(0.3, y + 0.8 * r), (0.26, y + r + 0.2), (0.28, y + r + 0.7),
         (0.42 if kit.chance(0.5) else 0.34, y + r + 1.0), (0.34, y + r + 1.02)], (long - 0.4, 0, 0),
         sides=18))  # fmt: skip
     for x in (1.4, 2.9):
         kit.add(trim if kit.chance(0.7) else coat, moved(lathe([(0.36, 0.8 * r), (0.34, r + 0.25), (0.2, r + 0.42),
             (0.0, r + 0.46)], sides=16), (x, y, 0)))  # fmt: skip
     kit.add(LAMP, lathe([(0.2, 0.0), (0.2, 0.22), (0.05, 0.26)], (long - 0.1, y + r + 0.22, 0), "x", 16))
-    kit.add(BLACK, box((-0.4, 1.05, -1.2), (long + 0.2, 1.25, 1.2)), box((-0.2, 0.55, -0.5), (long - 0.2, 1.1,
-        0.5)))  # fmt: skip
-    kit.add(coat, box((-1.9, 1.1, -1.3), (-0.1, 2.5, 1.3), 0.05))
+    kit.add(BLACK, block((-0.4, long + 0.2), (1.05, 1.25), 1.2), block((-0.2, long - 0.2), (0.55, 1.1), 0.5))
+    kit.add(coat, block((-1.9, -0.1), (1.1, 2.5), 1.3, 0.05))
     kit.both(coat, *(box((x - 0.1, 2.4, 1.1), (x + 0.1, 3.5, 1.3)) for x in (-1.8, -0.2)))
-    kit.add(BLACK, box((-1.0, 2.45, -1.2), (-0.2, 2.9, 1.2)))
+    kit.add(BLACK, block((-1.0, -0.2), (2.45, 2.9), 1.2))
     kit.both(trim, box((-1.6, 1.7, 1.25), (-0.4, 2.1, 1.32)))
     roof = [np.column_stack([np.full(9, x), 3.5 + 0.35 * np.sin(np.linspace(0, np.pi, 9)),
         1.45 * np.cos(np.linspace(0, np.pi, 9))]) for x in (-2.2, 0.1)]  # fmt: skip
@@ -328,8 +314,8 @@ def steam_train(kit: Kit) -> None:
     drive, count = kit.between(0.62, 0.75), kit.count(2, 3)
     places = [0.2 + 1.5 * i for i in range(count)]
     for x in places:
-        kit.both(red, torus((x, drive, 0.85), 0.88 * drive, 0.11, "z", 24), lathe([(0.25 * drive, -0.06),
-            (0.2 * drive, 0.12)], (x, drive, 0.85), "z", 12))  # fmt: skip
+        kit.both(red, torus((x, drive, 0.85), 0.88 * drive, 0.11, "z", 24),
+            lathe([(0.25 * drive, -0.06), (0.2 * drive, 0.12)], (x, drive, 0.85), "z", 12))  # fmt: skip
         angle = 2 * np.pi * np.arange(8) / 8
         spokes = np.stack([x + 0.85 * drive * np.cos(angle), drive + 0.85 * drive * np.sin(angle),
             0 * angle + 0.85], 1)  # fmt: skip
@@ -337,14 +323,14 @@ def steam_train(kit: Kit) -> None:
     kit.both(STEEL, box((places[0] - 0.15, drive - 0.28, 0.98), (places[-1] + 0.15, drive - 0.16, 1.06)),
         tube([(places[-1], drive - 0.2, 1.08), (long - 0.9, 0.75, 1.08)], 0.05, 6))  # fmt: skip
     kit.both(coat, lathe([(0.32, -0.45), (0.32, 0.45)], (long - 0.5, 0.78, 1.0), "x", 16))
-    kit.both(STEEL, *(lathe([(0.36, -0.05), (0.36, 0.05)], (x, 0.36, 0.85), "z", 16) for x in (long - 1.3,
-        long + 0.1)))  # fmt: skip
+    kit.both(STEEL, *(lathe([(0.36, -0.05), (0.36, 0.05)], (x, 0.36, 0.85), "z", 16)
+        for x in (long - 1.3, long + 0.1)))  # fmt: skip
     if kit.chance(0.6):
-        kit.add(red, beams([(long + 0.3, 0.95, z) for z in np.linspace(-1.1, 1.1, 9)], [(long + 1.2 - 0.6 * abs(z),
-            0.12, z) for z in np.linspace(-1.1, 1.1, 9)], 0.07))  # fmt: skip
-    kit.add(red, box((long + 0.15, 0.85, -1.25), (long + 0.32, 1.25, 1.25)))
-    kit.both(STEEL, lathe([(0.12, 0), (0.10, 0.3), (0.22, 0.32), (0.2, 0.38)], (long + 0.3, 1.05, 0.85), "x", 12))
-    kit.add(coat, box((-5.0, 0.95, -1.25), (-2.4, 2.4, 1.25), 0.05))
+        kit.add(red, beams([(long + 0.3, 0.95, z) for z in np.linspace(-1.1, 1.1, 9)],
+            [(long + 1.2 - 0.6 * abs(z), 0.12, z) for z in np.linspace(-1.1, 1.1, 9)], 0.07))  # fmt: skip
+    kit.add(red, block((long + 0.15, long + 0.32), (0.85, 1.25), 1.25))
+    kit.both(STEEL, lathe([(0.12, 0), (0.1, 0.3), (0.22, 0.32), (0.2, 0.38)], (long + 0.3, 1.05, 0.85), "x", 12))
+    kit.add(coat, block((-5.0, -2.4), (0.95, 2.4), 1.25, 0.05))
     kit.add(BLACK, ball((-3.6, 2.3, 0), (1.2, 0.35, 1.05), 12))
     _bogies(kit, (-3.7,), 0.38)
     rear = -5.4 - kit.between(4.2, 5.6)
@@ -359,20 +345,20 @@ def express(kit: Kit) -> None:
     t = np.linspace(0, 1, 9)
     slope = t ** kit.between(1.6, 2.4)
     stations = [[0.0, 0.05, 0.0, 0.05], [0.2, 0, 0, 0], [long - nose, 0, 0, 0]]
-    stations += [[long - nose + nose * a, 1.95 * b, 0.12 * b, 0.62 * b] for a, b in zip(t[1:], slope[1:],
-        strict=True)]  # fmt: skip
+    rows = zip(t[1:], slope[1:], strict=True)
+    stations += [[long - nose + nose * a, 1.95 * b, 0.12 * b, 0.62 * b] for a, b in rows]
     kit.add(coat, carriage(stations, 1.45, 0.55, 3.75, 0.48))
-    glass, (a, b) = [], (kit.between(0.26, 0.32), kit.between(0.62, 0.72))
+    glass, (a, b) = ([], (kit.between(0.26, 0.32), kit.between(0.62, 0.72)))
     for v in np.linspace(a, b, 5):
         s = float(np.interp(v, t, slope))
-        x, roof, side = long - nose + nose * v, 3.75 - 1.95 * s + 0.015, (1.45 - 0.62 * s) * 0.80
+        x, roof, side = long - nose + nose * v, 3.75 - 1.95 * s + 0.015, (1.45 - 0.62 * s) * 0.8
         angle = np.linspace(0, np.pi, 9)
-        top = np.stack([np.full(9, x), roof - 0.45 + 0.47 * np.sin(angle) ** 0.5, 1.20 * side * np.cos(angle)], 1)
+        top = np.stack([np.full(9, x), roof - 0.45 + 0.47 * np.sin(angle) ** 0.5, 1.2 * side * np.cos(angle)], 1)
         glass.append(np.concatenate([top, top[::-1] * [1, 1, 0.7] - [0, 0.5, 0]]))
     kit.add(GLASS, loft(glass))
     s = float(np.interp(0.88, t, slope))
     kit.both(LAMP, ball((long - 0.14 * nose, 1.45, 1.45 - 0.66 * s), (0.32, 0.09, 0.14), 10))
-    kit.add(BLACK, box((long - 0.25, 0.62, -0.5), (long + 0.06, 0.95, 0.5), 0.08))
+    kit.add(BLACK, block((long - 0.25, long + 0.06), (0.62, 0.95), 0.5, 0.08))
     _panes(kit, (0.9, long - nose - 0.6), (2.0, 2.75), 1.45, kit.count(5, 7), 0.3)
     _band(kit, stripe, (0.1, long - nose + 0.3), (1.2, 1.2 + kit.between(0.2, 0.5)), 1.45)
     if kit.chance(0.5):
@@ -380,8 +366,8 @@ def express(kit: Kit) -> None:
     _bogies(kit, (1.8, long - 2.3), 0.44)
     rear = -0.4 - kit.between(4.8, 6.5)
     _wagon(kit, rear, -0.4, coat, stripe)
-    kit.add(STEEL, *(beams((-3.0 - d, 3.7, 0), (-2.4, 4.25, 0), 0.06) for d in (0.0, 1.2)), box((-2.45, 4.2, -0.8),
-        (-2.3, 4.28, 0.8)))  # fmt: skip
+    kit.add(STEEL, *(beams((-3.0 - d, 3.7, 0), (-2.4, 4.25, 0), 0.06) for d in (0.0, 1.2)),
+        block((-2.45, -2.3), (4.2, 4.28), 0.8))  # fmt: skip
     _track(kit, rear, long)
 
 
@@ -389,40 +375,39 @@ def diesel_train(kit: Kit) -> None:
     """A square locomotive with a cab, grilles and rails, and goods wagons: tanks, boxes or coal."""
     coat, second = kit.lacquer(), kit.lacquer()
     long, cab = kit.between(7.6, 8.8), kit.between(1.8, 2.3)
-    kit.add(BLACK, box((0, 0.85, -1.4), (long, 1.15, 1.4), 0.04), box((3.0, 0.35, -1.0), (long - 3.2, 0.9, 1.0),
-        0.1))  # fmt: skip
+    kit.add(BLACK, block((0, long), (0.85, 1.15), 1.4, 0.04), block((3.0, long - 3.2), (0.35, 0.9), 1.0, 0.1))
     short = kit.between(1.0, 1.8)
     front = long - short
-    kit.add(coat, box((0.4, 1.1, -1.05), (front - cab, 3.4, 1.05), 0.12), box((front - cab, 1.1, -1.4), (front,
-        3.85, 1.4), 0.15))  # fmt: skip
-    kit.add(second, box((front - 0.1, 1.1, -1.05), (long - 0.25, 2.3, 1.05), 0.15))
-    kit.both(GLASS, box((front - 0.02, 2.6, 0.15), (front + 0.03, 3.35, 1.2), 0.01), box((front - cab + 0.3, 2.6,
-        1.38), (front - 0.3, 3.3, 1.43), 0.01))  # fmt: skip
+    kit.add(coat, block((0.4, front - cab), (1.1, 3.4), 1.05, 0.12),
+        block((front - cab, front), (1.1, 3.85), 1.4, 0.15))  # fmt: skip
+    kit.add(second, block((front - 0.1, long - 0.25), (1.1, 2.3), 1.05, 0.15))
+    kit.both(GLASS, box((front - 0.02, 2.6, 0.15), (front + 0.03, 3.35, 1.2), 0.01),
+        box((front - cab + 0.3, 2.6, 1.38), (front - 0.3, 3.3, 1.43), 0.01))  # fmt: skip
     kit.both(BLACK, *(boxes([(x, 2.4, 1.05)], (0.7, 1.2, 0.04)) for x in np.arange(1.0, front - cab - 0.5, 1.0)))
     _band(kit, second, (0.4, front - cab), (1.35, 1.6), 1.05)
-    kit.add(second, box((front - 0.05, 2.35, -1.35), (front + 0.02, 2.55, 1.35)))
-    kit.both(LAMP, lathe([(0.16, 0), (0.14, 0.06)], (front, 3.6, 0.2), "x", 12), lathe([(0.13, 0), (0.12, 0.05)],
-        (long - 0.26, 1.5, 0.75), "x", 12))  # fmt: skip
+    kit.add(second, block((front - 0.05, front + 0.02), (2.35, 2.55), 1.35))
+    kit.both(LAMP, lathe([(0.16, 0), (0.14, 0.06)], (front, 3.6, 0.2), "x", 12),
+        lathe([(0.13, 0), (0.12, 0.05)], (long - 0.26, 1.5, 0.75), "x", 12))  # fmt: skip
     for i in range(6):
         z = -1.25 + 0.5 * i
         kit.add((AMBER, BLACK)[i % 2], box((long - 0.02, 0.5, z - 0.25), (long + 0.1, 1.15, z + 0.25)))
-    kit.both(WHITE, tube([(0.2, 2.1, 1.35), (front - cab, 2.1, 1.35)], 0.03, 6), beams([(x, 1.15,
-        1.35) for x in np.arange(0.2, front - cab, 1.0)], [(x, 2.1, 1.35) for x in np.arange(0.2, front - cab,
-        1.0)], 0.05))  # fmt: skip
-    kit.add(BLACK, lathe([(0.22, 3.3), (0.2, 3.8)], (2.2, 0, 0), sides=12), lathe([(0.5, 3.35), (0.5, 3.5)], (3.6,
-        0, 0), sides=16))  # fmt: skip
+    kit.both(WHITE, tube([(0.2, 2.1, 1.35), (front - cab, 2.1, 1.35)], 0.03, 6),
+        beams([(x, 1.15, 1.35) for x in np.arange(0.2, front - cab, 1.0)],
+        [(x, 2.1, 1.35) for x in np.arange(0.2, front - cab, 1.0)], 0.05))  # fmt: skip
+    kit.add(BLACK, lathe([(0.22, 3.3), (0.2, 3.8)], (2.2, 0, 0), sides=12),
+        lathe([(0.5, 3.35), (0.5, 3.5)], (3.6, 0, 0), sides=16))  # fmt: skip
     _bogies(kit, (1.8, long - 2.0), 0.46)
     rear = -0.4
     for _ in range(2):
         size, what = kit.between(3.4, 4.2), kit.count(0, 2)
         a, b, load = rear - size, rear, kit.lacquer()
-        kit.add(BLACK, box((a, 0.85, -1.2), (b, 1.1, 1.2), 0.04), box((b - 0.1, 0.8, -0.15), (b + 0.5, 1.0, 0.15)))
+        kit.add(BLACK, block((a, b), (0.85, 1.1), 1.2, 0.04), block((b - 0.1, b + 0.5), (0.8, 1.0), 0.15))
         if what == 0:
             kit.add(load, lathe([(0.2, 0.0), (0.95, 0.15), (1.15, 0.45), (1.15, size - 0.65), (0.95, size - 0.35),
                 (0.2, size - 0.2)], (a + 0.1, 2.2, 0), "x", 20))  # fmt: skip
             kit.add(STEEL, lathe([(0.3, 3.3), (0.3, 3.55)], ((a + b) / 2, 0, 0), sides=12))
         elif what == 1:
-            kit.add(load, box((a + 0.1, 1.05, -1.3), (b - 0.1, 3.6, 1.3), 0.05))
+            kit.add(load, block((a + 0.1, b - 0.1), (1.05, 3.6), 1.3, 0.05))
             x = np.linspace(a + 0.3, b - 0.3, 9)
             kit.both(load, boxes(np.stack([x, 0 * x + 2.3, 0 * x + 1.3], 1), (0.08, 2.4, 0.1)))
         else:
@@ -440,7 +425,7 @@ def tram(kit: Kit) -> None:
     for rear, front, ahead in ((0.25, long, True), (-long, -0.25, False)):
         middle, half = (rear + front) / 2, (front - rear) / 2
         stations = np.array(_ends(half, 0.05, 0.2))
-        nose = np.array([[half - 1.3, 0, 0, 0], [half - 0.5, 0.10, 0.0, 0.10], [half - 0.1, 0.45, 0.02, 0.32],
+        nose = np.array([[half - 1.3, 0, 0, 0], [half - 0.5, 0.1, 0.0, 0.1], [half - 0.1, 0.45, 0.02, 0.32],
             [half, 0.7, 0.05, 0.45]])  # fmt: skip
         stations = np.concatenate([stations[:3], nose]) if ahead else np.concatenate([nose[::-1] * [-1, 1, 1, 1],
             stations[3:]])  # fmt: skip
@@ -450,20 +435,20 @@ def tram(kit: Kit) -> None:
         _band(kit, second, inner, (0.6, kit.between(1.0, 1.4)), 1.3)
         end, way = (front, 1) if ahead else (rear, -1)
         kit.add(GLASS, prism(*(np.array([[end + 0.03 * way, 1.45, z], [end + 0.03 * way, 2.62, z],
-            [end - 0.10 * way, 2.95, z], [end - 0.5 * way, 2.85, z], [end - 0.5 * way, 1.45, z]]) for z in (-0.80,
-            0.80))))  # fmt: skip
-        kit.add(BLACK, box((end - 0.3 if ahead else end - 0.06, 2.82, -0.6), (end + 0.06 if ahead else end + 0.3,
-            3.1, 0.6), 0.02))  # fmt: skip
+            [end - 0.1 * way, 2.95, z], [end - 0.5 * way, 2.85, z], [end - 0.5 * way, 1.45, z]])
+            for z in (-0.8, 0.8))))  # fmt: skip
+        kit.add(BLACK, block((end - 0.3 if ahead else end - 0.06, end + 0.06 if ahead else end + 0.3), (2.82, 3.1),
+            0.6, 0.02))  # fmt: skip
         kit.add(AMBER, boxes([(end + 0.065 * way, 2.96, z) for z in (-0.4, -0.2, 0.05, 0.3)], (0.02, 0.16, 0.13)))
         kit.both(LAMP if ahead else TAIL_LAMP, lathe([(0.14, -0.1), (0.12, 0.1)], (end - 0.08 * way, 1.0, 0.62),
             "x", 14))  # fmt: skip
-        kit.add(second, box((end - 0.25 if ahead else end - 0.04, 0.5, -0.8), (end + 0.04 if ahead else end + 0.25,
-            0.8, 0.8), 0.06))  # fmt: skip
+        kit.add(second, block((end - 0.25 if ahead else end - 0.04, end + 0.04 if ahead else end + 0.25),
+            (0.5, 0.8), 0.8, 0.06))  # fmt: skip
         _bogies(kit, (middle,), 0.32)
-    kit.add(BLACK, box((-0.35, 0.6, -1.15), (0.35, 3.2, 1.15)))
-    kit.add(STEEL, beams([(2.0, 3.4, 0.3), (2.0, 3.4, -0.3), (1.2, 3.9, 0), (1.2, 3.9, 0)], [(1.2, 3.9, 0), (1.2,
-        3.9, 0), (2.0, 4.35, 0.3), (2.0, 4.35, -0.3)], 0.05))  # fmt: skip
-    kit.add(STEEL, box((1.9, 4.32, -0.8), (2.1, 4.4, 0.8)), box((2.8, 3.35, -0.7), (4.2, 3.65, 0.7), 0.08))
+    kit.add(BLACK, block((-0.35, 0.35), (0.6, 3.2), 1.15))
+    kit.add(STEEL, beams([(2.0, 3.4, 0.3), (2.0, 3.4, -0.3), (1.2, 3.9, 0), (1.2, 3.9, 0)],
+        [(1.2, 3.9, 0), (1.2, 3.9, 0), (2.0, 4.35, 0.3), (2.0, 4.35, -0.3)], 0.05))  # fmt: skip
+    kit.add(STEEL, block((1.9, 2.1), (4.32, 4.4), 0.8), block((2.8, 4.2), (3.35, 3.65), 0.7, 0.08))
     _track(kit, -long, long)
 
 

@@ -1,7 +1,7 @@
-"""Objects from folders: ShapeNetCore's layout, meshes by class, materials, splits, and files that are no objects."""
+"""Objects from folders: ShapeNetCore's layout, meshes by class, materials, splits, files that are no objects."""
 
 import json
-import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from scene_ir.errors import FormatError, RangeError
 
 BUS, CAR = "02924116", "02958343"
 CUBE = trimesh.creation.box((2.0, 1.0, 4.0))
-KENNEY = Path(os.environ.get("DRIVESEM_KENNEY", "/nowhere"))
+KENNEY = Path(__file__).resolve().parents[4] / "shared" / "data" / "meshes_kenney"
 MTL = "newmtl red\nKd 0.8 0.1 0.2\nKs 0.5 0.5 0.5\nNs 40\nnewmtl blue\nKd 0 0 1\nKs 0 0 0\nNs 5\n"
 
 
@@ -33,7 +33,7 @@ def obj_text(mesh: trimesh.Trimesh = CUBE, library: str = "model_normalized.mtl"
 def shapenet(root: Path, synset: str, code: str, mesh: str | None = None, mtl: str = MTL) -> Path:
     """One object in ShapeNetCore's second layout."""
     folder = root / synset / code / "models"
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "model_normalized.obj").write_text(obj_text() if mesh is None else mesh)
     (folder / "model_normalized.mtl").write_text(mtl)
     return folder
@@ -51,12 +51,33 @@ def test_an_object_with_its_materials(tmp_path: Path) -> None:
     torch.testing.assert_close(vertices.amax(0) + vertices.amin(0), torch.zeros(3))
     red = model.specular > 0
     assert int(red.sum()) == 6
-    torch.testing.assert_close(model.diffuse[red], torch.tensor([[0.8, 0.1, 0.2]]).expand(6, 3), atol=2e-3, rtol=0)
-    torch.testing.assert_close(model.specular[red], torch.full((6,), 0.5), atol=3e-3, rtol=0)
+    torch.testing.assert_close(model.diffuse[red], torch.tensor([[0.8, 0.1, 0.2]]).expand(6, 3))
+    torch.testing.assert_close(model.specular[red], torch.full((6,), 0.5))
     assert set(model.shininess[red].tolist()) == {40.0}
     assert set(model.shininess[~red].tolist()) == {5.0}
     corners = vertices[model.mesh.faces]
     assert float(torch.det(corners).sum()) / 6 == pytest.approx(0.125, rel=1e-4)  # outwards as in the file
+
+
+@pytest.mark.parametrize(
+    ("lines", "diffuse", "specular", "shininess"),
+    [
+        ("", 0.5, 0.1, 10.0),
+        ("Kd 0.25 0.25 0.25\n", 0.25, 0.1, 10.0),
+        ("Ks 0.75 0.75 0.75\nNs -5\n", 0.5, 0.75, 0.0),
+        ("Kd nan 0 0\nKs 1e999 0 0\nNs nan\n", 0.5, 0.1, 10.0),
+        ("Kd 7 7 7\nKs -1 -1 -1\nNs 1e30\n", 1.0, 0.0, 1000.0),
+        ("Kd a b c\nKs 1 1\n", 0.5, 0.1, 10.0),
+    ],
+)
+def test_materials_that_say_little_or_nonsense(
+    tmp_path: Path, lines: str, diffuse: float, specular: float, shininess: float
+) -> None:
+    shapenet(tmp_path, BUS, "abc", mtl=f"newmtl red\n{lines}newmtl blue\n{lines}")
+    model = open_objects(str(tmp_path)).load("bus/abc")
+    assert model.diffuse.unique().tolist() == pytest.approx([diffuse])
+    assert model.specular.unique().tolist() == pytest.approx([specular])
+    assert model.shininess.unique().tolist() == [shininess]
 
 
 def test_a_texture_beside_the_models_is_averaged(tmp_path: Path) -> None:
@@ -72,9 +93,14 @@ def test_a_texture_beside_the_models_is_averaged(tmp_path: Path) -> None:
 
 
 def test_what_a_material_names_elsewhere_is_not_read(tmp_path: Path) -> None:
-    """A file outside the object's folder, a device: the object comes without it."""
+    """A file outside the object's folder, a device, a huge file: the object comes without it."""
     Image.fromarray(np.full((4, 4, 3), 255, np.uint8)).save(tmp_path / "secret.png")
-    for code, name in (("a", "../../../secret.png"), ("b", "/dev/zero"), ("c", str(tmp_path / "secret.png"))):
+    names = {"a": "../../../secret.png", "b": "/dev/zero", "c": str(tmp_path / "secret.png"), "e": "huge.png"}
+    (tmp_path / BUS / "e" / "models").mkdir(parents=True)
+    with (tmp_path / BUS / "e" / "models" / "huge.png").open("wb") as stream:
+        stream.write((tmp_path / "secret.png").read_bytes())
+        stream.truncate((1 << 28) + 1)  # sparse: takes no room
+    for code, name in names.items():
         shapenet(tmp_path, BUS, code, mtl=MTL.replace("Kd 0 0 1", f"Kd 0 0 1\nmap_Kd {name}"))
         model = open_objects(str(tmp_path)).load(f"bus/{code}")
         assert float(model.diffuse[:, 1].max()) < 0.2
@@ -131,7 +157,7 @@ def test_a_file_too_large_is_not_read(tmp_path: Path) -> None:
 def test_a_folder_without_objects(tmp_path: Path, content: str | None) -> None:
     if content:
         (tmp_path / content).write_text("")
-    with pytest.raises(FormatError, match="expected ShapeNetCore's folders, or .* by class, found no object"):
+    with pytest.raises(FormatError, match=r"expected ShapeNetCore's folders, or .* by class, found no object"):
         open_objects(str(tmp_path))
     with pytest.raises(FormatError, match="a folder of objects, found no such folder"):
         open_objects(str(tmp_path / "none"))
@@ -202,7 +228,7 @@ def test_meshes_by_class(tmp_path: Path) -> None:
     with pytest.raises(RangeError, match="most_triangles: expected at least 4"):
         FolderObjects(tmp_path, most_triangles=3)
     CUBE.export(tmp_path / "cat" / "one.obj")
-    with pytest.raises(FormatError, match="expected one mesh of a name, found one.obj too"):
+    with pytest.raises(FormatError, match=r"expected one mesh of a name, found one\.obj too"):
         open_objects(str(tmp_path))
 
 
@@ -220,11 +246,10 @@ def test_gltfs_front_is_turned(tmp_path: Path) -> None:
     assert float(torch.det(corners).sum()) > 0
 
 
-@pytest.mark.skipif(not KENNEY.is_dir(), reason="needs Kenney's car kit: a folder with GLB files in DRIVESEM_KENNEY")
+@pytest.mark.skipif(not KENNEY.is_dir(), reason=f"{KENNEY} is missing")
 def test_a_kit_of_cars_from_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "car").mkdir()
-    for path in sorted(KENNEY.glob("*.glb")):
-        (tmp_path / "car" / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(KENNEY, tmp_path / "car", dirs_exist_ok=True)
     objects = open_objects(str(tmp_path))
     for name in objects.names("train"):
         assert objects.load(name).diffuse.std() > 0.05

@@ -127,8 +127,9 @@ def test_tables() -> None:
     by_parameter, by_frame = sheets(frames, means(frames, 0, 0))
     assert by_parameter.rows[0] == ("rotate", "+1.50", "+75", "75", "2", "0", "2", "5 deg", "2.5 deg")
     row = dict(zip(by_frame.columns, by_frame.rows[0], strict=True))
-    assert (row["loss"], row["fails"], row["still"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
-    assert (row["left, %"], row["needs"], row["cars"], row["most by"]) == ("25.0", "rotate", "2 of 3", "[2] +2.50")
+    assert (row["loss"], row["failures"], row["still"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
+    assert (row["enough, %"], row["needs"], row["cars"]) == ("25.0", "rotate", "2 of 3")
+    assert row["most loss by"] == "[2] +2.50"
     parts = {row[0]: row for row in what_if(frames[0]).rows}
     assert parts["everything"][4:6] == ("3.00", "1 + 2")
     assert parts["rotate"][1:4] == ("+1.50", "+75", "75")

@@ -8,14 +8,25 @@ import pytest
 
 from drivesem.questions.gate.report import junit
 from drivesem.questions.gate.results import Pair
-from drivesem.questions.gate.rows import ALL, HOLE, KIND, rows_of
+from drivesem.questions.gate.rows import ALL, HOLE, KIND, PHANTOMS, rows_of
 
 DRAWS = 200
 
 
-def pair(before: int, after: int, of: int = 20, error: str = "missed", index: int = 0) -> Pair:
+def first(count: int, of: int) -> tuple[bool, ...]:
+    return tuple(i < count for i in range(of))
+
+
+def pair(
+    before: int,
+    after: int,
+    of: int = 20,
+    error: str = "missed",
+    index: int = 0,
+    phantoms: tuple[int, int] = (0, 0),
+) -> Pair:
     """The new detector fails in the samples in which the old one does, and in more or in fewer."""
-    return Pair(index, "Car", error, tuple(i < before for i in range(of)), tuple(i < after for i in range(of)))
+    return Pair(index, "Car", error, *(first(count, of) for count in (before, after, *phantoms)))
 
 
 def rows(found, tolerance: float = 0.05):
@@ -32,9 +43,10 @@ def test_shares_and_order() -> None:
         (KIND, "missed"),
         (KIND, "placed"),
         (ALL, ALL),
+        (PHANTOMS, PHANTOMS),
     ]
-    first, whole = told[0], told[-1]
-    assert (first.before, first.after, first.difference) == pytest.approx((0.2, 0.7, 0.5))
+    most, whole = told[0], told[-2]
+    assert (most.before, most.after, most.difference) == pytest.approx((0.2, 0.7, 0.5))
     assert (whole.before, whole.after, whole.samples, whole.holes) == pytest.approx((24 / 60, 29 / 60, 60, 3))
 
 
@@ -51,9 +63,21 @@ def test_what_grew_is_beyond_the_tolerance_and_beyond_chance() -> None:
     assert not any(row.grew for row in rows({"a": [pair(14, 4), pair(20, 0, index=1)]}))
 
 
+def test_phantoms_are_a_row_of_their_own() -> None:
+    """Of all samples, whether the object is lost there or not; they alone may fail a gate."""
+    told = rows({"a": [pair(10, 9, phantoms=(2, 12))], "b": [pair(3, 3, phantoms=(0, 9))]})
+    assert [row.hole for row in told if row.grew] == [PHANTOMS]
+    row = told[-1]
+    assert (row.before, row.after, row.samples, row.holes) == pytest.approx((2 / 40, 21 / 40, 40, 2))
+    case = ET.fromstring(junit(told)).find(f"testcase[@name='{PHANTOMS}']/failure")
+    assert case is not None
+    assert case.attrib["message"] == "phantoms in 5.0 % before, 52.5 % after"
+
+
 def test_pairing_counts() -> None:
     """Both fail half of the time, the one where the other does not: as often, so nothing grew, but not alike."""
-    opposite = Pair(0, "Car", "missed", tuple(i % 2 == 0 for i in range(20)), tuple(i % 2 == 1 for i in range(20)))
+    even, never = tuple(i % 2 == 0 for i in range(20)), (False,) * 20
+    opposite = Pair(0, "Car", "missed", even, tuple(not one for one in even), never, never)
     alike, other = rows({"a": [pair(10, 10)]})[0], rows({"a": [opposite]})[0]
     assert alike.low == alike.high == 0
     assert other.low is not None
@@ -64,7 +88,7 @@ def test_pairing_counts() -> None:
 
 def test_without_failures_there_is_nothing_to_say() -> None:
     assert rows({}) == []
-    assert rows({"a": [Pair(0, "Car", "missed", (), ())]}) == []
+    assert rows({"a": [Pair(0, "Car", "missed", (), (), (), ())]}) == []
     assert ET.fromstring(junit([])).attrib["tests"] == "0"
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivesem.questions.holes.merged import merged, of_kitti
+from drivesem.questions.holes.merged import Explained, Hole, of_kitti
+from drivesem.questions.holes.merged import merged as merged_of
+from drivesem.questions.holes.pooled import Told
 from drivesem.questions.holes.results import Around, Samples
 from drivesem.truth.rare import Share
 from drivesem.truth.rules import fit
@@ -20,14 +22,20 @@ def samples(height: list[float], fails: list[bool]) -> Samples:
     return Samples(NAMES, tuple((h, 0.5) for h in height), tuple(-1.0 if lost else 1.0 for lost in fails))
 
 
-def around(low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, label: str = "Car") -> Around:
+def merged(found: dict[str, list[Explained]], again: dict[tuple[str, int], Samples] | None = None) -> list[Hole]:
+    """Of failures by frame, of object after object."""
+    return merged_of({(name, i): one for name, own in found.items() for i, one in enumerate(own)}, again)
+
+
+def around(low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, label: str = "Car") -> Explained:
     """Fails where the height lies in a band, of 100 samples evenly from 0 to `wide`, and in some of 10 fresh."""
     heights = np.linspace(0, wide, 100).tolist()
     fresh = samples([(low + high) / 2] * 10, [i < fresh_fails for i in range(10)])
     asked = samples(heights, [low <= h <= high for h in heights])
     size = (high - low) / wide
     lost = Share(size, size / 2, size * 2, "samples", 0)
-    return Around(0, label, "missed", "certain", asked, NOTHING, {"height_px": (low, high)}, fresh, lost)
+    one = Around(0, label, "missed", "certain", asked, NOTHING, lost)
+    return Explained(one, Told({"height_px": (low, high)}, False), fresh)
 
 
 def test_bands_that_overlap_are_one_hole() -> None:
@@ -44,6 +52,18 @@ def test_bands_that_overlap_are_one_hole() -> None:
     assert 0 < hole.outside < 0.03
 
 
+def test_a_rule_of_many_stays_as_it_is() -> None:
+    """What is much like it joins it, and does not move its bounds."""
+    one = around(22, 42)
+    pooled = replace(one, told=Told({"height_px": (20.0, 45.0)}, True))
+    (hole,) = merged({"a": [around(25, 45)], "b": [pooled], "c": [pooled]})
+    assert hole.where == {"height_px": (20.0, 45.0)}
+    assert hole.pooled
+    assert hole.to_json()["pooled"]
+    assert len(hole.failures) == 3
+    assert hole.frames == ("b", "c", "a")
+
+
 def test_other_bands_and_classes_are_others() -> None:
     found = {"a": [around(20, 40), around(60, 70)], "b": [around(20, 40, label="Van")]}
     assert len(merged(found)) == 3
@@ -58,7 +78,7 @@ def test_the_largest_first_and_copies_last() -> None:
 def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
     four = samples([1, 2, 3, 4], [True, True, False, True])
     lost = Share(0.75, 0.3, 0.95, "samples", 0)
-    one = Around(0, "Car", "missed", "certain", four, NOTHING, {}, NOTHING, lost)
+    one = Explained(Around(0, "Car", "missed", "certain", four, NOTHING, lost), Told({}, False), NOTHING)
     (hole,) = merged({"a": [one]})
     assert (hole.words, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
 
@@ -71,7 +91,7 @@ def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 
 
 
 @pytest.fixture(scope="module")
-def fields() -> list[tuple[Around, Samples]]:
+def fields() -> list[tuple[Explained, Samples]]:
     """Rules of that field from samples, fresh ones inside of each, and those of a recheck."""
     found = []
     for seed in range(200):
@@ -79,12 +99,14 @@ def fields() -> list[tuple[Around, Samples]]:
         asked = drawn(rng, 96)
         where = fit(asked.columns(), asked.failing).where
         low, high = where.get("height_px", (0.0, 100.0))
-        one = replace(around(30, 60), asked=asked, where=where, fresh=drawn(rng, 32, low, high))
+        plain = around(30, 60)
+        own = replace(plain.around, asked=asked)
+        one = Explained(own, Told(where, False), drawn(rng, 32, low, high))
         found.append((one, drawn(rng, 150, low, high)))
     return found
 
 
-def test_a_probability_that_was_held_against_fresh_samples_holds(fields: list[tuple[Around, Samples]]) -> None:
+def test_a_probability_that_was_held_against_fresh_samples_holds(fields: list[tuple[Explained, Samples]]) -> None:
     held = 0
     for one, again in fields:
         (hole,) = merged({"a": [one]}, {("a", 0): again})
@@ -98,11 +120,12 @@ def test_a_probability_that_was_held_against_fresh_samples_holds(fields: list[tu
     assert 0.92 <= held / len(fields) <= 0.99  # 95 %: chance alone makes some that do not
 
 
-def test_a_probability_of_another_place_does_not(fields: list[tuple[Around, Samples]]) -> None:
+def test_a_probability_of_another_place_does_not(fields: list[tuple[Explained, Samples]]) -> None:
     """What is stated of samples anywhere, of which a third or so lie where the object is lost."""
     held = 0
     for one, again in fields:
-        anywhere = replace(one.asked, values=tuple((one.where["height_px"][0], 0.5) for _ in one.asked.values))
+        asked = one.around.asked
+        anywhere = replace(asked, values=tuple((one.told.where["height_px"][0], 0.5) for _ in asked.values))
         (hole,) = merged({"a": [replace(one, fresh=anywhere)]}, {("a", 0): again})
         assert hole.recheck is not None
         held += hole.recheck.holds
@@ -134,7 +157,8 @@ def test_kitti_knows_some_features() -> None:
 
 
 def test_sizes_by_samples_and_by_simulation_are_told_together() -> None:
-    rare = replace(around(22, 42), lost=Share(0.01, 0.002, 0.05, "subset simulation", 90))
+    one = around(22, 42)
+    rare = replace(one, around=replace(one.around, lost=Share(0.01, 0.002, 0.05, "subset simulation", 90)))
     (hole,) = merged({"a": [around(20, 40), rare]})
     size = hole.to_json()["size"]
     assert [size["probability"], *size["interval"]] == pytest.approx([0.105, 0.051, 0.225])

@@ -1,0 +1,67 @@
+"""Label files by the layout of what lies at a path. Those of KITTI and COCO are read without torch."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from drivesem.data import coco_labels, kitti_labels
+from drivesem.data.label_table import LabelTable
+from scene_ir import files
+from scene_ir.errors import FormatError, RangeError
+
+_VKITTI2 = re.compile("Scene[0-9]|vkitti_2")
+"""How the names of Virtual KITTI 2's folders begin."""
+LAYOUTS = ("kitti", "coco", "yolo", "vkitti1", "vkitti2")
+
+
+def layout_of(path: Path) -> str | None:
+    """One of LAYOUTS by what lies there; None for a folder of none. FormatError for a file of none, or nothing."""
+    if path.is_file():
+        if path.suffix.lower() == ".json":
+            return "coco"
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return "yolo"
+        raise FormatError(str(path), "a .json or .yaml file, or a folder of labels", f"a {path.suffix or 'file'}")
+    if not path.is_dir():
+        raise FormatError(str(path), "a file or folder of labels", "nothing there")
+    if (path / "data.yaml").is_file():
+        return "yolo"
+    if any((path / "annotations").glob("instances_*.json")):
+        return "coco"
+    if (path / "vkitti_1.3.1_rgb").is_dir():
+        return "vkitti1"
+    with os.scandir(path) as entries:
+        if any(_VKITTI2.match(entry.name) and entry.is_dir() for entry in entries):
+            return "vkitti2"
+    folder = kitti_labels.label_folder(path)
+    if folder is None:
+        return None
+    # YOLO's lines begin with a class number, KITTI's with a name
+    begins = (files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.text_files(folder))
+    first = next((words[0] for words in begins if words), "")
+    return "yolo" if first.isdecimal() else "kitti"
+
+
+def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
+    """The labels, or detections where `scored`, of a path. truth: the labels beside which detections are read, for
+    COCO's ids, YOLO's classes and image sizes. FormatError naming file, line or entry, and field.
+    """
+    if not path.exists():
+        raise FormatError(str(path), "a file or folder of labels", "nothing there")
+    if layout == "kitti":
+        return kitti_labels.read_table(path, scored)
+    if layout == "coco":
+        return coco_labels.read_table(path, scored, truth)
+    if layout == "yolo":
+        from drivesem.data import yolo
+
+        return yolo.read_table(path, scored, truth)
+    if layout not in LAYOUTS:
+        raise RangeError("layout", f"one of {', '.join(LAYOUTS)}", layout)
+    if scored:
+        raise FormatError(str(path), "detections with scores", "Virtual KITTI, which holds labels only")
+    from drivesem.data import vkitti1, vkitti2
+
+    return (vkitti1.Vkitti1Dataset if layout == "vkitti1" else vkitti2.Vkitti2Dataset)(path).table()

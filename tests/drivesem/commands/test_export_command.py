@@ -1,0 +1,251 @@
+"""`drivesem export` as a user types it: every layout is read back by something that is not its writer."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from pycocotools.coco import COCO
+
+from drivesem.cli import main
+from drivesem.data.vkitti2 import Vkitti2Dataset
+from drivesem.data.yolo import YoloDataset
+from drivesem.run.results import Failure, FrameResult, dump_frame, load_frame
+from drivesem.truth.redraw.base import NoSecondRendererError
+from drivesem.truth.redraw.screen import shared_screen
+from scene_ir import files
+from scene_ir.io import load_scene
+
+GRADE = "certain"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames: in the first, the second car is said to be lost for certain; the second withstands."""
+    out = tmp_path_factory.mktemp("run") / "a"
+    words = [
+        "attack",
+        "--params",
+        "translate",
+        "--steps",
+        "1",
+        "--limit",
+        "2",
+        "--nuisances",
+        "off",
+        "--no-confirm",
+    ]
+    assert main([*words, "--workers", "1", "--out", str(out)]) == 0
+    for name in ("demo-000", "demo-001"):
+        path = out / "frames" / name / "result.json"
+        result = load_frame(path)
+        car = result.targets_moved[1]
+        lost = Failure("lost", car.label, car.xyxy, index=1, error="missed", grade=GRADE)
+        files.write_text(path, dump_frame(replace(result, failures=(lost,) if name == "demo-000" else ())))
+    return out
+
+
+def result_of(run: Path, name: str) -> FrameResult:
+    return load_frame(run / "frames" / name / "result.json")
+
+
+def export(run: Path, to: str, out: Path, *words: str) -> Path:
+    assert main(["export", str(run), "--to", to, "--out", str(out), *words]) == 0
+    return out
+
+
+def picture(path: Path) -> Any:
+    return cv2.imread(str(path))
+
+
+def test_kitti_by_a_parser_of_its_own(run: Path, tmp_path: Path) -> None:
+    training = export(run, "kitti", tmp_path / "K") / "training"
+    assert [p.name for p in sorted((training / "image_2").iterdir())] == ["demo-000.png"]
+    source = run / "frames" / "demo-000"
+    assert np.array_equal(picture(training / "image_2/demo-000.png"), picture(source / "counterexample.png"))
+    result, scene = result_of(run, "demo-000"), load_scene(source / "scene")
+    matrix = None
+    for line in (training / "calib/demo-000.txt").read_text().splitlines():
+        if line.startswith("P2:"):
+            matrix = np.array([float(v) for v in line.split()[1:]]).reshape(3, 4)
+    assert matrix is not None
+    assert matrix == pytest.approx(scene.camera.matrix.numpy(), rel=1e-6)
+    cars = []
+    for line in (training / "label_2/demo-000.txt").read_text().splitlines():
+        kind, *numbers = line.split()
+        assert len(numbers) == 14
+        values = [float(v) for v in numbers]
+        if kind == "DontCare":
+            continue
+        cars.append(values)
+        left, top, right, bottom, h, w, length, x, y, z, turn = values[3:]
+        # the bottom's corners, projected by hand, lie within a car's width of the box
+        along = np.array([math.cos(turn), 0, -math.sin(turn)]) * length / 2
+        across = np.array([math.sin(turn), 0, math.cos(turn)]) * w / 2
+        seen = [matrix @ [*(np.array([x, y - up, z]) + a * along + c * across), 1]
+                for up in (0, h) for a in (-1, 1) for c in (-1, 1)]  # fmt: skip
+        pixels = np.array([point[:2] / point[2] for point in seen])
+        assert pixels[:, 0].min() < (left + right) / 2 < pixels[:, 0].max()
+        assert pixels[:, 1].min() < (top + bottom) / 2 < pixels[:, 1].max()
+    own = [record.xyxy for record in result.targets_moved if record.index is not None]
+    assert [values[3:7] for values in cars] == [pytest.approx(box, abs=1e-3) for box in own]
+
+
+def test_coco_by_pycocotools(run: Path, tmp_path: Path) -> None:
+    out = export(run, "coco", tmp_path / "C", "--grade", "all")
+    with contextlib.redirect_stdout(io.StringIO()):
+        told = COCO(str(out / "annotations" / "instances_all.json"))
+        found = told.loadRes(str(out / "detections.json"))
+    images = {row["drivesem"]["frame"]: row for row in told.loadImgs(told.getImgIds())}
+    assert set(images) == {"demo-000", "demo-001"}
+    for name, row in images.items():
+        result = result_of(run, name)
+        assert (out / "images" / row["file_name"]).is_file()
+        assert row["drivesem"]["theta"] == {c.name: c.value for c in result.theta}
+        assert row["drivesem"]["grade"] == (GRADE if name == "demo-000" else None)
+        objects = [r for r in told.loadAnns(told.getAnnIds(row["id"])) if not r["iscrowd"]]
+        for i, (entry, record) in enumerate(zip(objects, result.targets_moved, strict=False)):
+            x, y, w, h = entry["bbox"]
+            assert [x - 0.5, y - 0.5, x - 0.5 + w, y - 0.5 + h] == pytest.approx(record.xyxy, abs=1e-3)
+            assert entry.get("failure") == (GRADE if name == "demo-000" and i == 1 else None)
+        scores = sorted(r["score"] for r in found.loadAnns(found.getAnnIds(row["id"])))
+        assert scores == pytest.approx(sorted(d.score for d in result.detections_attacked if d.score is not None))
+
+
+def test_fiftyone_as_its_documentation_says(run: Path, tmp_path: Path) -> None:
+    out = export(run, "fiftyone", tmp_path / "F", "--grade", "all")
+    content = json.loads((out / "labels.json").read_text())
+    uuids = {path.stem for path in (out / "data").iterdir()}
+    assert set(content["labels"]) == uuids == {"demo-000", "demo-001"}
+    for uuid, detections in content["labels"].items():
+        height, width = picture(out / "data" / f"{uuid}.png").shape[:2]
+        records = [r for r in result_of(run, uuid).targets_moved if r.index is not None]
+        assert len(detections) == len(records)
+        for detection, record in zip(detections, records, strict=True):
+            assert content["classes"][detection["label"]] == record.label
+            left, top, wide, high = detection["bounding_box"]
+            box = [left * width, top * height, (left + wide) * width, (top + high) * height]
+            assert box == pytest.approx([v + 0.5 for v in record.xyxy], abs=1e-2)
+            assert detection["attributes"]["frame"] == uuid
+            assert detection["attributes"]["z_m"] > 0
+    failing = [d["attributes"].get("failure") for d in content["labels"]["demo-000"]]
+    assert failing.count(GRADE) == 1
+
+
+@pytest.mark.parametrize(("layout", "kind"), [("yolo", YoloDataset), ("vkitti2", Vkitti2Dataset)])
+def test_yolo_and_virtual_kitti_by_their_readers(layout: str, kind: Any, run: Path, tmp_path: Path) -> None:
+    out = export(run, layout, tmp_path / "out")
+    dataset = kind(out)
+    (identifier,) = dataset.identifiers
+    frame = dataset.frame(identifier)
+    records = [r for r in result_of(run, "demo-000").targets_moved if r.index is not None]
+    boxes = torch.tensor([r.xyxy for r in records])
+    assert float((frame.labels.boxes_xyxy - boxes).abs().max()) < (0.01 if layout == "yolo" else 1.01)
+    shown = picture(run / "frames/demo-000/counterexample.png")[..., ::-1]
+    assert np.array_equal((frame.photograph * 255).round().byte().permute(1, 2, 0).numpy(), shown)
+
+
+def test_provenance_says_where_a_picture_is_from(run: Path, tmp_path: Path) -> None:
+    told = files.read_json(export(run, "kitti", tmp_path / "K") / "provenance.json")
+    assert (told["run"], told["detector"], told["params"], told["labels"]) == (
+        "a",
+        "squeezedet",
+        ["translate"],
+        "moved",
+    )
+    (frame,) = told["frames"]
+    assert (frame["frame"], frame["grade"], frame["feasible"]) == ("demo-000", GRADE, True)
+    assert [row["kind"] for row in frame["failed"]] == ["missed"]
+
+
+def test_tables(run: Path, tmp_path: Path) -> None:
+    out = export(run, "tables", tmp_path / "T", "--grade", "all")
+    rows = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.glob("*.csv")}
+    assert [row["frame"] for row in rows["frames"]] == ["demo-000", "demo-001"]
+    assert [(row["frame"], row["grade"]) for row in rows["failures"]] == [("demo-000", GRADE)]
+    theta = {(row["frame"], row["name"]): float(row["value"]) for row in rows["theta"]}
+    expected = {(n, c.name): c.value for n in ("demo-000", "demo-001") for c in result_of(run, n).theta}
+    assert theta == expected
+    if find_spec("pyarrow") is None:
+        assert not list(out.glob("*.parquet"))
+    else:
+        parquet = pytest.importorskip("pyarrow.parquet")
+        read = parquet.read_table(out / "theta.parquet").to_pylist()
+        assert {(row["frame"], row["name"]): row["value"] for row in read} == expected
+
+
+def test_gltf_opens_in_trimesh(run: Path, tmp_path: Path) -> None:
+    try:
+        shared_screen()
+    except NoSecondRendererError as error:
+        pytest.skip(str(error))
+    folder = run / "frames" / "demo-000" / "scene"
+    out = export(folder, "gltf", tmp_path / "G")
+    (file,) = out.iterdir()
+    scene, saved = trimesh.load_scene(file), load_scene(folder)
+    assert set(scene.geometry) == {"surroundings", *(f"vehicle-{i}" for i in range(len(saved.objects)))}
+    for i in range(len(saved.objects)):
+        mesh = scene.geometry[f"vehicle-{i}"]
+        x, y, z = saved.objects.translation[i].tolist()
+        low, high = mesh.bounds
+        assert low[0] < x < high[0]
+        assert low[2] < -z < high[2]
+        assert abs(low[1] + y) < 0.3  # it stands on its wheels
+        assert mesh.visual.material.baseColorTexture is not None
+    behind = scene.geometry["surroundings"].visual.material.baseColorTexture
+    assert behind.size == (saved.camera.width, saved.camera.height)
+
+
+def test_convert_takes_a_run_with_its_pictures(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for layout, image in (("kitti", "training/image_2/demo-001.png"), ("yolo", "images/train/demo-001.png")):
+        words = ["convert", str(run), "--to", layout, "--copy-images", "--out", str(tmp_path / layout)]
+        assert main(words) == 0
+        assert (tmp_path / layout / image).is_file()
+    # both commands write the same labels
+    export(run, "kitti", tmp_path / "K")
+    label = "training/label_2/demo-000.txt"
+    assert (tmp_path / "K" / label).read_text() == (tmp_path / "kitti" / label).read_text()
+    capsys.readouterr()
+    assert main(["convert", str(run), "--to", "coco", "--out", str(tmp_path / "a.json")]) == 0
+    assert f"below {run / 'frames'}" in capsys.readouterr().err
+    for row in files.read_json(tmp_path / "a.json")["images"]:
+        assert (run / "frames" / row["file_name"]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere", "--to", "kitti", "--out", "x"], "--run: expected a folder of drivesem attack, found nowhere"),
+        (["nowhere", "--to", "gltf", "--out", "x"], "nowhere: expected a scene of drivesem derender"),
+        (["nowhere", "--to", "kitti"], "--out: expected a new or empty folder"),
+        (["--to", "kitti", "--out", "x"], "--run: expected a folder of drivesem attack"),
+        (["nowhere", "--to", "voc", "--out", "x"], "expected one of kitti"),
+    ],
+)
+def test_what_cannot_be_exported(words: list[str], message: str, refused: Any) -> None:
+    assert message in refused("export", *words)
+
+
+def test_no_frame_of_a_grade(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["export", str(run), "--to", "kitti", "--grade", "shared", "--out", str(tmp_path / "x")]
+    assert main(words) == 2
+    assert "--grade shared: expected frames that fail so surely" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "a").touch()
+    assert main([*words[:-1], str(tmp_path / "full")]) == 2
+    assert "--out: expected a new or empty folder" in capsys.readouterr().err

@@ -1,0 +1,75 @@
+"""The street behind vehicles at a part of the photograph's size: the same street; nothing changes elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import segment
+from scene_ir.derender.behind import Behind, Surroundings
+from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.derender.silhouette import grow
+from scene_ir.render.compositor import Compositor
+from scene_ir.types import Camera
+
+
+def surroundings(street) -> Surroundings:
+    height, width = street.mask.shape
+    rows = np.arange(height)[:, None]
+    ground = np.broadcast_to(rows > 100, (height, width)).astype(np.float32)
+    nothing = np.zeros_like(ground)
+    maps = dict.fromkeys(("sky", "foliage", "vehicle", "person"), nothing)
+    seen = segment.Segmentation(**maps, road=ground, ground=ground)
+    plane = torch.tensor([0.0, -1.0, 0.0, 1.65])
+    return Surroundings(88.0, plane, street.frame.camera, np.zeros_like(street.mask), nothing, seen)
+
+
+def photograph(street) -> np.ndarray:
+    return np.ascontiguousarray(street.frame.photograph.permute(1, 2, 0).numpy())
+
+
+@pytest.mark.parametrize("shrink", [2, 3, 4])
+def test_a_smaller_camera_sees_the_same(street, shrink: int) -> None:
+    around = surroundings(street)
+    smaller = around.smaller(shrink)
+    points = torch.tensor([[1.0, 1.6, 8.0, 1.0], [-3.0, 0.5, 20.0, 1.0]])
+    pixels = []
+    for camera in (around.camera, smaller.camera):
+        clip = points @ camera.matrix.T
+        # where pixels' edges are whole numbers, sizes are shares of the image's
+        pixels.append((clip[:, :2] / clip[:, 2:] + 0.5) / torch.tensor([camera.width, camera.height]))
+    torch.testing.assert_close(pixels[0], pixels[1])
+    assert smaller.others.shape == smaller.seen.ground.shape == (smaller.camera.height, smaller.camera.width)
+    assert smaller.horizon == pytest.approx((88.0 + 0.5) * smaller.camera.height / around.camera.height - 0.5)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_only_the_hole_is_filled_and_from_the_street(street, shrink: int) -> None:
+    image, hole = photograph(street), grow(street.mask, 3)
+    behind = Behind(image, np.full(hole.shape, 9.0, np.float32), surroundings(street), shrink)
+    for found in (behind.filled(hole, 0), behind.continued(hole)):
+        assert np.array_equal(found[~hole], image[~hole])
+        assert found.dtype == np.float32
+        assert 0 <= found.min() <= found.max() <= 1
+    apart = np.abs(behind.filled(hole, 0) - street.background)[hole].mean()
+    assert apart < 0.5 * np.abs(image - street.background)[hole].mean()
+    assert np.array_equal(behind.filled(hole, 0), behind.filled(hole, 0))
+
+
+def test_one_is_the_photographs_own_size(street) -> None:
+    around = surroundings(street).smaller(1)
+    assert isinstance(around.camera, Camera)
+    torch.testing.assert_close(around.camera.matrix, street.frame.camera.matrix)
+    assert np.array_equal(around.seen.ground, surroundings(street).seen.ground)
+
+
+def test_fast_scenes_render_the_photograph(street) -> None:
+    scene = derender(street.frame, DerenderSettings.fast())
+    with torch.no_grad():
+        again = Compositor(scene).render(scene).image
+    assert (again - street.frame.photograph).square().mean() < 1e-6
+    other = derender(street.frame, replace(DerenderSettings.fast(), shrink=1))
+    assert not torch.equal(scene.background, other.background)

@@ -1,0 +1,106 @@
+"""Where the processor's time goes while photographs are taken apart, with a fit and with --fast."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from statistics import mean, median
+from typing import Any
+from unittest.mock import patch
+
+from drivesem.bench.tables import Columns
+from scene_ir.derender import behind, depth, front, paint, segment, shadow, silhouette, stand
+from scene_ir.derender import derender as taking
+from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.types import Frame
+from tools.bench.label_free import frame_of, names
+from tools.bench.settings import BenchTool
+
+TITLE = "Where the time of taking a photograph apart goes"
+COLUMNS: Columns = {
+    "part": ("part", "part"),
+    "fit_s": ("with a fit, s a frame", "fit"), "fit_median": ("median", "median"),
+    "fast_s": ("--fast, s a frame", "--fast"), "fast_median": ("median", "median"),
+}  # fmt: skip
+METHOD = (
+    "Seconds of the processor, one thread, over all frames: the mean, and the median. Each frame is taken apart "
+    "with both settings in turn, after one that is not counted. A part's time is that of the functions that do it."
+)
+PARTS: dict[str, Sequence[tuple[Any, str]]] = {
+    "template and heading": [(stand, "likely")],
+    "what is whose pixel": [(taking._Looks, "at"), (taking._Looks, "cut")],
+    "fit": [(silhouette, "fit")],
+    "things in front": [(front, "labelled"), (front, "opacities")],
+    "maps": [(segment, "segment")],
+    "light and shadows": [(shadow, "light"), (taking, "_shaded")],
+    "fill behind": [(behind.Behind, "filled")],
+    "depth": [(depth, "surroundings")],
+    "sources": [(taking, "solve_sources")],
+    "paint": [(paint, "with_regions")],
+}
+"""Functions by what they do; none of them calls another one."""
+REST, WHOLE = "the rest", "all"
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """Seconds of one frame by part, with a fit and with --fast."""
+
+    fit: dict[str, float]
+    fast: dict[str, float]
+
+
+def measure(config: BenchTool) -> Iterator[Taken]:
+    """Frame by frame. Raises SceneError for one that cannot be used."""
+    chosen = names(config)
+    for place, name in enumerate((chosen[0], *chosen)):
+        frame = frame_of(config, name)
+        taken = Taken(spent(frame, DerenderSettings()), spent(frame, DerenderSettings.fast()))
+        if place:  # the first time loads kernels and networks
+            yield taken
+
+
+def spent(frame: Frame, settings: DerenderSettings) -> dict[str, float]:
+    """Seconds of the processor by part."""
+    seconds = dict.fromkeys(PARTS, 0.0)
+    with ExitStack() as watched:
+        for part, functions in PARTS.items():
+            for owner, name in functions:
+                watched.enter_context(_timed(owner, name, part, seconds))
+        start = time.process_time()
+        derender(frame, settings)
+        whole = time.process_time() - start
+    return seconds | {REST: whole - sum(seconds.values()), WHOLE: whole}
+
+
+@contextmanager
+def _timed(owner: Any, name: str, part: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Adds what a function of a module or a class takes to its part."""
+    function: Callable[..., Any] = getattr(owner, name)
+
+    def timed(*words: Any, **named: Any) -> Any:
+        start = time.process_time()
+        try:
+            return function(*words, **named)
+        finally:
+            seconds[part] += time.process_time() - start
+
+    with patch.object(owner, name, timed):
+        yield
+
+
+def summary(rows: Sequence[Taken]) -> list[dict[str, Any]]:
+    """A row a part, and one for all."""
+    found = []
+    for part in (*PARTS, REST, WHOLE):
+        fit, fast = ([getattr(row, way)[part] for row in rows] for way in ("fit", "fast"))
+        figures = {
+            "fit_s": mean(fit),
+            "fit_median": median(fit),
+            "fast_s": mean(fast),
+            "fast_median": median(fast),
+        }
+        found.append({"part": part} | {name: round(value, 3) for name, value in figures.items()})
+    return found
