@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from rich.console import Console
 from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
@@ -18,6 +17,7 @@ from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.run.folder import claim, folder_of
 from drivesem.settings.commands import Classify
 from scene_ir import files
@@ -95,8 +95,8 @@ def _fit_last(
     curve = _fit(last, batch, accuracy, len(labels["train"]), config, generator)
     figures = {name: accuracy(name) for name in splits}
     with torch.no_grad():
-        last.weight /= deviation
-        last.bias -= last.weight @ mean
+        last.weight.div_(deviation)
+        last.bias.sub_(last.weight @ mean)
     return curve, figures
 
 
