@@ -261,8 +261,9 @@ class Store:
 
 
 def _shown(names: Iterable[str]) -> Iterable[str]:
-    from rich.console import Console
     from rich.progress import track
+
+    from drivesem.report.terminal import Console
 
     names = list(names)
     bar = Console(stderr=True)

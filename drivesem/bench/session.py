@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import torch
-from rich.console import Console
 
 from drivesem.bench import tables
 from drivesem.bench.timing import machine, versions
+from drivesem.report.terminal import Console
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
 from scene_ir import files

@@ -10,15 +10,14 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from rich.console import Console
 from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
-from drivesem.classify.networks.squeezenet import SqueezeNet
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.run.folder import claim, folder_of
 from drivesem.settings.commands import Classify
 from scene_ir import files
@@ -56,10 +55,9 @@ def train_run(config: Classify) -> dict[str, Any]:
     splits = {name: Pictures(*read_pictures(folder, name, classes)) for name in ("train", "val", "test")}
     fit = _fit_last if config.layers == "last" else _fit_all
     curve, accuracy = fit(network, splits, config, generator)
-    last_only = config.layers == "last" and isinstance(network, SqueezeNet) and config.weights is None
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
-    save_classifier(network, path, facts, last_only)
+    save_classifier(network, path, facts)
     data = {
         "out": str(out),
         "weights": str(path),
@@ -97,8 +95,8 @@ def _fit_last(
     curve = _fit(last, batch, accuracy, len(labels["train"]), config, generator)
     figures = {name: accuracy(name) for name in splits}
     with torch.no_grad():
-        last.weight /= deviation
-        last.bias -= last.weight @ mean
+        last.weight.div_(deviation)
+        last.bias.sub_(last.weight @ mean)
     return curve, figures
 
 

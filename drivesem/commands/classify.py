@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from rich.console import Console
-
 from drivesem.classify.attack import attack_run
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun
@@ -14,6 +12,7 @@ from drivesem.classify.training import train_run
 from drivesem.report.answer import print_json
 from drivesem.report.classified import share
 from drivesem.report.tables import Sheet, percent
+from drivesem.report.terminal import Console
 from drivesem.run.folder import claim, folder_of
 from drivesem.run.page import PAGE
 from drivesem.settings.commands import Classify

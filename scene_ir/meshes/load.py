@@ -68,8 +68,6 @@ _NAMES = (
 )
 """What material and mesh names say of a part; the first that is found counts."""
 _DEFAULT_COLOUR = 0.8
-_MOST_BYTES = 1 << 30
-"""Of a mesh file, and of each file that it names."""
 _CAB = 0.2
 """Windows whose centre is farther than this from the middle, in lengths, are those of a cab."""
 

@@ -15,11 +15,13 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 class Classifier(nn.Module, ABC):
     """A network whose last layer, a linear one, tells `classes` apart. architecture: its name in weights files;
-    head: the path of that layer, by torchvision's names where it has the network.
+    head: the path of that layer, by torchvision's names where it has the network; published_head: what files of
+    the published weights hold in its place, where that has another name.
     """
 
     architecture: ClassVar[str]
     head: ClassVar[str]
+    published_head: ClassVar[str] = ""
 
     classes: tuple[str, ...]
     mean: Tensor

@@ -24,10 +24,8 @@ ARCHITECTURES: dict[str, type[Classifier]] = {
 }
 """By the name that weights files carry."""
 SHIPPED = detectors.registry.SHIPPED[SqueezeDet.name].parent / "squeezenet-objects.safetensors"
-"""The last layer of `squeezenet`, for the embedded objects; the rest is the shipped detector's."""
+"""`squeezenet`, for the embedded objects."""
 _TORCH_FILES = (".pth", ".pt", ".bin")
-_BACKBONE = "backbone"
-"""Key of a file that holds a last layer alone: whose convolutions it reads."""
 
 
 def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cpu") -> Classifier:
@@ -44,8 +42,6 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
     if network.classes != tuple(classes):
         expected = f"one for the {len(classes)} classes {', '.join(classes)}"
         raise FormatError(str(path), expected, f"one for {', '.join(network.classes)}")
-    if metadata.get(_BACKBONE) == SqueezeDet.name:
-        tensors = _of_squeezedet() | tensors
     load_into(network, tensors, path)
     return ready(network, device)
 
@@ -54,7 +50,7 @@ def to_train(
     architecture: str, weights: str | None, classes: Sequence[str], generator: torch.Generator
 ) -> Classifier:
     """A network with a new last layer for `classes`, and all else from a file: torchvision's (.pth), or a
-    safetensors file by the same names. squeezenet needs none.
+    safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions.
 
     Raises FormatError naming file and tensor where the file is another network's, RangeError for an unknown name.
     """
@@ -64,32 +60,28 @@ def to_train(
     if weights is None:
         if architecture != SqueezeNet.architecture:
             raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")
-        tensors, path = _of_squeezedet(), Path(SqueezeDet.name)
+        path = SHIPPED
     else:
         path = Path(weights)
-        tensors = _tensors(path)
+    tensors = _tensors(path)
     network.retarget(classes, generator)
     own, name = network.state_dict(), type(network).head
     # Of the file's own last layer, which tells other classes apart, nothing is used.
-    kept = {key: tensor for key, tensor in tensors.items() if key.rpartition(".")[0] != name}
+    replaced = (name, network.published_head)
+    kept = {key: tensor for key, tensor in tensors.items() if key.rpartition(".")[0] not in replaced}
     load_into(network, kept | {f"{name}.{part}": own[f"{name}.{part}"] for part in ("weight", "bias")}, path)
     return network
 
 
-def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str], last_only: bool = False) -> None:
-    """Write weights as float16, what was counted in training as float32. last_only: of a squeezenet, the last
-    layer alone, to be read beside the shipped detector.
-    """
-    name = type(network).head
+def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -> None:
+    """Write weights as float16, what was counted in training as float32."""
     learned = {key for key, _ in network.named_parameters()}
     tensors = {
         key: value.detach().cpu().contiguous().to(torch.float16 if key in learned else torch.float32)
         for key, value in network.state_dict().items()
-        if value.is_floating_point() and (not last_only or key.startswith(f"{name}."))
+        if value.is_floating_point()
     }
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
-    if last_only:
-        metadata[_BACKBONE] = SqueezeDet.name
     detectors.registry.write_weights(path, metadata, tensors)
 
 
@@ -114,13 +106,6 @@ def _of(path: str, architecture: str | None) -> type[Classifier]:
     if architecture not in ARCHITECTURES:
         raise FormatError(f"{path}: architecture", f"one of {', '.join(ARCHITECTURES)}", architecture)
     return ARCHITECTURES[architecture]
-
-
-def _of_squeezedet() -> dict[str, Tensor]:
-    """The shipped detector's first convolutions, by the names that SqueezeNet gives them."""
-    _, tensors = read_weights(detectors.registry.SHIPPED[SqueezeDet.name])
-    beyond = ("convdet.", "fires.fire10.", "fires.fire11.")
-    return {name: tensor for name, tensor in tensors.items() if not name.startswith(beyond)}
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:

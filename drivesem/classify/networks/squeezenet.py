@@ -1,5 +1,5 @@
 """SqueezeNet 1.1 (Iandola et al. 2016, arXiv:1602.07360) up to its last Fire module, and one layer on what that
-finds anywhere. Its convolutions are the first ones of SqueezeDet, whose shipped weights hold them.
+finds anywhere. The names of its convolutions are those of SqueezeDet, which begins with the same ones.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ class SqueezeNet(Classifier):
 
     architecture = "squeezenet"
     head = "classifier"
+    published_head = "conv10"
 
     def __init__(self, classes: Sequence[str]) -> None:
         mean = [value / 255 for value in reversed(BGR_MEAN)]
