@@ -37,7 +37,7 @@ from rich.progress import Progress
 
 VARYING = {"seconds", "seconds_now", "versions", "images_a_second", "processor_seconds_an_image", "stamp"}
 """Keys of JSON and columns of CSV that differ from run to run."""
-TIMES = re.compile(r"\b\d+(\.\d+)?(e-?\d+)? ?(s|ms|min|seconds|images a second|processor seconds each)\b")
+TIMES = re.compile(r"\b\d+(\.\d+)?(e-?\d+)? ?(s|ms|min|minutes|seconds|images a second|processor seconds each)\b")
 CLOCK = re.compile(r"\b\d+:\d\d(:\d\d)?\b|-:--:--")
 BLANKS = re.compile(r"[ \t]+|[─━┅╌═]+")
 TEXTS = {".txt", ".csv", ".md", ".html", ".yaml", ".json", ".out", ".err", ".log"}
