@@ -22,7 +22,7 @@ _IN_FOLDERS = re.compile(r"[/\\:]|^\.")
 """In names of files, what makes them more than a stem and a suffix."""
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _MOST_FLAG = 2**31
-"""Above occlusions and sides of images."""
+"""Above occlusions, boxes and sides of images."""
 _SHOWN = 3
 """Ids that an error names."""
 
@@ -127,15 +127,15 @@ class Rows:
         try:
             told = np.array(values).reshape(len(values), 4)
             boxes = told.astype(np.float64)
-            if told.dtype.kind in "iuf" and np.isfinite(boxes).all() and (boxes[:, 2:] >= 0).all():
+            if told.dtype.kind in "iuf" and (np.abs(boxes) < _MOST_FLAG).all() and (boxes[:, 2:] >= 0).all():
                 return boxes
         except (ValueError, TypeError):
             pass  # one of them is no box: found below
         for i, value in enumerate(values):
             if not (isinstance(value, list) and len(value) == 4 and all(type(v) in (int, float) for v in value)):
                 raise FormatError(self.at(i, "bbox"), "x, y, width, height", json.dumps(value)[:60])
-            if not all(map(math.isfinite, value)) or value[2] < 0 or value[3] < 0:
-                expected = "finite numbers, width and height of at least 0"
+            if not all(abs(v) < _MOST_FLAG for v in value) or value[2] < 0 or value[3] < 0:
+                expected = f"numbers below {_MOST_FLAG:,}, width and height of at least 0"
                 raise FormatError(self.at(i, "bbox"), expected, json.dumps(value)[:60])
         return np.array(values, dtype=np.float64).reshape(len(values), 4)
 

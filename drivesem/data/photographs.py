@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ FILM_MM = 36.0
 _EXIF, _FOCAL, _FOCAL_35 = 0x8769, 0x920A, 0xA405
 _PLANE_X, _PLANE_Y, _PLANE_UNIT, _ORIENTATION = 0xA20E, 0xA20F, 0xA210, 0x0112
 """Tags of EXIF 2.32: its own directory, focal length in mm and in 35 mm film, pixels a unit on the sensor."""
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
-_TURNED = {1: 0, 3: 2, 6: 3, 8: 1}
+_UNIT_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0}
+_TURNED: dict[float, int] = {1: 0, 3: 2, 6: 3, 8: 1}
 """EXIF's orientations without mirroring, and quarter turns to the left that put them upright."""
 _OTHER_CHANNELS = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
 """Pillow's modes of 8 bits that are not red, green and blue, but can be."""
@@ -66,15 +67,14 @@ def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
 
     RangeError for a focal_px that is no positive number, FormatError naming a file that is no image.
     """
-    exif, width, height = _header(image_path)
+    told, width, height = _header(image_path)
     if focal_px is not None:
         return Focal(_checked(focal_px), "given")
     longer = max(width, height)
-    told = exif.get_ifd(_EXIF)
     film = _positive(told.get(_FOCAL_35))
     if film:
         return Focal(film / FILM_MM * longer, "EXIF")
-    unit = _UNIT_MM.get(int(told.get(_PLANE_UNIT, 2)))
+    unit = _UNIT_MM.get(_positive(told.get(_PLANE_UNIT, 2)))
     length, density = _positive(told.get(_FOCAL)), _positive(told.get(_PLANE_X)) or _positive(told.get(_PLANE_Y))
     if unit and length and density:
         return Focal(length / unit * density, "EXIF")
@@ -102,16 +102,17 @@ def _positive(value: Any) -> float:
     return number if math.isfinite(number) and number > 0 else 0.0
 
 
-def _header(path: Path) -> tuple[Any, int, int]:
-    """EXIF, width and height, as seen upright. FormatError."""
-    with files.opened_image(path) as image:
+def _header(path: Path) -> tuple[dict[int, Any], int, int]:
+    """EXIF's values by tag, and width and height as seen upright. FormatError."""
+    with files.opened_image(path) as image:  # Pillow reads EXIF when it is asked for, and then says what is wrong
         exif = image.getexif()
+        told = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
         width, height = image.size
-    return (exif, height, width) if _turns(exif) % 2 else (exif, width, height)
+    return (told, height, width) if _turns(told) % 2 else (told, width, height)
 
 
-def _turns(exif: Any) -> int:
-    return _TURNED.get(int(exif.get(_ORIENTATION, 1)), 0)
+def _turns(told: Mapping[int, Any]) -> int:
+    return _TURNED.get(_positive(told.get(_ORIENTATION)), 0)
 
 
 def photograph(path: Path, focal_px: float | None = None) -> Frame:

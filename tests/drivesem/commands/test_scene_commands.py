@@ -92,7 +92,10 @@ def test_data_sets_are_those_that_can_be_read() -> None:
 @pytest.mark.parametrize("command", ["derender", "attack", "gradcheck"])
 def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     said = fail([command, "--dataset", "kitty", "--root", "."], capsys)
-    assert "--dataset: expected one of demo, kitti, vkitti1, vkitti2, coco, yolo, found 'kitty'" in said
+    assert (
+        "--dataset: expected one of demo, kitti, vkitti1, vkitti2, coco, yolo, photographs, scenes, found 'kitty'"
+        in said
+    )
 
 
 @pytest.mark.parametrize(
@@ -104,7 +107,10 @@ def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFix
         (["--device", "cuda"], "--device: expected cpu"),
         (["--meshes", "."], "--meshes: expected a PHOTO or a --dataset"),
         (["photo.png", "--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
-        (["--dataset", "kitti", "--root", "nowhere"], "nowhere: expected a KITTI folder"),
+        (
+            ["--dataset", "kitti", "--root", "nowhere"],
+            "nowhere: expected the folder of a data set (kitti: training/image_2, label_2 and calib)",
+        ),
         (["--dataset", "coco", "--root", "nowhere"], "nowhere"),
         (["--limit", "0"], "--limit"),
         (["photo.png"], "photo.png"),

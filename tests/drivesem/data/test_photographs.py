@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,19 @@ def test_focal_length_of_a_file(own: dict[int, object], expected: tuple[float, s
     assert (camera.width, camera.height) == (400, 300)
     assert camera.intrinsics[:2, 2].tolist() == [199.5, 149.5]
     assert float(camera.intrinsics[0, 0]) == pytest.approx(expected[0], rel=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "count"), [(3, 3), (2, 1), (7, 1), (12, 1)])
+def test_a_damaged_orientation_is_none_or_one_line(kind: int, count: int, tmp_path: Path) -> None:
+    """Of another type, or of several values; also without a warning of Pillow's."""
+    path = save(tmp_path / "a.jpg", {0x0112: 6}, {})
+    data, was = path.read_bytes(), b"\x01\x12\x00\x03\x00\x00\x00\x01"
+    little = was not in data
+    was = struct.pack("<HHI" if little else ">HHI", 0x0112, 3, 1)
+    assert data.count(was) == 1
+    path.write_bytes(data.replace(was, struct.pack("<HHI" if little else ">HHI", 0x0112, kind, count)))
+    with contextlib.suppress(FormatError):
+        assert photograph(path).photograph.shape[1:] in ((300, 400), (400, 300))
 
 
 @pytest.mark.parametrize(("orientation", "red"), [(1, (0, 0)), (3, (-1, -1)), (6, (0, -1)), (8, (-1, 0))])

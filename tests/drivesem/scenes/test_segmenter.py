@@ -188,7 +188,7 @@ def test_onnxruntime_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
 
 def test_the_command_takes_it(tmp_path, capsys, monkeypatch, picture):
     nothing = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-    monkeypatch.setattr(label_free, "detect", lambda _: nothing)
+    monkeypatch.setattr(label_free, "detect", lambda *_: nothing)
     photo, out = tmp_path / "plain.png", tmp_path / "scenes"
     files.write_png(photo, np.rint(picture * 255).astype(np.uint8))
     path = network(tmp_path / "own.onnx", COLOURS, metadata=TOLD)
