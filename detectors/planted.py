@@ -9,8 +9,7 @@ through boxes, scores and pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +18,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from detectors import boxes
-from detectors.base import Candidates, Detector, DetectorError, Lowerable, Predictor, lowered_probability
-from detectors.types import Detections, Targets
+from detectors.base import Detector, DetectorError, Lowerable, Predictor, lowered_probability
+from detectors.types import Detections
+from detectors.wrapping import Wrapping
 
 PREFIX = "planted:"
 """Before a fault in words, and the detector that has it: planted:height_px=30:38@squeezedet."""
@@ -271,7 +271,7 @@ class PlantedFault:
         return torch.zeros_like(scores).index_put((cars.rows,), by[cars.car])
 
 
-class PlantedDetector(Detector):
+class PlantedDetector(Wrapping):
     """`inner` with a planted fault; all else is inner's. Raises DetectorError where it knows no cars.
 
     It must tell its candidates, and its raw predictions must be `Lowerable`, as those of all detectors of this
@@ -279,13 +279,9 @@ class PlantedDetector(Detector):
     """
 
     def __init__(self, inner: Detector, fault: PlantedFault) -> None:
-        super().__init__()
-        self.inner = inner
+        super().__init__(inner)
         self.fault = fault
         self.name, self._label = _names(inner, fault)
-        self.classes = inner.classes
-        self.t_star = inner.t_star
-        self.fresh_layers = tuple(f"inner.{beginning}" for beginning in inner.fresh_layers)
 
     def forward(self, images: Tensor) -> Any:
         """What inner says of images (B, 3, H, W), less the fault. DetectorError where that is not `Lowerable`."""
@@ -300,24 +296,6 @@ class PlantedDetector(Detector):
     def _by(self, image: Tensor, raw: Any, index: int) -> Tensor:
         told = self.inner.candidates(raw.one(index))
         return self.fault.lowers(image, told.boxes_of(self._label), told.log_scores[:, self._label].exp())
-
-    def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """Inner's."""
-        return self.inner.loss(raw, targets)
-
-    def decode(self, raw: Any) -> list[Detections]:
-        """Inner's."""
-        return self.inner.decode(raw)
-
-    def candidates(self, raw: Any) -> Candidates:
-        """Inner's."""
-        return self.inner.candidates(raw)
-
-    @contextmanager
-    def holding(self, raw: Any) -> Iterator[None]:
-        """Inner's."""
-        with self.inner.holding(raw):
-            yield
 
 
 @dataclass(frozen=True, slots=True)

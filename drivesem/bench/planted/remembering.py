@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 from torch import Tensor
 
-from detectors.base import Candidates, Detector
-from detectors.types import Detections, Targets
+from detectors.base import Detector
+from detectors.wrapping import Wrapping
 
 _MOST = 96
 """Pictures whose predictions are kept, half a megabyte each: those that searches of one frame share."""
 
 
-class Remembering(Detector):
+class Remembering(Wrapping):
     """`inner`, which is asked once for each picture without a gradient. asked: how often it was."""
 
     def __init__(self, inner: Detector) -> None:
-        super().__init__()
-        self.inner = inner
-        self.name, self.classes, self.t_star = inner.name, inner.classes, inner.t_star
-        self.fresh_layers = tuple(f"inner.{beginning}" for beginning in inner.fresh_layers)
+        super().__init__(inner)
         self.asked = 0
         self._known: OrderedDict[bytes, Any] = OrderedDict()
 
@@ -41,21 +36,3 @@ class Remembering(Detector):
                 self._known.popitem(last=False)
         self._known.move_to_end(key)
         return self._known[key]
-
-    def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """Inner's."""
-        return self.inner.loss(raw, targets)
-
-    def decode(self, raw: Any) -> list[Detections]:
-        """Inner's."""
-        return self.inner.decode(raw)
-
-    def candidates(self, raw: Any) -> Candidates:
-        """Inner's."""
-        return self.inner.candidates(raw)
-
-    @contextmanager
-    def holding(self, raw: Any) -> Iterator[None]:
-        """Inner's."""
-        with self.inner.holding(raw):
-            yield

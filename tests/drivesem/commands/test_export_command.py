@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import importlib
 import io
 import json
 import math
@@ -181,7 +182,7 @@ def test_tables(run: Path, tmp_path: Path) -> None:
     if find_spec("pyarrow") is None:
         assert not list(out.glob("*.parquet"))
     else:
-        parquet = pytest.importorskip("pyarrow.parquet")
+        parquet = importlib.import_module("pyarrow.parquet")  # optional: pip install "drivesem[tables]"
         read = parquet.read_table(out / "theta.parquet").to_pylist()
         assert {(row["frame"], row["name"]): row["value"] for row in read} == expected
 
