@@ -24,8 +24,6 @@ from drivesem.cli import main
 from drivesem.data.vkitti2 import Vkitti2Dataset
 from drivesem.data.yolo import YoloDataset
 from drivesem.run.results import Failure, FrameResult, dump_frame, load_frame
-from drivesem.truth.redraw.base import NoSecondRendererError
-from drivesem.truth.redraw.screen import shared_screen
 from scene_ir import files
 from scene_ir.io import load_scene
 
@@ -187,11 +185,8 @@ def test_tables(run: Path, tmp_path: Path) -> None:
         assert {(row["frame"], row["name"]): row["value"] for row in read} == expected
 
 
+@pytest.mark.usefixtures("screen")
 def test_gltf_opens_in_trimesh(run: Path, tmp_path: Path) -> None:
-    try:
-        shared_screen()
-    except NoSecondRendererError as error:
-        pytest.skip(str(error))
     folder = run / "frames" / "demo-000" / "scene"
     out = export(folder, "gltf", tmp_path / "G")
     (file,) = out.iterdir()
