@@ -2,7 +2,10 @@
 that takes seconds to make, made once.
 """
 
+import resource
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +50,24 @@ QUICK = [
 
 settings.register_profile("drivesem", deadline=None, derandomize=True, database=None)
 settings.load_profile("drivesem")
+
+
+@pytest.fixture
+def full_disk() -> Callable[[int], AbstractContextManager[None]]:
+    """While it lasts, no file grows beyond so many bytes, as the system itself says it. No longer than a test's own
+    calls: what pytest prints may go to a file too.
+    """
+
+    @contextmanager
+    def limited(most: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

@@ -2,8 +2,8 @@
 
 import errno
 import os
-import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NoReturn
 
@@ -56,34 +56,27 @@ def test_where_there_are_no_links_two_copies_stay(
     assert not [p for p in second.rglob("*") if p.name.endswith(".tmp")]
 
 
-@pytest.fixture
-def full_disk() -> Iterator[Callable[[int], None]]:
-    """Lets no file grow beyond so many bytes, as the system itself says it."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_where_there_is_no_room_the_old_file_stays(tmp_path: Path, full_disk: Callable[[int], None]) -> None:
+def test_where_there_is_no_room_the_old_file_stays(
+    tmp_path: Path, full_disk: Callable[[int], AbstractContextManager[None]]
+) -> None:
     path = tmp_path / "a.txt"
     files.write_text(path, "old")
-    full_disk(1000)
-    with pytest.raises(WriteError, match=r"a\.txt: expected a place that can be written, found file too large"):
+    too_large = r"a\.txt: expected a place that can be written, found file too large"
+    with full_disk(1000), pytest.raises(WriteError, match=too_large):
         files.write_text(path, 2000 * "x")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path], "no half of the new one"
 
 
 def test_a_folder_for_which_there_is_no_room_is_not_there(
-    tmp_path: Path, full_disk: Callable[[int], None]
+    tmp_path: Path, full_disk: Callable[[int], AbstractContextManager[None]]
 ) -> None:
     def write() -> None:
         with files.whole_folder(tmp_path / "frame") as part:
             files.write_text(part / "small.txt", "x")
             files.write_text(part / "large.txt", 2000 * "x")
 
-    full_disk(1000)
-    with pytest.raises(WriteError, match=f"^{tmp_path}/frame/large.txt: expected"):
+    with full_disk(1000), pytest.raises(WriteError, match=f"^{tmp_path}/frame/large.txt: expected"):
         write()
     assert not list(tmp_path.iterdir())
 

@@ -7,11 +7,11 @@ import gc
 import itertools
 import json
 import os
-import resource
 import shutil
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -70,29 +70,20 @@ def hashes(out: Path) -> dict[str, str]:
     return json.loads((out / "manifest.json").read_text())["frames"]
 
 
-@pytest.fixture
-def full_disk() -> Iterator[Callable[[int], None]]:
-    """Lets no file grow beyond so many bytes, as the system itself says it; 0 for no limit."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda most: resource.setrlimit(resource.RLIMIT_FSIZE, (most or before[0], before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("words", [(), ("--keep-going",)])
 def test_a_full_disk_ends_an_attack_which_then_goes_on(
     words: tuple[str, ...],
     tiny_kitti: Path,
     tmp_path: Path,
-    full_disk: Callable[[int], None],
+    full_disk: Callable[[int], AbstractContextManager[None]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Also one that is to keep going: the next frame would find no room either."""
     out = tmp_path / "run"
     assert attack(tiny_kitti, out, "--limit", "1") == 0
     capsys.readouterr()
-    full_disk(5000)
-    assert attack(tiny_kitti, out, *words) == 2
-    full_disk(0)
+    with full_disk(5000):
+        assert attack(tiny_kitti, out, *words) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("drivesem: ")
     assert done(out) == [NAMES[0]]
     assert not files.leftovers(out)
@@ -145,13 +136,12 @@ def test_a_full_disk_leaves_no_half(
     name: str,
     tiny_kitti: Path,
     tmp_path: Path,
-    full_disk: Callable[[int], None],
+    full_disk: Callable[[int], AbstractContextManager[None]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "run"
-    full_disk(20_000)
-    line = say(name, tiny_kitti, out, capsys)
-    full_disk(0)
+    with full_disk(20_000):
+        line = say(name, tiny_kitti, out, capsys)
     assert "expected a place that can be written, found file too large" in line
     assert not files.leftovers(out)
     assert not [path for path in out.rglob("*") if path.suffix in (".png", ".npz", ".safetensors")]
