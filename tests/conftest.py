@@ -54,8 +54,9 @@ settings.load_profile("drivesem")
 
 @pytest.fixture
 def full_disk() -> Callable[[int], AbstractContextManager[None]]:
-    """While it lasts, no file grows beyond so many bytes, as the system itself says it. To be held no longer than a
-    test's own calls: what pytest prints may go to a file too.
+    """While it lasts, no file grows beyond so many bytes, as the system itself says it.
+
+    It is held no longer than a test's own calls: what pytest prints may go to a file too.
     """
 
     @contextmanager
