@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -39,6 +39,8 @@ from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.io import to_uint8
 
 CSV = "classified.csv"
+WRITTEN = (FRAMES, METRICS, PAGE, CSV)
+"""What a run leaves in its folder."""
 EMBEDDED_LIMIT = 48
 """Pictures of the embedded objects that are attacked where --limit is not given: of each class four."""
 
@@ -54,10 +56,15 @@ class Attacker:
     grader: PictureGrader
 
     @classmethod
-    def of(cls, config: Classify) -> Attacker:
-        """Raises UsageError or SceneError for settings, objects or a network that cannot be used."""
-        studio = Studio.of(config)
-        network = load_classifier(config.network, studio.objects.classes, config.device)
+    def of(cls, config: Classify, like: Attacker | None = None) -> Attacker:
+        """like: one that shows the same objects, and attacks the same network where it has that name. Raises
+        UsageError or SceneError for settings, objects or a network that cannot be used.
+        """
+        studio = Studio.of(config) if like is None else like.studio
+        if like is not None and like.config.network == config.network:
+            network = like.network
+        else:
+            network = load_classifier(config.network, studio.objects.classes, config.device)
         grader = PictureGrader(Nuisances.of(config.nuisances), Rule(config.draws), config.seed)
         params_of(config)
         return cls(config, studio, network, attack_of(config), grader)
@@ -143,9 +150,11 @@ def attack_picture(scene: ObjectScene, space: ObjectSpace, attacker: Attacker) -
     after, attacked = objective.picture(search.theta), objective.see(search.theta)
     passes = objective.passes
     grade, count = None, None
-    if not attacked.right:
+    if not attacked.right and config.grade:
         count = attacker.grader.count(scene.identifier, objective.look, before, after)
         grade = str(Grade.CERTAIN if attacker.grader.rule.holds(count) else Grade.THRESHOLD)
+    elif not attacked.right:
+        grade = str(Grade.THRESHOLD)
     return Found(
         theta=search.theta,
         before=before,
@@ -174,29 +183,46 @@ def attack_run(config: Classify) -> ClassifiedRun:
     shown, params = attacker.shown(), tuple(str(one) for one in params_of(config))
     name = f"classify-{Path(config.network).stem}-{config.method}-{'-'.join(params)}-seed{config.seed}"
     out = folder_of(config.out, Path("runs") / name)
-    claim(out, config, (FRAMES, METRICS, PAGE, CSV))
+    claim(out, config, WRITTEN)
     todo = [one for one in shown if not (out / FRAMES / one.identifier / RESULT).is_file()]
     work, build = partial(attacker.attack, out=out), partial(_attacker, config, out)
     failed = ask(todo, work, build, config, Bar("attacking pictures"), lambda one: one.identifier).failed
-    done = [one.identifier for one in shown if one.identifier not in failed]
+    done = [one for one in shown if one.identifier not in failed]
     if not done:
         raise FormatError("--objects", "a picture that can be attacked", f"none: {next(iter(failed.values()))}")
-    frames = [load_record(out / FRAMES / name / RESULT, ClassifiedFrame, SCHEMA) for name in done]
+    return report_run(config, out, attacker.network.classes, done, failed, time.perf_counter() - start)
+
+
+def report_run(
+    config: Classify,
+    out: Path,
+    classes: tuple[str, ...],
+    done: Sequence[Shown],
+    failed: Mapping[str, str],
+    seconds: float,
+) -> ClassifiedRun:
+    """Write report and figures of pictures that are attacked. Raises FormatError for a file that is not whole."""
+    frames = frames_of(out, done)
     run = ClassifiedRun.of(
         frames,
-        attacker.network.classes,
+        classes,
         dict(sorted(failed.items())),
-        round(time.perf_counter() - start, 3),
+        round(seconds, 3),
         out=str(out),
         objects=config.objects or "embedded",
         network=config.network,
         method=config.method,
-        params=params,
+        params=tuple(str(one) for one in params_of(config)),
     )
     files.write_json(out / METRICS, run.to_json())
     files.write_text(out / CSV, csv_text([frame.row() for frame in frames]))
     write_page(out / PAGE, run, frames)
     return run
+
+
+def frames_of(out: Path, done: Sequence[Shown]) -> list[ClassifiedFrame]:
+    """What came of pictures that are attacked. Raises FormatError."""
+    return [load_record(out / FRAMES / one.identifier / RESULT, ClassifiedFrame, SCHEMA) for one in done]
 
 
 def _attacker(config: Classify, out: Path) -> Callable[[Shown], None]:

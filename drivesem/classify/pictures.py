@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from torch import Tensor
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
 from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds, scene_name
-from drivesem.run.ask import Bar, ask
+from drivesem.run.ask import Bar, JobResults, ask
 from drivesem.settings.commands import Classify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
@@ -24,7 +24,7 @@ from scene_ir.io import to_uint8
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """An object to be drawn from a view."""
+    """An object to be drawn from a view. name: of the object, "bus/0007"; of its class and it."""
 
     split: Split
     name: str
@@ -96,10 +96,15 @@ def write_pictures(config: Classify, out: Path) -> tuple[dict[str, int], dict[st
     ]
     if not jobs:
         raise UsageError("--objects", "objects in any of the splits", "none")
-    work, build = partial(studio.write, out=out), partial(_drawer, config, out)
-    answers = ask(jobs, work, build, config, Bar("drawing objects"), lambda job: job.identifier)
+    answers = draw(jobs, studio, config, out)
     done = {split: sum(job.split == split for job in answers.results) for split in SPLITS}
     return done, answers.failed
+
+
+def draw(jobs: Sequence[Shown], studio: Studio, config: Classify, out: Path) -> JobResults[Shown, None]:
+    """Draw pictures into a folder, as far as they are not there. Raises SceneError."""
+    work, build = partial(studio.write, out=out), partial(_drawer, config, out)
+    return ask(jobs, work, build, config, Bar("drawing objects"), lambda job: job.identifier)
 
 
 def _drawer(config: Classify, out: Path) -> Callable[[Shown], None]:

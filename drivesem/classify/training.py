@@ -78,12 +78,30 @@ def _fit_last(
 ) -> tuple[list[dict[str, float]], dict[str, float]]:
     network.eval()
     known = {name: embedded(network, split, config.device) for name, split in splits.items()}
+    labels = {name: split.labels.to(config.device) for name, split in splits.items()}
+    return fit_last(network, known, labels, config, generator)
+
+
+def fit_last(
+    network: Classifier,
+    known: dict[str, Tensor],
+    labels: dict[str, Tensor],
+    config: Classify,
+    generator: torch.Generator,
+    onward: bool = False,
+) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Fit the last layer to features (N, K) and labels (N,) by split, of which `train` is learnt and `val`
+    watched: what each epoch came to, and the accuracy by split. onward: go on from what the layer is.
+    """
     # Fitted to features of mean 0 and deviation 1, whatever the network, and then told in its own.
     deviation, mean = torch.std_mean(known["train"], dim=0)
     deviation = deviation + 1e-3 * deviation.mean() + _TINY
     known = {name: (features - mean) / deviation for name, features in known.items()}
-    labels = {name: split.labels.to(config.device) for name, split in splits.items()}
     last = network.last
+    if onward:
+        with torch.no_grad():
+            last.bias.add_(last.weight @ mean)
+            last.weight.mul_(deviation)
 
     def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
         return last(known["train"][rows]), labels["train"][rows]
@@ -93,7 +111,7 @@ def _fit_last(
         return round(float((last(known[name]).argmax(1) == labels[name]).float().mean()), 4)
 
     curve = _fit(last, batch, accuracy, len(labels["train"]), config, generator)
-    figures = {name: accuracy(name) for name in splits}
+    figures = {name: accuracy(name) for name in known}
     with torch.no_grad():
         last.weight.div_(deviation)
         last.bias.sub_(last.weight @ mean)

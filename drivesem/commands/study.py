@@ -11,5 +11,10 @@ from drivesem.settings.devices import check_device
 def run(config: Study) -> int:
     """Run or continue a study; exit code 0. Raises UsageError or SceneError for bad input."""
     check_device(config.device)
-    say(study_run(config), config.json)
+    if config.name == "classification":
+        from drivesem.classify.study.asking import study_run as classification_run
+
+        say(classification_run(config), config.json)
+    else:
+        say(study_run(config), config.json)
     return 0

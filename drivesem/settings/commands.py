@@ -160,16 +160,29 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
 
     name: Annotated[
         tyro.conf.Positional[
-            Literal["single", "multi", "grades", "searches", "samples", "steps", "labels", "transfer", "retrain"]
+            Literal[
+                "single",
+                "multi",
+                "grades",
+                "searches",
+                "samples",
+                "steps",
+                "labels",
+                "transfer",
+                "retrain",
+                "classification",
+            ]
         ],
-        tyro.conf.arg(metavar="{single,multi,grades,searches,samples,steps,labels,transfer,retrain}"),
+        tyro.conf.arg(
+            metavar="{single,multi,grades,searches,samples,steps,labels,transfer,retrain,classification}"
+        ),
     ]
     """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
     gradient, sampling and placebo; searches: which method finds failures that hold, at as many passes each;
     samples: success against queries for each algorithm; steps: success against number and size of steps; labels:
     what labels that stay behind make of an attack; transfer: counterexamples of combination 2 before other
     detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
-    counterexamples."""
+    counterexamples; classification: the paper's tables for image classifiers (docs/classify.md)."""
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     quick: Flag = False
@@ -216,6 +229,19 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Retrain: counterexamples beside benign frames, or in the place of some; not of the paper's protocol."""
     label_mode: LabelMode = "moved"
     """Retrain: labels of counterexamples in training; not of the paper's protocol."""
+    networks: str = "squeezenet"
+    """Classification: networks to attack, with commas: squeezenet, or weights that classify train wrote."""
+    objects: str | None = None
+    """Classification: where objects come from, as in drivesem classify; --limit counts their pictures, by default
+    480, 36 with --quick, and --fresh those on which retrained networks are attacked, 232, 36 with --quick."""
+    backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
+    """Classification: photographs to put behind objects; by default pictures that are made."""
+    train_pictures: Count | None = None
+    """Classification: pictures to retrain on, of which half become counterexamples; by default 960, 144 with
+    --quick."""
+    tables: str | None = None
+    """Classification: which of them, with commas: degradation, parameters, hyperparameters, retraining,
+    robustness, worth, realism, transfer, sizes; by default all."""
 
     def check(self) -> None:
         super().check()
@@ -994,6 +1020,8 @@ class Classify(FrameCommand):
     draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
     """Attack: draws before a change and after it, in which a failure must hold to be certain: right in 15 of 16,
     then wrong in 12 of 16."""
+    grade: bool = True
+    """Attack: see whether failures are certain; without, all are by threshold."""
     nuisances: str = "shift_px=3"
     """Attack: what a draw changes of a picture (docs/grades.md)."""
 

@@ -1,0 +1,1 @@
+"""`drivesem study classification`: the paper's tables for classifiers."""

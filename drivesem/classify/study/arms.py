@@ -1,0 +1,131 @@
+"""What the study attacks: strategies, their settings, and who is attacked on which pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from drivesem.classify.attack import WRITTEN, Attacker, frames_of, report_run
+from drivesem.classify.pictures import Shown
+from drivesem.classify.results import ClassifiedFrame
+from drivesem.run.ask import Bar, ask
+from drivesem.run.folder import FRAMES, claim
+from drivesem.run.frame import RESULT
+from drivesem.settings.commands import Classify, Study
+from drivesem.settings.presets import presets
+from scene_ir import files
+
+ARMS = "arms"
+"""Folder of the attacks, each a run of `drivesem classify attack`."""
+GRADIENT = ("si-fgsm", "sgd", "scw")
+_SAMPLES: dict[str, dict[str, Any]] = {
+    f"{method}-{name}": {"method": method, "params": "pose", "within_pose": within}
+    for method in ("random", "halton")
+    for name, within in (("large", 0.75), ("small", 0.3))
+}
+STRATEGIES = (*GRADIENT, *_SAMPLES)
+"""In the order of tables."""
+NAMES = {
+    "benign": "benign",
+    "benign-on": "benign, trained on",
+    "si-fgsm": "si-FGSM",
+    "sgd": "sGD",
+    "scw": "sCW",
+    **{f"{m}-{n}": f"{m.title()} ({n})" for m in ("random", "halton") for n in ("large", "small")},
+}
+"""For people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One attack. name: its folder, below `ARMS`; config: of the attack, with its folder; shown: its pictures."""
+
+    name: str
+    config: Classify
+    shown: tuple[Shown, ...]
+
+    @property
+    def out(self) -> Path:
+        return Path(self.config.out or "")
+
+    def frames(self, kept: Sequence[Shown] | None = None) -> list[ClassifiedFrame]:
+        """What came of its pictures, or of some of them."""
+        return frames_of(self.out, self.shown if kept is None else kept)
+
+
+@cache
+def preset(network: str, method: str) -> Mapping[str, Any]:
+    """The paper's settings of a method for one of its networks."""
+    settings = files.read_yaml(presets()[f"classify-{network}-{method}"])
+    return {key: value for key, value in settings.items() if key != "for"}
+
+
+def attack_of(study: Study, out: Path, name: str, network: str, **settings: Any) -> Classify:
+    """The settings of an arm. network: the shipped one's name, or a file."""
+    config = Classify(
+        what="attack",
+        out=str(out / ARMS / name),
+        network=network,
+        objects=study.objects,
+        backgrounds=study.backgrounds,
+        seed=study.seed,
+        device=study.device,
+        workers=study.workers,
+        keep_going=study.keep_going,
+        engine=study.engine,
+        address=study.address,
+        grade=False,
+    )
+    return replace(config, **settings)
+
+
+def strategy_of(strategy: str, theirs: str) -> dict[str, Any]:
+    """The settings of a strategy, for a network that stands beside one of the paper's."""
+    return dict(_SAMPLES[strategy]) if strategy in _SAMPLES else dict(preset(theirs, strategy))
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    arm: int
+    shown: Shown
+
+
+class _Attackers:
+    """Attacks pictures in one process; of networks and objects, what arms share is loaded once."""
+
+    def __init__(self, arms: Sequence[Arm]) -> None:
+        self._arms = arms
+        self._kept: dict[int, Attacker] = {}
+
+    def __call__(self, job: _Job) -> None:
+        arm = self._arms[job.arm]
+        if job.arm not in self._kept:
+            like = [one for one in self._kept.values() if one.config.network == arm.config.network]
+            any_other = next(iter(self._kept.values()), None)
+            self._kept[job.arm] = Attacker.of(arm.config, like[0] if like else any_other)
+        self._kept[job.arm].attack(job.shown, arm.out)
+
+
+def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
+    """Attack all pictures of all arms, as far as that is not done: those that could not be, and why.
+
+    Raises UsageError or SceneError.
+    """
+    for arm in arms:
+        claim(arm.out, arm.config, WRITTEN)
+    jobs = [
+        _Job(i, one)
+        for i, arm in enumerate(arms)
+        for one in arm.shown
+        if not (arm.out / FRAMES / one.identifier / RESULT).is_file()
+    ]
+    build = partial(_Attackers, tuple(arms))
+    return ask(jobs, build(), build, study, Bar(title, remaining=True), lambda job: job.shown.identifier).failed
+
+
+def write_page(arm: Arm, classes: tuple[str, ...], kept: Sequence[Shown]) -> None:
+    """The page of an arm, as `drivesem classify attack` writes it."""
+    report_run(arm.config, arm.out, classes, kept, {}, sum(frame.seconds for frame in arm.frames(kept)))

@@ -1,0 +1,281 @@
+"""A study at work: its networks, its pictures, its attacks, and the networks that learnt from these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.loading import load_classifier
+from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.types import ObjectSet, Split
+from drivesem.classify.pictures import Shown, Studio, draw
+from drivesem.classify.scenes import VIEWS, open_backgrounds
+from drivesem.classify.study.arms import (
+    GRADIENT,
+    STRATEGIES,
+    Arm,
+    attack_of,
+    preset,
+    run_arms,
+    strategy_of,
+    write_page,
+)
+from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
+from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart
+from drivesem.classify.study.paper import NETWORKS
+from drivesem.classify.study.retraining import RETRAINED, half, retrained
+from drivesem.evaluation.resampling import DRAWS
+from drivesem.questions.realism.asking import AVAILABLE, chosen
+from drivesem.questions.realism.measures import load
+from drivesem.questions.transfer.asking import words
+from drivesem.run.folder import FRAMES, folder_of
+from drivesem.settings.commands import Classify, Study
+from drivesem.settings.errors import UsageError
+
+PICTURES = "pictures"
+"""Folder of the pictures that are trained on."""
+BENIGN, ONWARD = "benign", "benign-on"
+"""A network as it was, and trained on with benign pictures alone."""
+SINGLE = ("vertex", "pose", "lighting", "vertex,pose,lighting")
+"""What is moved in the table of parameters, beside pose and vertex, as in all others."""
+_NEEDS = {
+    "degradation": STRATEGIES,
+    "worth": STRATEGIES,
+    "realism": STRATEGIES,
+    **dict.fromkeys(("parameters", "retraining", "robustness", "transfer"), GRADIENT),
+    **dict.fromkeys(("hyperparameters", "sizes"), ()),
+}
+TABLES = tuple(_NEEDS)
+_SIZES = {"limit": (480, 36), "fresh": (232, 36), "train_pictures": (960, 144)}
+"""Pictures by default, and with --quick."""
+_Key = tuple[str, ...]
+
+
+@dataclass
+class Lab:
+    """study: its settings, all numbers of pictures said; eyes: of each network; tables: which are wanted; arms: by
+    what they are for; failed: pictures that could not be used, and why.
+    """
+
+    study: Study
+    out: Path
+    objects: ObjectSet
+    eyes: tuple[Eyes, ...]
+    tables: tuple[str, ...]
+    drawing: Drawing
+    test: tuple[Shown, ...]
+    train: tuple[Shown, ...]
+    arms: dict[_Key, Arm] = field(default_factory=dict[_Key, Arm])
+    taught: dict[tuple[str, str], Classifier] = field(default_factory=dict[tuple[str, str], Classifier])
+    failed: dict[str, str] = field(default_factory=dict[str, str])
+
+    @classmethod
+    def of(cls, study: Study) -> Lab:
+        """Raises UsageError or SceneError for settings, objects or networks that cannot be used."""
+        wanted = tuple(words(study.tables)) if study.tables is not None else TABLES
+        if not wanted or not set(wanted) <= set(TABLES):
+            raise UsageError("--tables", f"names among {', '.join(TABLES)}", repr(study.tables))
+        sizes = {name: getattr(study, name) or pair[study.quick] for name, pair in _SIZES.items()}
+        out = folder_of(study.out, Path("runs") / f"study-classification-seed{study.seed}")
+        objects = open_objects(study.objects)
+        open_backgrounds(study.backgrounds)
+        eyes = _eyes_of(study, objects.classes, out)
+        drawing = Drawing(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
+        test, train = (
+            _some(objects, *pair, study.seed)
+            for pair in (("test", sizes["limit"]), ("train", sizes["train_pictures"]))
+        )
+        return cls(replace(study, **sizes), out, objects, eyes, wanted, drawing, test, train)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return self.objects.classes
+
+    @property
+    def deep(self) -> tuple[Eyes, ...]:
+        """Networks of the tables that take long: with --quick the first alone."""
+        return self.eyes[:1] if self.study.quick else self.eyes
+
+    @property
+    def strategies(self) -> tuple[str, ...]:
+        """What the tables need of each network."""
+        return tuple(one for one in STRATEGIES if any(one in _NEEDS[name] for name in self.tables))
+
+    def wants(self, *names: str) -> bool:
+        return any(name in self.tables for name in names)
+
+    @cached_property
+    def done(self) -> tuple[Shown, ...]:
+        """The test pictures that could be used in all arms."""
+        return tuple(one for one in self.test if one.identifier not in self.failed)
+
+    @cached_property
+    def few(self) -> tuple[Shown, ...]:
+        """Those on which retrained networks are attacked; classes have their shares in them."""
+        rng = np.random.default_rng(self.study.seed)
+        places = keeping_shares(self.labels(self.done), self.study.fresh or len(self.done), rng)
+        return tuple(self.done[place] for place in places)
+
+    @cached_property
+    def learnt(self) -> tuple[tuple[Shown, ...], list[int]]:
+        """The pictures that are trained on, and the places of those that counterexamples replace."""
+        return self.train, half(len(self.train), self.study.seed)
+
+    def labels(self, shown: Sequence[Shown]) -> list[int]:
+        return [self.classes.index(one.name.partition("/")[0]) for one in shown]
+
+    def attack(self) -> None:
+        """All attacks on the networks as they are. Raises UsageError or SceneError."""
+        for eyes, strategy in product(self.eyes, self.strategies):
+            grade = not self.study.quick
+            self._add("test", eyes, strategy, self.test, grade=grade, **strategy_of(strategy, eyes.theirs))
+        for eyes, strategy in product(self.deep, GRADIENT):
+            usual = preset(eyes.theirs, strategy)
+            for params in SINGLE if self.wants("parameters") else ():
+                name = f"{strategy}-{params.replace(',', '-')}"
+                self._add(params, eyes, strategy, self.test, name, **{**usual, "params": params})
+            for network in NETWORKS if self.wants("hyperparameters") else ():
+                name = f"{strategy}-as-{network}"
+                self._add(network, eyes, strategy, self.test, name, **preset(network, strategy))
+            if self.wants("retraining", "robustness", "worth"):
+                shown, places = self.learnt
+                replaced = [shown[place] for place in places]
+                self._add("train", eyes, strategy, replaced, f"{strategy}-train", **usual)
+        self.failed |= run_arms(list(self.arms.values()), self.study, "attacking pictures")
+        if not self.done:
+            raise UsageError(
+                "--objects", "pictures that can be attacked", f"none: {next(iter(self.failed.values()))}"
+            )
+        for key, arm in self.arms.items():
+            if key[0] == "test":
+                write_page(arm, self.classes, self.done)
+
+    def _add(
+        self,
+        kind: str,
+        eyes: Eyes,
+        strategy: str,
+        shown: Sequence[Shown],
+        name: str | None = None,
+        **settings: Any,
+    ) -> None:
+        folder = f"{eyes.name}-{name or strategy}"
+        config = attack_of(self.study, self.out, folder, settings.pop("network", eyes.spec), **settings)
+        self.arms[kind, eyes.name, strategy] = Arm(folder, config, tuple(shown))
+
+    def teach(self) -> None:
+        """Networks retrained on each method's counterexamples, and attacked anew."""
+        if not self.wants("retraining", "robustness", "worth"):
+            return
+        shown, places = self.learnt
+        settings = Classify(
+            what="data",
+            objects=self.study.objects,
+            backgrounds=self.study.backgrounds,
+            workers=self.study.workers,
+            keep_going=self.study.keep_going,
+        )
+        studio = Studio.of(settings)
+        unseen = draw(shown, studio, settings, self.out / PICTURES).failed
+        kept = [i for i, one in enumerate(shown) if one.identifier not in {**unseen, **self.failed}]
+        paths = [
+            self.out / PICTURES / shown[i].split / self.classes[label] / f"{shown[i].identifier}.png"
+            for i, label in zip(kept, self.labels([shown[i] for i in kept]), strict=True)
+        ]
+        labels = torch.tensor(self.labels([shown[i] for i in kept]))
+        replaced = torch.tensor([i in set(places) for i in kept])
+        for eyes in self.deep:
+            benign = eyes.features("train", paths)
+            self.taught[eyes.name, BENIGN] = eyes.network
+            for trained in (ONWARD, *GRADIENT):
+                features = benign.clone()
+                if trained != ONWARD:
+                    arm = self.arms["train", eyes.name, trained]
+                    changed = [one for one in arm.shown if one.identifier not in {**unseen, **self.failed}]
+                    features[replaced] = eyes.features(f"{trained}-train", pictures(arm, changed)[1])
+                self.taught[eyes.name, trained] = retrained(
+                    eyes.network, self.weights(eyes, trained), features, labels, self.study.seed, self.study.device
+                )
+        if self.wants("robustness"):
+            self._attack_taught()
+
+    def _attack_taught(self) -> None:
+        before = set(self.arms)
+        for eyes, trained, strategy in product(self.deep, GRADIENT, GRADIENT):
+            usual = dict(preset(eyes.theirs, strategy))
+            name = f"{trained}-retrained-{strategy}"
+            network = str(self.weights(eyes, trained))
+            self._add(f"against {trained}", eyes, strategy, self.few, name, **usual, network=network)
+        fresh = [arm for key, arm in self.arms.items() if key not in before]
+        self.failed |= run_arms(fresh, self.study, "attacking retrained networks")
+
+    def weights(self, eyes: Eyes, trained: str) -> Path:
+        return self.out / RETRAINED / f"{eyes.name}-{trained}.safetensors"
+
+    def answers(
+        self, kind: str, eyes: Eyes, strategy: str, shown: Sequence[Shown], before: bool = False
+    ) -> Answers:
+        """What an attacked network made of pictures, after the attack or before it."""
+        frames = self.arms[kind, eyes.name, strategy].frames(shown)
+        return self.judged([f.right_before if before else f.right_after for f in frames], shown)
+
+    def judged(self, right: Sequence[bool], shown: Sequence[Shown]) -> Answers:
+        """Pictures with what was made of them."""
+        objects = {name: place for place, name in enumerate(sorted({one.name for one in shown}))}
+        unit = np.array([objects[one.name] for one in shown], np.int64)
+        return Answers(np.asarray(right, bool), np.array(self.labels(shown), np.int64), unit)
+
+    def certain(self, eyes: Eyes, strategy: str) -> int | None:
+        """How many failures are certain, where that was asked."""
+        frames = self.arms["test", eyes.name, strategy].frames(self.done)
+        return None if self.study.quick else sum(frame.grade == "certain" for frame in frames)
+
+    def features(self, source: Eyes, strategy: str, target: Eyes) -> Tensor:
+        """What a network's last layer reads of counterexamples against a network; of benign pictures too."""
+        attacked = next(one for one in self.strategies) if strategy == BENIGN else strategy
+        before, after = pictures(self.arms["test", source.name, attacked], self.done)
+        name = BENIGN if strategy == BENIGN else f"{strategy} against {source.name}"
+        return target.features(name, before if strategy == BENIGN else after)
+
+    def apart(self, eyes: Eyes, strategy: str) -> Apart:
+        """How far counterexamples are from the pictures before."""
+        before, after = pictures(self.arms["test", eyes.name, strategy], self.done)
+        path = self.out / LOOKED / f"{eyes.name}-{strategy}-distances.npz"
+        return apart(path, list(zip(before, after, strict=True)), self.measures)
+
+    @cached_property
+    def measures(self) -> dict[str, Any]:
+        return load(chosen(AVAILABLE, None, False)[0], None, False)
+
+
+def pictures(arm: Arm, shown: Sequence[Shown]) -> tuple[list[Path], list[Path]]:
+    """An arm's pictures before and after."""
+    folders = [arm.out / FRAMES / one.identifier for one in shown]
+    return [one / "benign.png" for one in folders], [one / "counterexample.png" for one in folders]
+
+
+def _some(objects: ObjectSet, split: Split, size: int, seed: int) -> tuple[Shown, ...]:
+    every = [Shown(split, name, view) for name, view in product(objects.names(split), VIEWS)]
+    if not every:
+        raise UsageError("--objects", f"objects to {split}", "none")
+    labels = [objects.classes.index(one.name.partition("/")[0]) for one in every]
+    return tuple(every[place] for place in keeping_shares(labels, size, np.random.default_rng(seed)))
+
+
+def _eyes_of(study: Study, classes: tuple[str, ...], out: Path) -> tuple[Eyes, ...]:
+    specs = words(study.networks)
+    names = [Path(spec).stem for spec in specs]
+    if not specs or len(set(names)) < len(names):
+        raise UsageError("--networks", "networks with commas, each of another name", repr(study.networks))
+    loaded = [load_classifier(spec, classes, study.device) for spec in specs]
+    found = zip(names, specs, loaded, strict=True)
+    return tuple(Eyes(name, spec, network, out, study.device) for name, spec, network in found)

@@ -1,0 +1,116 @@
+"""What networks and measures make of pictures, kept in files: features, and distances to what was before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.study.paper import theirs
+from drivesem.questions.realism.frechet import Gaussian, frechet
+from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures, psnr_db
+from drivesem.questions.worth.measures import Floats
+from drivesem.report.terminal import Console
+from drivesem.run.looking import weights_digest
+from scene_ir import files
+
+LOOKED = "looked"
+"""Folder of what is kept."""
+_AT_A_TIME = 32
+
+
+def _kept(path: Path, about: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+    """What a file holds, if it is about that; else it is computed, and written."""
+    if path.is_file():
+        found = files.read_npz(path)
+        if str(found["about"]) == about:
+            return found
+    found = {**compute(), "about": np.array(about)}
+    files.write_npz(path, found)
+    return found
+
+
+def _progress(title: str, items: Sequence[int]) -> Sequence[int]:
+    console = Console(stderr=True)
+    return track(items, title, console=console, transient=True, disable=not console.is_terminal)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """A network that looks at pictures. name: for files and people; spec: what loads it; folder: the study's."""
+
+    name: str
+    spec: str
+    network: Classifier
+    folder: Path
+    device: str
+
+    @property
+    def theirs(self) -> str:
+        """The network of the paper that it stands beside."""
+        return theirs(self.network.architecture)
+
+    def features(self, name: str, paths: Sequence[Path]) -> Tensor:
+        """Features (N, K) of pictures, which are known by a name of their own."""
+        about = "\n".join((weights_digest(self.network), *(f"{path.parent.name}/{path.name}" for path in paths)))
+        kept = _kept(self.folder / LOOKED / f"{self.name}-{name}.npz", about, lambda: self._look(name, paths))
+        return torch.from_numpy(kept["features"]).to(self.device)
+
+    @torch.no_grad()
+    def _look(self, name: str, paths: Sequence[Path]) -> Mapping[str, np.ndarray]:
+        found = []
+        for start in _progress(f"{self.name} looks at {name}", range(0, len(paths), _AT_A_TIME)):
+            stack = np.stack([files.read_image(path) for path in paths[start : start + _AT_A_TIME]])
+            images = torch.from_numpy(stack).permute(0, 3, 1, 2).to(self.device).float() / 255
+            found.append(self.network.embed(images).cpu().numpy())
+        return {"features": np.concatenate(found)}
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far pictures are from those they were made of. pairs (M,) by metric, PSNR's as squared errors; sets: by
+    metric the features (M, D) before and after.
+    """
+
+    pairs: Mapping[str, Floats]
+    sets: Mapping[str, tuple[Floats, Floats]]
+
+    def mean(self, metric: str, kept: np.ndarray) -> float | None:
+        """Of some pictures, kept (M,) bool: the mean distance, or the sets' one; None where there are too few."""
+        if metric in self.sets:
+            first, second = (side[kept] for side in self.sets[metric])
+            return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
+        if not kept.any():
+            return None
+        mean = float(self.pairs[metric][kept].mean())
+        return psnr_db(mean) if METRICS[metric].squared else mean
+
+
+def apart(
+    path: Path, pairs: Sequence[tuple[Path, Path]], measures: Mapping[str, PairDistance | SetFeatures]
+) -> Apart:
+    """Distances of pictures, before and after. path: the file that keeps them."""
+
+    def compute() -> Mapping[str, np.ndarray]:
+        columns: dict[str, list[np.ndarray | float]] = {}
+        for i in _progress(f"distances of {path.stem}", range(len(pairs))):
+            before, after = (files.read_image(side) for side in pairs[i])
+            for name, measure in measures.items():
+                if METRICS[name].pairwise:
+                    columns.setdefault(name, []).append(measure(before, after))  # type: ignore[call-arg]
+                else:
+                    columns.setdefault(f"{name} before", []).append(measure(before))  # type: ignore[call-arg]
+                    columns.setdefault(f"{name} after", []).append(measure(after))  # type: ignore[call-arg]
+        return {name: np.asarray(column, np.float64) for name, column in columns.items()}
+
+    about = "\n".join((", ".join(measures), *(str(after.parent.name) for _, after in pairs)))
+    found = _kept(path, about, compute)
+    pairwise = {name: found[name] for name in measures if METRICS[name].pairwise}
+    rest = [name for name in measures if not METRICS[name].pairwise]
+    return Apart(pairwise, {name: (found[f"{name} before"], found[f"{name} after"]) for name in rest})

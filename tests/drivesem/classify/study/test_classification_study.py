@@ -1,0 +1,188 @@
+"""`drivesem study classification` as it is typed, on objects that are known."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from drivesem.classify import pictures, scenes
+from drivesem.classify.networks import loading
+from drivesem.classify.study import lab, retraining
+from drivesem.classify.study.arms import STRATEGIES
+from drivesem.classify.training import fit_last
+from drivesem.cli import main
+from drivesem.settings.commands import Classify
+from scene_ir import files
+from tests.drivesem.classify.conftest import Colours
+from tests.drivesem.classify.standins import KINDS, StandIns
+
+
+class Tints(Colours):
+    """As `Colours`, with a last layer as others have."""
+
+    architecture = "tints"
+
+    def __init__(self, classes=KINDS) -> None:
+        super().__init__(classes)
+        weight = self.score.weight.detach()
+        self.score = nn.Linear(3, len(classes))
+        with torch.no_grad():
+            self.score.weight.copy_(weight)
+            self.score.bias.zero_()
+
+
+@pytest.fixture
+def two_networks(monkeypatch, tmp_path):
+    """Small pictures of boxes, balls and poles; the files of two networks that go by colour."""
+    for name, size in (("DRAWN_PX", 96), ("SEEN_PX", 64)):
+        monkeypatch.setattr(scenes, name, size)
+    monkeypatch.setattr(scenes, "camera", functools.partial(scenes.camera, 96))
+    for module in (pictures, lab):
+        monkeypatch.setattr(module, "open_objects", lambda source: StandIns())
+    monkeypatch.setitem(loading.ARCHITECTURES, Tints.architecture, Tints)
+    paths = []
+    for name in ("one", "two"):
+        network = Tints()
+        with torch.no_grad():
+            network.score.bias[0] = {"one": 0.0, "two": 0.3}[name]
+        paths.append(tmp_path / f"{name}.safetensors")
+        loading.save_classifier(network, paths[-1], {})
+    return ",".join(map(str, paths))
+
+
+def study(capsys, *words):
+    """Exit code, the JSON, and what else was said."""
+    code = main(["study", "classification", "--quick", "--workers", "1", "--bootstrap", "20", *words])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if said.out.startswith("{") else said.out, said.err
+
+
+def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
+    words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--tables", "sizes")
+    code, data, _ = study(capsys, *words, "--json")
+    assert code == 0
+    assert set(data["tables"]) == {"sizes"}
+    counts = {row["class"]: row for row in data["tables"]["sizes"]["rows"]}
+    assert counts["ball"] == {
+        "class": "ball",
+        "train objects": 6,
+        "val objects": 2,
+        "test objects": 2,
+        "train pictures": 24,
+        "test pictures": 1,
+    }
+    code, told, _ = study(capsys, *words)
+    assert code == 0
+    assert "Sizes" in told
+    assert "skateboard (paper)" in (tmp_path / "out" / "study.md").read_text()
+
+
+@pytest.mark.slow
+def test_transfer(two_networks, tmp_path, capsys):
+    words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--json")
+    code, data, _ = study(capsys, *words, "--tables", "transfer")
+    assert code == 0
+    assert set(data["tables"]) == {"transfer"}
+    rows = data["tables"]["transfer"]["rows"]
+    assert [(r["source"], r["target"]) for r in rows[::4]] == [("one", "two"), ("two", "one")]
+    assert [r["strategy"] for r in rows[:4]] == ["benign", "si-fgsm", "sgd", "scw"]
+    assert sorted(path.name for path in (tmp_path / "out" / "arms").iterdir()) == sorted(
+        f"{network}-{method}" for network in ("one", "two") for method in ("si-fgsm", "sgd", "scw")
+    )
+    # what the second network says of the first one's pictures, looked up anew
+    network = loading.load_classifier(two_networks.split(",")[1], KINDS)
+    right = []
+    for frame in sorted((tmp_path / "out" / "arms" / "one-sgd" / "frames").iterdir()):
+        image = torch.from_numpy(files.read_image(frame / "counterexample.png").transpose(2, 0, 1)).float() / 255
+        right.append(KINDS[int(network(image[None])[0].argmax())] == frame.name.partition("-")[0])
+    assert rows[2]["overall"] == pytest.approx(np.mean(right), abs=1e-4)
+
+
+@pytest.mark.slow
+def test_all_tables(two_networks, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3")
+    code, data, _ = study(capsys, *words, "--train-pictures", "12", "--json")
+    assert code == 0
+    tables = data["tables"]
+    assert set(tables) == {*lab.TABLES, "orders"}
+    for name, table in tables.items():
+        assert table["rows"], name
+        assert bool(table["reference"]) == (name != "orders")
+    assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3}
+    rows = tables["degradation"]["rows"]
+    assert [row["strategy"] for row in rows] == 2 * ["benign", *STRATEGIES]
+    for row in rows:
+        assert row["overall"] == pytest.approx(np.mean([row[kind] for kind in KINDS]), abs=1e-4)
+        assert row["low"] if "low" in row else row["overall_low"] <= row["overall"] <= row["overall_high"]
+    for table in ("retraining", "robustness"):
+        assert [row["train"] for row in tables[table]["rows"]][-3:] == ["si-fgsm", "sgd", "scw"]
+    worth = {(r["network"], r["strategy"], r["membership"], r["weighted"]): r for r in tables["worth"]["rows"]}
+    assert len(worth) == 2 * 8 * 2 * 2
+    assert "gain" in worth["one", "sgd", "binary", True]
+    assert {row["verdict"] for row in tables["orders"]["rows"]} <= {"holds", "reversed", "undecided"}
+    assert len((out / "study.md").read_text().split("\n## ")) == len(tables) + 1
+    # a second time nothing is attacked, and all is as it was
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
+    code, again, _ = study(capsys, *words, "--train-pictures", "12", "--json")
+    assert (code, again) == (0, data)
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("result.json")} == before
+    code, _, said = study(capsys, *words, "--train-pictures", "24")
+    assert code == 2
+    assert "other values of train_pictures" in said
+
+
+def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
+    one = two_networks.partition(",")[0]
+    cases = {
+        ("--tables", "accuracy"): "--tables: expected names among degradation, ",
+        ("--networks", f"{one},{one}"): "--networks: expected networks with commas, each of another name",
+        ("--networks", "vgg16"): "--network: expected squeezenet, or weights",
+        ("--networks", str(tmp_path / "gone.safetensors")): "gone.safetensors",
+        ("--backgrounds", str(tmp_path / "gone")): "--backgrounds: expected a folder of photographs",
+    }
+    for words, message in cases.items():
+        code, _, said = study(capsys, "--out", str(tmp_path / "out"), *words)
+        lines = [line for line in said.splitlines() if line.startswith("drivesem: ")]
+        assert (code, len(lines)) == (2, 1), words
+        assert message in lines[0]
+
+
+def test_training_on_begins_where_the_network_is():
+    network, generator = Tints(), torch.Generator().manual_seed(0)
+    features, labels = torch.rand(40, 3, generator=generator), torch.arange(40) % 3
+    with torch.no_grad():
+        before = network.last(features)
+    known, truth = dict.fromkeys(("train", "val"), features), dict.fromkeys(("train", "val"), labels)
+    config = Classify(what="train", epochs=1, rate=1e-9)
+    fit_last(network, known, truth, config, generator, onward=True)
+    assert torch.allclose(network.last(features), before, atol=1e-4)
+    fit_last(network, known, truth, config, generator)
+    assert not torch.allclose(network.last(features), before, atol=1e-2)
+
+
+def test_half_of_the_pictures_are_replaced():
+    places = retraining.half(9, 0)
+    assert len(places) == len(set(places)) == 4
+    assert places == sorted(places) == retraining.half(9, 0)
+    assert places != retraining.half(9, 1)
+    assert max(places) < 9
+
+
+def test_a_retrained_network_knows_what_it_was_shown(tmp_path):
+    """Pictures whose colours are swapped are learnt; the file is what the network is."""
+    network, generator = loading.ready(Tints()), torch.Generator().manual_seed(0)
+    network.last.weight.mul_(0.01)
+    labels = torch.arange(60) % 3
+    features = torch.eye(3)[labels].roll(1, 1) + 0.1 * torch.rand(60, 3, generator=generator)
+    loading.ARCHITECTURES["tints"] = Tints
+    try:
+        learnt = retraining.retrained(network, tmp_path / "x.safetensors", features, labels, 0, "cpu")
+    finally:
+        del loading.ARCHITECTURES["tints"]
+    assert not any(retraining.right(network, features, labels.tolist()))
+    assert all(retraining.right(learnt, features, labels.tolist()))
+    assert torch.allclose(retraining.chances(learnt, features).sum(1), torch.ones(60, dtype=torch.float64))
