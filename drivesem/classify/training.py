@@ -48,7 +48,8 @@ def train_run(config: Classify) -> dict[str, Any]:
     out = folder_of(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
     classes = open_objects(config.objects).classes
     generator = torch.Generator().manual_seed(config.seed)
-    network = to_train(config.network, config.weights, classes, generator).to(config.device)
+    anew = config.layers == "all"
+    network = to_train(config.network, config.weights, classes, generator, anew).to(config.device)
     claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES))
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]

@@ -241,7 +241,7 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     --quick."""
     tables: str | None = None
     """Classification: which of them, with commas: degradation, parameters, hyperparameters, retraining,
-    robustness, worth, realism, transfer, sizes; by default all."""
+    robustness, worth, realism, transfer, pixels, sizes; by default all."""
 
     def check(self) -> None:
         super().check()
@@ -978,7 +978,8 @@ class Classify(FrameCommand):
     """Attack: squeezenet, or weights that classify train wrote; train: squeezenet, vgg16, vgg16-pooled or resnet50
     (docs/classify.md)."""
     weights: str | None = None
-    """Train: what the network begins with, such as torchvision's file; squeezenet needs none."""
+    """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers all
+    others begin anew where none is named."""
     data: Annotated[str, Folder("a folder of classify data")] | None = None
     """Train: pictures that classify data wrote; by default they are made now."""
     layers: Literal["last", "all"] = "last"

@@ -47,16 +47,25 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
 
 
 def to_train(
-    architecture: str, weights: str | None, classes: Sequence[str], generator: torch.Generator
+    architecture: str,
+    weights: str | None,
+    classes: Sequence[str],
+    generator: torch.Generator,
+    anew: bool = False,
 ) -> Classifier:
     """A network with a new last layer for `classes`, and all else from a file: torchvision's (.pth), or a
-    safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions.
+    safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions. anew:
+    others begin with random weights where no file is named.
 
     Raises FormatError naming file and tensor where the file is another network's, RangeError for an unknown name.
     """
     if architecture not in ARCHITECTURES:
         raise RangeError("--network", f"one of {', '.join(ARCHITECTURES)}", architecture)
-    network = ARCHITECTURES[architecture](classes)
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(generator.initial_seed())
+        network = ARCHITECTURES[architecture](classes)
+    if weights is None and anew and architecture != SqueezeNet.architecture:
+        return network
     if weights is None:
         if architecture != SqueezeNet.architecture:
             raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")

@@ -6,18 +6,23 @@ from drivesem.classify.study.arms import ARMS
 from drivesem.classify.study.lab import PICTURES, TABLES, Lab
 from drivesem.classify.study.looking import LOOKED
 from drivesem.classify.study.retraining import RETRAINED
-from drivesem.classify.study.tables import remarks, tables_of
+from drivesem.classify.study.tables import ORDERS, flat, remarks, tables_of
 from drivesem.report.answer import Answer
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.settings.commands import Study
 from drivesem.settings.text import command_line
 
 _WRITTEN = (
-    *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, "orders"))),
+    *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
     *(ARMS, LOOKED, RETRAINED, PICTURES),
 )
 _FREE = (*PRESENTATION, "bootstrap", "quick", "tables", "networks", "fresh")
 """Settings that may change on the way: they add attacks, and alter none."""
+_WORDS = (
+    *("network", "strategy", "trained on", "parameters", "settings", "made against", "asked", "class"),
+    *("membership", "realism weight", "metric", "table", "first", "second", "the paper's order"),
+)
+"""Columns of words."""
 _NOTE = (
     "Overall: the mean over classes weighed by their sizes, which is the share of all pictures; in brackets 95 % "
     "of {draws} draws of objects. A picture that is misclassified as it is counts as wrong before and after. The "
@@ -50,11 +55,11 @@ def study_run(study: Study) -> Answer:
             },
             "frames_failed": dict(sorted(lab.failed.items())),
         },
-        tables={one.name: one.rows for one in found if one.rows},
+        tables={one.name: flat(one.rows) for one in found if one.rows},
         sheets=[one.sheet() for one in found],
         notes=[_NOTE.format(draws=lab.drawing.draws), *(note for one in found for note in remarks(one))],
-        words=("network", "strategy", "trained on", "parameters", "settings", "made against", "asked", "class"),
-        printed=[one.sheet(classes=False) for one in found],
+        words=_WORDS,
+        printed=[one.sheet(classes=False) for one in found if one.name != ORDERS],
         printed_words=(
             "network",
             "strategy",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -19,6 +19,7 @@ from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
+from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import (
     GRADIENT,
     STRATEGIES,
@@ -30,7 +31,7 @@ from drivesem.classify.study.arms import (
     write_page,
 )
 from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
-from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart
+from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
 from drivesem.classify.study.paper import NETWORKS
 from drivesem.classify.study.retraining import RETRAINED, half, retrained
 from drivesem.evaluation.resampling import DRAWS
@@ -40,6 +41,7 @@ from drivesem.questions.transfer.asking import words
 from drivesem.run.folder import FRAMES, folder_of
 from drivesem.settings.commands import Classify, Study
 from drivesem.settings.errors import UsageError
+from scene_ir import files
 
 PICTURES = "pictures"
 """Folder of the pictures that are trained on."""
@@ -51,8 +53,9 @@ _NEEDS = {
     "degradation": STRATEGIES,
     "worth": STRATEGIES,
     "realism": STRATEGIES,
-    **dict.fromkeys(("parameters", "retraining", "robustness", "transfer"), GRADIENT),
-    **dict.fromkeys(("hyperparameters", "sizes"), ()),
+    **dict.fromkeys(("parameters", "hyperparameters", "retraining", "robustness", "transfer"), GRADIENT),
+    "pixels": GRADIENT[:1],
+    "sizes": (),
 }
 TABLES = tuple(_NEEDS)
 _SIZES = {"limit": (480, 36), "fresh": (232, 36), "train_pictures": (960, 144)}
@@ -143,7 +146,7 @@ class Lab:
             for params in SINGLE if self.wants("parameters") else ():
                 name = f"{strategy}-{params.replace(',', '-')}"
                 self._add(params, eyes, strategy, self.test, name, **{**usual, "params": params})
-            for network in NETWORKS if self.wants("hyperparameters") else ():
+            for network in {*NETWORKS} - {eyes.theirs} if self.wants("hyperparameters") else ():
                 name = f"{strategy}-as-{network}"
                 self._add(network, eyes, strategy, self.test, name, **preset(network, strategy))
             if self.wants("retraining", "robustness", "worth"):
@@ -186,13 +189,13 @@ class Lab:
         )
         studio = Studio.of(settings)
         unseen = draw(shown, studio, settings, self.out / PICTURES).failed
-        kept = [i for i, one in enumerate(shown) if one.identifier not in {**unseen, **self.failed}]
+        usable = [i for i, one in enumerate(shown) if one.identifier not in {**unseen, **self.failed}]
         paths = [
             self.out / PICTURES / shown[i].split / self.classes[label] / f"{shown[i].identifier}.png"
-            for i, label in zip(kept, self.labels([shown[i] for i in kept]), strict=True)
+            for i, label in zip(usable, self.labels([shown[i] for i in usable]), strict=True)
         ]
-        labels = torch.tensor(self.labels([shown[i] for i in kept]))
-        replaced = torch.tensor([i in set(places) for i in kept])
+        labels = torch.tensor(self.labels([shown[i] for i in usable]))
+        replaced = torch.tensor([i in set(places) for i in usable])
         for eyes in self.deep:
             benign = eyes.features("train", paths)
             self.taught[eyes.name, BENIGN] = eyes.network
@@ -251,6 +254,22 @@ class Lab:
         before, after = pictures(self.arms["test", eyes.name, strategy], self.done)
         path = self.out / LOOKED / f"{eyes.name}-{strategy}-distances.npz"
         return apart(path, list(zip(before, after, strict=True)), self.measures)
+
+    def pixels(self, eyes: Eyes) -> Mapping[str, np.ndarray]:
+        """Of each attack on pixels: which test pictures (N,) are right after it, and their distances (N,)."""
+        paths = pictures(self.arms["test", eyes.name, GRADIENT[0]], self.done)[0]
+
+        def compute() -> Mapping[str, np.ndarray]:
+            before = [files.read_image(path) for path in paths]
+            images, labels = np.stack(before).transpose(0, 3, 1, 2), np.array(self.labels(self.done))
+            found: dict[str, np.ndarray] = {}
+            for name, after in pixels.attacked(eyes.network, images / np.float32(255), labels).items():
+                found[name] = np.array(pixels.right(eyes.network, after, labels))
+                pairs = zip(before, after.transpose(0, 2, 3, 1), strict=True)
+                found[f"{name} apart"] = np.array([self.measures["perceptual"](a, b) for a, b in pairs])
+            return found
+
+        return kept(self.out / LOOKED / f"{eyes.name}-pixels.npz", eyes.about(paths), compute)
 
     @cached_property
     def measures(self) -> dict[str, Any]:

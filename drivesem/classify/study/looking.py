@@ -25,7 +25,7 @@ LOOKED = "looked"
 _AT_A_TIME = 32
 
 
-def _kept(path: Path, about: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+def kept(path: Path, about: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
     """What a file holds, if it is about that; else it is computed, and written."""
     if path.is_file():
         found = files.read_npz(path)
@@ -58,9 +58,13 @@ class Eyes:
 
     def features(self, name: str, paths: Sequence[Path]) -> Tensor:
         """Features (N, K) of pictures, which are known by a name of their own."""
-        about = "\n".join((weights_digest(self.network), *(f"{path.parent.name}/{path.name}" for path in paths)))
-        kept = _kept(self.folder / LOOKED / f"{self.name}-{name}.npz", about, lambda: self._look(name, paths))
-        return torch.from_numpy(kept["features"]).to(self.device)
+        about = self.about(paths)
+        found = kept(self.folder / LOOKED / f"{self.name}-{name}.npz", about, lambda: self._look(name, paths))
+        return torch.from_numpy(found["features"]).to(self.device)
+
+    def about(self, paths: Sequence[Path]) -> str:
+        """What tells this network before these pictures from all others."""
+        return "\n".join((weights_digest(self.network), *(f"{path.parent.name}/{path.name}" for path in paths)))
 
     @torch.no_grad()
     def _look(self, name: str, paths: Sequence[Path]) -> Mapping[str, np.ndarray]:
@@ -110,7 +114,7 @@ def apart(
         return {name: np.asarray(column, np.float64) for name, column in columns.items()}
 
     about = "\n".join((", ".join(measures), *(str(after.parent.name) for _, after in pairs)))
-    found = _kept(path, about, compute)
+    found = kept(path, about, compute)
     pairwise = {name: found[name] for name in measures if METRICS[name].pairwise}
     rest = [name for name in measures if not METRICS[name].pairwise]
     return Apart(pairwise, {name: (found[f"{name} before"], found[f"{name} after"]) for name in rest})

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.objects.types import CLASSES, SPLITS
+from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, NAMES, STRATEGIES, preset
 from drivesem.classify.study.figures import Answers, verdict
 from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE, Lab
@@ -36,9 +37,10 @@ from drivesem.report.tables import Sheet
 Row = dict[str, Any]
 TESTS = (BENIGN, *GRADIENT)
 """Columns of what retrained networks are judged on."""
+ORDERS = "orders"
 _BOTH = "pose,vertex"
 _HEADS = {
-    "train": "trained on",
+    "trained_on": "trained on",
     "params": "parameters",
     "at_paper_sizes": "at the paper's class sizes",
     "weighted": "realism weight",
@@ -53,7 +55,7 @@ _HEADS = {
     "within_pose": "within pose",
 }
 _SETTINGS = ("step_vertex", "step_pose", "within_vertex", "within_pose", "steps")
-_PLAIN = ("pictures", "certain", "worth", "gain", *_SETTINGS)
+_PLAIN = ("pictures", "certain", "worth", "gain", "distance", *_SETTINGS)
 """Columns of numbers that are no shares."""
 
 
@@ -108,14 +110,13 @@ def tables_of(lab: Lab) -> list[Table]:
     found = [_BUILDERS[name](lab) for name in lab.tables]
     orders = [row for name in lab.tables for row in _ORDERS.get(name, lambda lab: [])(lab)]
     if orders:
-        counts = {one: sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed", "undecided")}
+        held, turned = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
         note = (
-            "Of the paper's orders of two figures "
-            + ", ".join(f"{n} {'are ' if k == 'undecided' else ''}{k}" for k, n in counts.items())
-            + "."
+            f"Of {len(orders)} orders of two of the paper's figures {held} hold here, {turned} are reversed, and "
+            f"{len(orders) - held - turned} are undecided."
         )
         columns = ("network", "table", "first", "second", "paper", "ours", "verdict")
-        found.append(Table("orders", "Does the paper's order hold?", columns, orders, (), (note,)))
+        found.append(Table(ORDERS, "Does the paper's order hold?", columns, orders, (), (note,)))
     return found
 
 
@@ -201,9 +202,8 @@ def _hyperparameters(lab: Lab) -> Table:
         settings = {"strategy": strategy, "settings": NETWORKS[network]}
         settings |= {key: preset(network, strategy).get(key) for key in _SETTINGS}
         for eyes in lab.deep:
-            rows.append(
-                {"network": eyes.name, **settings, **_overall(lab, lab.answers(network, eyes, strategy, lab.done))}
-            )
+            answers = lab.answers("test" if network == eyes.theirs else network, eyes, strategy, lab.done)
+            rows.append({"network": eyes.name, **settings, **_overall(lab, answers)})
         value = figures()["degradation"][network][strategy][-1]
         reference.append({"network": NETWORKS[network], **settings, "overall": value})
     columns = ("network", "strategy", "settings", *_SETTINGS, "overall")
@@ -211,7 +211,7 @@ def _hyperparameters(lab: Lab) -> Table:
 
 
 def _on_tests(lab: Lab, network: str, train: str, found: Mapping[str, Answers]) -> Row:
-    row: Row = {"network": network, "train": train}
+    row: Row = {"network": network, "trained_on": train}
     for test, answers in found.items():
         row |= _bounded(test, answers.overall(lab.drawing))
     return row | {"pictures": len(found[BENIGN].right)}
@@ -219,7 +219,7 @@ def _on_tests(lab: Lab, network: str, train: str, found: Mapping[str, Answers]) 
 
 def _paper_on_tests(table: str) -> list[Row]:
     return [
-        {"network": NETWORKS[network], "train": train, **dict(zip(TESTS, values, strict=True))}
+        {"network": NETWORKS[network], "trained_on": train, **dict(zip(TESTS, values, strict=True))}
         for network, rows in figures()[table].items()
         for train, values in rows.items()
     ]
@@ -246,7 +246,7 @@ def _retraining(lab: Lab) -> Table:
     ]
     title = "Retrained networks on pictures made against the benign one, %"
     return Table(
-        "retraining", title, ("network", "train", *TESTS, "pictures"), rows, _paper_on_tests("retraining")
+        "retraining", title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests("retraining")
     )
 
 
@@ -257,7 +257,7 @@ def _robustness(lab: Lab) -> Table:
     ]
     title = "Retrained networks on pictures made against themselves, %"
     return Table(
-        "robustness", title, ("network", "train", *TESTS, "pictures"), rows, _paper_on_tests("robustness")
+        "robustness", title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests("robustness")
     )
 
 
@@ -357,6 +357,20 @@ def _transfer(lab: Lab) -> Table:
     return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
 
 
+def _pixels(lab: Lab) -> Table:
+    rows: list[Row] = []
+    for eyes in lab.deep if pixels.available() else ():
+        found = lab.pixels(eyes)
+        for attack in pixels.ATTACKS:
+            answers = lab.judged(found[attack].tolist(), lab.done)
+            far = {"distance": round(float(found[f"{attack} apart"].mean()), 5)}
+            rows.append({"network": eyes.name, "strategy": attack, **_overall(lab, answers), **far})
+    note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
+    notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
+    columns = ("network", "strategy", "pictures", "overall", "distance")
+    return Table("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
+
+
 def _sizes(lab: Lab) -> Table:
     names = {split: [one.partition("/")[0] for one in lab.objects.names(split)] for split in SPLITS}
     used = {split: [one.name.partition("/")[0] for one in getattr(lab, split)] for split in ("test", "train")}
@@ -434,6 +448,7 @@ _BUILDERS: dict[str, Callable[[Lab], Table]] = {
     "robustness": _robustness,
     "transfer": _transfer,
     "hyperparameters": _hyperparameters,
+    "pixels": _pixels,
     "sizes": _sizes,
 }
 _ORDERS: dict[str, Callable[[Lab], list[Row]]] = {
@@ -442,6 +457,12 @@ _ORDERS: dict[str, Callable[[Lab], list[Row]]] = {
     "retraining": lambda lab: _learners_in_order(lab, "retraining", _known),
     "robustness": lambda lab: _learners_in_order(lab, "robustness", _fresh),
 }
+
+
+def flat(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the same columns, for a CSV file."""
+    columns = dict.fromkeys(name for row in rows for name in row)
+    return [{name: row.get(name) for name in columns} for row in rows]
 
 
 def remarks(table: Table) -> tuple[str, ...]:

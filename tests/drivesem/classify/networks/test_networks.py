@@ -225,3 +225,14 @@ def test_parameters_of_the_published_networks():
     thousand = [str(i) for i in range(1000)]
     counts = {kind: sum(p.numel() for p in kind(thousand).parameters()) for kind in (VGG16, ResNet50)}
     assert counts == {VGG16: 138_357_544, ResNet50: 25_557_032}
+
+
+def test_a_network_begins_anew_without_a_file():
+    one, again, other = (
+        to_train("vgg16-pooled", None, ("cat", "dog"), torch.Generator().manual_seed(seed), anew=True)
+        for seed in (0, 0, 1)
+    )
+    name = "features.0.weight"
+    assert torch.equal(one.get_parameter(name), again.get_parameter(name))
+    assert not torch.equal(one.get_parameter(name), other.get_parameter(name))
+    assert one.last.out_features == 2

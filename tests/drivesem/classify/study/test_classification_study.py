@@ -119,7 +119,7 @@ def test_all_tables(two_networks, tmp_path, capsys):
         assert row["overall"] == pytest.approx(np.mean([row[kind] for kind in KINDS]), abs=1e-4)
         assert row["low"] if "low" in row else row["overall_low"] <= row["overall"] <= row["overall_high"]
     for table in ("retraining", "robustness"):
-        assert [row["train"] for row in tables[table]["rows"]][-3:] == ["si-fgsm", "sgd", "scw"]
+        assert [row["trained_on"] for row in tables[table]["rows"]][-3:] == ["si-fgsm", "sgd", "scw"]
     worth = {(r["network"], r["strategy"], r["membership"], r["weighted"]): r for r in tables["worth"]["rows"]}
     assert len(worth) == 2 * 8 * 2 * 2
     assert "gain" in worth["one", "sgd", "binary", True]

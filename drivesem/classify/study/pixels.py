@@ -1,0 +1,65 @@
+"""Attacks on pixels, for comparison: those of the Adversarial Robustness Toolbox, which is optional."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import nn
+
+from drivesem.classify.networks.base import Classifier
+
+NEEDS = "pip install 'drivesem[pixels]'"
+_REACH, _STEP = 4 / 255, 1 / 255
+"""How far a pixel's channel may go, of 1, and in which steps."""
+_STEPS = 10
+_AT_A_TIME = 16
+ATTACKS = ("FGSM, 4/255", "PGD, 4/255", "CW, 2-norm")
+
+
+def available() -> bool:
+    """Whether the toolbox is installed."""
+    return importlib.util.find_spec("art") is not None
+
+
+def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Pictures (N, 3, H, W) in [0, 1] after each of `ATTACKS`, on the 8-bit grid, as uint8. labels (N,)."""
+    from art.attacks.evasion import CarliniL2Method, FastGradientMethod, ProjectedGradientDescent
+    from art.estimators.classification import PyTorchClassifier
+
+    classifier = PyTorchClassifier(
+        model=copy.deepcopy(network),
+        loss=nn.CrossEntropyLoss(),
+        input_shape=images.shape[1:],
+        nb_classes=len(network.classes),
+        clip_values=(0.0, 1.0),
+        device_type="gpu" if next(network.parameters()).is_cuda else "cpu",
+    )
+    size, quiet = {"batch_size": _AT_A_TIME}, {"verbose": False}
+    made: dict[str, Callable[[], object]] = {
+        "FGSM, 4/255": lambda: FastGradientMethod(classifier, eps=_REACH, **size),
+        "PGD, 4/255": lambda: ProjectedGradientDescent(
+            classifier, eps=_REACH, eps_step=_STEP, max_iter=_STEPS, **size, **quiet
+        ),
+        "CW, 2-norm": lambda: CarliniL2Method(classifier, binary_search_steps=3, max_iter=_STEPS, **size, **quiet),
+    }
+    truth = np.eye(len(network.classes), dtype=np.float32)[labels]
+    found = {}
+    for name in ATTACKS:
+        changed = made[name]().generate(x=images.astype(np.float32), y=truth)  # type: ignore[attr-defined]
+        found[name] = (np.clip(changed, 0, 1) * 255).round().astype(np.uint8)
+    return found
+
+
+@torch.no_grad()
+def right(network: Classifier, images: np.ndarray, labels: np.ndarray) -> list[bool]:
+    """Which pictures (N, 3, H, W) uint8 a network classifies rightly."""
+    found: list[bool] = []
+    device = next(network.parameters()).device
+    for start in range(0, len(images), _AT_A_TIME):
+        part = torch.from_numpy(images[start : start + _AT_A_TIME]).to(device).float() / 255
+        found += (network(part).argmax(1).cpu().numpy() == labels[start : start + _AT_A_TIME]).tolist()
+    return found
