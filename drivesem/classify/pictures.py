@@ -63,8 +63,7 @@ class Studio:
 
     def place(self, shown: Shown, out: Path) -> Path:
         """Where a picture of a data set is, in its folder."""
-        label = self.objects.classes[self.model(shown.name).label]
-        return out / shown.split / label / f"{shown.identifier}.png"
+        return out / shown.split / shown.name.partition("/")[0] / f"{shown.identifier}.png"
 
     @torch.no_grad()
     def write(self, shown: Shown, out: Path) -> None:

@@ -16,7 +16,7 @@ _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
     *(ARMS, LOOKED, RETRAINED, PICTURES),
 )
-_FREE = (*PRESENTATION, "bootstrap", "quick", "tables", "networks", "fresh")
+_FREE = (*PRESENTATION, "bootstrap", "tables", "networks", "fresh")
 """Settings that may change on the way: they add attacks, and alter none."""
 _WORDS = (
     *("network", "strategy", "trained on", "parameters", "settings", "made against", "asked", "class"),
@@ -60,16 +60,6 @@ def study_run(study: Study) -> Answer:
         notes=[_NOTE.format(draws=lab.drawing.draws), *(note for one in found for note in remarks(one))],
         words=_WORDS,
         printed=[one.sheet(classes=False) for one in found if one.name != ORDERS],
-        printed_words=(
-            "network",
-            "strategy",
-            "trained on",
-            "parameters",
-            "settings",
-            "made against",
-            "asked",
-            "class",
-        ),
         lead=[f"`{command.replace('study', f'study {study.name}', 1)}`", ""],
         failed=dict(sorted(lab.failed.items())),
     )

@@ -39,7 +39,7 @@ from drivesem.questions.realism.asking import AVAILABLE, chosen
 from drivesem.questions.realism.measures import load
 from drivesem.questions.transfer.asking import words
 from drivesem.run.folder import FRAMES, folder_of
-from drivesem.settings.commands import Classify, Study
+from drivesem.settings.commands import Study
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 
@@ -129,9 +129,9 @@ class Lab:
         return tuple(self.done[place] for place in places)
 
     @cached_property
-    def learnt(self) -> tuple[tuple[Shown, ...], list[int]]:
-        """The pictures that are trained on, and the places of those that counterexamples replace."""
-        return self.train, half(len(self.train), self.study.seed)
+    def replaced(self) -> list[int]:
+        """Places of the pictures to train on that counterexamples replace."""
+        return half(len(self.train), self.study.seed)
 
     def labels(self, shown: Sequence[Shown]) -> list[int]:
         return [self.classes.index(one.name.partition("/")[0]) for one in shown]
@@ -150,9 +150,8 @@ class Lab:
                 name = f"{strategy}-as-{network}"
                 self._add(network, eyes, strategy, self.test, name, **preset(network, strategy))
             if self.wants("retraining", "robustness", "worth"):
-                shown, places = self.learnt
-                replaced = [shown[place] for place in places]
-                self._add("train", eyes, strategy, replaced, f"{strategy}-train", **usual)
+                shown = [self.train[place] for place in self.replaced]
+                self._add("train", eyes, strategy, shown, f"{strategy}-train", **usual)
         self.failed |= run_arms(list(self.arms.values()), self.study, "attacking pictures")
         if not self.done:
             raise UsageError(
@@ -179,23 +178,14 @@ class Lab:
         """Networks retrained on each method's counterexamples, and attacked anew."""
         if not self.wants("retraining", "robustness", "worth"):
             return
-        shown, places = self.learnt
-        settings = Classify(
-            what="data",
-            objects=self.study.objects,
-            backgrounds=self.study.backgrounds,
-            workers=self.study.workers,
-            keep_going=self.study.keep_going,
-        )
+        settings = attack_of(self.study, self.out, "", self.eyes[0].spec)
         studio = Studio.of(settings)
-        unseen = draw(shown, studio, settings, self.out / PICTURES).failed
-        usable = [i for i, one in enumerate(shown) if one.identifier not in {**unseen, **self.failed}]
-        paths = [
-            self.out / PICTURES / shown[i].split / self.classes[label] / f"{shown[i].identifier}.png"
-            for i, label in zip(usable, self.labels([shown[i] for i in usable]), strict=True)
-        ]
-        labels = torch.tensor(self.labels([shown[i] for i in usable]))
-        replaced = torch.tensor([i in set(places) for i in usable])
+        self.failed |= draw(self.train, studio, settings, self.out / PICTURES).failed
+        usable = [i for i, one in enumerate(self.train) if one.identifier not in self.failed]
+        shown = [self.train[i] for i in usable]
+        labels = torch.tensor(self.labels(shown))
+        paths = [studio.place(one, self.out / PICTURES) for one in shown]
+        replaced = torch.tensor([i in set(self.replaced) for i in usable])
         for eyes in self.deep:
             benign = eyes.features("train", paths)
             self.taught[eyes.name, BENIGN] = eyes.network
@@ -203,7 +193,7 @@ class Lab:
                 features = benign.clone()
                 if trained != ONWARD:
                     arm = self.arms["train", eyes.name, trained]
-                    changed = [one for one in arm.shown if one.identifier not in {**unseen, **self.failed}]
+                    changed = [one for one in arm.shown if one.identifier not in self.failed]
                     features[replaced] = eyes.features(f"{trained}-train", pictures(arm, changed)[1])
                 self.taught[eyes.name, trained] = retrained(
                     eyes.network, self.weights(eyes, trained), features, labels, self.study.seed, self.study.device
@@ -244,7 +234,7 @@ class Lab:
 
     def features(self, source: Eyes, strategy: str, target: Eyes) -> Tensor:
         """What a network's last layer reads of counterexamples against a network; of benign pictures too."""
-        attacked = next(one for one in self.strategies) if strategy == BENIGN else strategy
+        attacked = self.strategies[0] if strategy == BENIGN else strategy
         before, after = pictures(self.arms["test", source.name, attacked], self.done)
         name = BENIGN if strategy == BENIGN else f"{strategy} against {source.name}"
         return target.features(name, before if strategy == BENIGN else after)
