@@ -8,7 +8,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.classify.attack import WRITTEN, Attacker, frames_of, report_run
+from drivesem.classify.attack import WRITTEN, Attacker, frames_of
 from drivesem.classify.pictures import Shown
 from drivesem.classify.results import ClassifiedFrame
 from drivesem.run.ask import Bar, ask
@@ -41,9 +41,8 @@ NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One attack. name: its folder, below `ARMS`; config: of the attack, with its folder; shown: its pictures."""
+    """One attack. config: its settings, with its folder; shown: its pictures."""
 
-    name: str
     config: Classify
     shown: tuple[Shown, ...]
 
@@ -51,15 +50,17 @@ class Arm:
     def out(self) -> Path:
         return Path(self.config.out or "")
 
-    def frames(self, kept: Sequence[Shown] | None = None) -> list[ClassifiedFrame]:
-        """What came of its pictures, or of some of them."""
-        return frames_of(self.out, self.shown if kept is None else kept)
+    def frames(self, kept: Sequence[Shown]) -> list[ClassifiedFrame]:
+        """What came of some of its pictures."""
+        return frames_of(self.out, kept)
 
 
 @cache
-def preset(network: str, method: str) -> Mapping[str, Any]:
-    """The paper's settings of a method for one of its networks."""
-    settings = files.read_yaml(presets()[f"classify-{network}-{method}"])
+def preset(network: str, strategy: str) -> Mapping[str, Any]:
+    """The paper's settings of a strategy for one of its networks; samples have the same for both."""
+    if strategy in _SAMPLES:
+        return _SAMPLES[strategy]
+    settings = files.read_yaml(presets()[f"classify-{network}-{strategy}"])
     return {key: value for key, value in settings.items() if key != "for"}
 
 
@@ -80,11 +81,6 @@ def attack_of(study: Study, out: Path, name: str, network: str, **settings: Any)
         grade=False,
     )
     return replace(config, **settings)
-
-
-def strategy_of(strategy: str, theirs: str) -> dict[str, Any]:
-    """The settings of a strategy, for a network that stands beside one of the paper's."""
-    return dict(_SAMPLES[strategy]) if strategy in _SAMPLES else dict(preset(theirs, strategy))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +120,3 @@ def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
     ]
     build = partial(_Attackers, tuple(arms))
     return ask(jobs, build(), build, study, Bar(title, remaining=True), lambda job: job.shown.identifier).failed
-
-
-def write_page(arm: Arm, classes: tuple[str, ...], kept: Sequence[Shown]) -> None:
-    """The page of an arm, as `drivesem classify attack` writes it."""
-    report_run(arm.config, arm.out, classes, kept, {}, sum(frame.seconds for frame in arm.frames(kept)))

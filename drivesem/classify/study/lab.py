@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from drivesem.classify.attack import report_run
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.sources import open_objects
@@ -20,16 +21,7 @@ from drivesem.classify.objects.types import ObjectSet, Split
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.study import pixels
-from drivesem.classify.study.arms import (
-    GRADIENT,
-    STRATEGIES,
-    Arm,
-    attack_of,
-    preset,
-    run_arms,
-    strategy_of,
-    write_page,
-)
+from drivesem.classify.study.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
 from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
 from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
 from drivesem.classify.study.paper import NETWORKS
@@ -140,7 +132,7 @@ class Lab:
         """All attacks on the networks as they are. Raises UsageError or SceneError."""
         for eyes, strategy in product(self.eyes, self.strategies):
             grade = not self.study.quick
-            self._add("test", eyes, strategy, self.test, grade=grade, **strategy_of(strategy, eyes.theirs))
+            self._add("test", eyes, strategy, self.test, grade=grade, **preset(eyes.theirs, strategy))
         for eyes, strategy in product(self.deep, GRADIENT):
             usual = preset(eyes.theirs, strategy)
             for params in SINGLE if self.wants("parameters") else ():
@@ -159,7 +151,8 @@ class Lab:
             )
         for key, arm in self.arms.items():
             if key[0] == "test":
-                write_page(arm, self.classes, self.done)
+                seconds = sum(frame.seconds for frame in arm.frames(self.done))
+                report_run(arm.config, arm.out, self.classes, self.done, {}, seconds)
 
     def _add(
         self,
@@ -172,7 +165,7 @@ class Lab:
     ) -> None:
         folder = f"{eyes.name}-{name or strategy}"
         config = attack_of(self.study, self.out, folder, settings.pop("network", eyes.spec), **settings)
-        self.arms[kind, eyes.name, strategy] = Arm(folder, config, tuple(shown))
+        self.arms[kind, eyes.name, strategy] = Arm(config, tuple(shown))
 
     def teach(self) -> None:
         """Networks retrained on each method's counterexamples, and attacked anew."""
