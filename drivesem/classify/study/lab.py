@@ -85,10 +85,8 @@ class Lab:
         open_backgrounds(study.backgrounds)
         eyes = _eyes_of(study, objects.classes, out)
         drawing = Drawing(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
-        test, train = (
-            _some(objects, *pair, study.seed)
-            for pair in (("test", sizes["limit"]), ("train", sizes["train_pictures"]))
-        )
+        test = _some(objects, "test", sizes["limit"], study.seed)
+        train = _some(objects, "train", sizes["train_pictures"], study.seed)
         return cls(replace(study, **sizes), out, objects, eyes, wanted, drawing, test, train)
 
     @property

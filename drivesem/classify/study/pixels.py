@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import importlib.util
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,10 +29,11 @@ def available() -> bool:
 
 def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Mapping[str, np.ndarray]:
     """Pictures (N, 3, H, W) in [0, 1] after each of `ATTACKS`, on the 8-bit grid, as uint8. labels (N,)."""
-    from art.attacks.evasion import CarliniL2Method, FastGradientMethod, ProjectedGradientDescent
-    from art.estimators.classification import PyTorchClassifier
+    # optional, and not there where types are checked
+    evasion = importlib.import_module("art.attacks.evasion")
+    estimators = importlib.import_module("art.estimators.classification")
 
-    classifier = PyTorchClassifier(
+    classifier = estimators.PyTorchClassifier(
         model=copy.deepcopy(network),
         loss=nn.CrossEntropyLoss(),
         input_shape=images.shape[1:],
@@ -39,17 +42,19 @@ def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Map
         device_type="gpu" if next(network.parameters()).is_cuda else "cpu",
     )
     size, quiet = {"batch_size": _AT_A_TIME}, {"verbose": False}
-    made: dict[str, Callable[[], object]] = {
-        "FGSM, 4/255": lambda: FastGradientMethod(classifier, eps=_REACH, **size),
-        "PGD, 4/255": lambda: ProjectedGradientDescent(
+    made: dict[str, Callable[[], Any]] = {
+        "FGSM, 4/255": lambda: evasion.FastGradientMethod(classifier, eps=_REACH, **size),
+        "PGD, 4/255": lambda: evasion.ProjectedGradientDescent(
             classifier, eps=_REACH, eps_step=_STEP, max_iter=_STEPS, **size, **quiet
         ),
-        "CW, 2-norm": lambda: CarliniL2Method(classifier, binary_search_steps=3, max_iter=_STEPS, **size, **quiet),
+        "CW, 2-norm": lambda: evasion.CarliniL2Method(
+            classifier, binary_search_steps=3, max_iter=_STEPS, **size, **quiet
+        ),
     }
     truth = np.eye(len(network.classes), dtype=np.float32)[labels]
     found = {}
     for name in ATTACKS:
-        changed = made[name]().generate(x=images.astype(np.float32), y=truth)  # type: ignore[attr-defined]
+        changed = made[name]().generate(x=images.astype(np.float32), y=truth)
         found[name] = (np.clip(changed, 0, 1) * 255).round().astype(np.uint8)
     return found
 

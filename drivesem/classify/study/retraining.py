@@ -34,8 +34,9 @@ def retrained(
         learner.last.requires_grad_(True)
         generator = torch.Generator().manual_seed(seed)
         config = Classify(what="train", epochs=EPOCHS, layers="last")
-        known = dict.fromkeys(("train", "val"), features)
-        fit_last(learner, known, dict.fromkeys(known, labels.to(device)), config, generator, onward=True)
+        truth = labels.to(device)
+        known = {"train": features, "val": features}
+        fit_last(learner, known, {"train": truth, "val": truth}, config, generator, onward=True)
         save_classifier(ready(learner, device), path, {"trained_on": str(len(labels))})
     return load_classifier(str(path), network.classes, device)
 

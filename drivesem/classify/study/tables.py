@@ -420,7 +420,7 @@ def _parameters_in_order(lab: Lab) -> list[Row]:
     rows: list[Row] = []
     moved = ("vertex", "pose", _BOTH)
     for eyes, strategy in product(lab.deep, GRADIENT):
-        theirs = dict(zip(moved, figures()["parameters"]["vgg16"][strategy], strict=True))
+        theirs: dict[str, float] = dict(zip(moved, figures()["parameters"]["vgg16"][strategy], strict=True))
         ours = {one: _moved(lab, eyes, strategy, one) for one in moved}
         rows += _order(lab, f"parameters, {NAMES[strategy]}", eyes, theirs, ours)
     return rows
