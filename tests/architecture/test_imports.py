@@ -34,6 +34,7 @@ LOADED_WHERE_USED = (
     "ray",
     "loky",
     "fsspec",
+    "art",
 )
 
 

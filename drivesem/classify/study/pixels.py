@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import importlib.util
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -29,11 +28,10 @@ def available() -> bool:
 
 def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Mapping[str, np.ndarray]:
     """Pictures (N, 3, H, W) in [0, 1] after each of `ATTACKS`, on the 8-bit grid, as uint8. labels (N,)."""
-    # optional, and not there where types are checked
-    evasion = importlib.import_module("art.attacks.evasion")
-    estimators = importlib.import_module("art.estimators.classification")
+    from art.attacks import evasion  # pyright: ignore[reportMissingImports]
+    from art.estimators import classification  # pyright: ignore[reportMissingImports]
 
-    classifier = estimators.PyTorchClassifier(
+    classifier = classification.PyTorchClassifier(
         model=copy.deepcopy(network),
         loss=nn.CrossEntropyLoss(),
         input_shape=images.shape[1:],
@@ -48,7 +46,7 @@ def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Map
             classifier, eps=_REACH, eps_step=_STEP, max_iter=_STEPS, **size, **quiet
         ),
         "CW, 2-norm": lambda: evasion.CarliniL2Method(
-            classifier, binary_search_steps=3, max_iter=_STEPS, **size, **quiet
+            classifier, max_iter=_STEPS, binary_search_steps=3, max_halving=2, max_doubling=2, **size, **quiet
         ),
     }
     truth = np.eye(len(network.classes), dtype=np.float32)[labels]
