@@ -51,7 +51,7 @@ class VGG16(Classifier):
 
 
 class PooledVGG16(Classifier):
-    """Its convolutions, and one layer on what the last of them find anywhere: where the three large layers of the
+    """Its convolutions, and one layer on mean and maximum of what the last of them find: where the three large layers of the
     published network are not at hand, which hold nine tenths of its weights.
     """
 
@@ -61,7 +61,8 @@ class PooledVGG16(Classifier):
     def __init__(self, classes: Sequence[str]) -> None:
         super().__init__(classes)
         self.features = _convolutions()
-        self.classifier = nn.Linear(512, len(self.classes))
+        self.classifier = nn.Linear(2 * 512, len(self.classes))
 
     def encode(self, prepared: Tensor) -> Tensor:
-        return self.features(prepared).mean(dim=(2, 3))
+        x = self.features(prepared)
+        return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)

@@ -112,8 +112,8 @@ def tables_of(lab: Lab) -> list[Table]:
     if orders:
         held, turned = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
         note = (
-            f"Of {len(orders)} orders of two of the paper's figures {held} hold here, {turned} are reversed, and "
-            f"{len(orders) - held - turned} are undecided."
+            f"Of {len(orders)} orders of two of the paper's figures: {held} hold here, reversed: {turned}, "
+            f"undecided: {len(orders) - held - turned}."
         )
         columns = ("network", "table", "first", "second", "paper", "ours", "verdict")
         found.append(Table(ORDERS, "Does the paper's order hold?", columns, orders, (), (note,)))

@@ -113,7 +113,7 @@ def test_vggs_convolutions_alone(tmp_path):
     save_file(vgg_file(small=True), tmp_path / "vgg.safetensors")
     network = ready(to_train("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
     assert isinstance(network, PooledVGG16)
-    assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 512)
+    assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 1024)
 
 
 def test_squeezenets_layers_are_squeezedets(tmp_path):
