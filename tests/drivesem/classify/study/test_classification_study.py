@@ -81,6 +81,32 @@ def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_pixels(two_networks, tmp_path, capsys, monkeypatch):
+    """Whatever attacks pixels, what comes of it is judged and measured: here all pictures become blue."""
+
+    def blue(network, images, labels):
+        assert images.shape == (3, 3, 64, 64)
+        assert images.max() <= 1
+        after = np.zeros(images.shape, np.uint8)
+        after[:, 2] = 255
+        return dict.fromkeys(pixels.ATTACKS, after)
+
+    monkeypatch.setattr(pixels, "attacked", blue)
+    monkeypatch.setattr(pixels, "available", lambda: True)
+    words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--tables", "pixels")
+    code, data, _ = study(capsys, *words, "--json")
+    rows = data["tables"]["pixels"]["rows"]
+    assert code == 0
+    assert [(row["network"], row["strategy"]) for row in rows] == [("one", name) for name in pixels.ATTACKS]
+    assert all(row["overall"] == pytest.approx(1 / 3, abs=1e-4) for row in rows)  # the pole, which is blue
+    assert all(row["distance"] > 0 for row in rows)
+    monkeypatch.setattr(pixels, "available", lambda: False)
+    code, data, _ = study(capsys, *words, "--json")
+    assert (code, data["tables"]["pixels"]["rows"]) == (0, [])
+    assert pixels.NEEDS in data["tables"]["pixels"]["notes"][0]
+
+
+@pytest.mark.slow
 def test_transfer(two_networks, tmp_path, capsys):
     words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--json")
     code, data, _ = study(capsys, *words, "--tables", "transfer")
