@@ -1056,7 +1056,22 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(Derender, Render, Edit, View, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
+    *(
+        Derender,
+        Render,
+        Edit,
+        View,
+        Synth,
+        Bench,
+        Gradcheck,
+        Eval,
+        Convert,
+        Export,
+        Check,
+        Anchors,
+        Train,
+        Retrain,
+    ),
     *(Classify, Doctor, Presets),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}

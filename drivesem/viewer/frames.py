@@ -18,6 +18,7 @@ from drivesem.scenes.sources import scene_folders
 from drivesem.settings.commands import View
 from drivesem.settings.errors import UsageError
 from drivesem.viewer.server import ShownFrame
+from scene_ir import files
 
 _SETTING = "SCENE|RUN"
 _OTHERWISE = "squeezedet"
@@ -40,7 +41,7 @@ def opened(config: View) -> Shown:
     """
     path = Path(config.scene)
     budget, t_star = budget_of(config.budget), config.t_star
-    if (path / CONFIG).is_file():
+    if _is_run(path):
         (run,) = load_runs([config.scene], setting=_SETTING)
         frames = {
             frame.result.identifier: ShownFrame(frame.folder / "scene", _told(frame.result))
@@ -59,6 +60,14 @@ def opened(config: View) -> Shown:
             raise UsageError("--frame", f"a frame of {config.scene}", config.frame)
         frames = {config.frame: frames[config.frame], **frames}
     return Shown(path.resolve().name, frames, detector, budget, t_star)
+
+
+def _is_run(path: Path) -> bool:
+    """Whether a folder is a run of drivesem attack: drivesem derender leaves its settings beside scenes too."""
+    if not (path / CONFIG).is_file():
+        return False
+    settings = files.read_yaml(path / CONFIG)
+    return isinstance(settings, dict) and {"detector", "params", "combo"} <= settings.keys()
 
 
 def _detector(config: View) -> Predictor:

@@ -15,6 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -30,7 +31,7 @@ from scene_ir.errors import SceneError, shown
 
 HOST = "127.0.0.1"
 POLICY = (
-    "default-src 'none'; img-src 'self' blob:; style-src 'self'; script-src 'self'; connect-src 'self'; "
+    "default-src 'none'; img-src 'self' blob: data:; style-src 'self'; script-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """What the page may do."""
@@ -151,7 +152,9 @@ class Viewer:
         with self._lock:
             known = self._stages.get(name)
             if known is None:
-                known = Stage(frame.folder, self.detector, self._budget, self._t_star)
+                make = partial(Stage, frame.folder, self.detector, self._budget, self._t_star)
+                # it draws and looks: neither thread may do so for another frame meanwhile
+                known = self._draw.submit(lambda: self._see.submit(make).result()).result()
                 self._stages[name] = known
                 while len(self._stages) > _KEPT_STAGES:
                     self._stages.popitem(last=False)

@@ -65,6 +65,7 @@ class Stage:
         self._drawn: OrderedDict[tuple[tuple[str, float], ...], Drawn] = OrderedDict()
         self._scores: OrderedDict[tuple[int, tuple[tuple[str, float], ...]], dict[str, Any]] = OrderedDict()
         self._picture: bytes | None = None
+        self.focus = self._focus()
 
     def drawn(self, state: State, keep: bool = True) -> Drawn:
         """The scene in a state, drawn or as it was drawn before. keep: for the next question about it."""
@@ -153,6 +154,7 @@ class Stage:
                 {name: getattr(knob, name) for name in knob.__slots__} for knob in self.knobs.knobs.values()
             ],
             "found": self.knobs.found,
+            "focus": self.focus,
             "cars": cars,
             "boxes": self._boxes(benign, told),
             "street": dict(zip(("x0", "x1", "z0", "z1"), self.street_m(), strict=True)),
@@ -181,11 +183,20 @@ class Stage:
         ground = np.stack([x, y, z, np.ones_like(x)], -1) @ rest.camera.matrix.double().numpy().T
         u, v = (ground[..., i] / ground[..., 2] for i in (0, 1))
         inside = (u >= 0) & (u <= rest.camera.width - 1) & (v >= 0) & (v <= rest.camera.height - 1)
-        above = cv2.remap(
-            to_uint8(rest.background), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
-        )
+        above = cv2.remap(to_uint8(rest.background), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
         rgba = np.dstack([above[..., ::-1], 255 * inside.astype(np.uint8)])
         return _encoded(".png", rgba)
+
+    def _focus(self) -> int:
+        """The vehicle to begin with: the first that is lost in the state that the scene holds, else the nearest of
+        those that are judged, else any.
+        """
+        found = self.knobs.found
+        cars = self._cars(self._look(found, self.drawn(found)))
+        far = self.knobs.rest.objects.translation[:, 2].tolist()
+        order = {"lost": 0, "found": 1, "missed": 2, "ignored": 3}
+        rows = (row for row in range(len(cars)) if far[row] > 0)
+        return min(rows, key=lambda row: (order[cars[row]["status"]], far[row]), default=0)
 
     def _look(self, state: State, drawn: Drawn) -> Rendered:
         if not state and self.knobs.rest.before is None:
@@ -222,7 +233,9 @@ class Stage:
             kind = status if status in ("lost", "ignored") else "true"
             text = f"{row}: {name}, {_NAMED.get(status, status)}"
             marks.append({"kind": kind, "xyxy": box, "text": text, "car": row})
-        rows = zip(detections.boxes_xyxy.tolist(), detections.labels.tolist(), detections.scores.tolist(), strict=True)
+        rows = zip(
+            detections.boxes_xyxy.tolist(), detections.labels.tolist(), detections.scores.tolist(), strict=True
+        )
         for i, (box, label, score) in enumerate(rows):
             if score >= self.objective.t_star:
                 kind = "phantom" if i in phantoms else "found"

@@ -20,7 +20,9 @@ def show(name: str, folder: Path) -> None:
     SceneError for a scene that cannot be read or textured.
     """
     if not has_display(sys.platform, os.environ):
-        raise UsageError("--window", "a display (the page needs none)", "neither DISPLAY nor WAYLAND_DISPLAY is set")
+        raise UsageError(
+            "--window", "a display (the page needs none)", "neither DISPLAY nor WAYLAND_DISPLAY is set"
+        )
     try:
         import open3d
     except (ImportError, OSError) as error:
