@@ -540,7 +540,8 @@ class View(Trust, Threshold, Tiles, Device, Command):
     frame: str | None = None
     """The frame to begin with, by name; by default the first."""
     detector: str | None = None
-    """A shipped detector, a file, or another project's (docs/detectors.md); by default the run's, or squeezedet."""
+    """A shipped detector, a file, or another project's (docs/detectors.md); by default the run's, else squeezedet.
+    """
     budget: str = "street"
     """How far sliders go: a preset, a YAML file, or NAME=VALUE with commas, as of drivesem attack."""
     port: Annotated[int, Within(0, 65535, expected="0 (any that is free) to 65535")] | None = None
@@ -1056,23 +1057,8 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(
-        Derender,
-        Render,
-        Edit,
-        View,
-        Synth,
-        Bench,
-        Gradcheck,
-        Eval,
-        Convert,
-        Export,
-        Check,
-        Anchors,
-        Train,
-        Retrain,
-    ),
-    *(Classify, Doctor, Presets),
+    *(Derender, Render, Edit, View, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train),
+    *(Retrain, Classify, Doctor, Presets),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""

@@ -59,8 +59,8 @@ _TRUTH = {"true": True, "false": False}
 @dataclass(frozen=True, slots=True)
 class ObjectEdit:
     """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
-    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none; mesh_share:
-    of the change of shape that a scene has already; size: share by which it grows.
+    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none;
+    mesh_share: of the change of shape that a scene has already; size: share by which it grows.
     """
 
     translate: tuple[float, float] = (0.0, 0.0)

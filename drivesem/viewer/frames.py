@@ -19,6 +19,7 @@ from drivesem.settings.commands import View
 from drivesem.settings.errors import UsageError
 from drivesem.viewer.server import ShownFrame
 from scene_ir import files
+from scene_ir.io import count_objects
 
 _SETTING = "SCENE|RUN"
 _OTHERWISE = "squeezedet"
@@ -26,7 +27,7 @@ _OTHERWISE = "squeezedet"
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """title: for people; frames: by name, the one to begin with first."""
+    """title: for people; frames: by name, the one to begin with first: by default one with vehicles."""
 
     title: str
     frames: Mapping[str, ShownFrame]
@@ -36,8 +37,8 @@ class Shown:
 
 
 def opened(config: View) -> Shown:
-    """What a command is to show. Raises UsageError for what cannot be shown or looked at, FormatError naming a file
-    that is not as it should be.
+    """What a command is to show. Raises UsageError for what cannot be shown or looked at, FormatError naming a
+    file that is not as it should be.
     """
     path = Path(config.scene)
     budget, t_star = budget_of(config.budget), config.t_star
@@ -55,10 +56,11 @@ def opened(config: View) -> Shown:
             raise UsageError(_SETTING, "a scene of drivesem derender, a folder of some, or a run", config.scene)
         frames = {name: ShownFrame(folder) for name, folder in scene_folders(path).items()}
         detector = _detector(config)
-    if config.frame is not None:
-        if config.frame not in frames:
-            raise UsageError("--frame", f"a frame of {config.scene}", config.frame)
-        frames = {config.frame: frames[config.frame], **frames}
+    if config.frame is not None and config.frame not in frames:
+        raise UsageError("--frame", f"a frame of {config.scene}", config.frame)
+    first = config.frame or next((name for name, frame in frames.items() if count_objects(frame.folder)), None)
+    if first is not None:
+        frames = {first: frames[first], **frames}
     return Shown(path.resolve().name, frames, detector, budget, t_star)
 
 

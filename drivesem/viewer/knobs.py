@@ -1,7 +1,8 @@
-"""What can be moved in a scene, in the units that people write; the states this makes, and the command that draws one.
+"""What can be moved in a scene, in the units that people write; the states this makes, and a command for each.
 
-Everything follows from theta (`drivesem.attack.space`): its names, units and bounds. Mesh offsets are 96 a vehicle,
-which nobody moves by hand: where a scene holds other shapes than its photograph, they are moved together, by a share.
+Everything follows from theta (`drivesem.attack.space`): its names, units and bounds. Mesh offsets are 96 a
+vehicle, which nobody moves by hand: where a scene holds other shapes than its photograph, they move together, by a
+share.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ _SCENE_CODES = {Parameter.WEATHER: WEATHER_NAMES, Parameter.FOLIAGE: FOLIAGE_NAM
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """One slider. name: as theta has it, such as `objects[3].yaw`; title: its last word; unit: m, deg, % or "" of a
-    code; low, high: how far it goes; step: from one place to the next; found: the value that the scene holds; car:
-    whose it is, None of what belongs to the scene; group: its parameter, or shape.
+    """One slider. name: as theta has it, such as `objects[3].yaw`; title: its last word; unit: m, deg, % or "" of
+    a code; low, high: how far it goes; step: from one place to the next; found: the value that the scene holds;
+    car: whose it is, None of what belongs to the scene; group: its parameter, or shape.
     """
 
     name: str

@@ -5,15 +5,16 @@
 const $ = id => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const PAGE = Math.random().toString(36).slice(2);
-const GRID = 9;
 const GROUPS = {translate: "Place", rotate: "Place", size: "Size and shape", shape: "Size and shape", color: "Paint",
   weather: "Weather", foliage: "Leaves", sun: "Sun"};
 const ORDER = ["Place", "Paint", "Size and shape", "Weather", "Leaves", "Sun"];
+const MEANING = {along: "forwards, along its photographed heading", across: "to its own left", yaw: "about its ground centre",
+  a: "from green to red", b: "from blue to yellow", shape: "share of the shape that was found"};
 const STATUS = {found: "found", lost: "lost", missed: "missed as photographed too", ignored: "not judged"};
 
 let overview = null, frame = null, values = new Map(), knobs = new Map(), sliders = new Map();
 let shown = {car: 0, x: "", y: "", before: false, boxes: true};
-let seen = null;          // what the detector last said, and of which state
+let seen = null;          // what the detector last said
 let serial = 1;           // of states: an answer about an earlier one is dropped
 let started = 0;          // when the state last changed
 
@@ -77,7 +78,7 @@ const followPicture = follow(async now => {
   $("after").src = next;
   if (url) URL.revokeObjectURL(url);
   url = next;
-  $("view").dataset.picture = now;
+  arrived("picture", now);
   $("times").dataset.picture = Math.round(performance.now() - started);
   tellTimes();
 });
@@ -85,13 +86,19 @@ const followDetections = follow(async now => {
   const answer = await ask("/detections", asked());
   if (answer === null) return;
   const told = await answer.json();
-  seen = {...told, serial: now};
-  $("view").dataset.detections = now;
+  seen = told;
   $("times").dataset.detections = Math.round(performance.now() - started);
   tellTimes();
   showSeen();
+  arrived("detections", now);
   if (now === serial) settled(now);
 });
+/* Tell, for styles and tests, when what is shown is of the state as it stands. */
+let latest = {};
+function arrived(what, now) {
+  latest[what] = now;
+  if (latest.picture === serial && latest.detections === serial) $("view").dataset.settled = serial;
+}
 function tellTimes() {
   const {picture, detections} = $("times").dataset;
   $("times").textContent = `picture ${picture ?? "–"} ms, detections ${detections ?? "–"} ms`;
@@ -117,6 +124,7 @@ async function settled(now) {
 function changed({keepMap = false} = {}) {
   serial += 1;
   started = performance.now();
+  delete $("view").dataset.settled;
   if (!keepMap) forgetMap();
   refresh();
   followPicture();
@@ -220,7 +228,8 @@ function choose(car, x = null, y = null, tell = true) {
   if (tell) { refresh(); showSeen(); settled(serial); }
 }
 function carLine() {
-  const reset = element("button", {type: "button"}, "as photographed");
+  if (!frame.cars.length) return element("p", {class: "soft small"}, "The scene has no vehicle that can be moved.");
+  const reset = element("button", {type: "button", title: "this vehicle as photographed"}, "reset");
   reset.addEventListener("click", () => restCar());
   return element("p", {class: "chosen-line"}, element("span", {id: "chosen"}), reset);
 }
@@ -248,7 +257,7 @@ function slider(knob) {
   const input = element("input", {type: "range", id, min: knob.low, max: knob.high, step: "any", "data-name": knob.name});
   const output = element("output", {for: id});
   const back = element("button", {type: "button", title: "as photographed", "aria-label": `${knob.title} as photographed`}, "×");
-  const row = element("div", {class: "knob"}, element("label", {for: id}, knob.title), input, output, back);
+  const row = element("div", {class: "knob"}, element("label", {for: id, title: MEANING[knob.title] ?? ""}, knob.title), input, output, back);
   input.addEventListener("input", () => move({[knob.name]: Number(input.value)}));
   input.addEventListener("keydown", event => {
     const step = {ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10}[event.key];
@@ -333,8 +342,10 @@ function drawStreet() {
     svg.append(drawing("image", {class: "ground", href: `/street?${new URLSearchParams({frame: frame.name})}`, x: x0, y: -z1, width: x1 - x0, height: z1 - z0, preserveAspectRatio: "none"}));
     for (let r = 10; r <= z1; r += 10) {
       svg.append(drawing("circle", {class: "ring", cx: 0, cy: 0, r}));
-      svg.append(drawing("text", {class: "far", x: .4, y: -r - .3, "font-size": Math.max(1, (z1 + 1) / 32)}, `${r} m`));
+      const x = -Math.min(.62 * r, x1 - 2), y = -Math.sqrt(r * r - x * x);
+      svg.append(drawing("text", {class: "far", x, y: y - .3, "font-size": Math.max(.9, (z1 + 1) / 36)}, `${r} m`));
     }
+    svg.append(drawing("path", {class: "camera", d: "M-.9 .9L0 -.6L.9 .9Z"}));
     svg.append(drawing("g", {id: "cars-above"}));
   }
   const status = car => (seen ?? frame).cars[car].status;
@@ -412,7 +423,8 @@ function fillAxes(axes) {
     $(id).value = shown[of];
     $(id).dataset.of = `${frame.name} ${shown.car}`;
   }
-  $("map-car").textContent = `Car ${shown.car}`;
+  const car = frame.cars[shown.car];
+  $("map-car").textContent = car ? `${car.class} ${shown.car}` : "";
 }
 for (const [id, of, other] of [["map-x", "x", "y"], ["map-y", "y", "x"]]) $(id).addEventListener("change", event => {
   const before = shown[of];
@@ -422,16 +434,16 @@ for (const [id, of, other] of [["map-x", "x", "y"], ["map-y", "y", "x"]]) $(id).
   refresh();
   settled(serial);
 });
-const at = (knob, i) => knob.low + (knob.high - knob.low) * i / (GRID - 1);
+const at = (knob, i) => knob.low + (knob.high - knob.low) * i / (overview.grid - 1);
 /* Every other cell first: a rough map soon, a fine one a little later. */
 function order() {
   const all = [];
-  for (let i = 0; i < GRID; i++) for (let j = 0; j < GRID; j++) all.push([i, j, (i % 4 === 0) && (j % 4 === 0) ? 0 : (i % 2 === 0) && (j % 2 === 0) ? 1 : 2]);
+  for (let i = 0; i < overview.grid; i++) for (let j = 0; j < overview.grid; j++) all.push([i, j, (i % 4 === 0) && (j % 4 === 0) ? 0 : (i % 2 === 0) && (j % 2 === 0) ? 1 : 2]);
   return all.sort((a, b) => a[2] - b[2]);
 }
 async function fillMap(now) {
   const x = knobs.get(shown.x), y = knobs.get(shown.y), mine = map, car = shown.car;
-  if (!x || !y || document.hidden) return;
+  if (!x || !y || !movable().includes(car) || document.hidden) return;
   for (const [i, j] of order()) {
     if (mine !== map || now !== serial) return;
     if (mine.cells.has(`${i} ${j}`)) continue;
@@ -461,8 +473,8 @@ function drawMap() {
   const [width, height] = [400, 330], [left, bottom, top, right] = [52, 42, 6, 8];
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   if (!x || !y) { svg.replaceChildren(); return; }
-  const w = (width - left - right) / GRID, h = (height - top - bottom) / GRID, parts = [];
-  for (let i = 0; i < GRID; i++) for (let j = 0; j < GRID; j++) {
+  const w = (width - left - right) / overview.grid, h = (height - top - bottom) / overview.grid, parts = [];
+  for (let i = 0; i < overview.grid; i++) for (let j = 0; j < overview.grid; j++) {
     const [cell, rough] = nearest(i, j), px = left + i * w, py = height - bottom - (j + 1) * h;
     const rect = drawing("rect", {class: `cell ${cell ? cell.status : "waits"}${rough ? " rough" : ""}`, x: px, y: py, width: w, height: h, "data-i": i, "data-j": j});
     if (cell) {
@@ -473,7 +485,7 @@ function drawMap() {
     if (cell && !rough && (cell.status === "lost" || cell.status === "missed"))
       parts.push(drawing("path", {class: "cross", d: `M${px + .3 * w} ${py + .3 * h}l${.4 * w} ${.4 * h}m0 ${-.4 * h}l${-.4 * w} ${.4 * h}`}));
   }
-  const place = (knob, value, from, size) => from + size / 2 + (value - knob.low) / (knob.high - knob.low) * (GRID - 1) * size;
+  const place = (knob, value, from, size) => from + size / 2 + (value - knob.low) / (knob.high - knob.low) * (overview.grid - 1) * size;
   const zeroX = place(x, 0, left, w), zeroY = height - bottom - place(y, 0, 0, h);
   if (x.low <= 0 && x.high >= 0) parts.push(drawing("line", {class: "zero", x1: zeroX, x2: zeroX, y1: top, y2: height - bottom}));
   if (y.low <= 0 && y.high >= 0) parts.push(drawing("line", {class: "zero", x1: left, x2: width - right, y1: zeroY, y2: zeroY}));
@@ -487,7 +499,8 @@ function drawMap() {
   parts.push(drawing("text", {class: "axis", x: 0, y: 0, "text-anchor": "middle", transform: `translate(13 ${top + (height - top - bottom) / 2}) rotate(-90)`}, `${y.title} →`));
   svg.replaceChildren(...parts);
   const cells = [...map.cells.values()], lost = cells.filter(c => c.status === "lost" || c.status === "missed").length;
-  $("map-said").textContent = `${lost} of ${cells.length} lost${cells.length < GRID * GRID ? ", still looking" : ""}`;
+  const none = !movable().includes(shown.car);
+  $("map-said").textContent = none ? "no vehicle to ask about" : `${lost} of ${cells.length} lost${cells.length < overview.grid * overview.grid ? ", still looking" : ""}`;
   $("map").dataset.cells = cells.length;
 }
 let aiming = false;
@@ -540,11 +553,19 @@ function showKeys() {
   const off = $("keys").classList.toggle("hidden");
   $("show-keys").setAttribute("aria-expanded", !off);
 }
+/* Arrows as one sees them: to the right and away; which of its axes that is depends on how the car stands. */
+function push(right, away, event) {
+  const car = frame.cars[shown.car];
+  if (!car) return;
+  const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
+  const along = right * cos - away * sin, across = right * sin + away * cos;
+  if (Math.abs(along) >= Math.abs(across)) nudge("translate.along", Math.sign(along), event);
+  else nudge("translate.across", Math.sign(across), event);
+}
 const KEYS = {
   b: flip, d: () => { shown.boxes = !shown.boxes; showSeen(); }, n: () => nextCar(1), p: () => nextCar(-1), r: restCar,
   0: () => become({}), f: () => become(frame.found), c: copyCommand, l: copyLink, "?": showKeys,
-  arrowup: e => nudge("translate.along", 1, e), arrowdown: e => nudge("translate.along", -1, e),
-  arrowright: e => nudge("translate.across", 1, e), arrowleft: e => nudge("translate.across", -1, e),
+  arrowup: e => push(0, 1, e), arrowdown: e => push(0, -1, e), arrowright: e => push(1, 0, e), arrowleft: e => push(-1, 0, e),
   q: e => nudge("yaw", -1, e), e: e => nudge("yaw", 1, e),
 };
 document.addEventListener("keydown", event => {

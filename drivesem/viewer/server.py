@@ -1,8 +1,8 @@
 """The page and its answers over HTTP, for this machine alone.
 
-Bound to 127.0.0.1. Everything is a GET that changes nothing. A request must name this server as its host, so that no
-other site's page can ask by a name of its own that leads here, and what it asks must be known: anything else gets one
-line and a 4xx.
+Bound to 127.0.0.1. Everything is a GET that changes nothing. A request must name this server as its host, so that
+no other site's page can ask by a name of its own that leads here, and what it asks must be known: anything else
+gets one line and a 4xx.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from drivesem.viewer.stage import Stage
 from scene_ir.errors import SceneError, shown
 
 HOST = "127.0.0.1"
+GRID = 9
+"""Cells of a failure map each way: a minute at most on two cores."""
 POLICY = (
     "default-src 'none'; img-src 'self' blob: data:; style-src 'self'; script-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -76,7 +78,8 @@ class Turn:
 
 
 class Viewer:
-    """What the server answers. frames: by name; title: of the page. budget, t_star: as of `Stage`.
+    """What the server answers. frames: by name; title: of the page. budget, t_star: as of `Stage`; grid: cells of
+    the failure map, each way.
 
     Drawing and looking have a thread each, so that the next picture is drawn while the detector looks at the last
     one. A request that a page has followed by a later one is dropped where it waits: queues don't grow.
@@ -89,7 +92,9 @@ class Viewer:
         detector: Predictor,
         budget: Budget,
         t_star: float | None = None,
+        grid: int = GRID,
     ) -> None:
+        self.grid = grid
         self.title, self.frames, self.detector = title, frames, detector
         self._budget, self._t_star = budget, t_star
         self._stages: OrderedDict[str, Stage] = OrderedDict()
@@ -100,7 +105,7 @@ class Viewer:
     def overview(self) -> dict[str, Any]:
         """What there is to see; for JSON."""
         frames = [{"name": name, "words": frame.words} for name, frame in self.frames.items()]
-        return {"title": self.title, "detector": self.detector.name, "frames": frames}
+        return {"title": self.title, "detector": self.detector.name, "grid": self.grid, "frames": frames}
 
     def facts(self, name: str) -> dict[str, Any]:
         """A frame's knobs and vehicles."""
@@ -148,7 +153,7 @@ class Viewer:
         """A frame made ready, or as it was before."""
         frame = self.frames.get(name)
         if frame is None:
-            raise RefusedError(f"frame: expected one of {len(self.frames)} frames, found {shown(name)}")
+            raise RefusedError(f"frame: expected one of {len(self.frames)} frames, found {shown(name) or 'none'}")
         with self._lock:
             known = self._stages.get(name)
             if known is None:
@@ -199,6 +204,12 @@ class Server(ThreadingHTTPServer):
         super().__init__((HOST, port), _Handler)
         number = self.server_port
         self.hosts = frozenset(f"{name}:{number}" for name in (HOST, "localhost"))
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A page that goes away is no error; anything else is told in one line."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            sys.stderr.write(f"drivesem: {type(error).__name__}: {' '.join(str(error).split())}\n")
 
     @property
     def url(self) -> str:

@@ -35,6 +35,8 @@ _MARGIN_M = 5.0
 """Of the street around the vehicles, as seen from above."""
 _LEAST_WIDTH_M, _NEAREST_M, _FARTHEST_M = 20.0, 3.0, 90.0
 _PIXELS_PER_M = 12
+_OFF_ROAD = 0.3
+"""How much shows of what is not road."""
 _NAMED = {"missed": "missed as photographed too", "ignored": "not judged"}
 
 
@@ -171,7 +173,9 @@ class Stage:
         return (-half, half, _NEAREST_M, far)
 
     def street(self) -> bytes:
-        """A PNG of the ground from above, as far as the photograph shows it; far is up. Else it is transparent."""
+        """A PNG of the ground from above, as far as the photograph shows it; far is up. Where it does not it is
+        transparent, and pale where there is no road: what stands there is smeared over the ground.
+        """
         x0, x1, z0, z1 = self.street_m()
         rest = self.knobs.rest
         columns, rows = (max(round((b - a) * _PIXELS_PER_M), 1) for a, b in ((x0, x1), (z0, z1)))
@@ -183,8 +187,11 @@ class Stage:
         ground = np.stack([x, y, z, np.ones_like(x)], -1) @ rest.camera.matrix.double().numpy().T
         u, v = (ground[..., i] / ground[..., 2] for i in (0, 1))
         inside = (u >= 0) & (u <= rest.camera.width - 1) & (v >= 0) & (v <= rest.camera.height - 1)
-        above = cv2.remap(to_uint8(rest.background), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-        rgba = np.dstack([above[..., ::-1], 255 * inside.astype(np.uint8)])
+        lookup = (u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        above = cv2.remap(to_uint8(rest.background), *lookup)
+        road = cv2.remap(rest.environment.road.float().numpy(), *lookup)
+        shows = np.where(inside, _OFF_ROAD + (1 - _OFF_ROAD) * road, 0.0)
+        rgba = np.dstack([above[..., ::-1], (255 * shows).round().astype(np.uint8)])
         return _encoded(".png", rgba)
 
     def _focus(self) -> int:
@@ -233,9 +240,8 @@ class Stage:
             kind = status if status in ("lost", "ignored") else "true"
             text = f"{row}: {name}, {_NAMED.get(status, status)}"
             marks.append({"kind": kind, "xyxy": box, "text": text, "car": row})
-        rows = zip(
-            detections.boxes_xyxy.tolist(), detections.labels.tolist(), detections.scores.tolist(), strict=True
-        )
+        parts = (detections.boxes_xyxy, detections.labels, detections.scores)
+        rows = zip(*(part.tolist() for part in parts), strict=True)
         for i, (box, label, score) in enumerate(rows):
             if score >= self.objective.t_star:
                 kind = "phantom" if i in phantoms else "found"

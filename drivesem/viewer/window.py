@@ -1,4 +1,4 @@
-"""A scene in 3D, in Open3D's window: vehicles with the photograph on them, and what stands behind them as a relief."""
+"""A scene in 3D, in Open3D's window: vehicles with the photograph on them, and a relief of what is behind them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ def show(name: str, folder: Path) -> None:
     SceneError for a scene that cannot be read or textured.
     """
     if not has_display(sys.platform, os.environ):
-        raise UsageError(
-            "--window", "a display (the page needs none)", "neither DISPLAY nor WAYLAND_DISPLAY is set"
-        )
+        raise UsageError("--window", "a display (the page needs none)", "no DISPLAY and no WAYLAND_DISPLAY")
     try:
         import open3d
     except (ImportError, OSError) as error:
