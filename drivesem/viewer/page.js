@@ -87,9 +87,9 @@ const followDetections = follow(async now => {
   if (answer === null) return;
   const told = await answer.json();
   seen = told;
+  showSeen();
   $("times").dataset.detections = Math.round(performance.now() - started);
   tellTimes();
-  showSeen();
   arrived("detections", now);
   if (now === serial) settled(now);
 });
