@@ -36,30 +36,30 @@ const valueOf = name => values.get(name) ?? 0;
 
 /* ---- asking the server ---------------------------------------------------------------------------------------- */
 
-async function ask(path, more = {}, signal = undefined) {
-  const answer = await fetch(`${path}?${new URLSearchParams(more)}`, {signal});
+async function ask(path, more = {}) {
+  const answer = await fetch(`${path}?${new URLSearchParams(more)}`);
   if (answer.status === 409) return null;
   if (!answer.ok) throw new Error((await answer.text()).trim());
   return answer;
 }
-const stateOf = () => Object.fromEntries(values);
-const asked = () => ({...stateOf(), frame: frame.name, page: PAGE, n: serial});
+const asked = () => ({...Object.fromEntries(values), frame: frame.name, page: PAGE, n: serial});
 
 function complain(error) {
-  if (error.name !== "AbortError") toast(error.message === "Failed to fetch" ? "drivesem view has ended" : error.message);
+  toast(error instanceof TypeError ? "no answer: drivesem view has ended" : error.message);
 }
 
-/* A loop a kind of answer: one request at a time, and the next is about the state as it is then. */
-function follow(work) {
+/* A loop a kind of answer: one request at a time, and the next is about the state as it is then. pick: another state
+   to ask about, such as one that is drawn already, while the newest is under way. */
+function follow(work, pick = () => null) {
   let done = 0, busy = false;
   return async function next() {
     if (busy || frame === null) return;
     busy = true;
     try {
       while (done !== serial) {
-        const now = serial;
-        await work(now);
-        done = now;
+        const picked = pick(), state = picked !== null && picked.n > done ? picked : asked();
+        await work(state);
+        done = state.n;
       }
     } catch (error) {
       done = serial;
@@ -68,9 +68,9 @@ function follow(work) {
   };
 }
 
-let url = "";
-const followPicture = follow(async now => {
-  const answer = await ask("/picture", asked());
+let url = "", pictured = null;
+const followPicture = follow(async state => {
+  const answer = await ask("/picture", state);
   if (answer === null) return;
   const next = URL.createObjectURL(await answer.blob()), image = new Image();
   image.src = next;
@@ -78,25 +78,23 @@ const followPicture = follow(async now => {
   $("after").src = next;
   if (url) URL.revokeObjectURL(url);
   url = next;
-  arrived("picture", now);
-  $("times").dataset.picture = Math.round(performance.now() - started);
-  tellTimes();
+  pictured = state;
+  arrived("picture", state.n);
 });
-const followDetections = follow(async now => {
-  const answer = await ask("/detections", asked());
+const followDetections = follow(async state => {
+  const answer = await ask("/detections", state);
   if (answer === null) return;
-  const told = await answer.json();
-  seen = told;
+  seen = await answer.json();
   showSeen();
-  $("times").dataset.detections = Math.round(performance.now() - started);
-  tellTimes();
-  arrived("detections", now);
-  if (now === serial) settled(now);
-});
+  arrived("detections", state.n);
+  if (state.n === serial) settled(serial);
+}, () => pictured);
 /* Tell, for styles and tests, when what is shown is of the state as it stands. */
 let latest = {};
 function arrived(what, now) {
   latest[what] = now;
+  $("times").dataset[what] = Math.round(performance.now() - started);
+  tellTimes();
   if (latest.picture === serial && latest.detections === serial) $("view").dataset.settled = serial;
 }
 function tellTimes() {
@@ -190,7 +188,8 @@ async function load(name, told) {
   const answer = await ask("/frame", {frame: name});
   frame = await answer.json();
   knobs = new Map(frame.knobs.map(knob => [knob.name, knob]));
-  seen = null;
+  seen = pictured = null;
+  $("title").textContent = [overview.title, overview.detector, frame.change].filter(Boolean).join(" · ");
   $("frame").value = name;
   const where = new URLSearchParams({frame: name});
   $("before").src = `/photograph?${where}`;
@@ -198,7 +197,7 @@ async function load(name, told) {
   for (const id of ["after", "before"]) { $(id).setAttribute("width", frame.width); $(id).setAttribute("height", frame.height); }
   $("found").classList.toggle("hidden", Object.keys(frame.found).length === 0);
   $("cars").replaceChildren(...frame.cars.filter(car => carKnobs(car.car).length).map(car => {
-    const chip = element("button", {type: "button", "data-car": car.car}, element("span", {class: "dot"}), `${car.car} ${car.class}`);
+    const chip = element("button", {type: "button", "data-car": car.car}, element("span", {class: "dot"}), `${car.car} ${car.class}`, element("small", {class: "soft"}));
     chip.addEventListener("click", () => choose(car.car));
     return chip;
   }));
@@ -310,6 +309,7 @@ function showSeen() {
     chip.className = status;
     chip.setAttribute("aria-pressed", car === shown.car);
     chip.title = STATUS[status];
+    chip.lastChild.textContent = status === "ignored" ? "" : seen.cars[car].score.toFixed(2);
   }
   const car = seen.cars[shown.car];
   if ($("chosen") && car) $("chosen").textContent = `${shown.car}: ${STATUS[car.status]}, score ${car.score.toFixed(2)} (t* ${frame.t_star.toFixed(2)}, was ${frame.cars[shown.car].score.toFixed(2)})`;
@@ -587,7 +587,6 @@ document.addEventListener("visibilitychange", () => { if (!document.hidden && fr
 
 (async () => {
   overview = await (await ask("/overview")).json();
-  $("title").textContent = `${overview.title} · ${overview.detector}`;
   document.title = `${overview.title} - drivesem view`;
   $("frame").replaceChildren(...overview.frames.map(({name, words: told}) => element("option", {value: name}, told ? `${name} (${told})` : name)));
   const {frame: name, told} = readLink();

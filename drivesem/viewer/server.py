@@ -46,6 +46,8 @@ _ASSETS = {
 _JSON, _JPEG, _PNG, _TEXT = "application/json", "image/jpeg", "image/png", "text/plain; charset=utf-8"
 _KEPT_STAGES, _KEPT_PAGES = 2, 64
 _MOST_FIELDS = 2000
+_ASIDE = "aside"
+"""A kind of request: for what is looked at while nothing moves."""
 _LONGEST_LINE = 300
 
 T = TypeVar("T")
@@ -69,9 +71,7 @@ class ShownFrame:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """Which of a page's requests this is: an earlier one need not be answered any more. page: "" where it does not
-    say.
-    """
+    """Which of a page's states a request is about. page: "" where it does not say."""
 
     page: str
     number: int
@@ -98,8 +98,8 @@ class Viewer:
         self.title, self.frames, self.detector = title, frames, detector
         self._budget, self._t_star = budget, t_star
         self._stages: OrderedDict[str, Stage] = OrderedDict()
-        self._latest: OrderedDict[str, int] = OrderedDict()
-        self._lock = threading.Lock()
+        self._latest: OrderedDict[str, dict[str, int]] = OrderedDict()
+        self._making, self._turns = threading.Lock(), threading.Lock()
         self._draw, self._see = (ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("draw", "see"))
 
     def overview(self) -> dict[str, Any]:
@@ -122,39 +122,39 @@ class Viewer:
 
     def picture(self, name: str, values: Mapping[str, float], turn: Turn) -> bytes:
         """A state's picture, JPEG."""
-        stage, state = self._asked(name, values, turn)
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn)
+        stage, state = self._asked(name, values, turn, "picture")
+        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, "picture")
         return stage.picture(drawn)
 
     def detections(self, name: str, values: Mapping[str, float], turn: Turn) -> dict[str, Any]:
         """What the detector finds in a state."""
-        stage, state = self._asked(name, values, turn)
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn)
-        return self._in_turn(self._see, lambda: stage.seen(state, drawn), turn)
+        stage, state = self._asked(name, values, turn, "detections")
+        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, "detections")
+        return self._in_turn(self._see, lambda: stage.seen(state, drawn), turn, "detections")
 
     def score(self, name: str, values: Mapping[str, float], turn: Turn, car: int) -> dict[str, Any]:
         """What the detector makes of one vehicle in a state."""
-        stage, state = self._asked(name, values, turn)
+        stage, state = self._asked(name, values, turn, _ASIDE)
         if not 0 <= car < len(stage.knobs.rest.objects):
             raise RefusedError(f"car: expected a row of the scene, found {car}")
         known = stage.known_score(state, car)
         if known is not None:
             return known
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state, keep=False), turn)
-        return self._in_turn(self._see, lambda: stage.score(state, car, drawn), turn)
+        drawn = self._in_turn(self._draw, lambda: stage.drawn(state, keep=False), turn, _ASIDE)
+        return self._in_turn(self._see, lambda: stage.score(state, car, drawn), turn, _ASIDE)
 
     def notes(self, name: str, values: Mapping[str, float], turn: Turn) -> list[str]:
         """What no car can do in a state."""
-        stage, state = self._asked(name, values, turn)
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn)
-        return self._in_turn(self._see, lambda: stage.notes(drawn), turn)
+        stage, state = self._asked(name, values, turn, _ASIDE)
+        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, _ASIDE)
+        return self._in_turn(self._see, lambda: stage.notes(drawn), turn, _ASIDE)
 
     def stage(self, name: str) -> Stage:
         """A frame made ready, or as it was before."""
         frame = self.frames.get(name)
         if frame is None:
             raise RefusedError(f"frame: expected one of {len(self.frames)} frames, found {shown(name) or 'none'}")
-        with self._lock:
+        with self._making:
             known = self._stages.get(name)
             if known is None:
                 make = partial(Stage, frame.folder, self.detector, self._budget, self._t_star)
@@ -172,22 +172,28 @@ class Viewer:
         for pool in (self._draw, self._see):
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _asked(self, name: str, values: Mapping[str, float], turn: Turn) -> tuple[Stage, State]:
+    def _asked(self, name: str, values: Mapping[str, float], turn: Turn, kind: str) -> tuple[Stage, State]:
         stage = self.stage(name)
         state = stage.knobs.state(values)
         if turn.page:
-            with self._lock:
-                self._latest[turn.page] = max(turn.number, self._latest.get(turn.page, 0))
+            with self._turns:
+                latest = self._latest.setdefault(turn.page, {})
+                latest[kind] = max(turn.number, latest.get(kind, 0))
                 self._latest.move_to_end(turn.page)
                 while len(self._latest) > _KEPT_PAGES:
                     self._latest.popitem(last=False)
         return stage, state
 
-    def _in_turn(self, pool: ThreadPoolExecutor, work: Callable[[], T], turn: Turn) -> T:
-        """Work in its thread. RefusedError where the page asked for something later meanwhile."""
+    def _in_turn(self, pool: ThreadPoolExecutor, work: Callable[[], T], turn: Turn, kind: str) -> T:
+        """Work in its thread. RefusedError where the page asked for a later state's meanwhile; of what is asked
+        aside, where it asked anything about one.
+        """
 
         def do() -> T:
-            if turn.page and turn.number < self._latest.get(turn.page, 0):
+            with self._turns:
+                latest = self._latest.get(turn.page, {})
+                newest = max(latest.values(), default=0) if kind == _ASIDE else latest.get(kind, 0)
+            if turn.number < newest:
                 raise RefusedError("superseded by a later request", HTTPStatus.CONFLICT)
             return work()
 

@@ -67,7 +67,10 @@ def test_it_begins_with_a_frame_that_has_vehicles(two_scenes: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nowhere"], "SCENE|RUN: expected a scene of drivesem derender, a folder of some, or a run, found nowhere"),
+        (
+            ["nowhere"],
+            "SCENE|RUN: expected a scene of drivesem derender, a folder of some, or a run, found nowhere",
+        ),
         (["nowhere", "--port", "65536"], "--port: expected 0 (any that is free) to 65535, found 65536"),
         (["nowhere", "--port", "-1"], "--port: expected 0"),
         (["nowhere", "--budget", "moon"], "--budget: expected paper, parking, street"),
@@ -184,4 +187,5 @@ def test_the_window_shows_the_scene(two_scenes: Path, monkeypatch: pytest.Monkey
 def test_a_window_needs_open3d(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     monkeypatch.setattr(window, "has_display", lambda *_: True)
-    assert "--window: expected Open3D (drivesem doctor says how to get it)" in refused("view", str(two_scenes), "--window")
+    said = refused("view", str(two_scenes), "--window")
+    assert "--window: expected Open3D (drivesem doctor says how to get it)" in said

@@ -80,7 +80,7 @@ def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
     for text in ("101%", "-1%"):
         with pytest.raises(FormatError, match="expected a share from 0% to 100%"):
             edit_of(f"objects[2].mesh={text}")
-    with pytest.raises(FormatError, match="expected a unit: 0.5%"):
+    with pytest.raises(FormatError, match=r"expected a unit: 0\.5%"):
         frame_edit("edit", {"objects": {2: {"mesh": "0.5"}}})
 
 

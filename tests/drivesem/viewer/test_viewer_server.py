@@ -232,7 +232,7 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
         for thread in threads[1:]:
             thread.start()
         for _ in range(3000):
-            if viewer._latest.get("p") == 20 and viewer._draw._work_queue.qsize() == 19:
+            if viewer._latest.get("p") == {"picture": 20} and viewer._draw._work_queue.qsize() == 19:
                 break
             threading.Event().wait(0.01)
         go_on.set()
@@ -242,6 +242,10 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
             "another page is not concerned"
         )
         assert get(server, query("/picture", **STILL, page="p", n=3)).status == 409
+        assert get(server, query("/detections", **STILL, page="p", n=19)).status == 200, "another kind"
+        assert get(server, query("/score", **STILL, page="p", n=19, **{"weather.fog": 0.7})).status == 409
+        assert get(server, query("/score", **STILL, page="p", n=20, **{"weather.fog": 0.7})).status == 200
+        assert get(server, query("/notes", **STILL, page="p", n=19)).status == 409
         assert get(server, query("/picture", **STILL)).status == 200, "no page at all"
     viewer.close()
     assert statuses == {1: 200, 20: 200, **dict.fromkeys(range(2, 20), 409)}
