@@ -340,7 +340,7 @@ function drawStreet() {
   svg.setAttribute("viewBox", `${x0} ${-z1} ${x1 - x0} ${z1 + 1}`);
   if (!svg.firstChild) {
     svg.append(drawing("image", {class: "ground", href: `/street?${new URLSearchParams({frame: frame.name})}`, x: x0, y: -z1, width: x1 - x0, height: z1 - z0, preserveAspectRatio: "none"}));
-    for (let r = 10; r <= z1; r += 10) {
+    for (let r = 10; r <= z1; r += z1 > 45 ? 20 : 10) {
       svg.append(drawing("circle", {class: "ring", cx: 0, cy: 0, r}));
       const x = -Math.min(.62 * r, x1 - 2), y = -Math.sqrt(r * r - x * x);
       svg.append(drawing("text", {class: "far", x, y: y - .3, "font-size": Math.max(.9, (z1 + 1) / 36)}, `${r} m`));
@@ -454,7 +454,7 @@ async function fillMap(now) {
     drawMap();
   }
 }
-/* From pale to deep blue with the score; what is lost is orange and crossed. */
+/* From pale to deep blue with the score; what is not found is orange and crossed. */
 function colour(cell) {
   if (cell.status === "lost" || cell.status === "missed") return "var(--lost)";
   if (cell.status === "ignored") return "var(--line)";
@@ -500,7 +500,7 @@ function drawMap() {
   svg.replaceChildren(...parts);
   const cells = [...map.cells.values()], lost = cells.filter(c => c.status === "lost" || c.status === "missed").length;
   const none = !movable().includes(shown.car);
-  $("map-said").textContent = none ? "no vehicle to ask about" : `${lost} of ${cells.length} lost${cells.length < overview.grid * overview.grid ? ", still looking" : ""}`;
+  $("map-said").textContent = none ? "no vehicle to ask about" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", still looking" : ""}`;
   $("map").dataset.cells = cells.length;
 }
 let aiming = false;
@@ -519,7 +519,7 @@ function drawRamp() {
   const lost = drawing("svg", {viewBox: "0 0 9 9"});
   lost.style.width = "1rem";
   lost.append(drawing("rect", {width: 9, height: 9, fill: "var(--lost)"}), drawing("path", {d: "M2.5 2.5l4 4m0 -4l-4 4", stroke: "#000"}));
-  $("ramp").replaceChildren(frame.t_star.toFixed(2), svg, "1 ", lost, " lost");
+  $("ramp").replaceChildren(frame.t_star.toFixed(2), svg, "1 ", lost, " not found");
 }
 
 /* ---- acts and keys -------------------------------------------------------------------------------------------- */

@@ -12,8 +12,9 @@ import math
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -46,6 +47,7 @@ _ASSETS = {
 _JSON, _JPEG, _PNG, _TEXT = "application/json", "image/jpeg", "image/png", "text/plain; charset=utf-8"
 _KEPT_STAGES, _KEPT_PAGES = 2, 64
 _MOST_FIELDS = 2000
+_PATIENCE_S = 10.0
 _ASIDE = "aside"
 """A kind of request: for what is looked at while nothing moves."""
 _LONGEST_LINE = 300
@@ -207,9 +209,34 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self, viewer: Viewer, port: int) -> None:
         self.viewer = viewer
+        self._answering, self._ended = 0, False
+        self._changed = threading.Condition()
         super().__init__((HOST, port), _Handler)
         number = self.server_port
         self.hosts = frozenset(f"{name}:{number}" for name in (HOST, "localhost"))
+
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """While a request is answered. RefusedError at the end of the server."""
+        with self._changed:
+            if self._ended:
+                raise RefusedError("drivesem view has ended", HTTPStatus.SERVICE_UNAVAILABLE)
+            self._answering += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._answering -= 1
+                self._changed.notify_all()
+
+    def server_close(self) -> None:
+        """Ends, once what is being answered is: an interpreter that goes while a library's code runs in another
+        thread is aborted by it.
+        """
+        super().server_close()
+        with self._changed:
+            self._ended = True
+            self._changed.wait_for(lambda: self._answering == 0, _PATIENCE_S)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A page that goes away is no error; anything else is told in one line."""
@@ -231,7 +258,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         try:
-            content, kind = self._answer()
+            with self.server.answering():
+                content, kind = self._answer()
             status = HTTPStatus.OK
         except RefusedError as error:
             content, kind, status = _line(error), _TEXT, error.status

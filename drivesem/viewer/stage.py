@@ -31,7 +31,7 @@ from scene_ir.types import Category, Render, SceneIR
 QUALITY = 92
 """Of JPEG files."""
 _KEPT_DRAWINGS, _KEPT_SCORES = 4, 4096
-_MARGIN_M = 5.0
+_MARGIN_M = 8.0
 """Of the street around the vehicles, as seen from above."""
 _LEAST_WIDTH_M, _NEAREST_M, _FARTHEST_M = 20.0, 3.0, 90.0
 _PIXELS_PER_M = 12

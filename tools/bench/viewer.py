@@ -36,11 +36,11 @@ COLUMNS: Columns = {
 }  # fmt: skip
 METHOD = (
     "The server of drivesem view in this process, asked over its port as the page asks it: picture and detections "
-    "of a state at once, on two connections that stay open, each state new. HTTP: from the request to the last byte. "
-    "Browser: in headless Chromium, from the slider's event to the decoded picture, and to the boxes that are "
-    "drawn; left out where Debian's chromium or Playwright is missing. Medians and quartiles; the processor's time "
-    "is of all threads of the server, for both answers. Sliders: the nearest judged vehicle's place, heading and "
-    "paint, and fog, in which the detector sees the whole picture anew."
+    "of a state at once, on two connections that stay open, each state new. HTTP: from the request to the last "
+    "byte. Browser: in headless Chromium, from the slider's event to the decoded picture, and to the boxes that "
+    "are drawn; left out where Debian's chromium or Playwright is missing. Medians and quartiles; the processor's "
+    "time is of all threads of the server, for both answers. Sliders: the nearest judged vehicle's place, heading "
+    "and paint, and fog, in which the detector sees the whole picture anew."
 )
 QUICK_STATES, FULL_STATES = 10, 30
 _LASTS = ("translate.along", "yaw", "paint.lightness")

@@ -252,6 +252,40 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
     assert drawn[:2] == [0.01, 0.2], "none of those between is drawn"
 
 
+def test_the_end_waits_for_what_is_being_answered(
+    still: Path, stubborn: Stubborn, served: Callable[[Viewer], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewer = Viewer("t", {"still": ShownFrame(still)}, stubborn, PRESETS["street"])
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(self: Viewer) -> dict[str, Any]:
+        begun.set()
+        assert go_on.wait(30)
+        return {}
+
+    monkeypatch.setattr(Viewer, "overview", slow)
+    answers: list[Answer] = []
+    with served(viewer) as server, closing(http.client.HTTPConnection(HOST, server.server_port)) as open_still:
+        open_still.request("GET", "/page.css")
+        open_still.getresponse().read()
+        asking = threading.Thread(target=lambda: answers.append(get(server, "/overview")))
+        asking.start()
+        assert begun.wait(30)
+        server.shutdown()
+        ending = threading.Thread(target=server.server_close)
+        ending.start()
+        ending.join(0.2)
+        assert ending.is_alive()
+        open_still.request("GET", "/page.css")
+        late = open_still.getresponse()
+        assert (late.status, late.read()) == (503, b"drivesem view has ended\n")
+        go_on.set()
+        for thread in (ending, asking):
+            thread.join(30)
+    viewer.close()
+    assert [answer.status for answer in answers] == [200]
+
+
 def test_few_frames_and_pages_are_kept(
     still: Path, changed: Path, stubborn: Stubborn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
