@@ -191,7 +191,7 @@ class Stage:
         above = cv2.remap(to_uint8(rest.background), *lookup)
         road = cv2.remap(rest.environment.road.float().numpy(), *lookup)
         shows = np.where(inside, _OFF_ROAD + (1 - _OFF_ROAD) * road, 0.0)
-        rgba = np.dstack([above[..., ::-1], (255 * shows).round().astype(np.uint8)])
+        rgba = np.dstack([above[..., ::-1], 255 * shows]).round().astype(np.uint8)
         return _encoded(".png", rgba)
 
     def _focus(self) -> int:

@@ -29,7 +29,7 @@ def show(name: str, folder: Path) -> None:
     with tempfile.TemporaryDirectory() as here:
         path = Path(here) / "scene.glb"
         path.write_bytes(glb_of(name, scene))
-        model = open3d.io.read_triangle_model(str(path))
+        model = open3d.io.read_triangle_model(str(path))  # pyright: ignore[reportArgumentType]
         # the camera that photographed it, at the origin of glTF's axes: along -z, y up
         open3d.visualization.draw(
             [{"name": name, "geometry": model}],

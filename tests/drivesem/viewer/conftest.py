@@ -25,12 +25,12 @@ class Stubborn:
     """Finds what was photographed where it was photographed, whatever the picture shows."""
 
     name = "stubborn"
-    classes = CLASSES
+    classes: tuple[str, ...] = CLASSES
 
     def __init__(self, scene: SceneIR) -> None:
         objects = scene.objects
         order = objects.occlusion.argsort()
-        self._found = Detections(
+        self.found = Detections(
             objects.box2d[order].float(),
             objects.category[order],
             objects.box2d.new_full((len(objects),), SCORE).float(),
@@ -40,7 +40,7 @@ class Stubborn:
         return len(images)
 
     def decode(self, raw: int) -> list[Detections]:
-        return [self._found] * raw
+        return [self.found] * raw
 
 
 @pytest.fixture(scope="session")

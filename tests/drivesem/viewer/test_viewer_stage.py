@@ -80,10 +80,10 @@ def test_far_away_it_is_lost_for_certain(still: Path) -> None:
     stage = Stage(still, detector, PRESETS["street"], None)
     car = judged(stage)
     # a detector that looks a box's width beside what is there, once the scene moves
-    detector._found = Detections(
-        detector._found.boxes_xyxy + torch.tensor([400.0, 0.0, 400.0, 0.0]),
-        detector._found.labels,
-        detector._found.scores,
+    detector.found = Detections(
+        detector.found.boxes_xyxy + torch.tensor([400.0, 0.0, 400.0, 0.0]),
+        detector.found.labels,
+        detector.found.scores,
     )
     state = {"weather.fog": 0.1}
     seen = stage.seen(state, stage.drawn(state))

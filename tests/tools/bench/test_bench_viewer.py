@@ -12,7 +12,7 @@ from tools.bench import viewer
 from tools.bench.__main__ import main
 
 
-@pytest.mark.parametrize("browser", [False, True])
+@pytest.mark.parametrize("browser", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_viewer(
     browser: bool,
     small_run: Path,
