@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from detectors.registry import load_detector
 from detectors.types import Detections, Targets
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import check_places
+from drivesem.attack.objective import Objective, Rendered
 from drivesem.viewer.stage import Stage, best_score
 from scene_ir.io import load_scene, to_uint8
+from scene_ir.types import Render, SceneIR
 from tests.drivesem.viewer.conftest import SCORE, Stubborn
 
 
@@ -94,6 +97,31 @@ def test_far_away_it_is_lost_for_certain(still: Path) -> None:
     assert stage.known_score(state, car) is None
     told = stage.score(state, car, stage.drawn(state))
     assert told == seen["cars"][car] == stage.known_score(state, car)
+
+
+def test_the_detector_looks_where_something_changed(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(still, load_detector("squeezedet"), PRESETS["street"], None)
+    car = judged(stage)
+    drawn = stage.drawn({f"objects[{car}].translate.along": 0.5})
+    objective, seen = stage.objective, []
+    everywhere = objective.look(drawn.scene, drawn.render)
+
+    def look(scene: SceneIR, render: Render) -> Rendered:
+        seen.append(render.drawn)
+        return Objective.look(objective, scene, render)
+
+    monkeypatch.setattr(objective, "look", look)
+    told = stage.seen({f"objects[{car}].translate.along": 0.5}, drawn)
+    assert drawn.render.drawn is not None
+    assert 0 < len(seen[0]) < len(drawn.render.drawn)
+    first = everywhere.detections
+    marks = [mark for mark in told["boxes"] if mark["kind"] in ("found", "phantom")]
+    above = first.scores >= objective.t_star
+    boxes = torch.tensor([mark["xyxy"] for mark in marks])
+    torch.testing.assert_close(boxes, first.boxes_xyxy[above], atol=0.01, rtol=0)
+    fog = stage.drawn({"weather.fog": 0.5})
+    stage.seen({"weather.fog": 0.5}, fog)
+    assert seen[1] is None, "fog is everywhere"
 
 
 def test_best_score_is_of_what_meets_the_target() -> None:
