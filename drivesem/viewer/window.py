@@ -7,12 +7,17 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from drivesem.run.gltf import glb_of
 from drivesem.settings.errors import UsageError
 from scene_ir.io import load_scene
 
 _SIZE = (1280, 720)
+_AHEAD, _FROM, _ZOOM = [0.0, 0.0, -20.0], [0.0, 0.12, 1.0], 0.06
+"""Where one looks and from where, in glTF's axes: from behind the camera that took the photograph."""
 
 
 def show(name: str, folder: Path) -> None:
@@ -25,22 +30,40 @@ def show(name: str, folder: Path) -> None:
         import open3d
     except (ImportError, OSError) as error:
         raise UsageError("--window", "Open3D (drivesem doctor says how to get it)", error) from error
-    scene = load_scene(folder)
+    meshes = _meshes(open3d, glb_of(name, load_scene(folder)))
+    window = open3d.visualization.Visualizer()
+    if not window.create_window(f"{name} - drivesem", *_SIZE):
+        raise UsageError("--window", "a display with OpenGL", "none that Open3D can use")
+    for mesh in meshes:
+        window.add_geometry(mesh)
+    how, view = window.get_render_option(), window.get_view_control()
+    how.light_on, how.mesh_show_back_face = False, True  # the photograph is lit
+    view.set_lookat(_AHEAD)
+    view.set_front(_FROM)
+    view.set_up([0.0, 1.0, 0.0])
+    view.set_zoom(_ZOOM)
+    window.run()
+    window.destroy_window()
+
+
+def _meshes(open3d: Any, glb: bytes) -> list[Any]:
+    """The meshes of a GLB file, with their textures, for the older of Open3D's windows: the newer one asks for
+    Vulkan.
+    """
     with tempfile.TemporaryDirectory() as here:
         path = Path(here) / "scene.glb"
-        path.write_bytes(glb_of(name, scene))
-        model = open3d.io.read_triangle_model(str(path))  # pyright: ignore[reportArgumentType]
-        # the camera that photographed it, at the origin of glTF's axes: along -z, y up
-        open3d.visualization.draw(
-            [{"name": name, "geometry": model}],
-            title=f"{name} - drivesem",
-            width=_SIZE[0],
-            height=_SIZE[1],
-            lookat=[0.0, 0.0, -20.0],
-            eye=[0.0, 2.0, 6.0],
-            up=[0.0, 1.0, 0.0],
-            show_skybox=False,
-        )
+        path.write_bytes(glb)
+        model = open3d.io.read_triangle_model(str(path))
+    meshes = []
+    for part in model.meshes:
+        mesh, skin = part.mesh, np.asarray(model.materials[part.material_idx].albedo_img)
+        uv = np.asarray(mesh.triangle_uvs)
+        uv[:, 1] = 1 - uv[:, 1]  # glTF counts them downwards
+        mesh.triangle_uvs = open3d.utility.Vector2dVector(uv)
+        mesh.textures = [open3d.geometry.Image(skin)]
+        mesh.triangle_material_ids = open3d.utility.IntVector([0] * len(mesh.triangles))
+        meshes.append(mesh)
+    return meshes
 
 
 def has_display(platform: str, environment: Mapping[str, str]) -> bool:

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivesem.cli import main
@@ -166,22 +167,59 @@ def test_where_a_display_is() -> None:
     assert window.has_display("darwin", {})
 
 
-def test_the_window_shows_the_scene(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[dict[str, Any]] = []
+class Library:
+    """What is asked of Open3D: a model of one mesh, and a window that notes what is done to it."""
 
-    def read(path: str) -> str:
-        assert Path(path).read_bytes() == b"glb of b"
-        return "model"
+    def __init__(self, opens: bool) -> None:
+        self.opens, self.read, self.shown, self.ran = opens, b"", [], 0
+        self.mesh = SimpleNamespace(triangle_uvs=np.array([[0.2, 0.3]]), triangles=[0])
+        self.utility = SimpleNamespace(Vector2dVector=np.array, IntVector=list)
+        self.geometry = SimpleNamespace(Image=np.array)
+        self.visualization = SimpleNamespace(Visualizer=lambda: self)
+        self.io = SimpleNamespace(read_triangle_model=self.model)
 
-    library = SimpleNamespace(
-        io=SimpleNamespace(read_triangle_model=read),
-        visualization=SimpleNamespace(draw=lambda parts, **how: shown.extend(parts)),
-    )
+    def model(self, path: str) -> SimpleNamespace:
+        self.read = Path(path).read_bytes()
+        skin = SimpleNamespace(albedo_img=np.full((2, 2, 3), 7, np.uint8))
+        return SimpleNamespace(meshes=[SimpleNamespace(mesh=self.mesh, material_idx=0)], materials=[skin])
+
+    def create_window(self, title: str, width: int, height: int) -> bool:
+        return self.opens
+
+    def add_geometry(self, mesh: Any) -> None:
+        self.shown.append(mesh)
+
+    def get_render_option(self) -> SimpleNamespace:
+        return SimpleNamespace()
+
+    def get_view_control(self) -> Any:
+        names = ("set_lookat", "set_front", "set_up", "set_zoom")
+        return SimpleNamespace(**dict.fromkeys(names, lambda _: None))
+
+    def run(self) -> None:
+        self.ran += 1
+
+    def destroy_window(self) -> None:
+        self.ran += 1
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_the_window_shows_the_scene(
+    opens: bool, two_scenes: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    library = Library(opens)
     monkeypatch.setitem(sys.modules, "open3d", library)
     monkeypatch.setattr(window, "has_display", lambda *_: True)
     monkeypatch.setattr(window, "glb_of", lambda name, scene: f"glb of {name}".encode())
-    assert main(["view", str(two_scenes), "--window", "--frame", "b"]) == 0
-    assert shown == [{"name": "b", "geometry": "model"}]
+    assert main(["view", str(two_scenes), "--window", "--frame", "b"]) == (0 if opens else 2)
+    assert library.read == b"glb of b"
+    if opens:
+        assert (library.shown, library.ran) == ([library.mesh], 2)
+        assert library.mesh.triangle_uvs.tolist() == [[0.2, 0.7]]
+        assert (library.mesh.textures[0] == 7).all()
+    else:
+        said = "drivesem: --window: expected a display with OpenGL, found none that Open3D can use\n"
+        assert capsys.readouterr().err == said
 
 
 def test_a_window_needs_open3d(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
