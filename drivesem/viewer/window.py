@@ -6,12 +6,15 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivesem.run.gltf import glb_of
+from drivesem.run.workers import mapping
+from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.io import load_scene
 
@@ -30,7 +33,9 @@ def show(name: str, folder: Path) -> None:
         import open3d
     except (ImportError, OSError) as error:
         raise UsageError("--window", "Open3D (drivesem doctor says how to get it)", error) from error
-    meshes = _meshes(open3d, glb_of(name, load_scene(folder)))
+    # in a process of its own: textures are baked by EGL, whose context is in the way of a window's
+    (glb,) = mapping(Sharing(workers=1), apart=True)(partial(_glb, name), [folder])
+    meshes = _meshes(open3d, glb)
     window = open3d.visualization.Visualizer()
     if not window.create_window(f"{name} - drivesem", *_SIZE):
         raise UsageError("--window", "a display with OpenGL", "none that Open3D can use")
@@ -44,6 +49,10 @@ def show(name: str, folder: Path) -> None:
     view.set_zoom(_ZOOM)
     window.run()
     window.destroy_window()
+
+
+def _glb(name: str, folder: Path) -> bytes:
+    return glb_of(name, load_scene(folder))
 
 
 def _meshes(open3d: Any, glb: bytes) -> list[Any]:

@@ -211,6 +211,7 @@ def test_the_window_shows_the_scene(
     monkeypatch.setitem(sys.modules, "open3d", library)
     monkeypatch.setattr(window, "has_display", lambda *_: True)
     monkeypatch.setattr(window, "glb_of", lambda name, scene: f"glb of {name}".encode())
+    monkeypatch.setattr(window, "mapping", lambda sharing, apart: map)
     assert main(["view", str(two_scenes), "--window", "--frame", "b"]) == (0 if opens else 2)
     assert library.read == b"glb of b"
     if opens:
