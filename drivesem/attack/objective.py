@@ -97,7 +97,7 @@ class Objective:
         self.keep_mb = keep_mb
         self._whole = True  # the reference comes first
         self._reference: Reference | None = None
-        self._benign = self._judged(base, base_render)
+        self._benign = self.look(base, base_render)
         self._whole = whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
@@ -144,7 +144,7 @@ class Objective:
                 return rendered
         scene = self.space.apply(self.space.scene, theta)
         self.passes += 1
-        rendered = self._judged(scene, self.compositor.render(scene))
+        rendered = self.look(scene, self.compositor.render(scene))
         self._recent.append((theta.clone(), rendered))
         return rendered
 
@@ -291,7 +291,8 @@ class Objective:
         return loss
 
     @torch.no_grad()
-    def _judged(self, scene: SceneIR, render: Render) -> Rendered:
+    def look(self, scene: SceneIR, render: Render) -> Rendered:
+        """A state of the scene that is drawn already, detected and labelled."""
         # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)

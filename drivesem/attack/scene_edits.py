@@ -30,20 +30,21 @@ class EditedScene:
     notes: tuple[str, ...]
 
 
-def edited(scene: SceneIR, edit: FrameEdit) -> EditedScene:
-    """The scene after an edit. RangeError where the edit names a row that the scene does not have."""
+def edited(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
+    """The scene after an edit. bent: as of `moved`. Raises as `moved` does."""
     removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
-    changed = moved(scene, edit)
+    changed = moved(scene, edit, bent)
     notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
     return EditedScene(without_objects(changed, removed), tuple(removed), tuple(notes))
 
 
-def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
+def moved(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> SceneIR:
     """The scene after an edit, with the vehicles that it removes still there (`scene_ir.removal` takes them out).
 
     What is said of all objects and of one adds up, and all of it adds to what the scene has: moves on the ground
     plane, along and across the heading that the vehicle has in `scene`; codes end at the bounds that theta's do.
-    Raises RangeError where the edit names a row that the scene does not have.
+    bent: a state of the scene in which its vehicles have the shapes that shares of shapes are of.
+    Raises RangeError where the edit names a row that the scene does not have, or a share where nothing is bent.
     """
     changes = _by_row(scene, edit)
     objects, environment = scene.objects, scene.environment
@@ -68,7 +69,7 @@ def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
         touched = {
             "translation": objects.translation + shift.sum(dim=1),
             "yaw": objects.yaw + turn,
-            "ffd": objects.ffd + ffd.from_symmetric(bend),
+            "ffd": objects.ffd + ffd.from_symmetric(bend) + _shares(scene, changes, bent),
             "size_lhw": objects.size_lhw * grown,
             "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
         }
@@ -79,6 +80,19 @@ def moved(scene: SceneIR, edit: FrameEdit) -> SceneIR:
         foliage=foliage.clamp(-limits.foliage, limits.foliage),
         light=(environment.light + environment.light.new_tensor(edit.sun)).clamp(-1.0, 1.0),
     )
+
+
+def _shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | None) -> Tensor:
+    """Lattice offsets (N, P, 3) by shares of the shapes of `bent`."""
+    ffds = scene.objects.ffd
+    share = ffds.new_tensor([sum((c.mesh_share for c in row), 0.0) for row in changes])
+    if bent is None:
+        for row, value in enumerate(share.tolist()):
+            if value:
+                expected = "lattice offsets; shares need a scene with changed shapes, and --photographed"
+                raise RangeError(f"objects[{row}].mesh", expected, f"{value:.0%}")
+        return ffds.new_zeros(())
+    return share[:, None, None] * (bent.objects.ffd - ffds)
 
 
 def _by_row(scene: SceneIR, edit: FrameEdit) -> list[list[ObjectEdit]]:

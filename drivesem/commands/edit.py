@@ -29,7 +29,7 @@ def run(config: Edit) -> int:
     save = None if config.save is None else _save_path(Path(config.save), folder)
     edit = frame_edit("edit", _changes(config))
     scene = load_scene(folder)
-    result = edited(scene, edit)
+    result = edited(scene.at_rest(), edit, scene) if config.photographed else edited(scene, edit)
     for note in result.notes:
         sys.stderr.write(f"drivesem: {note}\n")
     if save is not None:
@@ -58,8 +58,8 @@ def _changes(config: Edit) -> dict[Any, Any]:
             if row != ALL and not (row.isascii() and row.isdigit()):
                 raise UsageError("--remove", "rows from 0, or all", repr(text))
             changes = merged(changes, {"objects": {ALL if row == ALL else int(row): {"remove": True}}})
-    if not changes:
-        raise UsageError("edit", "a change: --set, --remove or --edits", "none")
+    if not changes and not config.photographed:
+        raise UsageError("edit", "a change: --set, --remove, --edits or --photographed", "none")
     return changes
 
 

@@ -38,6 +38,7 @@ from drivesem.settings.blocks import (
     Run,
     Scenes,
     Sharing,
+    Threshold,
     Tiles,
     Training,
     Trust,
@@ -545,12 +546,36 @@ class Edit(Command):
     sunset, overcast, twilight), weather.rain=0.4, foliage.hue=0.5."""
     remove: Repeated = ()
     """Rows of vehicles to take out, with their shadows; or all."""
+    photographed: Flag = False
+    """Begin with the scene as it was photographed, where the folder holds a counterexample or an edit. A shape is
+    then also given as a share of what it was bent to: 'objects[2].mesh=60%'."""
     edits: str | None = None
     """A YAML file of changes; what --set says of the same thing wins."""
     out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
     """PNG to write; by default edit.png in the scene's folder, or nothing where there is --save."""
     save: str | None = None
     """Folder to write the changed scene to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Trust, Threshold, Tiles, Device, Command):
+    """Open a page on which a scene or a counterexample moves as you move it, and the detector answers."""
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE|RUN")]
+    """A scene of drivesem derender, a folder of some, or a run of drivesem attack."""
+    frame: str | None = None
+    """The frame to begin with, by name; by default the first."""
+    detector: str | None = None
+    """A shipped detector, a file, or another project's (docs/detectors.md); by default the run's, else squeezedet.
+    """
+    budget: str = "street"
+    """How far sliders go: a preset, a YAML file, or NAME=VALUE with commas, as of drivesem attack."""
+    port: Annotated[int, Within(0, 65535, expected="0 (any that is free) to 65535")] | None = None
+    """Port of 127.0.0.1 to serve the page at; by default 8321, or the next that is free."""
+    browser: bool = True
+    """Open the page in the browser."""
+    window: Flag = False
+    """Instead of the page, show the frame in 3D in a window of Open3D, which needs a display."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -1061,8 +1086,8 @@ _ALL: tuple[type[Command], ...] = (
         SurveyResults,
         Verify,
     ),
-    *(Derender, Render, Edit, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train, Retrain),
-    *(Classify, Doctor, Presets),
+    *(Derender, Render, Edit, View, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train),
+    *(Retrain, Classify, Doctor, Presets),
 )
 COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
 """Commands by name, in the order in which `drivesem --help` lists them."""

@@ -9,6 +9,7 @@ An edit of one frame, as YAML or as nested mappings:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
       3: {size: 5%}                 # larger by so much, on its wheels; -5% is smaller
+      6: {mesh: 60%}                # drivesem edit --photographed: of the shape that the scene's vehicle has
       5: {remove: true}
       all: {rotate: 0.05}
 
@@ -58,8 +59,8 @@ _TRUTH = {"true": True, "false": False}
 @dataclass(frozen=True, slots=True)
 class ObjectEdit:
     """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
-    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none; size:
-    share by which it grows.
+    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none;
+    mesh_share: of the change of shape that a scene has already; size: share by which it grows.
     """
 
     translate: tuple[float, float] = (0.0, 0.0)
@@ -69,6 +70,7 @@ class ObjectEdit:
     mesh: tuple[float, ...] = ()
     size: float = 0.0
     remove: bool = False
+    mesh_share: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
@@ -77,6 +79,8 @@ class ObjectEdit:
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
         if not abs(self.size) <= MOST_GROWN:
             raise RangeError("edit size", f"a share of at most {MOST_GROWN:.0%} either way", self.size)
+        if not 0 <= self.mesh_share <= 1:
+            raise RangeError("edit mesh", "a share from 0% to 100%", self.mesh_share)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +147,7 @@ def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
 
 
 def _listed(parameter: str, value: str) -> Any:
-    if parameter in ("translate", "color", "mesh"):
+    if parameter in ("translate", "color") or (parameter == "mesh" and "%" not in value):
         return [part.strip() for part in value.split(",")]
     return _TRUTH.get(value, value) if parameter == "remove" else value
 
@@ -194,6 +198,9 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
         else:
             own[i] = finite_number(f"{where}: translate", item)
     mesh = entry.get("mesh")
+    share = 0.0
+    if isinstance(mesh, str):
+        mesh, share = None, measure(f"{where}: mesh", mesh, SHARE_UNITS)
     remove = entry.get("remove", False)
     if not isinstance(remove, bool):
         raise FormatError(f"{where}: remove", "true or false", repr(remove))
@@ -206,6 +213,7 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             mesh=() if mesh in (None, []) else _floats(f"{where}: mesh", mesh, SYMMETRIC_DIM),
             size=_share(f"{where}: size", entry.get("size", 0)),
             remove=remove,
+            mesh_share=share,
         )
     except RangeError as error:
         raise FormatError(where, error.expected, error.actual) from error

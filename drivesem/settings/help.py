@@ -26,7 +26,7 @@ TOPICS: dict[str, tuple[str, ...]] = {
     ),
     "How large, and who else": ("holes", "gate", "transfer", "study", "worth"),
     "Train, and hand on": ("train", "retrain", "anchors", "export", "convert"),
-    "Scenes and data": ("derender", "render", "edit", "synth", "eval"),
+    "Scenes and data": ("derender", "render", "edit", "view", "synth", "eval"),
     "Classifiers of images": ("classify",),
     "Is all well": ("doctor", "presets", "check", "gradcheck", "bench"),
 }
@@ -37,6 +37,7 @@ EXAMPLES = (
     ("drivesem attack --dataset photographs --root holiday.jpg", "on a photograph without labels"),
     ("drivesem attack --config quick", "a preset; drivesem presets lists them"),
     ("drivesem explain runs/a", "why it fails"),
+    ("drivesem view runs/a", "move the cars yourself, in the browser, and see what the detector says"),
     ("drivesem export runs/a --to coco --out for-training", "the counterexamples as training data"),
     ("drivesem doctor", "what this machine has, and what is missing"),
 )

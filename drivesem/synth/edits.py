@@ -75,6 +75,9 @@ def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
 def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
     if edit.remove:
         return None
+    if edit.mesh_share:
+        expected = "lattice offsets; a generated vehicle has no other shape to take a share of"
+        raise RangeError(f"object {actor.track}: mesh", expected, f"{edit.mesh_share:.0%}")
     length = actor.size_lhw[0]
     along, across = (a * length + b for a, b in zip(edit.translate, edit.translate_m, strict=True))
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)

@@ -98,6 +98,11 @@ RULES = (
         None,
     ),
     Rule(
+        "drivesem.viewer",
+        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run"))),
+        None,
+    ),
+    Rule(
         "drivesem.report",
         (
             "drivesem.run.results",

@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 
 from detectors.base import DetectorError
+from detectors.registry import load_predictor
 from drivesem.bench import memory, render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
@@ -36,6 +37,7 @@ from tools.bench import (
     redraw,
     rivals,
     synth,
+    viewer,
     weather,
 )
 from tools.bench.settings import BenchTool
@@ -72,6 +74,7 @@ def run(config: BenchTool) -> int:
         "synth": _synth,
         "rivals": _rivals,
         "eval": _eval,
+        "viewer": _viewer,
     }
     return conduct(config, _PROGRAM, measure[config.what])
 
@@ -178,6 +181,18 @@ def _eval(config: BenchTool, console: Console) -> Measured:
     _on_cpu(config)
     rows = watched(evaluation.measure(_frames(config, evaluation), config.seed), 3, console)
     return _measured(evaluation, {"rows": [asdict(row) for row in rows]})
+
+
+def _viewer(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    scene = None if config.scenes is None else Path(config.scenes)
+    states = viewer.QUICK_STATES if config.quick else viewer.FULL_STATES
+    try:
+        detector = load_predictor(config.detector, config.device, config.tiles)
+        rows = list(watched(viewer.measure(scene, detector, states, config.seed), 8, console))
+    except DetectorError as error:
+        raise UsageError("--detector", "a detector", error) from error
+    return _measured(viewer, {"rows": [asdict(row) for row in rows]})
 
 
 def _measured(benchmark: Any, fields: dict[str, Any]) -> Measured:

@@ -31,6 +31,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
             "synth",
             "rivals",
             "eval",
+            "viewer",
         ]
     ] = "derender"
     """derender: de-rendered generated frames beside the generator's truth; parts: where the
@@ -40,7 +41,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
     of photographs beside the photograph and ours; weather: the compositor's weather beside the generator's; synth:
     the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many frames
-    beside pycocotools."""
+    beside pycocotools; viewer: how long drivesem view takes to answer a slider."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -59,8 +60,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found, moves, redraw and weather: name of a shipped detector, a .safetensors file of one, or onnx:FILE, a
-    detector that was trained elsewhere."""
+    """Of found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of one, or
+    onnx:FILE, a detector that was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """Of found, label-free, parts, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1,
     vkitti2, coco or yolo."""
@@ -69,7 +70,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     label_2, calib."""
     scenes: str | None = None
     """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
-    besides one."""
+    besides one; of viewer: whose first is moved, by default an embedded one."""
     markdown: str | None = None
     """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
 

@@ -350,6 +350,22 @@ def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path, capsys: p
     assert read_frame_edit(path)["objects"][1] == {"remove": True}
 
 
+def test_an_edit_begins_with_the_photograph_again(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still, changed = tmp_path / "still.png", tmp_path / "S"
+    words = ["edit", str(demo), "--set", "objects[0].rotate=10deg", "--set", "weather.fog=0.5"]
+    succeed([*words, "--save", str(changed)], capsys)
+    succeed(["edit", str(changed), "--photographed", "-o", str(still)], capsys)
+    assert np.array_equal(files.read_image(still), files.read_image(demo / "photograph.png"))
+    once, again = tmp_path / "once.png", tmp_path / "again.png"
+    succeed(["edit", str(demo), "--set", "objects[0].rotate=4deg", "-o", str(once)], capsys)
+    words = ["edit", str(changed), "--photographed", "--set", "objects[0].rotate=4deg", "-o", str(again)]
+    succeed(words, capsys)
+    assert np.array_equal(files.read_image(once), files.read_image(again))
+    assert not np.array_equal(files.read_image(once), files.read_image(still))
+
+
 def test_without_vehicles_the_background_is_left(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -390,6 +406,7 @@ def test_impossible_places_are_said_and_drawn(
         (["--set", "objects[0].rotate=1"], "expected a unit: 1deg or 1rad"),
         (["--set", "objects[0].wheels=1"], "wheels"),
         (["--set", "weather=snow"], "snow"),
+        (["--set", "objects[0].mesh=50%"], "shares need a scene with changed shapes, and --photographed"),
         (["--remove", "99"], "objects[99]: expected a row from 0 to"),
         (["--remove", "red"], "--remove: expected rows from 0, or all, found 'red'"),
         (["--edits", "nowhere.yaml"], "nowhere.yaml: expected a readable file"),

@@ -49,6 +49,7 @@ def edit_of(*settings: str) -> FrameEdit:
         ("objects[all].rotate=0", {ALL: ObjectEdit()}),
         ("objects[3].size=-5%", {3: ObjectEdit(size=-0.05)}),
         ("objects[12].remove=true", {12: ObjectEdit(remove=True)}),
+        ("objects[1].mesh=60%", {1: ObjectEdit(mesh_share=0.6)}),
         (f"objects[1].mesh={','.join(['0.1'] * SYMMETRIC_DIM)}", {1: ObjectEdit(mesh=(0.1,) * SYMMETRIC_DIM)}),
     ],
 )
@@ -62,6 +63,25 @@ def test_settings_of_the_scene() -> None:
     )
     for name, codes in WEATHERS.items():
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_NAMES)
+
+
+def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
+    scene = street()
+    offsets = torch.zeros_like(scene.objects.ffd)
+    offsets[2, 5] = torch.tensor([0.1, -0.05, 0.02])
+    bent = scene.with_objects(ffd=scene.objects.ffd + offsets)
+    edit = edit_of("objects[2].mesh=25%")
+    torch.testing.assert_close(moved(scene, edit, bent).objects.ffd, 0.25 * offsets)
+    both = edit_of("objects[all].mesh=25%", "objects[2].mesh=50%")
+    torch.testing.assert_close(moved(scene, both, bent).objects.ffd, 0.75 * offsets)
+    message = r"objects\[2\]\.mesh: expected lattice offsets; shares need .* --photographed, found 25%"
+    with pytest.raises(RangeError, match=message):
+        moved(scene, edit)
+    for text in ("101%", "-1%"):
+        with pytest.raises(FormatError, match="expected a share from 0% to 100%"):
+            edit_of(f"objects[2].mesh={text}")
+    with pytest.raises(FormatError, match=r"expected a unit: 0\.5%"):
+        frame_edit("edit", {"objects": {2: {"mesh": "0.5"}}})
 
 
 def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:

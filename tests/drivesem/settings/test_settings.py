@@ -58,7 +58,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     "transfer": ("--run", "run", "--detectors", "squeezedet"),
     **dict.fromkeys(("holes", "gate", "report", "realism", "worth", "survey"), ("run",)),
     "survey-results": ("answers.csv", "--survey", "survey"),
-    **dict.fromkeys(("render", "edit"), ("scene",)),
+    **dict.fromkeys(("render", "edit", "view"), ("scene",)),
     "eval": ("--gt", "labels", "--pred", "results"),
     "convert": ("labels", "--to", "coco", "--out", "out"),
     "export": ("--run", "run", "--to", "coco", "--out", "out"),

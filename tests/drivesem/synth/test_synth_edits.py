@@ -52,6 +52,12 @@ def test_a_size_is_of_all_three_sides(plan):
     assert grown.position_xz == actor.position_xz
 
 
+def test_a_share_of_a_shape_is_refused(plan):
+    edit = FrameEdit(objects={ALL: ObjectEdit(mesh_share=0.5)})
+    with pytest.raises(RangeError, match=r"mesh: expected lattice offsets; .* found 50%"):
+        apply_edit(plan, edit)
+
+
 def test_the_sun_moves_about_the_vertical_and_shines_stronger(plan):
     light = plan.setting.light
     moved = apply_edit(plan, FrameEdit(sun=(1.0, 0.5, 1.0))).setting.light

@@ -1,0 +1,595 @@
+"use strict";
+/* One state, many views of it: sliders, picture, boxes, street, failure map, link, command. What belongs to the state
+   is in `values` (by knob, in its unit, zeros left out) and `shown` (car, axes, before); all else follows. */
+
+const $ = id => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+const PAGE = Math.random().toString(36).slice(2);
+const GROUPS = {translate: "Place", rotate: "Place", size: "Size and shape", shape: "Size and shape", color: "Paint",
+  weather: "Weather", foliage: "Leaves", sun: "Sun"};
+const ORDER = ["Place", "Paint", "Size and shape", "Weather", "Leaves", "Sun"];
+const MEANING = {along: "forwards, along its photographed heading", across: "to its own left", yaw: "about its ground centre",
+  a: "from green to red", b: "from blue to yellow", shape: "share of the shape that was found"};
+const STATUS = {found: "found", lost: "lost", missed: "missed as photographed too", ignored: "not judged"};
+
+let overview = null, frame = null, values = new Map(), knobs = new Map(), sliders = new Map();
+let shown = {car: 0, x: "", y: "", before: false, boxes: true};
+let seen = null;          // what the detector last said
+let serial = 1;           // of states: an answer about an earlier one is dropped
+let started = 0;          // when the state last changed
+
+function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+function drawing(name, attributes = {}, text = null) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== null) made.textContent = text;
+  return made;
+}
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const rounded = (value, step) => Number((Math.round(value / step) * step).toFixed(6));
+const valueOf = name => values.get(name) ?? 0;
+
+/* ---- asking the server ---------------------------------------------------------------------------------------- */
+
+async function ask(path, more = {}) {
+  const answer = await fetch(`${path}?${new URLSearchParams(more)}`);
+  if (answer.status === 409) return null;
+  if (!answer.ok) throw new Error((await answer.text()).trim());
+  return answer;
+}
+const asked = () => ({...Object.fromEntries(values), frame: frame.name, page: PAGE, n: serial});
+
+function complain(error) {
+  toast(error instanceof TypeError ? "no answer: drivesem view has ended" : error.message);
+}
+
+/* A loop a kind of answer: one request at a time, and the next is about the state as it is then. pick: another state
+   to ask about, such as one that is drawn already, while the newest is under way. */
+function follow(work, pick = () => null) {
+  let done = 0, busy = false;
+  return async function next() {
+    if (busy || frame === null) return;
+    busy = true;
+    try {
+      while (done !== serial) {
+        const picked = pick(), state = picked !== null && picked.n > done ? picked : asked();
+        await work(state);
+        done = state.n;
+      }
+    } catch (error) {
+      done = serial;
+      complain(error);
+    } finally { busy = false; }
+  };
+}
+
+let url = "", pictured = null;
+const followPicture = follow(async state => {
+  const answer = await ask("/picture", state);
+  if (answer === null) return;
+  const next = URL.createObjectURL(await answer.blob()), image = new Image();
+  image.src = next;
+  await image.decode();
+  $("after").src = next;
+  if (url) URL.revokeObjectURL(url);
+  url = next;
+  pictured = state;
+  arrived("picture", state.n);
+});
+const followDetections = follow(async state => {
+  const answer = await ask("/detections", state);
+  if (answer === null) return;
+  seen = await answer.json();
+  showSeen();
+  arrived("detections", state.n);
+  if (state.n === serial) settled(serial);
+}, () => pictured);
+/* Tell, for styles and tests, when what is shown is of the state as it stands. */
+let latest = {};
+function arrived(what, now) {
+  latest[what] = now;
+  $("times").dataset[what] = Math.round(performance.now() - started);
+  tellTimes();
+  if (latest.picture === serial && latest.detections === serial) $("view").dataset.settled = serial;
+}
+function tellTimes() {
+  const {picture, detections} = $("times").dataset;
+  $("times").textContent = `picture ${picture ?? "–"} ms, detections ${detections ?? "–"} ms`;
+}
+
+let resting = 0;
+async function settled(now) {
+  clearTimeout(resting);
+  resting = setTimeout(async () => {
+    if (now !== serial) return;
+    try {
+      const answer = await ask("/notes", asked());
+      if (answer === null || now !== serial) return;
+      const notes = await answer.json();
+      $("notes").textContent = notes.length ? `No car can do that: ${notes.join("; ")}` : "";
+      await fillMap(now);
+    } catch (error) { complain(error); }
+  }, 120);
+}
+
+/* ---- the state ------------------------------------------------------------------------------------------------ */
+
+function changed({keepMap = false} = {}) {
+  serial += 1;
+  started = performance.now();
+  delete $("view").dataset.settled;
+  if (!keepMap) forgetMap();
+  refresh();
+  followPicture();
+  followDetections();
+}
+function refresh() {
+  for (const [name, slider] of sliders) slider.show(valueOf(name));
+  drawStreet();
+  drawMap();
+  writeLink();
+}
+function put(name, value) {
+  const knob = knobs.get(name);
+  if (knob === undefined) return;
+  const kept = clamp(value, knob.low, knob.high);
+  if (kept === 0) values.delete(name); else values.set(name, kept);
+}
+function move(changes, {exact = false} = {}) {
+  const before = new Map(values);
+  for (const [name, value] of Object.entries(changes)) {
+    const knob = knobs.get(name);
+    if (knob) put(name, exact ? value : rounded(value, knob.step));
+  }
+  const names = new Set([...before.keys(), ...values.keys()].filter(n => before.get(n) !== values.get(n)));
+  if (names.size) changed({keepMap: [...names].every(n => n === shown.x || n === shown.y)});
+}
+function become(state) {
+  values = new Map();
+  for (const [name, value] of Object.entries(state)) put(name, value);
+  changed();
+}
+const named = (car, last) => `objects[${car}].${last}`;
+
+function writeLink() {
+  const told = new URLSearchParams({frame: frame.name, car: shown.car, x: shown.x, y: shown.y});
+  if (shown.before) told.set("show", "before");
+  for (const [name, value] of values) told.set(name, value);
+  history.replaceState(null, "", `#${told}`);
+}
+/* A link's state. Values without any: what the scene holds. */
+function readLink() {
+  const told = new URLSearchParams(location.hash.slice(1));
+  const name = told.get("frame");
+  const wanted = {frame: overview.frames.some(f => f.name === name) ? name : overview.frames[0].name, told};
+  return wanted;
+}
+function take(told) {
+  const had = told.has("frame");
+  const reserved = new Set(["frame", "car", "x", "y", "show"]);
+  values = new Map();
+  if (had) {
+    for (const [name, text] of told) if (!reserved.has(name) && text.trim() !== "" && Number.isFinite(Number(text))) put(name, Number(text));
+  } else for (const [name, value] of Object.entries(frame.found)) put(name, value);
+  const car = Number(told.get("car") ?? NaN);
+  shown.before = told.get("show") === "before";
+  choose(Number.isInteger(car) && frame.cars[car] ? car : -1, told.get("x"), told.get("y"), false);
+}
+
+/* ---- frames, cars, sliders ------------------------------------------------------------------------------------ */
+
+async function load(name, told) {
+  $("words").textContent = "loading";
+  const answer = await ask("/frame", {frame: name});
+  frame = await answer.json();
+  knobs = new Map(frame.knobs.map(knob => [knob.name, knob]));
+  seen = pictured = null;
+  $("title").textContent = [overview.title, overview.detector, frame.change].filter(Boolean).join(" · ");
+  $("frame").value = name;
+  const where = new URLSearchParams({frame: name});
+  $("before").src = `/photograph?${where}`;
+  $("boxes").setAttribute("viewBox", `0 0 ${frame.width} ${frame.height}`);
+  for (const id of ["after", "before"]) { $(id).setAttribute("width", frame.width); $(id).setAttribute("height", frame.height); }
+  $("found").classList.toggle("hidden", Object.keys(frame.found).length === 0);
+  $("cars").replaceChildren(...frame.cars.filter(car => carKnobs(car.car).length).map(car => {
+    const chip = element("button", {type: "button", "data-car": car.car}, element("span", {class: "dot"}), `${car.car} ${car.class}`, element("small", {class: "soft"}));
+    chip.addEventListener("click", () => choose(car.car));
+    return chip;
+  }));
+  sliders = new Map();
+  fill($("scene-knobs"), frame.knobs.filter(knob => knob.car === null));
+  $("street").replaceChildren();
+  take(told);
+  changed();
+}
+const carKnobs = car => frame.knobs.filter(knob => knob.car === car);
+const movable = () => frame.cars.filter(car => carKnobs(car.car).length).map(car => car.car);
+
+/* The car that sliders, keys and the map are about; -1: the one to begin with. */
+function choose(car, x = null, y = null, tell = true) {
+  if (!movable().includes(car)) car = frame.focus;
+  const last = shown.x.startsWith("objects[") ? [shown.x, shown.y].map(n => n.slice(n.indexOf("].") + 2)) : null;
+  const axes = frame.knobs.filter(knob => knob.car === null || knob.car === car).map(knob => knob.name);
+  const first = [x, last && named(car, last[0]), named(car, "translate.across"), axes[0]].find(n => n && axes.includes(n));
+  const second = [y, last && named(car, last[1]), named(car, "translate.along"), ...axes].find(n => n && n !== first && axes.includes(n));
+  if (shown.car !== car || shown.x !== first || shown.y !== second || $("map-x").dataset.of !== `${frame.name} ${car}`) {
+    shown = {...shown, car, x: first ?? "", y: second ?? ""};
+    forgetMap();
+    for (const [name] of sliders) if (knobs.get(name)?.car !== null) sliders.delete(name);
+    fill($("car-knobs"), carKnobs(car), carLine());
+    fillAxes(axes);
+  }
+  if (tell) { refresh(); showSeen(); settled(serial); }
+}
+function carLine() {
+  if (!frame.cars.length) return element("p", {class: "soft small"}, "The scene has no vehicle that can be moved.");
+  const reset = element("button", {type: "button", title: "this vehicle as photographed"}, "reset");
+  reset.addEventListener("click", () => restCar());
+  return element("p", {class: "chosen-line"}, element("span", {id: "chosen"}), reset);
+}
+function restCar() {
+  move(Object.fromEntries(carKnobs(shown.car).map(knob => [knob.name, 0])), {exact: true});
+}
+function fill(place, list, ...first) {
+  const groups = new Map();
+  for (const knob of list) {
+    const title = GROUPS[knob.group] ?? knob.group;
+    if (!groups.has(title)) groups.set(title, []);
+    groups.get(title).push(knob);
+  }
+  const sets = ORDER.filter(title => groups.has(title)).map(title =>
+    element("fieldset", {}, element("legend", {}, title), element("div", {}, ...groups.get(title).map(slider))));
+  place.replaceChildren(...first, ...sets);
+}
+function words(knob, value) {
+  const digits = knob.unit === "m" || knob.unit === "" ? 2 : 1;
+  const text = value.toFixed(digits).replace("-", "−");
+  return knob.unit === "" ? text : `${text} ${knob.unit === "deg" ? "°" : knob.unit}`.replace(" °", "°");
+}
+function slider(knob) {
+  const id = `knob-${knob.name}`;
+  const input = element("input", {type: "range", id, min: knob.low, max: knob.high, step: "any", "data-name": knob.name});
+  const output = element("output", {for: id});
+  const back = element("button", {type: "button", title: "as photographed", "aria-label": `${knob.title} as photographed`}, "×");
+  const row = element("div", {class: "knob"}, element("label", {for: id, title: MEANING[knob.title] ?? ""}, knob.title), input, output, back);
+  input.addEventListener("input", () => move({[knob.name]: Number(input.value)}));
+  input.addEventListener("keydown", event => {
+    const step = {ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10}[event.key];
+    if (step === undefined) return;
+    event.preventDefault();
+    move({[knob.name]: valueOf(knob.name) + step * knob.step * (event.shiftKey ? 10 : 1)});
+  });
+  back.addEventListener("click", () => { move({[knob.name]: 0}); input.focus(); });
+  sliders.set(knob.name, {show(value) {
+    if (Number(input.value) !== value) input.value = value;
+    input.setAttribute("aria-valuetext", words(knob, value));
+    output.textContent = words(knob, value);
+    row.classList.toggle("moved", value !== 0);
+  }});
+  return row;
+}
+
+/* ---- the picture ---------------------------------------------------------------------------------------------- */
+
+function showSeen() {
+  const told = shown.before || seen === null ? {boxes: frame.boxes, cars: frame.cars, words: seen?.words, lost: seen?.lost} : seen;
+  const rects = [], labels = [];
+  for (const mark of told.boxes) {
+    const [x0, y0, x1, y1] = mark.xyxy;
+    const group = drawing("g", {class: `box ${mark.kind}${mark.car === shown.car ? " chosen" : ""}`});
+    for (const ink of ["under", "ink"]) group.append(drawing("rect", {class: ink, x: x0, y: y0, width: Math.max(x1 - x0, 0), height: Math.max(y1 - y0, 0)}));
+    if (mark.car !== null) group.addEventListener("click", () => choose(mark.car));
+    rects.push(group);
+    if (mark.kind === "true" && mark.car !== shown.car) continue;
+    if (mark.kind === "ignored" && mark.car !== shown.car) continue;
+    const late = x0 > 0.85 * frame.width, low = mark.kind !== "found" && mark.kind !== "phantom";
+    const label = element("span", {class: `name-of ${mark.kind}${late ? " late" : ""}${low ? " low" : ""}`}, mark.text);
+    label.style.left = `${100 * clamp((late ? x1 : x0) / frame.width, 0, 1)}%`;
+    label.style.top = `${100 * clamp((low ? y1 : y0) / frame.height, low ? 0 : .05, low ? .94 : 1)}%`;
+    labels.push(label);
+  }
+  $("boxes").replaceChildren(...rects);
+  $("names").replaceChildren(...labels);
+  for (const [id, on] of [["after", !shown.before], ["before", shown.before]]) $(id).classList.toggle("hidden", !on);
+  $("side").textContent = shown.before ? "photograph" : "after";
+  $("flip").setAttribute("aria-pressed", shown.before);
+  $("marks").setAttribute("aria-pressed", shown.boxes);
+  $("view").classList.toggle("bare", !shown.boxes);
+  if (seen === null) return;
+  $("words").textContent = seen.words[0].toUpperCase() + seen.words.slice(1);
+  $("words").parentElement.classList.toggle("lost", seen.lost + seen.phantoms > 0);
+  $("command").textContent = seen.command;
+  for (const chip of $("cars").children) {
+    const car = Number(chip.dataset.car), status = seen.cars[car].status;
+    chip.className = status;
+    chip.setAttribute("aria-pressed", car === shown.car);
+    chip.title = STATUS[status];
+    chip.lastChild.textContent = status === "ignored" ? "" : seen.cars[car].score.toFixed(2);
+  }
+  const car = seen.cars[shown.car];
+  if ($("chosen") && car) $("chosen").textContent = `${shown.car}: ${STATUS[car.status]}, score ${car.score.toFixed(2)} (t* ${frame.t_star.toFixed(2)}, was ${frame.cars[shown.car].score.toFixed(2)})`;
+  drawStreet();
+}
+
+/* ---- the street from above ------------------------------------------------------------------------------------ */
+
+/* Where a car is: x, z in metres, its heading and its right, as theta moves it from where it was photographed. */
+function placed(car) {
+  const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
+  const along = valueOf(named(car.car, "translate.along")), across = valueOf(named(car.car, "translate.across"));
+  const yaw = car.yaw + valueOf(named(car.car, "yaw")) * Math.PI / 180;
+  return {x: car.x + along * cos + across * sin, z: car.z - along * sin + across * cos, yaw,
+    grown: 1 + valueOf(named(car.car, "size")) / 100};
+}
+function corners(x, z, yaw, length, width) {
+  const [cos, sin] = [Math.cos(yaw), Math.sin(yaw)];
+  return [[1, 1], [1, -1], [-1, -1], [-1, 1]].map(([a, b]) => {
+    const [l, w] = [a * length / 2, b * width / 2];
+    return `${(x + l * cos + w * sin).toFixed(3)},${-(z - l * sin + w * cos).toFixed(3)}`;
+  }).join(" ");
+}
+let dragged = null;
+function drawStreet() {
+  if (frame === null) return;
+  const {x0, x1, z0, z1} = frame.street, svg = $("street");
+  svg.setAttribute("viewBox", `${x0} ${-z1} ${x1 - x0} ${z1 + 1}`);
+  if (!svg.firstChild) {
+    svg.append(drawing("image", {class: "ground", href: `/street?${new URLSearchParams({frame: frame.name})}`, x: x0, y: -z1, width: x1 - x0, height: z1 - z0, preserveAspectRatio: "none"}));
+    for (let r = 10; r <= z1; r += z1 > 45 ? 20 : 10) {
+      svg.append(drawing("circle", {class: "ring", cx: 0, cy: 0, r}));
+      const x = -Math.min(.62 * r, x1 - 2), y = -Math.sqrt(r * r - x * x);
+      svg.append(drawing("text", {class: "far", x, y: y - .3, "font-size": Math.max(.9, (z1 + 1) / 36)}, `${r} m`));
+    }
+    svg.append(drawing("path", {class: "camera", d: "M-.9 .9L0 -.6L.9 .9Z"}));
+    svg.append(drawing("g", {id: "cars-above"}));
+  }
+  const status = car => (seen ?? frame).cars[car].status;
+  const parts = [];
+  const chosen = frame.cars[shown.car];
+  if (chosen && movable().includes(shown.car)) {
+    parts.push(reachOf(chosen));
+    for (const car of frame.cars.filter(c => movable().includes(c.car)))
+      parts.push(drawing("polygon", {class: "was", points: corners(car.x, car.z, car.yaw, car.length, car.width)}));
+  }
+  const size = Math.max(1.1, (z1 + 1) / 30);
+  for (const car of frame.cars.filter(c => movable().includes(c.car))) {
+    const here = placed(car), length = car.length * here.grown, width = car.width * here.grown;
+    const group = drawing("g", {class: `car ${status(car.car)}${car.car === shown.car ? " chosen" : ""}`, "data-car": car.car});
+    group.append(drawing("title", {}, `${car.class} ${car.car}: ${STATUS[status(car.car)]}`));
+    group.append(drawing("polygon", {class: "body", points: corners(here.x, here.z, here.yaw, length, width)}));
+    const [cos, sin] = [Math.cos(here.yaw), Math.sin(here.yaw)], nose = .34 * length;
+    group.append(drawing("polygon", {class: "nose", points: corners(here.x + nose * cos, here.z - nose * sin, here.yaw, .1 * length, .8 * width)}));
+    group.append(drawing("text", {x: here.x, y: -here.z, "font-size": size}, car.car));
+    parts.push(group);
+    if (car.car === shown.car && knobs.has(named(car.car, "yaw"))) {
+      const far = .5 * length + 1.6, at = {x: here.x + far * cos, z: here.z - far * sin};
+      parts.push(drawing("line", {class: "stick", x1: here.x + .5 * length * cos, y1: -(here.z - .5 * length * sin), x2: at.x, y2: -at.z}));
+      parts.push(drawing("circle", {class: "turn", cx: at.x, cy: -at.z, r: .62, "data-car": car.car}));
+    }
+  }
+  $("cars-above").replaceChildren(...parts);
+}
+function reachOf(car) {
+  const along = knobs.get(named(car.car, "translate.along")), across = knobs.get(named(car.car, "translate.across"));
+  if (!along || !across) return drawing("g");
+  const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
+  const points = [[along.low, across.low], [along.high, across.low], [along.high, across.high], [along.low, across.high]];
+  return drawing("polygon", {class: "reach", points: points.map(([a, b]) => `${car.x + a * cos + b * sin},${-(car.z - a * sin + b * cos)}`).join(" ")});
+}
+function metres(event) {
+  const point = new DOMPoint(event.clientX, event.clientY).matrixTransform($("street").getScreenCTM().inverse());
+  return {x: point.x, z: -point.y};
+}
+$("street").addEventListener("pointerdown", event => {
+  const grip = event.target.closest("[data-car]");
+  if (!grip) return;
+  event.preventDefault();
+  const car = Number(grip.dataset.car);
+  if (car !== shown.car) choose(car);
+  const at = metres(event), here = placed(frame.cars[car]);
+  dragged = {car, turns: grip.classList.contains("turn"), dx: at.x - here.x, dz: at.z - here.z};
+  $("street").setPointerCapture(event.pointerId);
+});
+$("street").addEventListener("pointermove", event => {
+  if (!dragged) return;
+  const car = frame.cars[dragged.car], at = metres(event), [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
+  if (dragged.turns) {
+    const here = placed(car), yaw = Math.atan2(-(at.z - here.z), at.x - here.x);
+    const turn = Math.atan2(Math.sin(yaw - car.yaw), Math.cos(yaw - car.yaw));
+    move({[named(dragged.car, "yaw")]: turn * 180 / Math.PI});
+  } else {
+    const dx = at.x - dragged.dx - car.x, dz = at.z - dragged.dz - car.z;
+    move({[named(dragged.car, "translate.along")]: dx * cos - dz * sin, [named(dragged.car, "translate.across")]: dx * sin + dz * cos});
+  }
+});
+for (const name of ["pointerup", "pointercancel"]) $("street").addEventListener(name, () => { dragged = null; });
+
+/* ---- the failure map ------------------------------------------------------------------------------------------ */
+
+let map = {cells: new Map(), run: 0};
+function forgetMap() { map = {cells: new Map(), run: map.run + 1}; }
+function fillAxes(axes) {
+  for (const [id, of] of [["map-x", "x"], ["map-y", "y"]]) {
+    $(id).replaceChildren(...axes.map(name => {
+      const knob = knobs.get(name);
+      const title = `${GROUPS[knob.group].toLowerCase()}: ${knob.title}`;
+      return element("option", {value: name}, title);
+    }));
+    $(id).value = shown[of];
+    $(id).dataset.of = `${frame.name} ${shown.car}`;
+  }
+  const car = frame.cars[shown.car];
+  $("map-car").textContent = car ? `${car.class} ${shown.car}` : "";
+}
+for (const [id, of, other] of [["map-x", "x", "y"], ["map-y", "y", "x"]]) $(id).addEventListener("change", event => {
+  const before = shown[of];
+  shown[of] = event.target.value;
+  if (shown.x === shown.y) { shown[other] = before; $(`map-${other}`).value = before; }
+  forgetMap();
+  refresh();
+  settled(serial);
+});
+const at = (knob, i) => knob.low + (knob.high - knob.low) * i / (overview.grid - 1);
+/* Every other cell first: a rough map soon, a fine one a little later. */
+function order() {
+  const all = [];
+  for (let i = 0; i < overview.grid; i++) for (let j = 0; j < overview.grid; j++) all.push([i, j, (i % 4 === 0) && (j % 4 === 0) ? 0 : (i % 2 === 0) && (j % 2 === 0) ? 1 : 2]);
+  return all.sort((a, b) => a[2] - b[2]);
+}
+async function fillMap(now) {
+  const x = knobs.get(shown.x), y = knobs.get(shown.y), mine = map, car = shown.car;
+  if (!x || !y || !movable().includes(car) || document.hidden) return;
+  for (const [i, j] of order()) {
+    if (mine !== map || now !== serial) return;
+    if (mine.cells.has(`${i} ${j}`)) continue;
+    const state = {...asked(), [x.name]: rounded(at(x, i), 1e-6), [y.name]: rounded(at(y, j), 1e-6), car};
+    const answer = await ask("/score", state);
+    if (answer === null || mine !== map) return;
+    mine.cells.set(`${i} ${j}`, await answer.json());
+    drawMap();
+  }
+}
+/* From pale to deep blue with the score; what is not found is orange and crossed. */
+function colour(cell) {
+  if (cell.status === "lost" || cell.status === "missed") return "var(--lost)";
+  if (cell.status === "ignored") return "var(--line)";
+  const share = clamp((cell.score - frame.t_star) / (1 - frame.t_star), 0, 1);
+  return `color-mix(in oklab, #08306b ${Math.round(100 * share)}%, #c9def2)`;
+}
+function nearest(i, j) {
+  for (const step of [1, 2, 4]) {
+    const cell = map.cells.get(`${Math.round(i / step) * step} ${Math.round(j / step) * step}`);
+    if (cell) return [cell, step > 1];
+  }
+  return [null, false];
+}
+function drawMap() {
+  const x = knobs.get(shown.x), y = knobs.get(shown.y), svg = $("map");
+  const [width, height] = [400, 330], [left, bottom, top, right] = [52, 42, 6, 8];
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  if (!x || !y) { svg.replaceChildren(); return; }
+  const w = (width - left - right) / overview.grid, h = (height - top - bottom) / overview.grid, parts = [];
+  for (let i = 0; i < overview.grid; i++) for (let j = 0; j < overview.grid; j++) {
+    const [cell, rough] = nearest(i, j), px = left + i * w, py = height - bottom - (j + 1) * h;
+    const rect = drawing("rect", {class: `cell ${cell ? cell.status : "waits"}${rough ? " rough" : ""}`, x: px, y: py, width: w, height: h, "data-i": i, "data-j": j});
+    if (cell) {
+      rect.setAttribute("fill", colour(cell));
+      rect.append(drawing("title", {}, `${words(x, at(x, i))}, ${words(y, at(y, j))}: ${STATUS[cell.status]}, score ${cell.score.toFixed(2)}`));
+    }
+    parts.push(rect);
+    if (cell && !rough && (cell.status === "lost" || cell.status === "missed"))
+      parts.push(drawing("path", {class: "cross", d: `M${px + .3 * w} ${py + .3 * h}l${.4 * w} ${.4 * h}m0 ${-.4 * h}l${-.4 * w} ${.4 * h}`}));
+  }
+  const place = (knob, value, from, size) => from + size / 2 + (value - knob.low) / (knob.high - knob.low) * (overview.grid - 1) * size;
+  const zeroX = place(x, 0, left, w), zeroY = height - bottom - place(y, 0, 0, h);
+  if (x.low <= 0 && x.high >= 0) parts.push(drawing("line", {class: "zero", x1: zeroX, x2: zeroX, y1: top, y2: height - bottom}));
+  if (y.low <= 0 && y.high >= 0) parts.push(drawing("line", {class: "zero", x1: left, x2: width - right, y1: zeroY, y2: zeroY}));
+  const cx = place(x, valueOf(x.name), left, w), cy = height - bottom - place(y, valueOf(y.name), 0, h);
+  for (const name of ["under-here", "here"]) parts.push(drawing("circle", {class: name, cx, cy, r: 7}));
+  for (const [value, px, anchor] of [[x.low, left + w / 2, "middle"], [x.high, width - right - w / 2, "middle"]])
+    parts.push(drawing("text", {x: px, y: height - bottom + 15, "text-anchor": anchor}, words(x, value)));
+  for (const [value, py] of [[y.low, height - bottom - h / 2], [y.high, top + h / 2]])
+    parts.push(drawing("text", {x: left - 5, y: py + 4, "text-anchor": "end"}, words(y, value)));
+  parts.push(drawing("text", {class: "axis", x: left + (width - left - right) / 2, y: height - 8, "text-anchor": "middle"}, `${x.title} →`));
+  parts.push(drawing("text", {class: "axis", x: 0, y: 0, "text-anchor": "middle", transform: `translate(13 ${top + (height - top - bottom) / 2}) rotate(-90)`}, `${y.title} →`));
+  svg.replaceChildren(...parts);
+  const cells = [...map.cells.values()], lost = cells.filter(c => c.status === "lost" || c.status === "missed").length;
+  const none = !movable().includes(shown.car);
+  $("map-said").textContent = none ? "no vehicle to ask about" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", still looking" : ""}`;
+  $("map").dataset.cells = cells.length;
+}
+let aiming = false;
+function aim(event) {
+  const target = document.elementFromPoint(event.clientX, event.clientY)?.closest("#map .cell");
+  if (!target) return;
+  const x = knobs.get(shown.x), y = knobs.get(shown.y);
+  move({[x.name]: at(x, Number(target.dataset.i)), [y.name]: at(y, Number(target.dataset.j))});
+}
+$("map").addEventListener("pointerdown", event => { aiming = true; aim(event); });
+$("map").addEventListener("pointermove", event => { if (aiming) aim(event); });
+for (const name of ["pointerup", "pointercancel", "pointerleave"]) $("map").addEventListener(name, () => { aiming = false; });
+function drawRamp() {
+  const svg = drawing("svg", {viewBox: "0 0 90 9", preserveAspectRatio: "none"});
+  for (let i = 0; i < 12; i++) svg.append(drawing("rect", {x: i * 7.5, y: 0, width: 7.6, height: 9, fill: colour({status: "found", score: frame.t_star + (1 - frame.t_star) * i / 11})}));
+  const lost = drawing("svg", {viewBox: "0 0 9 9"});
+  lost.style.width = "1rem";
+  lost.append(drawing("rect", {width: 9, height: 9, fill: "var(--lost)"}), drawing("path", {d: "M2.5 2.5l4 4m0 -4l-4 4", stroke: "#000"}));
+  $("ramp").replaceChildren(frame.t_star.toFixed(2), svg, "1 ", lost, " not found");
+}
+
+/* ---- acts and keys -------------------------------------------------------------------------------------------- */
+
+let fading = 0;
+function toast(text) {
+  $("toast").textContent = text;
+  clearTimeout(fading);
+  fading = setTimeout(() => { $("toast").textContent = ""; }, 3500);
+}
+async function copy(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    toast(`${what} copied`);
+  } catch {
+    getSelection().selectAllChildren($("command"));
+    toast("select and copy it by hand: this browser does not let pages copy");
+  }
+}
+function flip() { shown.before = !shown.before; showSeen(); writeLink(); }
+function nextCar(step) {
+  const all = movable();
+  if (all.length) choose(all[(all.indexOf(shown.car) + step + all.length) % all.length]);
+}
+function nudge(last, sign, event) {
+  const knob = knobs.get(named(shown.car, last)), step = {m: .05, deg: .5}[knob?.unit] ?? 0;
+  if (knob) move({[knob.name]: valueOf(knob.name) + sign * step * (event.shiftKey ? 10 : 1)});
+}
+const copyCommand = () => copy($("command").textContent, "Command"), copyLink = () => copy(location.href, "Link");
+function showKeys() {
+  const off = $("keys").classList.toggle("hidden");
+  $("show-keys").setAttribute("aria-expanded", !off);
+}
+/* Arrows as one sees them: to the right and away; which of its axes that is depends on how the car stands. */
+function push(right, away, event) {
+  const car = frame.cars[shown.car];
+  if (!car) return;
+  const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
+  const along = right * cos - away * sin, across = right * sin + away * cos;
+  if (Math.abs(along) >= Math.abs(across)) nudge("translate.along", Math.sign(along), event);
+  else nudge("translate.across", Math.sign(across), event);
+}
+const KEYS = {
+  b: flip, d: () => { shown.boxes = !shown.boxes; showSeen(); }, n: () => nextCar(1), p: () => nextCar(-1), r: restCar,
+  0: () => become({}), f: () => become(frame.found), c: copyCommand, l: copyLink, "?": showKeys,
+  arrowup: e => push(0, 1, e), arrowdown: e => push(0, -1, e), arrowright: e => push(1, 0, e), arrowleft: e => push(-1, 0, e),
+  q: e => nudge("yaw", -1, e), e: e => nudge("yaw", 1, e),
+};
+document.addEventListener("keydown", event => {
+  const act = KEYS[event.key.toLowerCase()];
+  const typing = event.target.matches("select, input") && (event.target.matches("select") || event.key.startsWith("Arrow"));
+  if (!act || frame === null || typing || event.ctrlKey || event.metaKey || event.altKey) return;
+  event.preventDefault();
+  act(event);
+});
+for (const [id, act] of [["flip", flip], ["marks", KEYS.d], ["rest", KEYS[0]], ["found", KEYS.f], ["copy-link", copyLink],
+  ["copy-command", copyCommand], ["show-keys", showKeys]]) $(id).addEventListener("click", act);
+$("frame").addEventListener("change", event => load(event.target.value, new URLSearchParams()).catch(complain));
+addEventListener("hashchange", () => {
+  const {frame: name, told} = readLink();
+  if (name !== frame?.name) load(name, told).catch(complain);
+  else { take(told); changed(); showSeen(); }
+});
+document.addEventListener("visibilitychange", () => { if (!document.hidden && frame) settled(serial); });
+
+(async () => {
+  overview = await (await ask("/overview")).json();
+  document.title = `${overview.title} - drivesem view`;
+  $("frame").replaceChildren(...overview.frames.map(({name, words: told}) => element("option", {value: name}, told ? `${name} (${told})` : name)));
+  const {frame: name, told} = readLink();
+  await load(name, told);
+  drawRamp();
+})().catch(complain);

@@ -1,0 +1,230 @@
+"""`drivesem view` as a user types it, without a browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivesem.cli import main
+from drivesem.commands import view
+from drivesem.settings.commands import View
+from drivesem.settings.parsing import parse
+from drivesem.viewer import frames, window
+from scene_ir.io import load_scene, save_scene
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def two_scenes(small_run: Path, tmp_path: Path) -> Path:
+    """A folder of derender: its settings, and two scenes."""
+    folder = tmp_path / "scenes"
+    scene = load_scene(small_run / "frames" / "demo-000" / "scene").at_rest()
+    for name in ("a", "b"):
+        save_scene(scene, folder / name)
+    (folder / "config.yaml").write_text("dataset: kitti\nlimit: 2\n")
+    return folder
+
+
+def test_defaults() -> None:
+    assert parse(["view", "a"]) == View(scene="a")
+    config = parse(["view", "a", "--no-browser", "--port", "0", "--detector", "yolov3-slim", "--frame", "b"])
+    assert config == View(scene="a", browser=False, port=0, detector="yolov3-slim", frame="b")
+
+
+def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
+    shown = frames.opened(View(scene=str(small_run)))
+    assert list(shown.frames) == ["demo-000"]
+    assert shown.frames["demo-000"].words == "withstood"
+    assert shown.frames["demo-000"].folder == small_run / "frames" / "demo-000" / "scene"
+    assert shown.detector.name == "squeezedet"
+    assert shown.title == "a"
+
+
+def test_scenes_of_derender_are_no_run(two_scenes: Path) -> None:
+    assert list(frames.opened(View(scene=str(two_scenes))).frames) == ["a", "b"]
+    assert list(frames.opened(View(scene=str(two_scenes), frame="b")).frames) == ["b", "a"]
+    assert list(frames.opened(View(scene=str(two_scenes / "b"))).frames) == ["b"]
+
+
+def test_it_begins_with_a_frame_that_has_vehicles(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames, "count_objects", lambda folder: 1 if folder.name == "b" else 0)
+    assert list(frames.opened(View(scene=str(two_scenes))).frames) == ["b", "a"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["nowhere"],
+            "SCENE|RUN: expected a scene of drivesem derender, a folder of some, or a run, found nowhere",
+        ),
+        (["nowhere", "--port", "65536"], "--port: expected 0 (any that is free) to 65535, found 65536"),
+        (["nowhere", "--port", "-1"], "--port: expected 0"),
+        (["nowhere", "--budget", "moon"], "--budget: expected paper, parking, street"),
+        ([], "SCENE|RUN"),
+    ],
+)
+def test_refuses(words: list[str], message: str, refused: Refused) -> None:
+    assert message in refused("view", *words)
+
+
+def test_refuses_what_a_folder_lacks(two_scenes: Path, small_run: Path, refused: Refused) -> None:
+    said = refused("view", str(two_scenes), "--frame", "c")
+    assert said == f"drivesem: --frame: expected a frame of {two_scenes}, found c"
+
+
+def test_refuses_a_detector_that_is_none(two_scenes: Path, refused: Refused) -> None:
+    assert "--detector: expected a detector that knows cars" in refused("view", str(two_scenes), "--detector", "x")
+
+
+def test_refuses_code_of_a_run(small_run: Path, tmp_path: Path, refused: Refused) -> None:
+    folder = tmp_path / "theirs"
+    shutil.copytree(small_run, folder)
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace("detector: squeezedet", "detector: module:theirs.py:D"))
+    assert "--trust, which lets this run the code in theirs.py" in refused("view", str(folder))
+
+
+def test_refuses_a_port_that_is_taken(two_scenes: Path, refused: Refused) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        said = refused("view", str(two_scenes), "--port", str(port), "--no-browser")
+    assert said == f"drivesem: --port: expected a free port of 127.0.0.1, found {port}, which cannot be had"
+
+
+def test_the_next_port_that_is_free(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        monkeypatch.setattr(view, "_PORT", port)
+        server = view._server(frames.opened(View(scene=str(two_scenes))), None)
+        try:
+            assert port < server.server_port < port + view._TRIED
+        finally:
+            server.server_close()
+            server.viewer.close()
+
+
+def test_it_serves_until_ctrl_c(small_run: Path) -> None:
+    words = [sys.executable, "-m", "drivesem.cli", "view", str(small_run), "--port", "0", "--no-browser", "--json"]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    assert child.stdout is not None
+    try:
+        told = json.loads(child.stdout.readline())
+        assert (told["frames"], told["detector"]) == (1, "squeezedet")
+        with urllib.request.urlopen(f"{told['url']}picture?frame=demo-000&weather.fog=0.5", timeout=60) as answer:
+            assert answer.read(2) == b"\xff\xd8", "a JPEG"
+    finally:
+        child.send_signal(signal.SIGINT)
+        out, err = child.communicate(timeout=30)
+    assert child.returncode == 0
+    assert out + err.strip() == ""
+
+
+def test_the_browser_is_opened_at_the_page(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+
+    def stop(self: Any, *_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+    monkeypatch.setattr(view.Server, "serve_forever", stop)
+    monkeypatch.setattr(view, "_PORT", 0)
+    assert main(["view", str(two_scenes / "a")]) == 0
+    (url,) = opened
+    assert url.startswith("http://127.0.0.1:")
+
+
+def test_a_window_needs_a_display(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(window, "has_display", lambda *_: False)
+    said = refused("view", str(two_scenes), "--window")
+    expected = "a display (the page needs none), found no DISPLAY and no WAYLAND_DISPLAY"
+    assert said == f"drivesem: --window: expected {expected}"
+
+
+def test_where_a_display_is() -> None:
+    assert not window.has_display("linux", {})
+    assert not window.has_display("linux", {"DISPLAY": ""})
+    assert window.has_display("linux", {"DISPLAY": ":0"})
+    assert window.has_display("linux", {"WAYLAND_DISPLAY": "wayland-0"})
+    assert window.has_display("darwin", {})
+
+
+class Library:
+    """What is asked of Open3D: a model of one mesh, and a window that notes what is done to it."""
+
+    def __init__(self, opens: bool) -> None:
+        self.opens, self.read, self.shown, self.ran = opens, b"", [], 0
+        self.mesh = SimpleNamespace(triangle_uvs=np.array([[0.2, 0.3]]), triangles=[0])
+        self.utility = SimpleNamespace(Vector2dVector=np.array, IntVector=list)
+        self.geometry = SimpleNamespace(Image=np.array)
+        self.visualization = SimpleNamespace(Visualizer=lambda: self)
+        self.io = SimpleNamespace(read_triangle_model=self.model)
+
+    def model(self, path: str) -> SimpleNamespace:
+        self.read = Path(path).read_bytes()
+        skin = SimpleNamespace(albedo_img=np.full((2, 2, 3), 7, np.uint8))
+        return SimpleNamespace(meshes=[SimpleNamespace(mesh=self.mesh, material_idx=0)], materials=[skin])
+
+    def create_window(self, title: str, width: int, height: int) -> bool:
+        return self.opens
+
+    def add_geometry(self, mesh: Any) -> None:
+        self.shown.append(mesh)
+
+    def get_render_option(self) -> SimpleNamespace:
+        return SimpleNamespace()
+
+    def get_view_control(self) -> Any:
+        names = ("set_lookat", "set_front", "set_up", "set_zoom")
+        return SimpleNamespace(**dict.fromkeys(names, lambda _: None))
+
+    def run(self) -> None:
+        self.ran += 1
+
+    def destroy_window(self) -> None:
+        self.ran += 1
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_the_window_shows_the_scene(
+    opens: bool, two_scenes: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    library = Library(opens)
+    monkeypatch.setitem(sys.modules, "open3d", library)
+    monkeypatch.setattr(window, "has_display", lambda *_: True)
+    monkeypatch.setattr(window, "glb_of", lambda name, scene: f"glb of {name}".encode())
+    monkeypatch.setattr(window, "mapping", lambda sharing, apart: map)
+    assert main(["view", str(two_scenes), "--window", "--frame", "b"]) == (0 if opens else 2)
+    assert library.read == b"glb of b"
+    if opens:
+        assert (library.shown, library.ran) == ([library.mesh], 2)
+        assert library.mesh.triangle_uvs.tolist() == [[0.2, 0.7]]
+        assert (library.mesh.textures[0] == 7).all()
+    else:
+        said = "drivesem: --window: expected a display with OpenGL, found none that Open3D can use\n"
+        assert capsys.readouterr().err == said
+
+
+def test_a_window_needs_open3d(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    monkeypatch.setattr(window, "has_display", lambda *_: True)
+    said = refused("view", str(two_scenes), "--window")
+    assert "--window: expected Open3D (drivesem doctor says how to get it)" in said

@@ -1,0 +1,171 @@
+"""What can be moved, in which units, and the command that draws a state."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivesem.attack.budgets import PRESETS, budget_of
+from drivesem.attack.scene_edits import moved
+from drivesem.attack.space import Parameter
+from drivesem.settings.commands import Edit, Render
+from drivesem.settings.edits import frame_edit, merged, parse_setting
+from drivesem.settings.parsing import parse
+from drivesem.viewer.knobs import PICTURE, Knobs
+from scene_ir import ffd
+from scene_ir.errors import RangeError
+from scene_ir.exchange import without
+from scene_ir.io import load_scene
+from scene_ir.types import SceneIR
+
+STREET = PRESETS["street"]
+
+
+@pytest.fixture(scope="module")
+def knobs(still: Path) -> Knobs:
+    return Knobs(load_scene(still), STREET)
+
+
+@pytest.fixture(scope="module")
+def bent(still: Path) -> SceneIR:
+    """The scene with vehicle 1 in another shape and paint, vehicle 0 elsewhere, in fog."""
+    scene = load_scene(still)
+    edit = frame_edit("edit", {"objects": {0: {"translate": ["1.25m", "-0.5m"], "rotate": "-7.5deg"}}})
+    scene = moved(scene, edit)
+    offsets, paint = scene.objects.ffd.clone(), scene.objects.texture_code.clone()
+    offsets[1] += ffd.from_symmetric(0.05 * ffd.low_modes()[2])
+    paint[1, 0] = -0.5
+    scene = scene.with_objects(ffd=offsets, texture_code=paint)
+    return scene.with_environment(weather=torch.tensor([0.25, 0.0, 0.0, 0.0]))
+
+
+def drawn_by(command: str, scene: SceneIR) -> SceneIR:
+    """The scene that a command draws, by what it says alone."""
+    config = parse(shlex.split(command)[1:])
+    if isinstance(config, Render):
+        return scene
+    assert isinstance(config, Edit)
+    changes: dict[Any, Any] = {}
+    for text in config.set:
+        changes = merged(changes, parse_setting(text))
+    edit = frame_edit("edit", changes)
+    return moved(scene.at_rest(), edit, scene) if config.photographed else moved(scene, edit)
+
+
+def assert_alike(one: SceneIR, other: SceneIR) -> None:
+    for name in ("translation", "yaw", "size_lhw", "ffd", "texture_code"):
+        torch.testing.assert_close(getattr(one.objects, name), getattr(other.objects, name), atol=2e-6, rtol=0)
+    for name in ("weather", "foliage", "light"):
+        mine, theirs = getattr(one.environment, name), getattr(other.environment, name)
+        torch.testing.assert_close(mine, theirs, atol=2e-6, rtol=0)
+
+
+def test_knobs_are_thetas_coordinates_in_peoples_units(knobs: Knobs) -> None:
+    space = knobs.space
+    assert set(space.params) == set(Parameter) - {Parameter.MESH}
+    for i in range(space.dim):
+        factor, unit = space.physical(i, 1.0) or (1.0, "")
+        low, high = float(space.lower[i]) * factor, float(space.upper[i]) * factor
+        if low == high:
+            assert space.name(i) not in knobs.knobs, "nothing to move"
+            continue
+        knob = knobs.knobs[space.name(i)]
+        assert knob.unit == unit
+        assert low - 1e-4 <= knob.low < knob.high <= high + 1e-4
+        assert (high - knob.high, knob.low - low) == pytest.approx((0, 0), abs=knob.step)
+    assert {knob.unit for knob in knobs.knobs.values()} == {"m", "deg", "%", ""}
+
+
+def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(knobs: Knobs, still: Path) -> None:
+    assert knobs.found == {}
+    assert_alike(knobs.apply({}), load_scene(still))
+    assert knobs.command(still, {}) == shlex.join(["drivesem", "render", str(still), "--out", PICTURE])
+
+
+def test_what_a_scene_holds_is_found(bent: SceneIR) -> None:
+    knobs = Knobs(bent, STREET)
+    found = knobs.found
+    expected = {
+        "objects[0].translate.along": 1.25,
+        "objects[0].translate.across": -0.5,
+        "objects[0].yaw": -7.5,
+        "objects[1].paint.lightness": -0.5,
+        "objects[1].shape": 100.0,
+        "weather.fog": 0.25,
+    }
+    assert found == pytest.approx(expected, abs=1e-4)
+    assert_alike(knobs.apply(found), bent)
+
+
+def test_a_shape_goes_by_its_share(bent: SceneIR, still: Path) -> None:
+    knobs, rest = Knobs(bent, STREET), load_scene(still).objects.ffd
+    half = knobs.apply(knobs.state({"objects[1].shape": 50.0})).objects.ffd
+    torch.testing.assert_close(half, rest + 0.5 * (bent.objects.ffd - rest))
+    command = knobs.command(Path("S"), {"objects[1].shape": 50.0})
+    assert command == "drivesem edit S --photographed --set 'objects[1].mesh=50%' --out view.png"
+    assert_alike(drawn_by(command, bent), knobs.apply({"objects[1].shape": 50.0}))
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_the_command_says_the_state(data: st.DataObject, knobs: Knobs, bent: SceneIR) -> None:
+    mine = data.draw(st.sampled_from([knobs, Knobs(bent, STREET)]))
+    names = data.draw(st.lists(st.sampled_from(sorted(mine.knobs)), max_size=6, unique=True))
+    values = {}
+    for name in names:
+        knob = mine.knobs[name]
+        values[name] = round(data.draw(st.floats(knob.low, knob.high)), 5)
+        values[name] = min(max(values[name], knob.low), knob.high)
+    state = mine.state(values)
+    assert_alike(drawn_by(mine.command(Path("a b"), state), mine.scene), mine.apply(state))
+
+
+def test_a_narrow_budget_reaches_what_is_there(bent: SceneIR) -> None:
+    knobs = Knobs(bent, budget_of("translate=0.5m,color=0.1,weather=0.1"))
+    along = knobs.knobs["objects[0].translate.along"]
+    assert (along.low, along.high) == pytest.approx((-0.5, 1.25), abs=1e-4)
+    assert knobs.knobs["objects[1].paint.lightness"].low == -0.5
+    held = ("size", "sun")
+    assert not any(knob.group in held for knob in knobs.knobs.values()), "by the paper's budget"
+    assert_alike(knobs.apply(knobs.found), bent)
+
+
+def test_what_is_not_there_cannot_be_moved(still: Path) -> None:
+    scene = load_scene(still)
+    knobs = Knobs(without(scene, 0), STREET)
+    assert {knob.car for knob in knobs.knobs.values()} == {None, *range(1, len(scene.objects))}
+    objects = scene.objects
+    nobody = {entry.name: getattr(objects, entry.name)[:0] for entry in fields(objects)}
+    empty = Knobs(replace(scene, objects=replace(objects, **nobody)), STREET)
+    assert {knob.car for knob in empty.knobs.values()} == {None}
+    assert float(empty.apply({"weather.rain": 0.5}).environment.weather[1]) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"objects[0].wheels": 1.0},
+            r"objects\[0\]\.wheels: expected a parameter of this scene, found",
+        ),
+        ({"objects[99].yaw": 1.0}, "an unknown name"),
+        ({"objects[0].yaw": 20.1}, r"objects\[0\]\.yaw: expected -20 to 20 deg, found 20.1"),
+        ({"weather.fog": -0.1}, "weather.fog: expected 0 to 1, found -0.1"),
+        ({"weather.fog": float("nan")}, "weather.fog: expected 0 to 1, found nan"),
+    ],
+)
+def test_values_that_are_none(values: dict[str, float], message: str, knobs: Knobs) -> None:
+    with pytest.raises(RangeError, match=message):
+        knobs.state(values)
+
+
+def test_meshes_alone_are_refused(street: Any) -> None:
+    with pytest.raises(RangeError):
+        Knobs(street(), STREET)
