@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,9 @@ from torch import Tensor
 
 from drivesem.attack.methods.base import Attack
 from drivesem.classify.grading import PictureGrader
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.base import Scorer
 from drivesem.classify.networks.loading import load_classifier
+from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.objective import ClassifierObjective, Seen
 from drivesem.classify.pictures import Shown, Studio, views_of
 from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of, steps_of
@@ -39,8 +40,17 @@ from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.io import to_uint8
 
 CSV = "classified.csv"
+WRITTEN = (FRAMES, METRICS, PAGE, CSV)
+"""What a run leaves in its folder."""
 EMBEDDED_LIMIT = 48
 """Pictures of the embedded objects that are attacked where --limit is not given: of each class four."""
+
+
+def network_of(name_or_path: str, classes: Sequence[str], device: str) -> Scorer:
+    """A network to attack: as `load_classifier`, or an ONNX file. Raises FormatError."""
+    if Path(name_or_path).suffix == ".onnx":
+        return OnnxClassifier(Path(name_or_path), classes)
+    return load_classifier(name_or_path, classes, device)
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,7 @@ class Attacker:
 
     config: Classify
     studio: Studio
-    network: Classifier
+    network: Scorer
     method: Attack
     grader: PictureGrader
 
@@ -57,10 +67,13 @@ class Attacker:
     def of(cls, config: Classify) -> Attacker:
         """Raises UsageError or SceneError for settings, objects or a network that cannot be used."""
         studio = Studio.of(config)
-        network = load_classifier(config.network, studio.objects.classes, config.device)
+        network = network_of(config.network, studio.objects.classes, config.device)
         grader = PictureGrader(Nuisances.of(config.nuisances), Rule(config.draws), config.seed)
         params_of(config)
-        return cls(config, studio, network, attack_of(config), grader)
+        method = attack_of(config)
+        if method.needs_gradient and not network.differentiable:
+            raise UsageError("--method", f"random or halton: {config.network} has no gradient", config.method)
+        return cls(config, studio, network, method, grader)
 
     def shown(self) -> list[Shown]:
         """The pictures to attack: classes in turn, and of an object its views in turn with the others'."""
@@ -82,12 +95,17 @@ class Attacker:
         ]
         return turned[:limit]
 
+    def scene(self, shown: Shown) -> tuple[ObjectScene, ObjectSpace]:
+        """A picture's scene, and what may move in it. Raises SceneError."""
+        config, scene = self.config, self.studio.scene(shown)
+        return scene, ObjectSpace(
+            scene.vertices, params_of(config), steps_of(config), reach_of(config), config.shape
+        )
+
     def attack(self, shown: Shown, out: Path) -> None:
         """One picture, to its folder. Raises SceneError."""
         start = time.perf_counter()
-        config = self.config
-        scene = self.studio.scene(shown)
-        space = ObjectSpace(scene.vertices, params_of(config), steps_of(config), reach_of(config), config.shape)
+        scene, space = self.scene(shown)
         try:
             found = attack_picture(scene, space, self)
         except (RangeError, ShapeError) as error:
@@ -174,29 +192,46 @@ def attack_run(config: Classify) -> ClassifiedRun:
     shown, params = attacker.shown(), tuple(str(one) for one in params_of(config))
     name = f"classify-{Path(config.network).stem}-{config.method}-{'-'.join(params)}-seed{config.seed}"
     out = folder_of(config.out, Path("runs") / name)
-    claim(out, config, (FRAMES, METRICS, PAGE, CSV))
+    claim(out, config, WRITTEN)
     todo = [one for one in shown if not (out / FRAMES / one.identifier / RESULT).is_file()]
     work, build = partial(attacker.attack, out=out), partial(_attacker, config, out)
     failed = ask(todo, work, build, config, Bar("attacking pictures"), lambda one: one.identifier).failed
-    done = [one.identifier for one in shown if one.identifier not in failed]
+    done = [one for one in shown if one.identifier not in failed]
     if not done:
         raise FormatError("--objects", "a picture that can be attacked", f"none: {next(iter(failed.values()))}")
-    frames = [load_record(out / FRAMES / name / RESULT, ClassifiedFrame, SCHEMA) for name in done]
+    return report_run(config, out, attacker.network.classes, done, failed, time.perf_counter() - start)
+
+
+def report_run(
+    config: Classify,
+    out: Path,
+    classes: tuple[str, ...],
+    done: Sequence[Shown],
+    failed: Mapping[str, str],
+    seconds: float,
+) -> ClassifiedRun:
+    """Write report and figures of pictures that are attacked. Raises FormatError for a file that is not whole."""
+    frames = frames_of(out, done)
     run = ClassifiedRun.of(
         frames,
-        attacker.network.classes,
+        classes,
         dict(sorted(failed.items())),
-        round(time.perf_counter() - start, 3),
+        round(seconds, 3),
         out=str(out),
         objects=config.objects or "embedded",
         network=config.network,
         method=config.method,
-        params=params,
+        params=tuple(str(one) for one in params_of(config)),
     )
     files.write_json(out / METRICS, run.to_json())
     files.write_text(out / CSV, csv_text([frame.row() for frame in frames]))
     write_page(out / PAGE, run, frames)
     return run
+
+
+def frames_of(out: Path, done: Sequence[Shown]) -> list[ClassifiedFrame]:
+    """What came of pictures that are attacked. Raises FormatError."""
+    return [load_record(out / FRAMES / one.identifier / RESULT, ClassifiedFrame, SCHEMA) for one in done]
 
 
 def _attacker(config: Classify, out: Path) -> Callable[[Shown], None]:

@@ -34,6 +34,8 @@ LOADED_WHERE_USED = (
     "ray",
     "loky",
     "fsspec",
+    "mitsuba",
+    "timm",
 )
 
 

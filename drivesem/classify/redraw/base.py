@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from drivesem.classify.results import Likeness
 from drivesem.classify.scenes import SEEN_PX, ObjectScene, camera
 from drivesem.classify.space import Change
 from scene_ir.render.lit import Lights
@@ -22,9 +23,9 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """An object as it stands before the camera: points, normals (3F, 3), corner by corner, in camera space (x right,
-    y down, z forward), each face wound and each normal turned towards the side that is seen; diffuse (F, 3) linear,
-    specular (F,), shininess (F,).
+    """An object as it stands before the camera: points, normals (3F, 3), corner by corner, in camera space (x
+    right, y down, z forward), each face wound and each normal turned towards the side that is seen; diffuse (F, 3)
+    linear, specular (F,), shininess (F,).
     """
 
     points: Array
@@ -41,7 +42,9 @@ class Solid:
         """An object, with a change."""
         model = scene.model
         corners, normals, away = scene.mesh.corners(scene.placed(change))
-        order = torch.where(away[:, None], torch.tensor([0, 2, 1]), torch.tensor([0, 1, 2]))[..., None].expand(-1, -1, 3)
+        order = torch.where(away[:, None], torch.tensor([0, 2, 1]), torch.tensor([0, 1, 2]))[..., None].expand(
+            -1, -1, 3
+        )
         return cls(
             points=corners.gather(1, order).reshape(-1, 3).numpy(),
             normals=normals.reshape(-1, 3, 3).gather(1, order).reshape(-1, 3).numpy(),
@@ -67,16 +70,6 @@ class Redraw(Protocol):
 def line_of(error: BaseException) -> str:
     """An error on one line."""
     return " ".join(f"{type(error).__name__} {error}".split())
-
-
-@dataclass(frozen=True, slots=True)
-class Likeness:
-    """How alike two renderers draw an object. iou: of the pixels that it covers by half at least; colour: mean
-    distance in CIE L*a*b* (Delta E of 1976) over the pixels that both cover so, at the size that a network sees.
-    """
-
-    iou: float
-    colour: float
 
 
 def likeness(scene: ObjectScene, one: Tensor, other: Tensor) -> Likeness:

@@ -1,9 +1,8 @@
 """Mitsuba 3 (Jakob et al. 2022): light that is traced, with shadows and without gradients.
 
-By its LLVM back end, or its scalar variant where LLVM is missing. What the project's own renderer adds up is
-translated: the lamp to a point light of equal irradiance, the light from all around to a sky whose irradiance is
-the same for every normal, Phong's lobe to a rough conductor of equal width and equal height. What differs is what
-physics adds: parts of an object shade each other.
+What the project's own renderer adds up is translated: the lamp to a point light of equal irradiance, the light from
+all around to a sky whose irradiance is the same for every normal, Phong's lobe to a rough conductor of equal width and
+equal height. What differs is what physics adds: parts of an object shade each other.
 """
 
 from __future__ import annotations
@@ -24,9 +23,10 @@ from scene_ir.render.lit import GAMMA, UP
 NAME = "mitsuba"
 _RAYS = 16
 """A pixel; pictures are shown at less than half the size, so that 80 make a pixel that is seen."""
-_VARIANTS = ("scalar_rgb",)
+_VARIANT = "scalar_rgb"
+"""Needs no LLVM; where LLVM is too old for Mitsuba, that back end ends the process without an error to catch."""
 _GLOSSY = 0.1
-"""Share of the surface that a blend gives to its glossy layer; both are scaled so that their sum is what is asked."""
+"""Share of the surface that a blend gives to its glossy layer; both are scaled up by what they lose by it."""
 _SKY = (16, 32)
 _EXPECTED = "Mitsuba 3 (pip install 'drivesem[mitsuba]')"
 
@@ -133,17 +133,11 @@ def _flat(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @cache
 def _mitsuba() -> Any:
-    """The library, in the first variant that runs."""
+    """The library, with as many threads as torch has now."""
     try:
         library = importlib.import_module("mitsuba")
+        library.set_variant(_VARIANT)
+        importlib.import_module("drjit").set_thread_count(torch.get_num_threads())
     except Exception as error:  # also what a library raises whose own libraries are missing
         raise NoSecondRendererError(NAME, _EXPECTED, line_of(error)) from error
-    for variant in _VARIANTS:
-        try:
-            library.set_variant(variant)
-            library.Float(0) + 1  # LLVM is looked for here
-        except Exception as error:
-            failure = error
-            continue
-        return library
-    raise NoSecondRendererError(NAME, _EXPECTED, line_of(failure)) from failure
+    return library
