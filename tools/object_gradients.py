@@ -3,9 +3,9 @@
     python -m tools.object_gradients [bus/0080:left ...] [--steps 0.0003 0.001] [--directions 12] [--places 1]
 
 All vertices move at random, each by itself, by the step in the root mean square of each coordinate (object sizes).
-The value is the picture times smooth noise. Printed is the cosine, over directions, of derivatives by gradient with
-central differences. --places: both are averaged over so many places within a step around, which leaves out what
-only jumps.
+The value is the picture times smooth noise. Printed is the cosine, over directions, of derivatives by gradient
+with central differences. --places: both are averaged over so many places within a step around, which leaves out
+what only jumps.
 """
 
 from __future__ import annotations

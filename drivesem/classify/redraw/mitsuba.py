@@ -1,8 +1,8 @@
 """Mitsuba 3 (Jakob et al. 2022): light that is traced, with shadows and without gradients.
 
-What the project's own renderer adds up is translated: the lamp to a point light of equal irradiance, the light from
-all around to a sky whose irradiance is the same for every normal, Phong's lobe to a rough conductor of equal width and
-equal height. What differs is what physics adds: parts of an object shade each other.
+What the project's own renderer adds up is translated: the lamp to a point light of equal irradiance, the light
+from all around to a sky whose irradiance is the same for every normal, Phong's lobe to a rough conductor of equal
+width and equal height. What differs is what physics adds: parts of an object shade each other.
 """
 
 from __future__ import annotations

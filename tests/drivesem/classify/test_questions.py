@@ -22,7 +22,7 @@ from tests.drivesem.classify.conftest import Colours
 from tests.drivesem.classify.standins import StandIns, model
 
 NAME = "box-0008-forward"
-MOST = 0.30
+MOST = 0.36
 
 
 class Areas(Colours):
@@ -61,7 +61,7 @@ def finished(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patched(patch)
         words = ("--params", "pose", "--method", "halton", "--views", "forward", "--limit", "1")
-        words += ("--within-pose", "0.4", "--backgrounds", str(root / "grey"), "--workers", "1")
+        words += ("--within-pose", "0.4", "--queries", "8", "--backgrounds", str(root / "grey"), "--workers", "1")
         assert main(["classify", "attack", "--out", str(root / "run"), *words]) == 0
     assert files.read_json(root / "run" / "frames" / NAME / "result.json")["grade"] == "certain"
     return root / "run"
@@ -137,14 +137,14 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
 
 
 def test_holes_tell_poses(run, tmp_path, capsys):
-    words = ("holes", run, "--out", tmp_path / "holes", "--samples", "40", "--fresh", "12", "--reach", "0.4")
+    words = ("holes", run, "--out", tmp_path / "holes", "--samples", "24", "--fresh", "8", "--reach", "0.4")
     code, data, _ = answer(capsys, *words)
     assert code == 0
     (hole,) = data["holes"]
     assert hole["predicted"] == "ball"
     assert hole["where"]
     assert hole["probability"] == hole["fails"] / hole["count"]
-    assert hole["count"] == 12
+    assert hole["count"] == 8
     assert hole["probability"] > hole["fails_outside"] / hole["count_outside"]
     assert hole["interval"][0] < hole["probability"] <= hole["interval"][1]
     before = (tmp_path / "holes" / "frames" / NAME / "hole.json").stat().st_mtime_ns
@@ -158,9 +158,7 @@ def test_a_hole_in_words():
     assert hole.sentence() == sentence
 
 
-@pytest.mark.parametrize(
-    ("after", "code", "grew"), [("keen", 0, False), ("squeezenet", 0, False), ("blind", 1, True)]
-)
+@pytest.mark.parametrize(("after", "code", "grew"), [("keen", 0, False), ("blind", 1, True)])
 def test_gate(run, tmp_path, capsys, after, code, grew):
     words = ("gate", run, "--network", after, "--samples", "24", "--out", tmp_path / "gate")
     found, data, _ = answer(capsys, *words)
@@ -168,7 +166,7 @@ def test_gate(run, tmp_path, capsys, after, code, grew):
     assert {row["level"] for row in data["rows"]} == {"hole", "kind", "all"}
     (whole,) = (row for row in data["rows"] if row["level"] == "all")
     assert whole["samples"] == 24
-    expected = {"keen": 0.0, "squeezenet": whole["before"], "blind": 1.0}
+    expected = {"keen": 0.0, "blind": 1.0}
     assert whole["after"] == expected[after]
     assert 0 < whole["before"] < 1
     suite = ET.parse(tmp_path / "gate" / "gate.xml").getroot()

@@ -219,7 +219,7 @@ def test_names_and_files_that_are_no_networks(tmp_path):
         ({"architecture": "squeezenet", "classes": json.dumps(["cat", "dog"])}, "found one for cat, dog"),
         ({"architecture": "squeezenet", "classes": "cat"}, "classes: expected a list of names"),
         ({"architecture": "squeezedet", "classes": json.dumps(CLASSES)}, "architecture: expected one of"),
-        ({}, "architecture: expected one of"),
+        ({}, "classes: expected a list of names"),
     ],
 )
 def test_a_file_for_something_else(tmp_path, metadata, message):

@@ -47,7 +47,7 @@ def test_the_same_place_and_the_same_light(renderer, kind, change):
     assert float(other.max()) <= 1
     alike = likeness(scene, own, other)
     assert alike.iou >= 0.995
-    assert alike.colour <= 3.0
+    assert alike.colour <= 4.0
 
 
 def test_a_lamp_that_moves_lights_the_other_side(renderer):
@@ -82,7 +82,9 @@ def test_likeness_by_hand():
     other = one.clone()
     other[:, 200:300] = 0.0
     other[:3] = 0.0
-    assert likeness(scene, one, other) == Likeness(0.5, 100.0)  # black from white
+    black = likeness(scene, one, other)
+    assert black.iou == 0.5
+    assert black.colour == pytest.approx(100.0, abs=0.1)  # black from white
 
 
 def test_faces_and_normals_look_towards_the_camera():
