@@ -2,6 +2,7 @@
 that takes seconds to make, made once.
 """
 
+import os
 import resource
 import shutil
 from collections.abc import Callable, Iterator
@@ -11,6 +12,10 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Processes that share the tests take a thread each: two threads in each of two are slower than one.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 QUICK = [
     "architecture",

@@ -87,6 +87,9 @@ class Screen:
 
     def __init__(self) -> None:
         self._library = _pyrender()
+        from OpenGL.error import GLError
+
+        self._errors = (GLError,)
         try:
             self._renderer = self._library.OffscreenRenderer(64, 64)
         except Exception as error:  # a driver's errors have no common kind
@@ -170,6 +173,15 @@ class Screen:
         return np.ascontiguousarray(found[..., 0]), np.where(depth > 0, depth, np.float32(np.inf))
 
     def _render(self, scene: Any, flags: int, names: dict[Any, Any] | None, window: Window) -> tuple[Any, Array]:
+        try:
+            return self._rendered(scene, flags, names, window)
+        except self._errors:
+            # Renderers of a process share one display, and the first that is deleted, ours or a user's, ends it.
+            del self._renderer
+            self._renderer = self._library.OffscreenRenderer(64, 64)
+            return self._rendered(scene, flags, names, window)
+
+    def _rendered(self, scene: Any, flags: int, names: dict[Any, Any] | None, window: Window) -> tuple[Any, Array]:
         self._renderer.viewport_width = window.width * SUPERSAMPLING
         self._renderer.viewport_height = window.height * SUPERSAMPLING
         return self._renderer.render(scene, flags=flags, seg_node_map=names)

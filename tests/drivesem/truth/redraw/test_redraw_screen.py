@@ -50,6 +50,17 @@ def test_edges_are_averages(screen: Screen) -> None:
     np.testing.assert_allclose(drawn.colour[35, 20, 0], drawn.colour[35, 20, 3], atol=0.01)
 
 
+def test_another_renderer_of_the_process_may_come_and_go(screen: Screen) -> None:
+    import pyrender
+
+    def seen() -> np.ndarray:
+        return screen.draw([square(20, 30, 30, 40, 8)], [plain(255, 0, 0)], INTRINSICS, Window(0, 0, 60, 60)).colour
+
+    before = seen()
+    pyrender.OffscreenRenderer(8, 8).delete()
+    np.testing.assert_array_equal(seen(), before)
+
+
 def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str, *_: object) -> None:
         raise OSError(f"{name}: cannot open shared object file")
