@@ -39,7 +39,7 @@ from scene_ir import files
 _SCHEMA = 1
 _HOLE = "hole.json"
 _WRITTEN = ("holes.json", "holes.md", "holes.csv", FRAMES)
-AXES = ("pitch", "yaw", "roll")
+AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
 _NOTES = (
     "Where: pitch, yaw and roll of the object in degrees, the view's own turn included (top: pitch 20; left and "
     "right: yaw 29 and -29), with shape and light as they were found. Misclassified: share of fresh samples "
@@ -78,8 +78,9 @@ class PoseHole:
         ends = (f"{axis} from {low:.0f} to {high:.0f} degrees" for axis, (low, high) in self.where.items())
         low, high = self.interval
         share = f"{100 * self.fails / self.count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
-        place = " and ".join(ends) or "any pose near"
-        return f"The {self.label} of {self.identifier} is a {self.predicted} in {share} with {place}"
+        place = " and ".join(ends) or "any angle near"
+        called = f"misclassified, mostly as {self.predicted}"
+        return f"The {self.label} of {self.identifier} is {called}, in {share} of poses with {place}"
 
 
 class HoleWorker:

@@ -26,6 +26,7 @@ from drivesem.run.records import dump_record, load_record
 from drivesem.settings.commands import Classify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
+from scene_ir.errors import RangeError
 from scene_ir.io import to_uint8
 
 _SCHEMA = 1
@@ -67,7 +68,7 @@ class LeastChange:
         turns = [f"{name.partition('.')[2]} {value:+.3f} rad" for name, value in self.angles.items() if value]
         turns += [f"vertices by {self.vertex:.4f}"] if self.vertex else []
         turns += [f"light by {self.light:.2f}"] if self.light else []
-        return f"{self.identifier} is a {self.predicted} with {', '.join(turns)}"
+        return f"{self.identifier} is called {self.predicted} with {', '.join(turns)}"
 
     def row(self) -> tuple[str, ...]:
         """A line of the table."""
@@ -94,7 +95,10 @@ class LeastWorker:
             size=lambda wanted: float(problem.size(wanted)),
             points=_POINTS,
         )
-        found = minimal(theta, blocks(space), search)
+        try:
+            found = minimal(theta, blocks(space), search)
+        except RangeError as error:  # judged otherwise on this machine
+            raise RangeError(f"{name}: {error.field}", error.expected, error.actual) from error
         result = LeastChange(
             identifier=name,
             source=files.digest(self.run.folder / FRAMES / name / RESULT),
@@ -157,10 +161,11 @@ def _answer(out: Path, found: Sequence[LeastChange], facts: dict[str, Any], fail
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [
-        {key: row[key] for key in ("identifier", "label", "predicted", "share", "vertex", "light", "sign_changes")}
-        | {axis: row["angles"].get(axis) for axis in _AXES}
-        | {f"found_{axis}": row["found"].get(axis) for axis in _AXES}
-        for row in rows
+        {"identifier": one.identifier, "label": one.label, "predicted": one.predicted, "share": one.share}
+        | {axis: one.angles.get(axis) for axis in _AXES}
+        | {f"found_{axis}": one.found.get(axis) for axis in _AXES}
+        | {"vertex": one.vertex, "light": one.light, "sign_changes": one.sign_changes}
+        for one in found
     ]
     return Answer(
         out=out,

@@ -29,8 +29,6 @@ AROUND = 0.2
 """Share of the environment's light that a glossy surface mirrors, where the lamp's counts in full."""
 _SHOWS = 2 / 255
 """Contrast from which a border between two faces is blended."""
-_MEETS = 1e-7
-"""Of inverse depths: planes that differ by no more at a border meet there."""
 _TINY = 1e-12
 
 
@@ -209,23 +207,23 @@ def _blended(colour: Tensor, fragments: Fragments, clip: Tensor, faces: Tensor, 
     pixels = fragments.layout.pixels()[here].to(torch.float64)
     start = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
     share, across = _crossing(clip, faces, face[here], face[there], start, step)
+    # Of a border along the step, the pixels to its sides are the ones that share it.
+    share = torch.where(across, share, 0.5).to(colour)
     change = colour.index_select(0, there) - colour.index_select(0, here)
-    taken = (across * (0.5 - share)).to(colour)
-    colour = colour.index_add(0, here, taken.clamp_min(0)[:, None] * change)
-    return colour.index_add(0, there, taken.clamp_max(0)[:, None] * change)
+    colour = colour.index_add(0, here, (0.5 - share).clamp_min(0)[:, None] * change)
+    return colour.index_add(0, there, (0.5 - share).clamp_max(0)[:, None] * change)
 
 
 def _crossing(
     clip: Tensor, faces: Tensor, one: Tensor, other: Tensor, start: Tensor, step: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Where (P,) in [0, 1] on the segments from pixels (P, 3), (x, y, 1), to those a step (P, 3) further the face
-    `one` (P,), which is seen at the start, gives way to the face `other`; and how much (P,) the border runs across
-    the step rather than along it, in [0, 1]: of a border along the step the pixels to its sides share it.
+    `one` (P,), which is seen at the start, gives way to the face `other`; and whether (P,) the border runs across
+    the step rather than along it.
 
     Where both faces reach over one part of the segment, the border is that of the nearer one there, or where they
     pass through each other. Where neither does, something thin lies between, mostly the rest of a polygon: the
-    border is that at which the two planes meet. All of it goes over into each other without a jump, so that
-    gradients tell what happens.
+    border is that at which the two planes meet.
     """
     leaving = _Exit.of(clip, faces, one, start, start + step)
     entering = _Exit.of(clip, faces, other, start + step, start)
@@ -233,30 +231,24 @@ def _crossing(
     # How much nearer the first one's plane is, as inverse depth, which is linear on the picture.
     plane = leaving.plane - entering.plane
     at_leave, at_enter = (
-        (plane.detach() * (start + share.detach()[:, None] * step)).sum(dim=1) for share in (leave, enter)
+        (plane * (start + share.detach()[:, None] * step)).sum(dim=1) for share in (leave, enter)
     )
     overlap = enter.detach() < leave.detach()
-    through = overlap & (at_enter * at_leave < 0)
-    # Of what both reach over, the part up to the crossing is seen of one of them, the part beyond of the other.
+    through = overlap & (at_enter.detach() > 0) & (at_leave.detach() < 0)
+    far = at_leave.detach().abs() <= at_enter.detach().abs()
+    chosen = torch.where(overlap, (at_leave + at_enter).detach() >= 0, far)
     crossed = -(plane * start).sum(dim=1) / torch.where(through, (plane * step).sum(dim=1), 1.0)
-    crossing = torch.where(at_enter > 0, crossed, enter + leave - crossed)
-    gap, rest = at_enter.abs() + _MEETS, at_leave.abs() + _MEETS
-    outlasts = torch.where(overlap, (at_leave + at_enter >= 0).to(gap), gap / (gap + rest))
-    share = torch.where(through, crossing, outlasts * leave + (1 - outlasts) * enter)
-    turned = (outlasts * _along(leaving.slope, step)) + (1 - outlasts) * _along(entering.slope, step)
-    return share, torch.where(through, _along(plane[:, :2], step), turned)
-
-
-def _along(slope: Tensor, step: Tensor) -> Tensor:
-    """Share (P,) of slopes (P, 2), squared, along steps (P, 3) to the right or down."""
-    squared = slope.detach() ** 2
-    return (squared * step[:, :2]).sum(dim=1) / squared.sum(dim=1).clamp_min(_TINY)
+    share = torch.where(through, crossed, torch.where(chosen, leave, enter))
+    slope = torch.where(chosen[:, None], leaving.slope, entering.slope)
+    slope = torch.where(through[:, None], plane.detach()[:, :2], slope)
+    along, across = (slope * step[:, :2]).sum(dim=1).abs(), (slope * (1 - step[:, :2])).sum(dim=1).abs()
+    return share, (along > across) | ((along == across) & (step[:, 0] > 0))
 
 
 @dataclass(frozen=True, slots=True)
 class _Exit:
-    """Where faces are left on segments. share (P,) in [0, 1]; slope (P, 2): of the edge function there; plane
-    (P, 3): inverse depth at pixel (x, y, 1) is its product with it.
+    """Where faces are left on segments. share (P,) in [0, 1]; slope (P, 2): of the edge function there,
+    without a gradient; plane (P, 3): inverse depth at pixel (x, y, 1) is its product with it.
     """
 
     share: Tensor
@@ -274,7 +266,7 @@ class _Exit:
         leaves = outside.detach() * det.detach().sign() < 0
         share = torch.where(leaves, inside / torch.where(leaves, inside - outside, 1.0), 1.0)
         nearest = share.detach().argmin(dim=1, keepdim=True)
-        slope = normals.gather(1, nearest[..., None].expand(-1, 1, 3))[:, 0, :2]
+        slope = normals.detach().gather(1, nearest[..., None].expand(-1, 1, 3))[:, 0, :2]
         return cls(share.gather(1, nearest)[:, 0].clamp(0, 1), slope, normals.sum(dim=1) / det)
 
 

@@ -88,4 +88,4 @@ def likeness(scene: ObjectScene, one: Tensor, other: Tensor) -> Likeness:
 def _lab(picture: Tensor) -> Array:
     """A picture (3, H, W) as (H, W, 3) of CIE L*a*b*, in which 1 is hardly seen and 100 is black from white."""
     rgb = np.ascontiguousarray(picture.clamp(0, 1).permute(1, 2, 0).numpy())
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.float32)

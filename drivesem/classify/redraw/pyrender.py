@@ -58,7 +58,7 @@ class PyrenderRenderer:
         # A pixel's samples are averaged after gamma, background and all.
         linear = sum((image[..., :3] / np.maximum(coverage, 1e-6)) ** (1 / GAMMA) for image in drawn)
         colour = np.minimum(linear, 1) ** GAMMA
-        both: Array = np.concatenate([colour * coverage, coverage], axis=2).astype(np.float32)
-        both = cv2.resize(both, (size[1], size[0]), interpolation=cv2.INTER_AREA)
-        both[..., :3] /= np.maximum(both[..., 3:], 1e-6)
-        return torch.from_numpy(both).permute(2, 0, 1).contiguous()
+        both = np.concatenate([colour * coverage, coverage], axis=2).astype(np.float32)
+        seen: Array = np.asarray(cv2.resize(both, (size[1], size[0]), interpolation=cv2.INTER_AREA), np.float32)
+        seen[..., :3] /= np.maximum(seen[..., 3:], 1e-6)
+        return torch.from_numpy(seen).permute(2, 0, 1).contiguous()

@@ -131,7 +131,7 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
     areas = [float(area_of(scene.picture(Change(angles=share * angles))[None])) for share in (0.9, 1.0)]
     assert areas[0] <= MOST
     assert areas[1] >= MOST - 1e-3
-    assert f"{NAME} is a ball with" in found["sentence"]
+    assert f"{NAME} is called ball with" in found["sentence"]
     assert (tmp_path / "why" / "explain.csv").is_file()
     assert files.read_image(tmp_path / "why" / "frames" / NAME / "least.png").shape == (224, 224, 3)
 
@@ -154,8 +154,10 @@ def test_holes_tell_poses(run, tmp_path, capsys):
 
 def test_a_hole_in_words():
     hole = PoseHole("bus-0007-left", "", "bus", "train", {"yaw": (31.2, 43.8)}, 30, 32, 2, 40, 20, 64, 96)
-    sentence = "The bus of bus-0007-left is a train in 94 % [80, 98] with yaw from 31 to 44 degrees"
-    assert hole.sentence() == sentence
+    assert hole.sentence() == (
+        "The bus of bus-0007-left is misclassified, mostly as train, in 94 % [80, 98] of poses with yaw from 31 to "
+        "44 degrees"
+    )
 
 
 @pytest.mark.parametrize(("after", "code", "grew"), [("keen", 0, False), ("blind", 1, True)])

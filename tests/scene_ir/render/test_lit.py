@@ -159,31 +159,6 @@ def test_a_border_between_two_colours_sweeps_over_pixels_evenly(start, step):
     assert moved == pytest.approx(step * 1.6 / 2 * (shade_of - dark), rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("slope", "crossing", "share"),
-    [(2e-4, 0.45, 0.45), (-2e-4, 0.45, 0.45), (2e-4, -0.5, 0.7), (2e-4, 1.5, 0.2), (2e-4, 0.65, 0.25)],
-)
-def test_what_a_pixel_takes_where_two_surfaces_reach_over_one_another(slope, crossing, share):
-    """Between the pixels 30 and 31 one ends at 0.7, the other begins at 0.2, and they pass through each other:
-    each is seen where it is nearer, on either side of the crossing. slope: of the first one's inverse depth, less
-    the other's.
-    """
-    corners = []
-    for ends, steep in (((5.0, 30.7), slope / 2), ((30.2, 90.0), -slope / 2)):
-        for column in ends:
-            z = 1 / (0.2 + steep * (column - 30 - crossing))
-            x = (column - (SIZE - 1) / 2) / (1.6 * SIZE) * z
-            corners += [[x, -0.1 * z, z], [x, 0.1 * z, z]]
-    faces = torch.tensor([[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6]])
-    pair = LitMesh(torch.tensor(corners), faces, materials([[1.0] * 3] * 2 + [[0.0] * 3] * 2, 0.0))
-    flat = Lights(torch.zeros(3), DARK, torch.tensor(0.5))
-    row = pair.render(pair.vertices, camera(), flat, "reference")[0, SIZE // 2]
-    light, dark = 0.5**GAMMA, 1e-4**GAMMA
-    taken = [1 - max(0.5 - share, 0), max(share - 0.5, 0)]
-    expected = torch.tensor([dark + part * (light - dark) for part in taken])
-    torch.testing.assert_close(row[30:32], expected, atol=2e-3, rtol=0)
-
-
 def test_smooth_surfaces_have_smooth_normals_and_edges_stay_sharp():
     ball, box = solid(trimesh.creation.icosphere(3, 0.5)), solid(MESHES["box"])
     centred = ball.vertices[ball.faces]
