@@ -72,10 +72,11 @@ class LeastChange:
 
     def row(self) -> tuple[str, ...]:
         """A line of the table."""
+        dropped = ", ".join(name.removeprefix("pose.") for name in self.dropped)
         told = [f"{self.angles[axis]:+.3f}" if self.angles.get(axis) else "-" for axis in _AXES]
         return (
             *(self.identifier, self.predicted, f"{100 * self.share:.0f}", *told),
-            *(f"{self.vertex:.4f}" if self.vertex else "-", ", ".join(self.dropped) or "-"),
+            *(f"{self.vertex:.4f}" if self.vertex else "-", dropped or "-"),
         )
 
 
@@ -173,7 +174,7 @@ def _answer(out: Path, found: Sequence[LeastChange], facts: dict[str, Any], fail
         heading="How little is enough",
         data={**facts, "share_median": round(middle, 4) if found else None, "least": rows},
         tables={"explain": flat} if found else {},
-        sheets=[Sheet(title, columns, tuple(one.row() for one in found))],
+        sheets=[Sheet(title, columns, tuple(one.row() for one in found), {"unbroken": columns[:2]})],
         notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
         words=("picture", "called", "left out"),
         failed={f"picture {name}": reason for name, reason in failed.items()},

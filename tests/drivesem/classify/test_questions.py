@@ -155,8 +155,8 @@ def test_holes_tell_poses(run, tmp_path, capsys):
 def test_a_hole_in_words():
     hole = PoseHole("bus-0007-left", "", "bus", "train", {"yaw": (31.2, 43.8)}, 30, 32, 2, 40, 20, 64, 96)
     assert hole.sentence() == (
-        "The bus of bus-0007-left is misclassified, mostly as train, in 94 % [80, 98] of poses with yaw from 31 to "
-        "44 degrees"
+        "The bus of bus-0007-left is misclassified, mostly as train, in 94 % [80, 98] of poses with yaw "
+        "from 31 to 44 degrees"
     )
 
 
