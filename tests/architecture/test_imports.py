@@ -87,7 +87,7 @@ RULES = (
                 *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.truth.redraw"),
                 *("drivesem.attack.contrast", "drivesem.attack.labels.Difficulty"),
             ),
-            ("torch", "numpy", "scipy", "cv2", "pyrender"),
+            ("torch", "numpy", "scipy", "cv2", "pyrender", "OpenGL"),
             never=("drivesem.truth.redraw.compositor",),
         )
         for name in ("photograph", "baking", "placing", "screen", "shadows", "weathering")

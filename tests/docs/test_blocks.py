@@ -25,7 +25,7 @@ from drivesem.settings.parsing import parse
 from tools.bench.settings import BenchTool
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 LANGUAGES = ("python", "sh", "yaml", "json", "")
 CHEAP = ("render", "edit", "report", "plausibility", "convert", "verify")
 """Commands that take seconds where a run, scenes and a data set are there."""
@@ -95,7 +95,7 @@ def test_every_block_has_a_language() -> None:
     assert not bare, "commands stand in sh blocks"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_what_a_page_names_is_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     paths = {match[0].rstrip("/") for match in _PATH.finditer(text)}
@@ -134,7 +134,7 @@ def test_python_that_does_not_run_compiles(block: Block) -> None:
 @pytest.mark.parametrize(
     "page",
     [page for page in PAGES if any(b.language == "python" and b.runs for b in blocks_of(page))],
-    ids=lambda page: page.name,
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_python_runs(page: Path, workplace: Path) -> None:
     names: dict[str, object] = {"__name__": "__main__"}

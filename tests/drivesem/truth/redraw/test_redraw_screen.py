@@ -54,7 +54,8 @@ def test_another_renderer_of_the_process_may_come_and_go(screen: Screen) -> None
     import pyrender
 
     def seen() -> np.ndarray:
-        return screen.draw([square(20, 30, 30, 40, 8)], [plain(255, 0, 0)], INTRINSICS, Window(0, 0, 60, 60)).colour
+        window = Window(0, 0, 60, 60)
+        return screen.draw([square(20, 30, 30, 40, 8)], [plain(255, 0, 0)], INTRINSICS, window).colour
 
     before = seen()
     pyrender.OffscreenRenderer(8, 8).delete()
