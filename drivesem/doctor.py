@@ -111,6 +111,12 @@ PARTS = (
         _version("onnxruntime"),
     ),
     Part("torchvision", "torchvision's detectors", "pip install 'drivesem[torchvision]'", _TORCHVISION),
+    Part(
+        "mitsuba",
+        "the second renderer of objects with light that is traced (classify confirm)",
+        "pip install 'drivesem[mitsuba]'",
+        _version("mitsuba"),
+    ),
     Part("ultralytics", "Ultralytics' detectors", "pip install 'drivesem[ultralytics]'", _version("ultralytics")),
     Part("ray", "--engine ray: frames shared by a cluster", "pip install 'drivesem[ray]'", _version("ray")),
     Part("fsspec", "URLs in --root and --out", "pip install 'drivesem[remote]'", _version("fsspec")),

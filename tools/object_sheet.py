@@ -3,6 +3,11 @@
     python -m tools.object_sheet OUT.png [--objects FOLDER] [--classes bus train] [--each 6] [--size 160]
 
 A row a class and view (forward, top, left, right), a column an object. Plain shading: a light beside the camera.
+
+    python -m tools.object_sheet OUT.png --beside mitsuba
+
+draws two held-out objects of each class, 24 pictures with all views, by the project's renderer and by a second one
+beside it, and prints how alike they are.
 """
 
 from __future__ import annotations
@@ -14,10 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from drivesem.classify import scenes
+from drivesem.classify.confirm import open_renderer
 from drivesem.classify.objects.sources import open_objects
-from drivesem.classify.objects.types import ObjectModel
+from drivesem.classify.objects.types import ObjectModel, ObjectSet
+from drivesem.classify.redraw.base import Solid, likeness
 from drivesem.synth.soup import creased_normals
 from scene_ir import files
+from scene_ir.io import to_uint8
 from scene_ir.raster.verbs import Layout, interpolate, rasterize
 
 VIEWS = {"forward": (0.0, 0.0), "top": (0.0, 0.35), "left": (-0.5, 0.0), "right": (0.5, 0.0)}
@@ -68,6 +77,29 @@ def _camera(yaw: float, elevation: float) -> Tensor:
     return torch.from_numpy(tilt @ turn)
 
 
+@torch.no_grad()
+def beside(objects: ObjectSet, second: str) -> np.ndarray:
+    """The sheet of both renderers: in each of three columns the own picture, then the other."""
+    renderer, rows, found = open_renderer(second), [], []
+    for place, kind in enumerate(objects.classes):
+        names = [name for name in objects.names("test") if name.startswith(f"{kind}/")]
+        for name, view in zip(names, list(scenes.VIEWS)[place % 2 :: 2], strict=False):
+            scene = scenes.ObjectScene(name, objects.load(name), view, scenes.generated_background(name))
+            own = scene.mesh.render(scene.placed(), scenes.camera(), scene.lights())
+            other = renderer.draw(Solid.of(scene))
+            found.append(likeness(scene, own, other))
+            print(f"{name} {view}: silhouettes IoU {found[-1].iou:.4f}, colours Delta E {found[-1].colour:.2f}")
+            rows.append(np.hstack([to_uint8(scene.shown(drawn).clamp(0, 1)) for drawn in (own, other)]))
+    ious, colours = [one.iou for one in found], [one.colour for one in found]
+    print(
+        f"{second}, {len(found)} views: IoU {np.mean(ious):.4f} in the mean, {min(ious):.4f} at least; "
+        f"Delta E (CIE 1976) {np.mean(colours):.2f} in the mean, {max(colours):.2f} at most"
+    )
+    third = -(-len(rows) // 3)
+    rows += [np.zeros_like(rows[0])] * (3 * third - len(rows))
+    return np.hstack([np.vstack(rows[i * third : (i + 1) * third]) for i in range(3)])
+
+
 def main() -> None:
     """Write the sheet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -78,8 +110,12 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=6, help="objects a class")
     parser.add_argument("--start", type=int, default=0, help="the first of them")
     parser.add_argument("--size", type=int, default=160, help="px a picture")
+    parser.add_argument("--beside", choices=("mitsuba", "pyrender"), help="a second renderer")
     told = parser.parse_args()
     objects = open_objects(told.objects)
+    if told.beside is not None:
+        files.write_png(told.out, beside(objects, told.beside))
+        return
     names = objects.names("train")
     rows = []
     for name in told.classes or objects.classes:

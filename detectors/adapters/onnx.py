@@ -61,22 +61,10 @@ class OnnxPredictor:
     def __init__(self, path: Path, tiling: str = "auto", spec: Path | None = None) -> None:
         if tiling not in TILINGS:
             raise DetectorError(f"tiles: expected {' or '.join(TILINGS)}, found {tiling!r}")
-        runtime = _runtime(path)
-        if not path.is_file():
-            raise DetectorError(f"{path}: expected an ONNX file, found none")
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
-        options.inter_op_num_threads = 1
-        options.log_severity_level = _QUIET
-        # A thread that waits by spinning takes its core from torch's.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            inputs = [(told.name, list(told.shape)) for told in session.get_inputs()]
-            shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
-            names = _names(session.get_modelmeta().custom_metadata_map)
-        except Exception as error:  # ONNX Runtime's own classes differ from version to version
-            raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
+        session = session_of(path)
+        inputs = [(told.name, list(told.shape)) for told in session.get_inputs()]
+        shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
+        names = _names(session.get_modelmeta().custom_metadata_map)
         settings = settings_of(path, spec)
         self.input_hw = _input_hw(path, inputs, settings.get("size"))
         self._reading = reading(shapes, self.input_hw, settings, names, str(path))
@@ -129,6 +117,25 @@ class OnnxPredictor:
         placed, scores, labels, is_cut = (torch.cat(parts) for parts in zip(*found, strict=True))
         kept = merge(placed, scores, labels, is_cut)
         return Detections(boxes.clip(placed[kept], *image_hw), labels[kept], scores[kept])
+
+
+def session_of(path: Path) -> Any:
+    """The graph of an ONNX file, ready to run, with as many threads as torch has now. Raises DetectorError where
+    the file, or ONNX Runtime, is missing, or the file is damaged.
+    """
+    runtime = _runtime(path)
+    if not path.is_file():
+        raise DetectorError(f"{path}: expected an ONNX file, found none")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _QUIET
+    # A thread that waits by spinning takes its core from torch's.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's own classes differ from version to version
+        raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
 
 
 def _placed(edges: Tensor, seen: Seen) -> Tensor:

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from drivesem.attack.methods.base import Attack
 from drivesem.classify.grading import PictureGrader
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.base import Scorer
 from drivesem.classify.networks.loading import load_classifier
+from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.objective import ClassifierObjective, Seen
 from drivesem.classify.pictures import Shown, Studio, views_of
 from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of, steps_of
@@ -45,13 +46,20 @@ EMBEDDED_LIMIT = 48
 """Pictures of the embedded objects that are attacked where --limit is not given: of each class four."""
 
 
+def network_of(name_or_path: str, classes: Sequence[str], device: str) -> Scorer:
+    """A network to attack: as `load_classifier`, or an ONNX file. Raises FormatError."""
+    if Path(name_or_path).suffix == ".onnx":
+        return OnnxClassifier(Path(name_or_path), classes)
+    return load_classifier(name_or_path, classes, device)
+
+
 @dataclass(frozen=True)
 class Attacker:
     """What one process needs: built once, used for many pictures."""
 
     config: Classify
     studio: Studio
-    network: Classifier
+    network: Scorer
     method: Attack
     grader: PictureGrader
 
@@ -64,10 +72,13 @@ class Attacker:
         if like is not None and like.config.network == config.network:
             network = like.network
         else:
-            network = load_classifier(config.network, studio.objects.classes, config.device)
+            network = network_of(config.network, studio.objects.classes, config.device)
         grader = PictureGrader(Nuisances.of(config.nuisances), Rule(config.draws), config.seed)
         params_of(config)
-        return cls(config, studio, network, attack_of(config), grader)
+        method = attack_of(config)
+        if method.needs_gradient and not network.differentiable:
+            raise UsageError("--method", f"random or halton: {config.network} has no gradient", config.method)
+        return cls(config, studio, network, method, grader)
 
     def shown(self) -> list[Shown]:
         """The pictures to attack: classes in turn, and of an object its views in turn with the others'."""
@@ -89,12 +100,17 @@ class Attacker:
         ]
         return turned[:limit]
 
+    def scene(self, shown: Shown) -> tuple[ObjectScene, ObjectSpace]:
+        """A picture's scene, and what may move in it. Raises SceneError."""
+        config, scene = self.config, self.studio.scene(shown)
+        return scene, ObjectSpace(
+            scene.vertices, params_of(config), steps_of(config), reach_of(config), config.shape
+        )
+
     def attack(self, shown: Shown, out: Path) -> None:
         """One picture, to its folder. Raises SceneError."""
         start = time.perf_counter()
-        config = self.config
-        scene = self.studio.scene(shown)
-        space = ObjectSpace(scene.vertices, params_of(config), steps_of(config), reach_of(config), config.shape)
+        scene, space = self.scene(shown)
         try:
             found = attack_picture(scene, space, self)
         except (RangeError, ShapeError) as error:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from drivesem.classify.objective import Seen
 from drivesem.truth.certificate import Rule
-from drivesem.truth.grades import Count
+from drivesem.truth.grades import SECOND, Agreement, Count
 from drivesem.truth.nuisances import Nuisances
 
 
@@ -48,6 +48,16 @@ class PictureGrader:
             _mean(margins["before"]),
             _mean(margins["after"]),
         )
+
+    @torch.no_grad()
+    def agreement(
+        self, identifier: str, look: Callable[[Tensor], Seen], by: str, before: Tensor, after: Tensor
+    ) -> Agreement:
+        """What draws of a second renderer's pictures (3, H, W), before the change and after it, say."""
+        stream, hw = f"confirm:{identifier}:{self.seed}", (int(before.shape[1]), int(before.shape[2]))
+        draws = [self.nuisances.of_picture(stream, number, hw) for number in range(SECOND[1])]
+        right, wrong = ([look(draw.picture(p)).right for draw in draws] for p in (before, after))
+        return Agreement(by, sum(right), wrong.count(False), len(draws))
 
 
 def _mean(values: list[float]) -> float | None:

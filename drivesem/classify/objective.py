@@ -10,7 +10,7 @@ from torch import Tensor
 
 from drivesem.attack.methods.base import Group, Problem, Score
 from drivesem.attack.theta import ThetaSpace
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.base import Scorer
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import Moved, ObjectSpace
 from scene_ir.errors import RangeError
@@ -67,12 +67,17 @@ def aim(scores: Tensor, label: int, aimed: Aimed) -> Tensor:
     return torch.cat([chances[:label], chances[label + 1 :]]).amax()
 
 
+def as_written(image: Tensor) -> Tensor:
+    """A picture on the 8-bit grid."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
 class ClassifierObjective:
     """What an attack on a classifier raises, as a function of theta (D,). passes: of the network so far, a
     gradient counted as GRADIENT_PASSES. Raises RangeError where a loss or gradient is not finite.
     """
 
-    def __init__(self, scene: ObjectScene, space: ObjectSpace, network: Classifier, aimed: Aimed) -> None:
+    def __init__(self, scene: ObjectScene, space: ObjectSpace, network: Scorer, aimed: Aimed) -> None:
         self.scene = scene
         self.space = space
         self.network = network
@@ -96,7 +101,7 @@ class ClassifierObjective:
     @torch.no_grad()
     def picture(self, theta: Tensor) -> Tensor:
         """(3, H, W) on the 8-bit grid: what is judged is what is written."""
-        return (self.scene.picture(self.space.change(theta)).clamp(0, 1) * 255).round() / 255
+        return as_written(self.scene.picture(self.space.change(theta)))
 
     @torch.no_grad()
     def look(self, image: Tensor) -> Seen:

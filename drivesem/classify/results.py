@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from drivesem.truth.grades import Count, Grade
+from drivesem.truth.grades import Agreement, Count, Grade
 
 SCHEMA = 1
 
@@ -23,10 +23,30 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
+class Likeness:
+    """How alike two renderers draw an object. iou: of the pixels that it covers by half at least; colour: mean
+    distance in CIE L*a*b* (Delta E of 1976) over the pixels that both cover, at the size that a network sees.
+    """
+
+    iou: float
+    colour: float
+
+
+@dataclass(frozen=True, slots=True)
+class SecondLook:
+    """What a second renderer's pictures of a failure say. before, after: how alike they are to the own ones."""
+
+    agreement: Agreement
+    before: Likeness
+    after: Likeness
+
+
+@dataclass(frozen=True, slots=True)
 class ClassifiedFrame:
     """One picture of a run. label: the true class; sizes: the largest change of each parameter, in theta's units;
     moved: pose and light by name, as people write them; grade, count: of a failure, see `truth.grades`; None where
-    there is none. queries: gradients and judged samples; passes: of the network, a gradient counted as 3.
+    there is none; second: of `classify confirm`. queries: gradients and judged samples; passes: of the network, a
+    gradient counted as 3.
     """
 
     identifier: str
@@ -43,6 +63,7 @@ class ClassifiedFrame:
     queries: int
     passes: int
     seconds: float
+    second: SecondLook | None = None
 
     @property
     def right_before(self) -> bool:
@@ -61,18 +82,22 @@ class ClassifiedFrame:
             flat |= {f"{name}_{key}": value for key, value in data[name].items()}
         flat |= {"right_before": count.before, "draws_before": count.before_draws}
         flat |= {"wrong_after": count.after, "draws_after": count.after_draws}
+        flat |= {"second": self.second.agreement.by if self.second else None}
         return flat | {f"size_{key}": value for key, value in self.sizes.items()} | self.moved
 
 
 @dataclass(frozen=True, slots=True)
 class ClassTally:
-    """Pictures of one class. benign, attacked: classified rightly before and after the change."""
+    """Pictures of one class. benign, attacked: classified rightly before and after the change; certain, confirmed:
+    failures that are at least so sure.
+    """
 
     name: str
     pictures: int
     benign: int
     attacked: int
     certain: int
+    confirmed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +131,9 @@ class ClassifiedRun:
         for name in classes:
             own = [frame for frame in frames if frame.label == name]
             benign, attacked = (sum(getattr(f, right) for f in own) for right in ("right_before", "right_after"))
-            certain = sum(frame.grade == Grade.CERTAIN for frame in own)
-            tallies.append(ClassTally(name, len(own), benign, attacked, certain))
+            confirmed = sum(frame.grade == Grade.CONFIRMED for frame in own)
+            certain = confirmed + sum(frame.grade == Grade.CERTAIN for frame in own)
+            tallies.append(ClassTally(name, len(own), benign, attacked, certain, confirmed))
         return cls(
             classes=tuple(tallies),
             frames_failed=failed,
@@ -135,7 +161,9 @@ class ClassifiedRun:
     def grades(self) -> dict[str, int]:
         """How many failures are at least so sure."""
         failures = sum(one.benign - one.attacked for one in self.classes)
-        return {str(Grade.THRESHOLD): failures, str(Grade.CERTAIN): sum(one.certain for one in self.classes)}
+        certain = sum(one.certain for one in self.classes)
+        confirmed = sum(one.confirmed for one in self.classes)
+        return {str(Grade.THRESHOLD): failures, str(Grade.CERTAIN): certain, str(Grade.CONFIRMED): confirmed}
 
     def _share(self, which: str) -> float | None:
         total = sum(getattr(one, which) for one in self.classes)

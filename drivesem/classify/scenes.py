@@ -53,7 +53,8 @@ class ObjectScene:
     backend: Backend = "warp"
 
     @cached_property
-    def _mesh(self) -> LitMesh:
+    def mesh(self) -> LitMesh:
+        """What draws it."""
         model = self.model
         materials = Materials(model.diffuse, model.specular, model.shininess)
         return LitMesh(model.mesh.vertices, model.mesh.faces, materials)
@@ -80,7 +81,11 @@ class ObjectScene:
 
     def picture(self, change: Change | None = None) -> Tensor:
         """(3, SEEN_PX, SEEN_PX) RGB in [0, 1]; differentiable to the change."""
-        drawn = self._mesh.render(self.placed(change), camera(), self.lights(change), self.backend)
+        drawn = self.mesh.render(self.placed(change), camera(), self.lights(change), self.backend)
+        return self.shown(drawn)
+
+    def shown(self, drawn: Tensor) -> Tensor:
+        """What a renderer drew (4, DRAWN_PX, DRAWN_PX), before the background, as a network sees it."""
         whole = over(drawn, self.background.to(drawn))
         return F.interpolate(whole[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True)[0]
 

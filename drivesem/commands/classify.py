@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivesem.classify.attack import attack_run
+from drivesem.classify.confirm import confirm_run
+from drivesem.classify.gate import gate_run
+from drivesem.classify.holes import holes_run
+from drivesem.classify.least import explain_run
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun
 from drivesem.classify.training import train_run
@@ -13,16 +17,27 @@ from drivesem.report.answer import print_json
 from drivesem.report.classified import share
 from drivesem.report.tables import Sheet, percent
 from drivesem.report.terminal import Console
+from drivesem.run.ask import say
 from drivesem.run.folder import claim, folder_of
 from drivesem.run.page import PAGE
 from drivesem.settings.commands import Classify
 from drivesem.settings.devices import check_device
 
+_ASKED = {"explain": explain_run, "holes": holes_run}
+
 
 def run(config: Classify) -> int:
-    """Draw, train or attack; exit code 0. Raises UsageError or SceneError for bad input."""
+    """Draw, train, attack, or ask about a run; exit code 0, and 1 where a gate is not passed.
+    Raises UsageError or SceneError for bad input."""
     check_device(config.device)
-    does = {"data": _data, "train": _train, "attack": _attack}
+    if config.what == "gate":
+        passed, answer = gate_run(config)
+        say(answer, config.json)
+        return 0 if passed else 1
+    if config.what in _ASKED:
+        say(_ASKED[config.what](config), config.json)
+        return 0
+    does = {"data": _data, "train": _train, "attack": _attack, "confirm": _confirm}
     does[config.what](config, Console(stderr=True) if config.json else Console())
     return 0
 
@@ -65,15 +80,46 @@ def _attack(config: Classify, console: Console) -> None:
         print_json(found.to_json())
 
 
+def _confirm(config: Classify, console: Console) -> None:
+    found, facts = confirm_run(config)
+    console.print(_table(found).table(("class",)))
+    console.print(
+        f"{facts['renderer']} agrees on {facts['agree']} of {facts['failures']} failures; "
+        f"{found.grades['certain']} are certain, {found.grades['confirmed']} confirmed",
+        soft_wrap=True,
+    )
+    if facts["iou"]:
+        console.print(
+            f"silhouettes of both renderers: IoU {facts['iou']['mean']:.4f} in the mean, "
+            f"{facts['iou']['least']:.4f} at least; "
+            f"colours: {facts['colour']['mean']:.1f} in the mean, {facts['colour']['most']:.1f} at most "
+            "(CIE 1976, mean of an object)",
+            soft_wrap=True,
+        )
+    _say_failed(facts["frames_failed"], console)
+    console.print(f"report: {Path(found.out) / PAGE}", soft_wrap=True, markup=False)
+    if config.json:
+        print_json({**found.to_json(), "second": facts})
+
+
 def _table(run: ClassifiedRun) -> Sheet:
     rows = [
-        (one.name, str(one.pictures), *_shares(one.benign, one.attacked, one.pictures), str(one.certain))
+        (
+            *(one.name, str(one.pictures), *_shares(one.benign, one.attacked, one.pictures)),
+            *(str(one.certain), str(one.confirmed)),
+        )
         for one in run.classes
         if one.pictures
     ]
-    rows.append(("all", str(run.pictures), percent(run.benign), percent(run.attacked), str(run.grades["certain"])))
+    rows.append(("all", str(run.pictures), percent(run.benign), percent(run.attacked), *_sure(run)))
     title = f"{run.network} on {run.objects} objects: {run.method}, {' + '.join(run.params)}"
-    return Sheet(title, ("class", "pictures", "accuracy, %", "attacked, %", "certain"), tuple(rows))
+    columns = ("class", "pictures", "accuracy, %", "attacked, %", "certain", "confirmed")
+    shown = len(columns) if run.grades["confirmed"] else len(columns) - 1
+    return Sheet(title, columns[:shown], tuple(row[:shown] for row in rows))
+
+
+def _sure(run: ClassifiedRun) -> tuple[str, str]:
+    return str(run.grades["certain"]), str(run.grades["confirmed"])
 
 
 def _shares(benign: int, attacked: int, pictures: int) -> tuple[str, str]:

@@ -17,22 +17,23 @@ from drivesem.report.tables import percent
 from drivesem.truth.grades import Grade
 from scene_ir import files
 
+SECOND_PICTURE = "second.png"
+"""A second renderer's picture of a failure, in the folder of its frame."""
 _QUALITY = 90
 """Of the page's pictures, which are copies of the folders'."""
-_ORDER = {Grade.CERTAIN: 0, Grade.THRESHOLD: 1, None: 2}
+_ORDER = {Grade.CONFIRMED: 0, Grade.CERTAIN: 1, Grade.THRESHOLD: 2, None: 3}
 
 
 @dataclass(frozen=True, slots=True)
 class _Card:
     frame: ClassifiedFrame
-    before: str
-    after: str
+    shots: tuple[tuple[str, str], ...]
     moved: str
 
 
 def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]) -> None:
     """Write the page beside the run's folder of frames. Raises FormatError where a picture is missing."""
-    worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 2), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
+    worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
     cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     part = resources.files("drivesem.report")
@@ -55,7 +56,9 @@ def _card(frame: ClassifiedFrame, folder: Path) -> _Card:
     sizes = ", ".join(f"{name} {size:.3g}" for name, size in frame.sizes.items() if name == "vertex")
     moved = ", ".join(f"{name.rpartition('.')[2]} {value}" for name, value in frame.moved.items())
     told = "; ".join(words for words in (moved, sizes) if words)
-    return _Card(frame, _embedded(folder / "benign.png"), _embedded(folder / "counterexample.png"), told)
+    shots = [("before", "benign.png"), ("after", "counterexample.png")]
+    shots += [(frame.second.agreement.by, SECOND_PICTURE)] if frame.second is not None else []
+    return _Card(frame, tuple((name, _embedded(folder / file)) for name, file in shots), told)
 
 
 def _embedded(path: Path) -> str:

@@ -987,9 +987,23 @@ class Retrain(Trust, Training, FrameCommand):
 class Classify(FrameCommand):
     """Image classifiers instead of detectors: objects whose shape, pose or light changes until a network errs."""
 
-    what: tyro.conf.Positional[Literal["data", "train", "attack"]]
+    what: tyro.conf.Positional[Literal["data", "train", "attack", "confirm", "explain", "holes", "gate"]]
     """data: pictures of all objects, by split and class; train: a network on these; attack: look for changes that
-    a network gets wrong."""
+    a network gets wrong. Of a run of attack, RUN: confirm draws its failures again by a second renderer; explain
+    says how little of each change is enough; holes, in which poses the object is misclassified;
+    gate, whether --network fails more often there: exit code 1."""
+    folder: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="RUN")] = None
+    """Folder of a run of drivesem classify attack."""
+    renderer: Literal["auto", "mitsuba", "pyrender"] = "auto"
+    """Confirm: the second renderer; by default Mitsuba where it is installed, else pyrender."""
+    samples: Annotated[int, at_least(24, "of which a rule can be made")] = 64
+    """Holes, gate: poses around each failure, each seen once, with nuisances."""
+    fresh: Count = 32
+    """Holes: further ones inside of the rule that was found, of its stated probability."""
+    reach: Annotated[float, POSITIVE] = 0.6
+    """Holes, gate: how far pitch, yaw and roll go either way from the pose that was found, rad."""
+    tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
+    """Gate: by how much the share of misclassified poses may grow, of a failure, of a class, and of all."""
     objects: str | None = None
     """Where objects come from: ShapeNetCore v2's folder, or one of meshes by class; by default 12 classes that are
     made by code."""
@@ -1000,11 +1014,11 @@ class Classify(FrameCommand):
     backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
     """Photographs to put behind objects; by default pictures that are made."""
     network: str = "squeezenet"
-    """Attack: squeezenet, or weights that classify train wrote; train: squeezenet, vgg16, vgg16-pooled or resnet50
-    (docs/classify.md)."""
+    """Attack: squeezenet, weights that classify train wrote, or an ONNX file; train: squeezenet, vgg16,
+    vgg16-pooled, resnet50, torchvision:NAME or timm:NAME; gate: as attack (docs/classify.md)."""
     weights: str | None = None
-    """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers all
-    others begin anew where none is named."""
+    """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers
+    all others begin anew where none is named."""
     data: Annotated[str, Folder("a folder of classify data")] | None = None
     """Train: pictures that classify data wrote; by default they are made now."""
     layers: Literal["last", "all"] = "last"
@@ -1056,6 +1070,14 @@ class Classify(FrameCommand):
         needless = self.weights is not None and self.what != "train"
         refuse(needless, "--weights", "classify train (an attack takes --network FILE)", f"classify {self.what}")
         refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
+        of_run = self.what in ("confirm", "explain", "holes", "gate")
+        refuse(
+            of_run and not self.folder, "RUN", f"a folder of drivesem classify attack, to {self.what}", "nothing"
+        )
+        refuse(not of_run and self.folder is not None, "RUN", f"no folder, for classify {self.what}", self.folder)
+        refuse(
+            self.what == "confirm" and self.out is not None, "--out", "none: confirm goes on in the run", self.out
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,10 @@ _DARKEST = 1e-4
 """Of linear light: gamma has a slope there."""
 _CREASE_COS = 0.766
 """Cosine of 40 degrees: faces of one corner that meet at less are shaded as one smooth surface."""
-_UP = 0.4
+UP = 0.4
 """How much more of the environment's light comes from above than from below, either way from the mean."""
+AROUND = 0.2
+"""Share of the environment's light that a glossy surface mirrors, where the lamp's counts in full."""
 _SHOWS = 2 / 255
 """Contrast from which a border between two faces is blended."""
 _TINY = 1e-12
@@ -100,8 +102,7 @@ class LitMesh:
         self, fragments: Fragments, clip: Tensor, vertices: Tensor, lights: Lights, backend: verbs.Backend
     ) -> Tensor:
         """(T, 3) after gamma; 0 where nothing is hit."""
-        corners = vertices[self.faces]  # (F, 3, 3)
-        normal = self._normals(corners)
+        corners, normal, _ = self.corners(vertices)
         attributes = torch.cat([corners.reshape(-1, 3), normal], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
         own = clip.index_select(0, self.faces.reshape(-1))
@@ -119,14 +120,17 @@ class LitMesh:
         )
         return torch.zeros_like(seen[:, :3]).index_add(0, hit, light.clamp(_DARKEST, 1) ** GAMMA)
 
-    def _normals(self, corners: Tensor) -> Tensor:
-        """(3F, 3) unit normals of corners (F, 3, 3) in camera space, towards the side that is seen."""
+    def corners(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of vertices (V, 3) in camera space each face's corners (F, 3, 3); their unit normals (3F, 3), towards
+        the side that is seen; and which faces (F,) look away, by their winding.
+        """
+        corners = vertices[self.faces]
         across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         summed = torch.zeros_like(corners).reshape(-1, 3)
         summed = summed.index_add(0, self._corner, across.index_select(0, self._face))
         away = (across.detach() * corners.detach().mean(dim=1)).sum(dim=1) > 0
         sign = torch.where(away, -1.0, 1.0).to(corners).repeat_interleave(3)
-        return _unit(summed) * sign[:, None]
+        return corners, _unit(summed) * sign[:, None], away
 
 
 def shade(
@@ -146,9 +150,10 @@ def shade(
     facing = (normal * to_lamp).sum(dim=1).clamp_min(0)
     mirrored = 2 * (normal * to_lamp).sum(dim=1, keepdim=True) * normal - to_lamp
     glance = (mirrored * -_unit(point)).sum(dim=1).clamp_min(_TINY)
-    around = lights.environment * (1 - _UP * normal[:, 1])  # y points down
+    around = lights.environment * (1 - UP * normal[:, 1])  # y points down
     lobe = torch.where(facing > 0, glance**shininess, 0)
-    return diffuse * (around + arrives * facing)[:, None] + (specular * (arrives * lobe + 0.2 * around))[:, None]
+    gloss = specular * (arrives * lobe + AROUND * around)
+    return diffuse * (around + arrives * facing)[:, None] + gloss[:, None]
 
 
 def over(drawn: Tensor, background: Tensor) -> Tensor:

@@ -35,6 +35,8 @@ LOADED_WHERE_USED = (
     "loky",
     "fsspec",
     "art",
+    "mitsuba",
+    "timm",
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -13,15 +13,27 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of RGB in [0, 1]: what torchvision's weights were trained with."""
 
 
+class Scorer(Protocol):
+    """What attacks ask of a classifier. differentiable: whether its scores have a gradient to the pictures."""
+
+    differentiable: bool
+    classes: tuple[str, ...]
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]."""
+        ...
+
+
 class Classifier(nn.Module, ABC):
     """A network whose last layer, a linear one, tells `classes` apart. architecture: its name in weights files;
     head: the path of that layer, by torchvision's names where it has the network; published_head: what files of
     the published weights hold in its place, where that has another name.
     """
 
-    architecture: ClassVar[str]
+    differentiable = True
+    architecture: str
     head: ClassVar[str]
-    published_head: ClassVar[str] = ""
+    published_head: str = ""
 
     classes: tuple[str, ...]
     mean: Tensor
@@ -56,6 +68,10 @@ class Classifier(nn.Module, ABC):
     def forward(self, images: Tensor) -> Tensor:
         """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]."""
         return self.last(self.embed(images))
+
+    def own_name(self, published: str) -> str:
+        """What a tensor of the published weights is called here."""
+        return published
 
     def retarget(self, classes: Sequence[str], generator: torch.Generator) -> None:
         """Have a new last layer, for other classes, with small random weights."""

@@ -13,10 +13,11 @@ from torch import Tensor
 import detectors.registry
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
 from drivesem.classify.networks.resnet import ResNet50
 from drivesem.classify.networks.squeezenet import SqueezeNet
 from drivesem.classify.networks.vgg import VGG16, PooledVGG16
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError
 from scene_ir.weights import load_into, read_weights
 
 ARCHITECTURES: dict[str, type[Classifier]] = {
@@ -35,10 +36,12 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
     """
     path = SHIPPED if name_or_path == SqueezeNet.architecture else Path(name_or_path)
     if path.suffix != ".safetensors":
-        expected = f"{SqueezeNet.architecture}, or weights that drivesem classify train wrote (.safetensors)"
-        raise FormatError("--network", expected, name_or_path)
+        trained = "weights that drivesem classify train wrote (.safetensors)"
+        expected = f"{SqueezeNet.architecture}, {trained}, or an ONNX file (.onnx)"
+        known = ", which tells ImageNet's classes apart: train it on these (classify train --network)"
+        raise FormatError("--network", expected, name_or_path + (known if _is_library(name_or_path) else ""))
     metadata, tensors = read_weights(path)
-    network = _of(str(path), metadata.get("architecture"))(classes_of(path, metadata))
+    network = _made(metadata.get("architecture"), classes_of(path, metadata), f"{path}: architecture")
     if network.classes != tuple(classes):
         expected = f"one for the {len(classes)} classes {', '.join(classes)}"
         raise FormatError(str(path), expected, f"one for {', '.join(network.classes)}")
@@ -57,24 +60,26 @@ def to_train(
     safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions. anew:
     others begin with random weights where no file is named.
 
-    Raises FormatError naming file and tensor where the file is another network's, RangeError for an unknown name.
+    timm:NAME and torchvision:NAME have the library's own without a file. Raises FormatError naming file and tensor
+    where the file is another network's, and for an unknown name.
     """
-    if architecture not in ARCHITECTURES:
-        raise RangeError("--network", f"one of {', '.join(ARCHITECTURES)}", architecture)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(generator.initial_seed())
-        network = ARCHITECTURES[architecture](classes)
-    if weights is None and anew and architecture != SqueezeNet.architecture:
-        return network
+        network = _made(architecture, classes, "--network", pretrained=weights is None)
     if weights is None:
+        if isinstance(network, LibraryClassifier):
+            network.retarget(classes, generator)
+            return network
+        if anew and architecture != SqueezeNet.architecture:
+            return network
         if architecture != SqueezeNet.architecture:
             raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")
         path = SHIPPED
     else:
         path = Path(weights)
-    tensors = _tensors(path)
+    tensors = {network.own_name(key): tensor for key, tensor in _tensors(path).items()}
     network.retarget(classes, generator)
-    own, name = network.state_dict(), type(network).head
+    own, name = network.state_dict(), network.head
     # Of the file's own last layer, which tells other classes apart, nothing is used.
     replaced = (name, network.published_head)
     kept = {key: tensor for key, tensor in tensors.items() if key.rpartition(".")[0] not in replaced}
@@ -111,10 +116,18 @@ def classes_of(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _of(path: str, architecture: str | None) -> type[Classifier]:
+def _made(architecture: str | None, classes: Sequence[str], where: str, *, pretrained: bool = False) -> Classifier:
+    """The network of that name, with any weights, or with a library's own."""
+    if architecture is not None and _is_library(architecture):
+        return LibraryClassifier(architecture, classes, pretrained=pretrained)
     if architecture not in ARCHITECTURES:
-        raise FormatError(f"{path}: architecture", f"one of {', '.join(ARCHITECTURES)}", architecture)
-    return ARCHITECTURES[architecture]
+        known = ", ".join([*ARCHITECTURES, *(f"{library}:NAME" for library in LIBRARIES)])
+        raise FormatError(where, f"one of {known}", architecture)
+    return ARCHITECTURES[architecture](classes)
+
+
+def _is_library(architecture: str) -> bool:
+    return architecture.partition(":")[0] in LIBRARIES and ":" in architecture
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:

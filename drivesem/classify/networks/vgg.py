@@ -51,8 +51,8 @@ class VGG16(Classifier):
 
 
 class PooledVGG16(Classifier):
-    """Its convolutions, and one layer on mean and maximum of what the last of them find: where the three large layers of the
-    published network are not at hand, which hold nine tenths of its weights.
+    """Its convolutions, and one layer on mean and maximum of what the last of them find: where the three large
+    layers of the published network are not at hand, which hold nine tenths of its weights.
     """
 
     architecture = "vgg16-pooled"

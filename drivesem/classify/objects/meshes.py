@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from drivesem.classify.objects.types import ObjectModel
+from drivesem.classify.objects.types import ObjectModel, used
 from scene_ir.errors import FormatError
 from scene_ir.meshes.load import read_scene
 from scene_ir.meshes.lod import simplify
@@ -52,10 +52,10 @@ def read_object(path: Path, name: str, label: int, folder: Path, most_triangles:
     vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
     faces = np.concatenate([np.asarray(p.faces, np.int64) + s for p, s in zip(parts, starts[:-1], strict=True)])
     looks = np.concatenate([_looks(part, path) for part in parts])
-    used = np.unique(faces)
-    if not np.isfinite(vertices[used]).all():
+    shown = np.unique(faces)
+    if not np.isfinite(vertices[shown]).all():
         raise FormatError(f"{path}: vertices", "finite coordinates", "NaN or infinity")
-    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
+    low, high = vertices[shown].min(axis=0), vertices[shown].max(axis=0)
     longest = float((high - low).max())
     if not 0 < longest < np.inf:
         raise FormatError(f"{path}: vertices", "an object with some extent", f"a longest side of {longest}")
@@ -68,13 +68,12 @@ def read_object(path: Path, name: str, label: int, folder: Path, most_triangles:
     faces, looks = faces[doubled > _SMALL], looks[doubled > _SMALL]
     if len(faces) == 0:
         raise FormatError(f"{path}: faces", "at least one face with an area", "none")
-    used, welded = np.unique(faces, return_inverse=True)
-    welded = torch.from_numpy(welded.reshape(-1, 3))
-    mesh = Mesh(torch.from_numpy(unit[used]), welded, torch.full((len(faces),), int(Part.OTHER)), name)
+    part = torch.full((len(faces),), int(Part.OTHER))
+    mesh = used(Mesh(torch.from_numpy(unit), torch.from_numpy(faces), part, name))
     if most_triangles is not None and len(faces) > most_triangles:
         mesh, looks = _simplified(mesh, looks, most_triangles)
     table = torch.from_numpy(looks.astype(np.float32))
-    return ObjectModel(name, label, mesh, table[:, :3].contiguous(), table[:, 3], table[:, 4])
+    return ObjectModel(name, label, used(mesh), table[:, :3].contiguous(), table[:, 3], table[:, 4])
 
 
 def _simplified(mesh: Mesh, looks: Array, triangles: int) -> tuple[Mesh, Array]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import torch
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
@@ -57,6 +58,14 @@ class ObjectModel:
             if low < 0 or high > most:
                 expected = "at least 0" if most == float("inf") else "values in [0, 1]"
                 raise RangeError(f"{self.name}: {field}", expected, low if low < 0 else high)
+
+
+def used(mesh: Mesh) -> Mesh:
+    """The mesh without vertices that no face has, which nothing draws and an attack would move all the same."""
+    places, faces = torch.unique(mesh.faces, return_inverse=True)
+    return (
+        mesh if len(places) == len(mesh.vertices) else replace(mesh, vertices=mesh.vertices[places], faces=faces)
+    )
 
 
 class ObjectSet(Protocol):

@@ -25,10 +25,18 @@ _NONE = "No certain failure of an object in these runs: nothing to compare, so t
 
 
 def answer_of(
-    out: Path, passed: bool, rows: Sequence[GateRow], facts: Mapping[str, Any], failed: Mapping[str, str]
+    out: Path,
+    passed: bool,
+    rows: Sequence[GateRow],
+    facts: Mapping[str, Any],
+    failed: Mapping[str, str],
+    words: tuple[str, str] = ("lost", _NOTE),
 ) -> Answer:
-    """What is said, and gate.xml. facts: what stands first in the JSON."""
-    files.write_text(out / "gate.xml", junit(rows))
+    """What is said, and gate.xml. facts: what stands first in the JSON; words: what a failure is called, and what
+    figures mean.
+    """
+    verb, note = words
+    files.write_text(out / "gate.xml", junit(rows, verb))
     holes, others = ([r for r in rows if (r.level == HOLE) == own] for own in (True, False))
     verdict = "passed" if passed else "not passed"
     title = f"Gate {verdict}: {facts['after']} after {facts['before']}"
@@ -38,21 +46,21 @@ def answer_of(
         heading=title,
         data={"passed": passed, **facts, "out": str(out), "rows": [row.to_json() for row in rows]},
         tables={"gate": [_flat(row) for row in rows]} if rows else {},
-        sheets=[_sheet(title, [*others, *holes])],
-        printed=[_sheet(title, [*others, *holes[:_SHOWN]])],
-        notes=(_NOTE,) if rows else (_NONE,),
+        sheets=[_sheet(title, [*others, *holes], verb)],
+        printed=[_sheet(title, [*others, *holes[:_SHOWN]], verb)],
+        notes=(note,) if rows else (_NONE,),
         failed=failed,
     )
 
 
-def junit(rows: Sequence[GateRow]) -> str:
+def junit(rows: Sequence[GateRow], lost: str = "lost") -> str:
     """A test case a row, in the XML that JUnit made common; a row that grew is a failure."""
     grew = sum(row.grew for row in rows)
     suite = ET.Element("testsuite", name="drivesem gate", tests=str(len(rows)), failures=str(grew), errors="0")
     for row in rows:
         case = ET.SubElement(suite, "testcase", classname=f"drivesem.gate.{row.level}", name=row.hole)
         if row.grew:
-            verb = "phantoms in" if row.level == PHANTOMS else "lost"
+            verb = "phantoms in" if row.level == PHANTOMS else lost
             told = f"{verb} {100 * row.before:.1f} % before, {100 * row.after:.1f} % after"
             ET.SubElement(
                 case, "failure", message=told, type="grew"
@@ -61,7 +69,7 @@ def junit(rows: Sequence[GateRow]) -> str:
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def _sheet(title: str, rows: Sequence[GateRow]) -> Sheet:
+def _sheet(title: str, rows: Sequence[GateRow], lost: str) -> Sheet:
     lines = tuple(
         (
             "all holes" if row.level == ALL else row.hole,
@@ -73,7 +81,7 @@ def _sheet(title: str, rows: Sequence[GateRow]) -> Sheet:
         )
         for row in rows
     )
-    return Sheet(title, ("hole", "lost before, %", "after, %", "difference, points", "samples", ""), lines)
+    return Sheet(title, ("hole", f"{lost} before, %", "after, %", "difference, points", "samples", ""), lines)
 
 
 def _difference(row: GateRow) -> str:

@@ -14,18 +14,18 @@ GATE = "gate.json"
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One certain failure's neighbourhood. index: of the object; error: kind of the failure; before, after: by
-    sample, whether either detector does not find the object; phantoms_before, phantoms_after: by sample, whether
-    it reports anything where nothing is, in the whole picture.
+    """One certain failure's neighbourhood. index: of the object, None where a picture is of one; error: kind of
+    the failure; before, after: by sample, whether either detector does not find the object; phantoms_before,
+    phantoms_after: by sample, whether it reports anything where nothing is, in the whole picture.
     """
 
-    index: int
+    index: int | None
     label: str
     error: str
     before: tuple[bool, ...]
     after: tuple[bool, ...]
-    phantoms_before: tuple[bool, ...]
-    phantoms_after: tuple[bool, ...]
+    phantoms_before: tuple[bool, ...] = ()
+    phantoms_after: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

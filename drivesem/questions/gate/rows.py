@@ -44,7 +44,12 @@ def rows_of(found: Mapping[str, Sequence[Pair]], tolerance: float, draws: int, s
     """Rows of pairs by frame: holes, those that grew most first; then kinds; then all of them; then phantoms in
     their samples. tolerance: by how much a share may grow. A pair without samples has no row.
     """
-    named = [(f"{frame}: objects[{p.index}]", p) for frame, pairs in found.items() for p in pairs if p.before]
+    named = [
+        (frame if p.index is None else f"{frame}: objects[{p.index}]", p)
+        for frame, pairs in found.items()
+        for p in pairs
+        if p.before
+    ]
     holes = [_row(HOLE, name, [pair], tolerance, draws, seed) for name, pair in named]
     holes.sort(key=lambda row: (-row.difference, row.hole))
     kinds = dict.fromkeys(pair.error for _, pair in named)
@@ -53,9 +58,13 @@ def rows_of(found: Mapping[str, Sequence[Pair]], tolerance: float, draws: int, s
         for kind in sorted(kinds)
     ]
     pairs = [pair for _, pair in named]
-    seen = [replace(pair, before=pair.phantoms_before, after=pair.phantoms_after) for pair in pairs]
+    seen = [
+        replace(pair, before=pair.phantoms_before, after=pair.phantoms_after)
+        for pair in pairs
+        if pair.phantoms_before
+    ]
     whole = [_row(ALL, ALL, pairs, tolerance, draws, seed)] if named else []
-    phantoms = [_row(PHANTOMS, PHANTOMS, seen, tolerance, draws, seed)] if named else []
+    phantoms = [_row(PHANTOMS, PHANTOMS, seen, tolerance, draws, seed)] if seen else []
     return [*holes, *others, *whole, *phantoms]
 
 

@@ -18,6 +18,8 @@ from drivesem.truth.redraw.base import NoSecondRendererError
 
 Array = NDArray[np.float32]
 
+_TO_OPENGL = np.array([1, -1, -1], np.float32)
+"""OpenGL looks along -z, with y upwards."""
 SUPERSAMPLING = 2
 """Drawn pixels a pixel, each way; pyrender takes four samples in each of them."""
 NEAR_M, FAR_M = 0.1, 1000.0
@@ -33,6 +35,18 @@ class Skin:
 
     uv: Array
     texture: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Coat:
+    """Triangles of one gloss under a lamp. points, normals: (3F, 3), corner by corner; colours: (3F, 3), what each
+    corner's light is multiplied by, linear under a lamp; roughness, metallic: in [0, 1], see glTF."""
+
+    points: Array
+    normals: Array
+    colours: Array
+    roughness: float
+    metallic: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +111,41 @@ class Screen:
         scene, nodes = self._scene([points], [nothing], intrinsics, window)
         return Alone(window, self._owners(scene, nodes, window)[1])
 
+    def shade(
+        self, coats: Sequence[Coat], lamp: tuple[Array, float] | None, intrinsics: Array, window: Window
+    ) -> Array:
+        """(h s, w s, 4) in [0, 1] by drawn pixel: colour, raised to 1/2.2 under a lamp, and coverage; both are
+        averages over a pixel's samples. lamp: where (3,), and its intensity; without one colours show as they are.
+        """
+        library = self._library
+        scene = library.Scene(bg_color=(0.0, 0.0, 0.0, 0.0), ambient_light=(0.0, 0.0, 0.0))
+        for coat in coats:
+            material = library.MetallicRoughnessMaterial(
+                roughnessFactor=coat.roughness, metallicFactor=coat.metallic
+            )
+            opaque = np.ones((len(coat.colours), 1), np.float32)
+            part = library.Primitive(
+                positions=coat.points * _TO_OPENGL,
+                normals=coat.normals * _TO_OPENGL,
+                color_0=np.concatenate([coat.colours, opaque], axis=1),
+                material=material,
+                mode=4,
+            )
+            scene.add(library.Mesh([part]))
+        flags = library.RenderFlags.RGBA | library.RenderFlags.SKIP_CULL_FACES
+        if lamp is None:
+            flags |= library.RenderFlags.FLAT
+        else:
+            pose = np.eye(4)
+            pose[:3, 3] = lamp[0] * _TO_OPENGL
+            scene.add(library.PointLight(color=(1.0, 1.0, 1.0), intensity=lamp[1]), pose=pose)
+        self._look(scene, intrinsics, window)
+        return self._render(scene, flags, None, window)[0].astype(np.float32) / np.float32(255)
+
     def _scene(
         self, points: Sequence[Array], skins: Sequence[Skin], intrinsics: Array, window: Window
     ) -> tuple[Any, list[Any]]:
-        library, s = self._library, SUPERSAMPLING
+        library = self._library
         scene = library.Scene(bg_color=(0.0, 0.0, 0.0, 0.0), ambient_light=(1.0, 1.0, 1.0))
         linear = 9729  # GL_LINEAR: an atlas has no smaller levels
         sampler = library.Sampler(magFilter=linear, minFilter=linear)
@@ -108,16 +153,18 @@ class Screen:
         for placed, skin in zip(points, skins, strict=True):
             texture = library.Texture(sampler=sampler, source=skin.texture, source_channels="RGB")
             material = library.MetallicRoughnessMaterial(baseColorTexture=texture)
-            # OpenGL looks along -z, with y upwards.
-            corners = placed * np.array([1, -1, -1], np.float32)
-            part = library.Primitive(positions=corners, texcoord_0=skin.uv, material=material, mode=4)
+            part = library.Primitive(positions=placed * _TO_OPENGL, texcoord_0=skin.uv, material=material, mode=4)
             nodes.append(scene.add(library.Mesh([part])))
-        k = intrinsics.astype(np.float64)
+        self._look(scene, intrinsics, window)
+        return scene, nodes
+
+    def _look(self, scene: Any, intrinsics: Array, window: Window) -> None:
+        """Add the camera."""
+        library, s, k = self._library, SUPERSAMPLING, intrinsics.astype(np.float64)
         # Pixel centres are integers here, and halves there.
         centre = (k[0, 2] + 0.5 - window.x0) * s, (k[1, 2] + 0.5 - window.y0) * s
         camera = library.IntrinsicsCamera(k[0, 0] * s, k[1, 1] * s, *centre, znear=NEAR_M, zfar=FAR_M)
         scene.add(camera)
-        return scene, nodes
 
     def _owners(self, scene: Any, nodes: Sequence[Any], window: Window) -> tuple[NDArray[np.uint8], Array]:
         flags = self._library.RenderFlags

@@ -137,7 +137,7 @@ def test_bad_input_is_one_line_and_exit_code_2(standins, tmp_path, capsys, monke
     monkeypatch.setattr(attacking, "load_classifier", loading.load_classifier)
     code, _, said = answer(capsys, "attack", "--network", "resnet50")
     assert code == 2
-    assert "--network: expected squeezenet, or weights" in said
+    assert "--network: expected squeezenet, weights" in said
 
 
 def test_an_object_that_cannot_be_used(standins, tmp_path, capsys):

@@ -162,14 +162,14 @@ def test_a_border_between_two_colours_sweeps_over_pixels_evenly(start, step):
 def test_smooth_surfaces_have_smooth_normals_and_edges_stay_sharp():
     ball, box = solid(trimesh.creation.icosphere(3, 0.5)), solid(MESHES["box"])
     centred = ball.vertices[ball.faces]
-    away = ball._normals(centred + torch.tensor([0.0, 0.0, 3.0])).reshape(-1, 3, 3)
+    away = ball.corners(ball.vertices + torch.tensor([0.0, 0.0, 3.0]))[1].reshape(-1, 3, 3)
     facing = (
         torch.linalg.cross(centred[:, 1] - centred[:, 0], centred[:, 2] - centred[:, 0])
         * (centred.mean(1) + torch.tensor([0, 0, 3.0]))
     ).sum(1) < 0
     outwards = torch.nn.functional.normalize(centred[facing], dim=-1)
     assert float((away[facing] * outwards).sum(-1).min()) > math.cos(math.radians(5))
-    normals = box._normals(box.vertices[box.faces] + torch.tensor([0.0, 0.0, 3.0]))
+    normals = box.corners(box.vertices + torch.tensor([0.0, 0.0, 3.0]))[1]
     assert torch.allclose(normals.abs().amax(dim=1), torch.ones(len(normals)))
 
 

@@ -1,18 +1,24 @@
 """Classifiers: torchvision's names of weights, passes checked by hand, files and what is wrong with them."""
 
 import json
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
+from torch import nn
 
+from drivesem.classify.networks import libraries as libraries_module
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
+from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.networks.resnet import ResNet50
 from drivesem.classify.networks.squeezenet import SqueezeNet
 from drivesem.classify.networks.vgg import VGG16, PooledVGG16
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError
+from tools.onnx_graph import constant_graph
 
 CLASSES = ("box", "ball", "pole")
 VGG_CONVOLUTIONS = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256)}
@@ -189,7 +195,9 @@ def test_weights_of_another_network(tmp_path, spoil, message):
 
 
 def test_names_and_files_that_are_no_networks(tmp_path):
-    with pytest.raises(RangeError, match="squeezenet, vgg16, vgg16-pooled, resnet50"):
+    with pytest.raises(
+        FormatError, match="squeezenet, vgg16, vgg16-pooled, resnet50, torchvision:NAME, timm:NAME"
+    ):
         to_train("alexnet", None, CLASSES, seeded())
     with pytest.raises(FormatError, match="--weights: expected a file with weights of vgg16, found nothing"):
         to_train("vgg16", None, CLASSES, seeded())
@@ -211,7 +219,7 @@ def test_names_and_files_that_are_no_networks(tmp_path):
         ({"architecture": "squeezenet", "classes": json.dumps(["cat", "dog"])}, "found one for cat, dog"),
         ({"architecture": "squeezenet", "classes": "cat"}, "classes: expected a list of names"),
         ({"architecture": "squeezedet", "classes": json.dumps(CLASSES)}, "architecture: expected one of"),
-        ({}, "architecture: expected one of"),
+        ({}, "classes: expected a list of names"),
     ],
 )
 def test_a_file_for_something_else(tmp_path, metadata, message):
@@ -236,3 +244,108 @@ def test_a_network_begins_anew_without_a_file():
     assert torch.equal(one.get_parameter(name), again.get_parameter(name))
     assert not torch.equal(one.get_parameter(name), other.get_parameter(name))
     assert one.last.out_features == 2
+
+
+class Body(nn.Module):
+    """What a library's network looks like: features, then one linear layer."""
+
+    def __init__(self):
+        super().__init__()
+        self.conv = nn.Conv2d(3, 4, 3, bias=False)
+        self.head = nn.ModuleDict({"fc": nn.Linear(4, 1000)})
+        self.default_cfg = {"mean": (0.5, 0.5, 0.5), "std": (0.25, 0.25, 0.25)}
+
+    def forward(self, x):
+        return self.head["fc"](self.conv(x).mean(dim=(2, 3)))
+
+
+@pytest.fixture
+def libraries(monkeypatch):
+    """timm and torchvision, as far as they are asked."""
+    asked = []
+
+    def create(name, **options):
+        if name != "tiny":
+            raise RuntimeError(f"Unknown model ({name})")
+        asked.append(options)
+        torch.manual_seed(0)
+        return Body()
+
+    found = {"timm": SimpleNamespace(create_model=create), "torchvision.models": SimpleNamespace(get_model=create)}
+    monkeypatch.setattr(libraries_module.importlib, "import_module", lambda name: found[name])
+    return asked
+
+
+@pytest.mark.parametrize("library", ["timm", "torchvision"])
+def test_networks_of_libraries_get_a_new_last_layer(library, libraries, tmp_path):
+    network = to_train(f"{library}:tiny", None, CLASSES, seeded())
+    assert libraries[0] in ({"pretrained": True}, {"weights": "DEFAULT"})
+    images = torch.rand(2, 3, 16, 16, generator=seeded())
+    body = network.body.conv
+    features = body((images - 0.5) / 0.25).mean(dim=(2, 3))
+    torch.testing.assert_close(network(images), network.last(features))
+    save_classifier(network, tmp_path / "a.safetensors", {})
+    again = load_classifier(str(tmp_path / "a.safetensors"), CLASSES)
+    assert libraries[-1] in ({"pretrained": False}, {"weights": None})
+    torch.testing.assert_close(again(images), network(images), rtol=1e-2, atol=1e-2)
+
+
+def test_weights_by_a_librarys_names(libraries, tmp_path):
+    weights = {"conv.weight": torch.full((4, 3, 3, 3), 0.5), "head.fc.weight": torch.zeros(1000, 4)}
+    torch.save(weights | {"head.fc.bias": torch.zeros(1000)}, tmp_path / "tiny.pth")
+    network = to_train("timm:tiny", str(tmp_path / "tiny.pth"), CLASSES, seeded())
+    assert bool((network.body.conv.weight == 0.5).all())
+    assert network.last.out_features == 3
+
+
+def test_libraries_that_are_not_there_and_names_they_do_not_know(libraries, monkeypatch):
+    with pytest.raises(FormatError, match="--network: expected a network of timm, found timm:huge: RuntimeError"):
+        to_train("timm:huge", None, CLASSES, seeded())
+    with pytest.raises(FormatError, match="found timm:tiny, which tells ImageNet's classes apart: train it"):
+        load_classifier("timm:tiny", CLASSES)
+
+    def missing(name):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(libraries_module.importlib, "import_module", missing)
+    with pytest.raises(FormatError, match="--network: expected timm installed, for timm:tiny, found No module"):
+        to_train("timm:tiny", None, CLASSES, seeded())
+
+
+SCORES = np.array([[1.0, 3.0, 2.0]])
+
+
+def test_an_onnx_file(tmp_path):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(constant_graph((1, 3, 8, 8), {"scores": SCORES}))
+    network = OnnxClassifier(path, CLASSES)
+    assert not network.differentiable
+    assert network(torch.rand(2, 3, 16, 16)).tolist() == [[1.0, 3.0, 2.0]] * 2
+    (tmp_path / "net.yaml").write_text("classes: [pole, box, ball]\n")
+    assert OnnxClassifier(path, CLASSES)(torch.rand(1, 3, 16, 16)).tolist() == [[3.0, 2.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("graph", "settings", "message"),
+    [
+        (constant_graph((1, 3, 8, 8), {"scores": np.zeros((1, 5))}), None, "one score for each of the 3 classes"),
+        (constant_graph((1, 8), {"scores": SCORES}), None, "one batch of pictures"),
+        (
+            constant_graph((1, 3, 8, 8), {"scores": SCORES}),
+            "classes: [a, b, c]",
+            "classes: expected box, ball, pole",
+        ),
+        (
+            constant_graph((1, 3, 8, 8), {"scores": SCORES}),
+            "t_star: 0.5",
+            "net.yaml: expected settings among size",
+        ),
+        (b"no graph", None, "expected an ONNX classifier"),
+    ],
+)
+def test_an_onnx_file_that_is_no_classifier_of_these(tmp_path, graph, settings, message):
+    (tmp_path / "net.onnx").write_bytes(graph)
+    if settings is not None:
+        (tmp_path / "net.yaml").write_text(settings)
+    with pytest.raises(FormatError, match=message):
+        OnnxClassifier(tmp_path / "net.onnx", CLASSES)

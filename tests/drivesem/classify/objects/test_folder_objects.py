@@ -253,3 +253,19 @@ def test_a_kit_of_cars_from_elsewhere(tmp_path: Path) -> None:
     objects = open_objects(str(tmp_path))
     for name in objects.names("train"):
         assert objects.load(name).diffuse.std() > 0.05
+
+
+@pytest.mark.parametrize("most", [None, 200])
+def test_vertices_that_no_face_has_are_left_out(tmp_path: Path, most: int | None) -> None:
+    """Of a file, and of what simplifying leaves over: an attack on vertices would move them all the same."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    lonely = "v 9 9 9\n" + obj_text(ball).replace("f ", "F ")
+    lines = [
+        "f " + " ".join(str(int(i) + 1) for i in line[2:].split()) if line.startswith("F ") else line
+        for line in lonely.splitlines()
+    ]
+    shapenet(tmp_path, BUS, "abc", "\n".join(lines))
+    mesh = open_objects(str(tmp_path), most_triangles=most).load("bus/abc").mesh
+    assert (len(mesh.faces) <= 200) == (most is not None)
+    assert torch.equal(mesh.faces.unique(), torch.arange(len(mesh.vertices)))
+    assert float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).max()) == pytest.approx(1.0, rel=1e-3)

@@ -1,0 +1,211 @@
+"""`drivesem classify holes`: the poses in which an object is misclassified, around each failure of a run.
+
+Samples, rules and intervals are those of detectors' holes; the features are the angles themselves, so that fresh
+samples are drawn inside of a rule and not looked for.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from drivesem.classify.attack import Attacker
+from drivesem.classify.finished import ClassifyRun
+from drivesem.classify.objective import ClassifierObjective, as_written
+from drivesem.classify.scenes import SEEN_PX, VIEWS
+from drivesem.classify.space import Change
+from drivesem.evaluation.resampling import wilson
+from drivesem.report.answer import Answer
+from drivesem.report.tables import Sheet
+from drivesem.run.ask import Bar
+from drivesem.run.folder import FRAMES, PRESENTATION, claim
+from drivesem.run.frame import RESULT
+from drivesem.run.records import dump_record, load_record
+from drivesem.settings.commands import Classify
+from drivesem.settings.errors import UsageError
+from drivesem.truth.rules import Floats, Where, fit
+from scene_ir import files
+
+_SCHEMA = 1
+_HOLE = "hole.json"
+_WRITTEN = ("holes.json", "holes.md", "holes.csv", FRAMES)
+AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
+_NOTES = (
+    "Where: pitch, yaw and roll of the object in degrees, the view's own turn included (top: pitch 20; left and "
+    "right: yaw 29 and -29), with shape and light as they were found. Misclassified: share of fresh samples "
+    "inside of the rule, each seen once, with nuisances, and Wilson's 95 % interval. Elsewhere: the same of "
+    "samples outside of it, within --reach of the pose that was found.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseHole:
+    """Around one failure. source: digest of the run's result; predicted: what it is called most often there;
+    where: intervals by axis, degrees, empty where no angle tells failures; fails, count: of fresh samples inside;
+    fails_outside, count_outside: of samples outside of it; fails_all, count_all: of the whole neighbourhood.
+    """
+
+    identifier: str
+    source: str
+    label: str
+    predicted: str
+    where: dict[str, tuple[float, float]]
+    fails: int
+    count: int
+    fails_outside: int
+    count_outside: int
+    fails_all: int
+    count_all: int
+    passes: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Of the probability inside."""
+        return wilson(self.fails, self.count)
+
+    def sentence(self) -> str:
+        """For people."""
+        ends = (f"{axis} from {low:.0f} to {high:.0f} degrees" for axis, (low, high) in self.where.items())
+        low, high = self.interval
+        share = f"{100 * self.fails / self.count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+        place = " and ".join(ends) or "any angle near"
+        called = f"misclassified, mostly as {self.predicted}"
+        return f"The {self.label} of {self.identifier} is {called}, in {share} of poses with {place}"
+
+
+class HoleWorker:
+    """What one process needs: built once, used for many failures."""
+
+    def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
+        self.config, self.run, self.out, self.attacker = config, run, out, Attacker.of(run.config)
+
+    def __call__(self, name: str) -> None:
+        """One failure, from the run's folder to its own."""
+        config = self.config
+        objective, theta = self.run.rebuilt(self.attacker, name)
+        change = objective.space.change(theta)
+        rng = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
+        bounds = bounds_of(change, config.reach)
+        poses = Poses(objective, change, self.attacker, f"holes:{name}:{config.seed}")
+        asked = rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
+        called = [objective.look(poses.picture(one, number)).predicted for number, one in enumerate(asked)]
+        fails = np.array([one != objective.scene.model.label for one in called])
+        rule = fit(_columns(asked), fails)
+        for axis, interval in rule.where.items():
+            bounds[AXES.index(axis)] = interval
+        fresh = rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3))
+        numbered = enumerate(fresh, start=config.samples)
+        inside = [objective.look(poses.picture(one, number)).predicted for number, one in numbered]
+        wrong = [one for one in inside if one != objective.scene.model.label]
+        frame, classes = self.run.frames[name], self.attacker.network.classes
+        result = PoseHole(
+            identifier=name,
+            source=files.digest(self.run.folder / FRAMES / name / RESULT),
+            label=frame.label,
+            predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else frame.attacked.predicted,
+            where=_as_seen(rule.where, frame.view),
+            fails=len(wrong),
+            count=len(inside),
+            fails_outside=rule.fails_outside,
+            count_outside=rule.count_outside,
+            fails_all=int(fails.sum()),
+            count_all=len(fails),
+            passes=objective.passes,
+        )
+        with files.whole_folder(self.out / FRAMES / name) as part:
+            files.write_text(part / _HOLE, dump_record(result, _SCHEMA))
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """An object as it was found, in other poses. stream: of the draws of what a camera does."""
+
+    objective: ClassifierObjective
+    change: Change
+    attacker: Attacker
+    stream: str
+
+    @torch.no_grad()
+    def picture(self, degrees: Floats, number: int) -> Tensor:
+        """The picture (3, H, W) in a pose (3,), in the draw of that number."""
+        change = replace(self.change, angles=torch.from_numpy(np.radians(degrees)).float())
+        picture = as_written(self.objective.scene.picture(change))
+        draw = self.attacker.grader.nuisances.of_picture(self.stream, number, (SEEN_PX, SEEN_PX))
+        return draw.picture(picture)
+
+
+def bounds_of(change: Change, reach: float) -> Floats:
+    """Lowest and highest angles (3, 2), degrees, within `reach` rad of a change's pose."""
+    found = np.zeros(3) if change.angles is None else np.degrees(change.angles.numpy().astype(float))
+    return np.stack([found - math.degrees(reach), found + math.degrees(reach)], axis=1)
+
+
+def _columns(degrees: Floats) -> dict[str, Floats]:
+    return {axis: degrees[:, i] for i, axis in enumerate(AXES)}
+
+
+def _as_seen(where: Where, view: str) -> dict[str, tuple[float, float]]:
+    """A rule with the view's own turn in it."""
+    turn = dict(zip(AXES, (*np.degrees(VIEWS[view]).tolist(), 0.0), strict=True))
+    return {axis: (round(low + turn[axis], 2), round(high + turn[axis], 2)) for axis, (low, high) in where.items()}
+
+
+def holes_run(config: Classify) -> Answer:
+    """Look around a run's failures, or go on with it. Raises UsageError or SceneError."""
+    run = ClassifyRun.of(config)
+    if not run.failures(config.limit):
+        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
+    out = Path(config.out) if config.out else run.folder / "holes"
+    build = partial(HoleWorker, config, run, out)
+    build()
+    claim(out, config, _WRITTEN, (*PRESENTATION, "folder"))
+    read = partial(load_record, kind=PoseHole, schema=_SCHEMA)
+    found, failed = run.ask(config, out, (_HOLE, read), build, Bar("looking around failures", remaining=True))
+    answer = _answer(out, found, run.facts(out, failed), failed)
+    answer.write()
+    return answer
+
+
+def _answer(out: Path, found: Sequence[PoseHole], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
+    ordered = sorted(found, key=lambda hole: (-hole.interval[0], hole.identifier))
+    rows = [
+        asdict(hole)
+        | {"probability": hole.fails / hole.count, "interval": list(hole.interval), "sentence": hole.sentence()}
+        for hole in ordered
+    ]
+    lines = tuple(
+        (
+            hole.sentence(),
+            "-" if not hole.count_outside else f"{100 * hole.fails_outside / hole.count_outside:.0f}",
+            f"{100 * hole.fails_all / hole.count_all:.0f}",
+        )
+        for hole in ordered
+    )
+    title = f"Holes of {facts['network']}, by pose"
+    return Answer(
+        out=out,
+        name="holes",
+        heading="Holes by pose",
+        data={**facts, "holes": rows},
+        tables={"holes": [_flat(row) for row in rows]} if rows else {},
+        sheets=[Sheet(title, ("where", "elsewhere, %", "of all near, %"), lines)],
+        notes=_NOTES,
+        failed={f"picture {name}": reason for name, reason in failed.items()},
+    )
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    told = {key: row[key] for key in ("identifier", "label", "predicted", "probability", "fails", "count")}
+    for axis in AXES:
+        told[f"{axis}_low"], told[f"{axis}_high"] = row["where"].get(axis, (None, None))
+    return {**told, "fails_outside": row["fails_outside"], "count_outside": row["count_outside"]}

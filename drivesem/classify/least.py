@@ -1,0 +1,181 @@
+"""`drivesem classify explain`: how little of a change is enough, by the search that does so for detectors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from drivesem.classify.attack import Attacker
+from drivesem.classify.finished import ClassifyRun
+from drivesem.classify.space import Moved, ObjectSpace
+from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
+from drivesem.report.answer import Answer
+from drivesem.report.tables import Sheet
+from drivesem.run.ask import Bar
+from drivesem.run.folder import FRAMES, PRESENTATION, claim
+from drivesem.run.frame import RESULT
+from drivesem.run.records import dump_record, load_record
+from drivesem.settings.commands import Classify
+from drivesem.settings.errors import UsageError
+from scene_ir import files
+from scene_ir.errors import RangeError
+from scene_ir.io import to_uint8
+
+_SCHEMA = 1
+_LEAST = "least.json"
+_WRITTEN = ("explain.json", "explain.md", "explain.csv", FRAMES)
+_POINTS = 16
+"""Of the grid of scales, as for detectors."""
+_AXES = ("pose.pitch", "pose.yaw", "pose.roll")
+_NOTES = (
+    "Enough: the share of the change, in steps of the attack, of the least that is still misclassified. Angles in "
+    "rad, beyond the view; a dash where the angle is not needed. Vertices: the farthest goes so far, in object "
+    "sizes. Left out: what went without a loss. What fails only between two of 16 shares is not seen.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LeastChange:
+    """One failure. source: digest of the run's result. share: of the change's size that is enough; angles, found:
+    rad by axis, of the least change and of the whole one; vertex, light: the largest of each in the least change;
+    dropped: what was left out; predicted: the class that it is called then; sign_changes: how often failing
+    begins or ends on the way to the whole change. `seconds` alone may differ between two calls.
+    """
+
+    identifier: str
+    source: str
+    label: str
+    predicted: str
+    share: float
+    angles: dict[str, float]
+    found: dict[str, float]
+    vertex: float
+    light: float
+    dropped: tuple[str, ...]
+    sign_changes: int
+    passes: int
+
+    def sentence(self) -> str:
+        """For people."""
+        turns = [f"{name.partition('.')[2]} {value:+.3f} rad" for name, value in self.angles.items() if value]
+        turns += [f"vertices by {self.vertex:.4f}"] if self.vertex else []
+        turns += [f"light by {self.light:.2f}"] if self.light else []
+        return f"{self.identifier} is called {self.predicted} with {', '.join(turns)}"
+
+    def row(self) -> tuple[str, ...]:
+        """A line of the table."""
+        dropped = ", ".join(name.removeprefix("pose.") for name in self.dropped)
+        told = [f"{self.angles[axis]:+.3f}" if self.angles.get(axis) else "-" for axis in _AXES]
+        return (
+            *(self.identifier, self.predicted, f"{100 * self.share:.0f}", *told),
+            *(f"{self.vertex:.4f}" if self.vertex else "-", dropped or "-"),
+        )
+
+
+class LeastWorker:
+    """What one process needs: built once, used for many failures."""
+
+    def __init__(self, run: ClassifyRun, out: Path) -> None:
+        self.run, self.out, self.attacker = run, out, Attacker.of(run.config)
+
+    def __call__(self, name: str) -> None:
+        """One failure, from the run's folder to its own."""
+        objective, theta = self.run.rebuilt(self.attacker, name)
+        space, problem = objective.space, objective.problem()
+        search = LeastSearch(
+            project=lambda wanted: problem.project(wanted).theta,
+            fails=lambda wanted: not objective.see(wanted).right,
+            size=lambda wanted: float(problem.size(wanted)),
+            points=_POINTS,
+        )
+        try:
+            found = minimal(theta, blocks(space), search)
+        except RangeError as error:  # judged otherwise on this machine
+            raise RangeError(f"{name}: {error.field}", error.expected, error.actual) from error
+        result = LeastChange(
+            identifier=name,
+            source=files.digest(self.run.folder / FRAMES / name / RESULT),
+            label=self.run.frames[name].label,
+            predicted=self.attacker.network.classes[objective.see(found.theta).predicted],
+            share=round(search.size(found.theta) / search.size(theta), 6),
+            angles=_angles(space, found.theta),
+            found=_angles(space, theta),
+            vertex=space.sizes(found.theta).get(Moved.VERTEX, 0.0),
+            light=space.sizes(found.theta).get(Moved.LIGHTING, 0.0),
+            dropped=found.dropped,
+            sign_changes=found.sign_changes,
+            passes=objective.passes,
+        )
+        with files.whole_folder(self.out / FRAMES / name) as part:
+            files.write_png(part / "least.png", to_uint8(objective.picture(found.theta)))
+            files.write_text(part / _LEAST, dump_record(result, _SCHEMA))
+
+
+def blocks(space: ObjectSpace) -> list[ThetaBlock]:
+    """What to try to leave out: each parameter, the vertices first, then each coordinate of pose and light."""
+    found = []
+    for parameter, where in space.blocks.items():
+        found.append(ThetaBlock(str(parameter), _mask(space, where.start, where.stop)))
+    for parameter, where in space.blocks.items():
+        if parameter is not Moved.VERTEX:
+            found += [ThetaBlock(space.name(i), _mask(space, i, i + 1)) for i in range(where.start, where.stop)]
+    return found
+
+
+def _mask(space: ObjectSpace, start: int, stop: int) -> Tensor:
+    place = torch.arange(space.dim)
+    return (place >= start) & (place < stop)
+
+
+def _angles(space: ObjectSpace, theta: Tensor) -> dict[str, float]:
+    pose = space.block(theta, Moved.POSE)
+    return {} if pose is None else dict(zip(_AXES, (round(a, 6) for a in pose.tolist()), strict=True))
+
+
+def explain_run(config: Classify) -> Answer:
+    """Find the least change of a run's failures, or go on with it. Raises UsageError or SceneError."""
+    run = ClassifyRun.of(config)
+    if not run.failures(config.limit):
+        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
+    out = Path(config.out) if config.out else run.folder / "explain"
+    build = partial(LeastWorker, run, out)
+    build()
+    claim(out, config, _WRITTEN, (*PRESENTATION, "folder"))
+    read = partial(load_record, kind=LeastChange, schema=_SCHEMA)
+    found, failed = run.ask(config, out, (_LEAST, read), build, Bar("shortening changes"))
+    answer = _answer(out, found, run.facts(out, failed), failed)
+    answer.write()
+    return answer
+
+
+def _answer(out: Path, found: Sequence[LeastChange], facts: dict[str, Any], failed: dict[str, str]) -> Answer:
+    columns = ("picture", "called", "enough, %", "pitch, rad", "yaw, rad", "roll, rad", "vertices", "left out")
+    title = f"How little is enough: {len(found)} failures of {facts['network']}"
+    middle = median(one.share for one in found) if found else math.nan
+    rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
+    flat = [
+        {"identifier": one.identifier, "label": one.label, "predicted": one.predicted, "share": one.share}
+        | {axis: one.angles.get(axis) for axis in _AXES}
+        | {f"found_{axis}": one.found.get(axis) for axis in _AXES}
+        | {"vertex": one.vertex, "light": one.light, "sign_changes": one.sign_changes}
+        for one in found
+    ]
+    return Answer(
+        out=out,
+        name="explain",
+        heading="How little is enough",
+        data={**facts, "share_median": round(middle, 4) if found else None, "least": rows},
+        tables={"explain": flat} if found else {},
+        sheets=[Sheet(title, columns, tuple(one.row() for one in found), {"unbroken": columns[:2]})],
+        notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
+        words=("picture", "called", "left out"),
+        failed={f"picture {name}": reason for name, reason in failed.items()},
+    )
