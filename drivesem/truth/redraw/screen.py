@@ -87,17 +87,12 @@ class Screen:
 
     def __init__(self) -> None:
         self._library = _pyrender()
-        from OpenGL.error import GLError
-
-        self._errors = (GLError,)
-        try:
-            self._renderer = self._library.OffscreenRenderer(64, 64)
-        except Exception as error:  # a driver's errors have no common kind
-            raise NoSecondRendererError("pyrender", _EXPECTED, _line(error)) from error
+        self._open()
 
     def draw(self, points: Sequence[Array], skins: Sequence[Skin], intrinsics: Array, window: Window) -> Drawn:
         """Objects, tested by depth among each other. points: (3F, 3) m of each, corner by corner, in the axes of
         the picture's own camera, their fronts winding as `Mesh.faces` do; intrinsics: (3, 3) px."""
+        self._reopen()
         flags = self._library.RenderFlags
         scene, nodes = self._scene(points, skins, intrinsics, window)
         colour, _ = self._render(scene, flags.FLAT | flags.RGBA, None, window)
@@ -107,6 +102,7 @@ class Screen:
 
     def alone(self, points: Array, intrinsics: Array, window: Window) -> Alone:
         """One object, see `draw`."""
+        self._reopen()
         nothing = Skin(np.zeros((len(points), 2), np.float32), np.zeros((1, 1, 3), np.uint8))
         scene, nodes = self._scene([points], [nothing], intrinsics, window)
         return Alone(window, self._owners(scene, nodes, window)[1])
@@ -117,6 +113,7 @@ class Screen:
         """(h s, w s, 4) in [0, 1] by drawn pixel: colour, raised to 1/2.2 under a lamp, and coverage; both are
         averages over a pixel's samples. lamp: where (3,), and its intensity; without one colours show as they are.
         """
+        self._reopen()
         library = self._library
         scene = library.Scene(bg_color=(0.0, 0.0, 0.0, 0.0), ambient_light=(0.0, 0.0, 0.0))
         for coat in coats:
@@ -173,18 +170,40 @@ class Screen:
         return np.ascontiguousarray(found[..., 0]), np.where(depth > 0, depth, np.float32(np.inf))
 
     def _render(self, scene: Any, flags: int, names: dict[Any, Any] | None, window: Window) -> tuple[Any, Array]:
-        try:
-            return self._rendered(scene, flags, names, window)
-        except self._errors:
-            # Renderers of a process share one display, and the first that is deleted, ours or a user's, ends it.
-            del self._renderer
-            self._renderer = self._library.OffscreenRenderer(64, 64)
-            return self._rendered(scene, flags, names, window)
-
-    def _rendered(self, scene: Any, flags: int, names: dict[Any, Any] | None, window: Window) -> tuple[Any, Array]:
         self._renderer.viewport_width = window.width * SUPERSAMPLING
         self._renderer.viewport_height = window.height * SUPERSAMPLING
         return self._renderer.render(scene, flags=flags, seg_node_map=names)
+
+    def _open(self) -> None:
+        """Make a renderer, and leave a mark in its context by which `_reopen` knows it."""
+        try:
+            self._renderer = self._library.OffscreenRenderer(64, 64)
+            from OpenGL import GL
+
+            self._mark = os.urandom(16)
+            self._buffer = GL.glGenBuffers(1)
+            GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._buffer)
+            GL.glBufferData(GL.GL_ARRAY_BUFFER, len(self._mark), self._mark, GL.GL_STATIC_DRAW)
+        except Exception as error:  # a driver's errors have no common kind
+            raise NoSecondRendererError("pyrender", _EXPECTED, _line(error)) from error
+
+    def _reopen(self) -> None:
+        """Before a scene is made: open another context if this one is gone. All pyrender renderers of a process
+        share one display, and the first that is deleted, maybe a user's, ends it with all of its contexts. Their
+        handles may then be given to others' contexts, so that drawing on would show no error, but another picture.
+        """
+        from OpenGL import GL
+
+        try:
+            self._renderer._platform.make_current()
+            GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._buffer)
+            if bytes(GL.glGetBufferSubData(GL.GL_ARRAY_BUFFER, 0, len(self._mark))) == self._mark:
+                return
+        except Exception:  # a driver's errors have no common kind; whichever it is, the mark cannot be read
+            pass
+        # Without its platform the old renderer cannot delete what by now belongs to another.
+        self._renderer._platform = None
+        self._open()
 
 
 @cache

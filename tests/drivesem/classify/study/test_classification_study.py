@@ -166,7 +166,7 @@ def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
     cases = {
         ("--tables", "accuracy"): "--tables: expected names among degradation, ",
         ("--networks", f"{one},{one}"): "--networks: expected networks with commas, each of another name",
-        ("--networks", "vgg16"): "--network: expected squeezenet, or weights",
+        ("--networks", "vgg16"): "--network: expected squeezenet, weights",
         ("--networks", str(tmp_path / "gone.safetensors")): "gone.safetensors",
         ("--backgrounds", str(tmp_path / "gone")): "--backgrounds: expected a folder of photographs",
     }

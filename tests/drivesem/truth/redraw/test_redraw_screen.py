@@ -61,6 +61,15 @@ def test_another_renderer_of_the_process_may_come_and_go(screen: Screen) -> None
     pyrender.OffscreenRenderer(8, 8).delete()
     np.testing.assert_array_equal(seen(), before)
 
+    # Another that lives on may have been given the handle of the one that is gone: both have to draw.
+    pyrender.OffscreenRenderer(8, 8).delete()
+    other = pyrender.OffscreenRenderer(8, 8)
+    np.testing.assert_array_equal(seen(), before)
+    empty = pyrender.Scene(bg_color=(0.0, 0.0, 1.0, 1.0))
+    empty.add(pyrender.PerspectiveCamera(yfov=1.0))
+    assert other.render(empty)[0][4, 4].tolist() == [0, 0, 255]
+    np.testing.assert_array_equal(seen(), before)
+
 
 def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str, *_: object) -> None:
