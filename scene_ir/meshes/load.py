@@ -296,6 +296,8 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
         total += len(shape.faces)
         if total > _MOST_FACES:
             raise FormatError(f"{file}: faces", f"at most {_MOST_FACES:,}", "more")
+        if shape.vertices.shape[1] != 3:
+            raise FormatError(f"{file}: vertices", "three coordinates each", shape.vertices.shape[1])
         placed = trimesh.transform_points(shape.vertices, transform)
         index = np.asarray(shape.faces, dtype=np.int64)
         if index.min() < 0 or index.max() >= len(placed):
