@@ -90,7 +90,7 @@ class FramePool:
         for samples in (*looked, *drawn):
             of_cars = {index: sample for index, sample in samples.items() if bool(cars[index])}
             seen.append(_seen(objective, of_cars, everywhere.margins(of_cars)))
-        names = next((tuple(sample.features) for samples in drawn for sample in samples.values()), ())
+        names = next((tuple(sample.features) for samples in (*looked, *drawn) for sample in samples.values()), ())
         return cls(name, objective.t_star, names, tuple(seen[:LOOKS]), tuple(seen[LOOKS:]))
 
     def hidden_as_photographed(self, fault: PlantedFault) -> set[int]:
@@ -126,7 +126,7 @@ def sharpness(pools: Sequence[FramePool], fault: PlantedFault) -> float:
     """Share of the cars found at Halton's states, inside of a fault's bands by label, that it hides."""
     bands = bands_by_label(pools, fault)
     inside = lost = 0
-    for pool in pools:
+    for pool in (pool for pool in pools if pool.names):  # of a frame without cars there are none
         rows = [pool.names.index(band.feature) for band in bands]
         ends = [(row, band.low, band.high) for row, band in zip(rows, bands, strict=True)]
         cars = [

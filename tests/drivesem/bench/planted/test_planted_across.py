@@ -29,7 +29,7 @@ from drivesem.bench.planted.across_names import (
     searched_evidence,
     summary_rows,
 )
-from drivesem.bench.planted.pool import FramePool, SeenCar
+from drivesem.bench.planted.pool import LOOKS, FramePool, SeenCar
 from drivesem.questions.holes.results import Samples
 
 NAMES = ("height_px", "aspect", "across", "lightness", "contrast", "moved_m")
@@ -92,6 +92,14 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
 def test_what_no_car_reaches_is_not_planted() -> None:
     assert plant_across(world(2, 4), ("height_px",), 0) is None, "too few frames"
     assert plant_across([], ("height_px",), 0) is None
+
+
+def test_a_frame_without_cars_changes_nothing(pools: list[FramePool]) -> None:
+    empty = FramePool("empty", T_STAR, (), ((),) * LOOKS, ((),) * 12)
+    with_it, without = (plant_across(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
+    assert with_it is not None and without is not None
+    assert (with_it.fault, with_it.sharp) == (without.fault, without.sharp)
+    assert rows_of([with_it], [*pools, empty], [], ())[0].named == rows_of([without], pools, [], ())[0].named
 
 
 def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
