@@ -97,7 +97,8 @@ def test_what_no_car_reaches_is_not_planted() -> None:
 def test_a_frame_without_cars_changes_nothing(pools: list[FramePool]) -> None:
     empty = FramePool("empty", T_STAR, (), ((),) * LOOKS, ((),) * 12)
     with_it, without = (plant_across(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
-    assert with_it is not None and without is not None
+    assert with_it is not None
+    assert without is not None
     assert (with_it.fault, with_it.sharp) == (without.fault, without.sharp)
     assert rows_of([with_it], [*pools, empty], [], ())[0].named == rows_of([without], pools, [], ())[0].named
 
