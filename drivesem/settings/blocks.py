@@ -327,6 +327,9 @@ class Attacking(Regions, Threshold, Precision, Scenes):
     """How far parameters may go: paper; parking (0.5 m, 5 degrees); street (4 m along, 1 m across, 20 degrees,
     10 % in size, 15 degrees of sun); a YAML file; or translate=0.5m,rotate=5deg, also after a preset:
     street,translate=2m."""
+    parametrisation: Literal["ground", "roi"] = "ground"
+    """What a car's place is told in. ground: own lengths along and across its heading; roi: as 3D-SDN, which the
+    paper moved: the offset of its middle in sizes of its box in the picture, and log depth (docs/attacks.md)."""
     objective_labels: LabelMode = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.space import SPECS, Parameter, ParameterSpace
+from drivesem.attack.space import Parameter, ParameterSpace
 
 Kind = Literal["parameter", "object"]
 SURROUNDINGS = "surroundings"
@@ -68,7 +68,7 @@ def cells(space: ParameterSpace) -> Iterator[Cell]:
     for parameter in space.params:
         where = space.slice_of(parameter)
         assert where is not None
-        spec = SPECS[parameter]
+        spec = space.specs[parameter]
         if not spec.per_object:
             yield Cell(parameter, None, where)
             continue
