@@ -197,6 +197,9 @@ class DataSource(Seed, Limit):
 class Scenes(DataSource):
     """Frames, and how photographs are taken apart."""
 
+    split: str | None = None
+    """Of --root: the frames that 3D-SDN tests on (3d-sdn; Virtual KITTI), trains on (3d-sdn-train), or a file with
+    the names of frames, one a line (docs/derender.md)."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     cache: str | None = None
@@ -214,6 +217,8 @@ class Scenes(DataSource):
         beside = f"--dataset {self.dataset}"
         useless = self.cache is not None and self.dataset in (DEMO, SCENES)
         refuse(useless, "--cache", "a --dataset of photographs beside it", beside)
+        labelled = self.dataset in DATASETS
+        refuse(self.split is not None and not labelled, "--split", f"--dataset {', '.join(DATASETS)}", beside)
         self._check_photographs(beside)
 
     def _check_photographs(self, beside: str) -> None:

@@ -265,6 +265,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         )
         beside = f"study {self.name}"
         refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
+        divided = self.split is not None and self.name == "retrain"
+        refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
         other = self.other_detector is not None and self.name != "attribution"
         refuse(other, "--other-detector", "study attribution", beside)
 
@@ -904,6 +906,10 @@ class Train(Training, FrameCommand):
     """Folder of the data set, or several with commas: their frames are joined."""
     held_out: str | None = None
     """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
+    split: str | None = None
+    """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), or a file of names (docs/derender.md)."""
+    held_out_split: str | None = None
+    """The same of --held-out, which may be the same folder."""
     also: str | None = None
     """Folder of further frames whose figures go into the model card, KITTI layout."""
     frames: Annotated[int, POSITIVE] = 1000
@@ -960,6 +966,10 @@ class Train(Training, FrameCommand):
         made, given = self.dataset == SYNTH, (self.root, self.held_out) != (None, None)
         refuse(not made and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
         refuse(made and given, "--root, --held-out", "none with --dataset synth, which makes both", "one")
+        split = self.split if self.root is None else None
+        refuse(split is not None, "--split", "--root beside it", "nothing")
+        split = self.held_out_split if self.held_out is None else None
+        refuse(split is not None, "--held-out-split", "--held-out beside it", "nothing")
 
 
 @dataclass(frozen=True, kw_only=True)

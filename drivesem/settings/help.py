@@ -42,7 +42,9 @@ EXAMPLES = (
     ("drivesem doctor", "what this machine has, and what is missing"),
 )
 GROUPS: dict[str, tuple[str, ...]] = {
-    "what is attacked": (*("detector", "dataset", "root", "limit", "part", "focal", "finder", "tiles", "t_star"),),
+    "what is attacked": (
+        *("detector", "dataset", "root", "split", "limit", "part", "focal", "finder", "tiles", "t_star"),
+    ),
     "what may change": (
         *(
             "combo",

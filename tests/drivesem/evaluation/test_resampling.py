@@ -150,7 +150,8 @@ def test_holm_steps_down_keeps_the_order_and_leaves_out_what_was_not_tested() ->
     assert holm([]) == []
 
 
-def test_a_difference_without_its_test_is_the_same(rng: np.random.Generator = np.random.default_rng(0)) -> None:
+def test_a_difference_without_its_test_is_the_same() -> None:
+    rng = np.random.default_rng(0)
     sides = [[Figure("r", (Recalled(_tally(rng.integers(0, 6, 12), 12)),))] for _ in range(2)]
     (with_p,), (without,) = (
         differences(*sides, 12, 30, np.random.default_rng(1), test=test) for test in (True, False)
