@@ -199,9 +199,9 @@ class _Measures:
                 befores = [self._figures[name].before[0] for name in names]
                 less.append(befores[0])
                 more.append(befores[1])
-        frames = self._figures[OURS].frames
-        sides = ([Figure("ap50", tuple(p for figure in side for p in figure.parts))] for side in (less, more))
-        (found,) = differences(*sides, frames, self._draws, np.random.default_rng(self._seed))
+        first, second = (Figure("ap50", tuple(p for one in side for p in one.parts)) for side in (less, more))
+        frames, rng = self._figures[OURS].frames, np.random.default_rng(self._seed)
+        (found,) = differences([first], [second], frames, self._draws, rng)
         times = len(less) / len(steps)
         values = (found.difference, found.low, found.high)
         return Interval("ap50", *(None if value is None else times * value for value in values)), found.p

@@ -149,7 +149,8 @@ def _told(runs: Sequence[ArmRun], figures: Figures, draws: int, seed: int) -> St
     return StudyRow(
         runs=runs,
         benign=summary.benign.headline,
-        **after,
+        paper=after["paper"],
+        moved=after["moved"],
         drops={mode: figures.drops(mode, draws, seed) for mode in MODES},
         effects={},
         controls={},
