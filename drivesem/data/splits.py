@@ -1,9 +1,12 @@
-"""Which frames of a data set: 3D-SDN's split of Virtual KITTI, or names in a file."""
+"""Which frames of a data set: 3D-SDN's split of Virtual KITTI, a share drawn at random, or names in a file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from drivesem.data.registry import Dataset
 from scene_ir import files
@@ -16,6 +19,11 @@ _TESTED = {1: range(356, 447), 2: range(185, 233), 6: range(69), 18: range(270, 
 """Frames of each world that 3D-SDN tests on, in all ten variations; all others are trained on (Yao et al. 2018,
 `get_lists` of their code): 4,440 and 16,820 of 21,260 images.
 """
+
+
+_RANDOM = re.compile(r"random:(0?\.\d+)(:rest)?")
+_STREAM = 20261125
+"""Of the random order, the same for both of its parts."""
 
 
 class ChosenFrames:
@@ -39,13 +47,18 @@ class ChosenFrames:
 
 
 def chosen(dataset: Dataset, split: str) -> Dataset:
-    """The frames of a split: one of PUBLISHED, which is Virtual KITTI's, or a text file with a name a line, with
-    or without an ending such as .png. FormatError for other data sets, for a name that it has no frame of, and
-    where no frame is left.
+    """The frames of a split: one of PUBLISHED, which is Virtual KITTI's; `random:0.75`, a share drawn at random
+    and always the same, or `random:0.75:rest`, all others; or a text file with a name a line, with or without an
+    ending such as .png. FormatError for other data sets, for a name that it has no frame of, and where no frame is
+    left.
     """
-    names = dataset.identifiers
+    names, share = dataset.identifiers, _RANDOM.fullmatch(split)
     if split in PUBLISHED:
         kept = {name for name in names if _is_tested(name) == (split == PUBLISHED[0])}
+    elif share is not None:
+        order = np.random.default_rng(_STREAM).permutation(len(names))
+        count = round(float(share[1]) * len(names))
+        kept = {names[i] for i in (order[count:] if share[2] else order[:count])}
     else:
         kept = _named(Path(split), names)
     if not kept:

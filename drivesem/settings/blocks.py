@@ -198,8 +198,8 @@ class Scenes(DataSource):
     """Frames, and how photographs are taken apart."""
 
     split: str | None = None
-    """Of --root: the frames that 3D-SDN tests on (3d-sdn; Virtual KITTI), trains on (3d-sdn-train), or a file with
-    the names of frames, one a line (docs/derender.md)."""
+    """Of --root: the frames that 3D-SDN tests on (3d-sdn; Virtual KITTI) or trains on (3d-sdn-train); a share at
+    random (random:0.75) or all others (random:0.75:rest); or a file of names, one a line (docs/derender.md)."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     cache: str | None = None

@@ -907,7 +907,8 @@ class Train(Training, FrameCommand):
     held_out: str | None = None
     """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
     split: str | None = None
-    """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), or a file of names (docs/derender.md)."""
+    """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), random:0.75 or random:0.75:rest, or a file of
+    names (docs/derender.md)."""
     held_out_split: str | None = None
     """The same of --held-out, which may be the same folder."""
     also: str | None = None

@@ -115,7 +115,7 @@ def _size(space: ParameterSpace, theta: Tensor, cell: Cell) -> Size:
         values.append(value if physical is None else physical[0])
         units.add("code" if physical is None else physical[1])
     (unit,) = units
-    if cell.parameter is Parameter.TRANSLATE:
+    if cell.parameter is Parameter.TRANSLATE and space.parametrisation == "ground":
         value = math.hypot(*values)
     elif cell.parameter is Parameter.MESH:
         value = max(math.hypot(*values[k : k + 3]) for k in range(0, len(values), 3))

@@ -73,6 +73,18 @@ def test_generated_worlds_are_divided_and_read(tmp_path: Path, make_shot: Callab
     assert list(source.identifiers()) == ["0006/clone/00069"]
 
 
+def test_a_share_at_random_and_all_others_are_the_whole_in_its_order() -> None:
+    dataset = Named(virtual("vkitti1"))
+    some, others = (chosen(dataset, f"random:0.75{rest}").identifiers for rest in ("", ":rest"))
+    assert len(some) == round(0.75 * len(dataset.identifiers))
+    assert sorted((*some, *others)) == sorted(dataset.identifiers)
+    assert some == tuple(sorted(some, key=dataset.identifiers.index)) == chosen(dataset, "random:.75").identifiers
+    worlds = [{name[:10] for name in part} for part in (some, others)]
+    assert worlds[0] == worlds[1]  # the same drives
+    with pytest.raises(FormatError):
+        chosen(dataset, "random:1.5")
+
+
 def test_names_in_a_file_are_taken_in_the_data_sets_order(tmp_path: Path) -> None:
     dataset = Named(["0001/clone/00000", "0001/clone/00001", "a.b"])
     listed = tmp_path / "names.txt"

@@ -104,18 +104,21 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
 def test_a_detector_counts_with_what_its_fall_begins_from(
     frame: Callable[..., Any], arm_run: Callable[..., Any]
 ) -> None:
-    """A detector that finds one car less before and after has fallen no further."""
+    """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
     plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
     for arm in plan.arms():
         results = [frame(f"{i}") for i in range(FRAMES)]
         if arm.config.detector == "other":
             one = results[0].detections_benign[:1]
             results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
+            results[1] = replace(results[1], detections_attacked=one)
         runs.append(arm_run(arm, results))
     found = attributed(Study(name="attribution"), plan, Ran(tuple(runs), 0, {}), DRAWS)
     assert found.shares[-1].name == "detector"
-    assert found.shares[-1].points.value == pytest.approx(0, abs=1e-12)
-    assert (found.ours, found.papers) == (0, pytest.approx(0))
+    # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
+    assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))
+    assert found.shares[-1].points.value == pytest.approx(found.papers, abs=1e-12)
+    assert [share.points.value for share in found.shares[:-1]] == [0] * 6
 
 
 def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
