@@ -374,7 +374,7 @@ def notes(found: Findings) -> list[str]:
         )
     unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
     if unknown:
-        told.append(f"Grades unknown, of an older version: {', '.join(unknown)}.")
+        told.append(f"Grades unknown, of an older version or without them: {', '.join(unknown)}.")
     share = feasible_fraction([result for run in found.ran.runs for result in run.results])
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
     if found.ran.without_vehicles:
