@@ -170,7 +170,7 @@ class _Measures:
 
     def __init__(self, plan: Plan, ran: Ran, draws: int, seed: int) -> None:
         self._plan, self._draws, self._seed = plan, draws, seed
-        self._figures = {run.arm.name: Figures.of(run) for run in ran.runs}
+        self._figures = {run.arm.name: Figures.of(run).of_ap50() for run in ran.runs}
         self._detector = {run.arm.name: run.arm.config.detector for run in ran.runs}
 
     def falls(self, name: str) -> dict[str, Interval]:
@@ -182,6 +182,11 @@ class _Measures:
         figures = self._figures[self._plan.name(papers)]
         before, after = figures.before[0].value(), self._after(papers).value()
         return None if before is None or after is None else before - after
+
+    def step(self, one: _Arms, other: _Arms) -> float | None:
+        """How much further AP50 falls at the second stop than at the first."""
+        before, after = self.fall(one), self.fall(other)
+        return None if before is None or after is None else after - before
 
     def more(self, steps: Sequence[tuple[_Arms, _Arms]]) -> tuple[Interval, float | None]:
         """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p.
@@ -223,9 +228,9 @@ def attributed(study: Study, plan: Plan, ran: Ran, draws: int) -> Attribution:
             for way in ways
         ]
         points, p = measures.more(steps)
-        single = [measures.more([step])[0].value for step in steps]
         alone, _ = measures.more([(none, frozenset(factors))])
-        return Share(name, alone, points, (single[0], single[1])), p
+        in_order, in_reverse = (measures.step(*step) for step in steps)
+        return Share(name, alone, points, (in_order, in_reverse)), p
 
     found = [share(factor, [factor]) for factor in plan.factors]
     adjusted = holm([p for _, p in found])
