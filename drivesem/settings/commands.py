@@ -112,7 +112,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     early_stop: Flag = False
     """Stop a frame at its first success instead of using all steps or queries."""
     grade: bool = True
-    """See how sure failures are; without, all are by threshold, and a frame takes half the time."""
+    """See how sure failures are; without, all are by threshold, and certificates take no time."""
     changes: Annotated[str, Of(("climb", "corners"))] | None = None
     """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
     (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried on what was
