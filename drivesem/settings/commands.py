@@ -910,7 +910,7 @@ class Train(Training, FrameCommand):
     """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), random:0.75 or random:0.75:rest, or a file of
     names (docs/derender.md)."""
     held_out_split: str | None = None
-    """The same of --held-out, which may be the same folder."""
+    """The same of --held-out; where that is not given, of --root."""
     also: str | None = None
     """Folder of further frames whose figures go into the model card, KITTI layout."""
     frames: Annotated[int, POSITIVE] = 1000
@@ -967,10 +967,8 @@ class Train(Training, FrameCommand):
         made, given = self.dataset == SYNTH, (self.root, self.held_out) != (None, None)
         refuse(not made and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
         refuse(made and given, "--root, --held-out", "none with --dataset synth, which makes both", "one")
-        split = self.split if self.root is None else None
-        refuse(split is not None, "--split", "--root beside it", "nothing")
-        split = self.held_out_split if self.held_out is None else None
-        refuse(split is not None, "--held-out-split", "--held-out beside it", "nothing")
+        split = self.split or self.held_out_split
+        refuse(made and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
 
 
 @dataclass(frozen=True, kw_only=True)

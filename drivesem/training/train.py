@@ -218,7 +218,8 @@ def _warn_of_shared(config: Train, console: Console) -> None:
 def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
     """Layout, folder to train on, folder to judge by."""
     if config.dataset != SYNTH:
-        return config.dataset, Path(config.root or ""), Path(config.held_out) if config.held_out else None
+        held_out = config.held_out or (config.root if config.held_out_split else None)
+        return config.dataset, Path(config.root or ""), Path(held_out) if held_out else None
     from drivesem.synth.write import Order, synthesise
 
     root, held_out = out / "frames" / "train", out / "frames" / "held_out"
