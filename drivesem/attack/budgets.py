@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.attack.feasibility_check import Reach
-from drivesem.attack.space import Budget, Parameter
+from drivesem.attack.space import Budget, Parameter, Parametrisation
 from drivesem.settings.edits import (
     ANGLE_UNITS,
     LENGTH_UNITS,
@@ -69,9 +69,9 @@ def budget_of(text: str) -> Budget:
     return _budget("--budget", {name.strip(): _value(value) for name, _, value in pairs}, PRESETS[preset])
 
 
-def reach_of(budget: Budget) -> Reach:
+def reach_of(budget: Budget, parametrisation: Parametrisation = "ground") -> Reach:
     """The same budget, as the second check of feasibility takes it."""
-    return Reach(**asdict(budget))
+    return Reach(**asdict(budget), roi=parametrisation == "roi")
 
 
 def written(budget: Budget) -> str:

@@ -85,7 +85,7 @@ class Reach:
     across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
     partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
     boxes, of a lattice offset; size: share of its own, of a car that is neither hidden nor cut; codes: their
-    largest values.
+    largest values. roi: translate counts shares of the label's box in the picture, and log depth.
     """
 
     translate: float = 0.25
@@ -100,6 +100,7 @@ class Reach:
     partly: float = math.inf
     size: float = 0.0
     sun: float = 0.0
+    roi: bool = False
 
 
 PAPERS = Reach()
@@ -111,7 +112,10 @@ def check_reach(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
     """
     found = _codes(base, perturbed, reach)
     for i in range(len(base.objects)):
-        lines = _distance(_Pose(base, i), _Pose(perturbed, i), reach)
+        poses = _Pose(base, i), _Pose(perturbed, i)
+        lines = (_in_region(base, i, *poses, reach) if reach.roi else _on_ground(*poses, reach)) + _rest(
+            *poses, reach
+        )
         found += [f"objects[{i}]: {line}" for line in lines]
     return found
 
@@ -376,8 +380,25 @@ def _height(base: SceneIR, old: _Car, new: _Car) -> list[str]:
     return [f"off the ground by {rise:.3f} m"] if abs(rise) > HEIGHT_TOLERANCE_M else []
 
 
-def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
-    """By how much a car moved, turned and was bent, where that is more than `reach`."""
+def _in_region(base: SceneIR, i: int, old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+    """By how much the middle of a car's box moved, in sizes of its label in the picture and in the logarithm of
+    the squared distance, where that is more than `reach`.
+    """
+    matrix = base.camera.matrix.double().numpy()
+    eye = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    middles = np.stack([pose.position - [0.0, pose.size[1] / 2, 0.0] for pose in (old, new)])
+    clip = middles @ matrix[:, :3].T + matrix[:, 3]
+    pixels = clip[:, :2] / clip[:, 2:]
+    x0, y0, x1, y1 = base.objects.box2d[i].tolist()
+    shares = (pixels[1] - pixels[0]) / np.maximum([x1 - x0, y1 - y0], 1.0)
+    depth = 2 * math.log(np.linalg.norm(middles[1] - eye) / np.linalg.norm(middles[0] - eye))
+    if max(*np.abs(shares), abs(depth)) <= reach.translate + REACH_TOLERANCE:
+        return []
+    return [f"moved by {shares[0]:.3f}, {shares[1]:.3f} of its box and {depth:.3f} in log depth"]
+
+
+def _on_ground(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+    """By how much a car moved along and across, where that is more than `reach`."""
     found = []
     metres = old.axes @ (new.position - old.position)
     along, across = metres[0] / old.size[0], metres[2] / old.size[0]
@@ -388,6 +409,12 @@ def _distance(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
         found.append(f"moved by {along:.3f}, {across:.3f} own lengths")
     elif abs(metres[0]) > most_m + REACH_TOLERANCE or abs(metres[2]) > across_m + REACH_TOLERANCE:
         found.append(f"moved by {metres[0]:.3f}, {metres[2]:.3f} m")
+    return found
+
+
+def _rest(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+    """By how much a car turned, was bent and grew, where that is more than `reach`."""
+    found = []
     turned = math.remainder(new.yaw - old.yaw, 2 * math.pi)
     if abs(turned) > reach.rotate + REACH_TOLERANCE:
         found.append(f"turned by {turned:.3f} rad")

@@ -22,7 +22,7 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.attack.methods.base import Group, Problem, Score, Views
-from drivesem.attack.space import SPECS, Parameter, ParameterSpace
+from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.evaluation import failures
 from drivesem.settings.blocks import KEEP_MB
 from scene_ir import ffd
@@ -205,7 +205,7 @@ class Objective:
     def problem(self, feasible: FeasibleSet, keep_last: bool = False, views: Views | None = None) -> Problem:
         """This objective as attacks see it. keep_last, views: as of `Problem`."""
         return Problem(
-            loss_and_grad=self.loss_and_grad,
+            loss_and_grad=lambda theta: self._along(feasible, theta),
             project=feasible.project,
             score=self.score,
             step=self.space.step,
@@ -217,8 +217,13 @@ class Objective:
             views=views,
         )
 
+    def _along(self, feasible: FeasibleSet, theta: Tensor) -> tuple[float, Tensor]:
+        """Loss and gradient (D,), as far as the feasible set leaves theta free."""
+        loss, gradient = self.loss_and_grad(theta)
+        return loss, feasible.along(theta, gradient)
+
     def _group(self, parameter: Parameter, where: slice) -> Group:
-        owners = self.space.count if SPECS[parameter].per_object else 0
+        owners = self.space.count if self.space.specs[parameter].per_object else 0
         modes = ffd.low_modes() if parameter is Parameter.MESH else None
         smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.SIZE)
         return Group(parameter.value, where, owners, modes, smooth)

@@ -10,10 +10,12 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from drivesem.attack.regions import ROI_DIM, Regions
 from drivesem.attack.theta import ParameterSpec, ThetaSpace
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -63,6 +65,12 @@ SPECS: dict[Parameter, ParameterSpec] = {
     ),
 }
 
+Parametrisation = Literal["ground", "roi"]
+"""What `translate` counts: own lengths along and across, on the ground; or as 3D-SDN does (`attack.regions`)."""
+_IN_REGIONS = ParameterSpec(
+    ROI_DIM, True, "of its box, log depth", tuple(f"translate.{n}" for n in ("right", "down", "log_depth"))
+)
+
 COMBOS: dict[int, tuple[Parameter, ...]] = {
     1: (Parameter.TRANSLATE, Parameter.ROTATE),
     2: (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.MESH),
@@ -104,8 +112,14 @@ class Budget:
         unbounded = ("translate_m", "across_m", "of_distance", "partly")
         _check_positive("budget", self, unbounded, may_be_held=("size", "sun"))
 
-    def check(self, params: Iterable[Parameter]) -> None:
-        """FormatError where one of the parameters is held by this budget."""
+    def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
+        """FormatError where one of the parameters is held by this budget, or bounded in metres, which `roi` has
+        none of.
+        """
+        metres = (self.translate_m, self.across_m, self.of_distance, self.partly)
+        if parametrisation == "roi" and min(metres) < math.inf:
+            expected = "a budget without metres, such as paper or translate=0.1, with --parametrisation roi"
+            raise FormatError("budget", expected, "one with metres")
         for parameter in params:
             if getattr(self, parameter.value) == 0:
                 expected = f"a budget in which {parameter} may change, such as street"
@@ -143,7 +157,7 @@ def _check_positive(
 @dataclass(frozen=True, slots=True)
 class Perturbation:
     """theta by parameter; None where a parameter is held. color (N, 5), weather (4,), foliage (3,),
-    translate (N, 2), rotate (N, 1), mesh (N, 96), size (N, 1), sun (3,): changes from the
+    translate (N, 2), of `roi` (N, 3), rotate (N, 1), mesh (N, 96), size (N, 1), sun (3,): changes from the
     photographed scene.
     """
 
@@ -187,7 +201,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
     """The vector theta (D,) of one scene: names, bounds, steps, and the way from theta to a perturbed scene.
 
     Blocks follow each other in the order of `Parameter`; a block of a parameter of cars is (N, size), row-major.
-    dtype and device are those of the scene. Raises FormatError for a parameter that the budget holds.
+    dtype and device are those of the scene. parametrisation: of translate; of `roi` the budget's bound and the
+    step count for each of its three numbers. Raises FormatError for a parameter that the budget holds.
     """
 
     def __init__(
@@ -196,22 +211,26 @@ class ParameterSpace(ThetaSpace[Parameter]):
         params: Sequence[str],
         budget: Budget | None = None,
         steps: StepSizes | None = None,
+        parametrisation: Parametrisation = "ground",
     ) -> None:
-        super().__init__(normalise_params(params), SPECS, len(scene.objects), scene.objects.translation)
+        specs = SPECS | {Parameter.TRANSLATE: _IN_REGIONS} if parametrisation == "roi" else SPECS
+        super().__init__(normalise_params(params), specs, len(scene.objects), scene.objects.translation)
         self.scene = scene
+        self.parametrisation: Parametrisation = parametrisation
         self.budget = budget or Budget()
-        self.budget.check(self.params)
+        self.budget.check(self.params, parametrisation)
         self.steps = steps or StepSizes()
         # Constant, as nobody asks for a gradient to the photographed scene.
         self._axes = _ground_axes_of(scene).detach()
+        self.regions = Regions.of(scene) if parametrisation == "roi" else None
         for parameter, where in self._slices.items():
             low, high = self._bounds(parameter)
             self.lower[where] = low
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
-            if SPECS[parameter].per_object:
+            if specs[parameter].per_object:
                 for bound in (self.lower, self.upper):
-                    bound[where].view(self.count, SPECS[parameter].size)[behind_camera(scene)] = 0
+                    bound[where].view(self.count, specs[parameter].size)[behind_camera(scene)] = 0
 
     def unflatten(self, theta: Tensor) -> Perturbation:
         """theta (D,) as named tensors (views of it). Raises ShapeError."""
@@ -229,7 +248,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
                 if value is not None:
                     raise ShapeError(f"perturbation.{parameter.value}", "None (it is held)", tuple(value.shape))
                 continue
-            spec = SPECS[parameter]
+            spec = self.specs[parameter]
             shape = (self.count, spec.size) if spec.per_object else (spec.size,)
             if value is None or tuple(value.shape) != shape:
                 raise ShapeError(
@@ -243,9 +262,9 @@ class ParameterSpace(ThetaSpace[Parameter]):
     def apply(self, scene: SceneIR, theta: Tensor) -> SceneIR:
         """The scene at theta (D,); differentiable to theta. At theta = 0 all tensors equal the originals exactly.
 
-        A translation is a fraction of the car's own length, along and across its photographed heading; the car
-        keeps its height above the ground plane, and a size grows from its bottom face: the wheels stay where they
-        are. Mesh offsets are symmetric left to right, added to the source's.
+        A translation is a fraction of the car's own length, along and across its photographed heading, and the car
+        keeps its height above the ground plane; or it is what `Regions` says. A size grows from its bottom face:
+        the wheels stay where they are. Mesh offsets are symmetric left to right, added to the source's.
         Raises ShapeError, and RangeError naming a coordinate that is not finite.
         """
         self.check(theta)
@@ -253,8 +272,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
         objects, environment = scene.objects, scene.environment
         changes: dict[str, Tensor] = {}
         if part.translate is not None:
-            axes = self._axes if scene is self.scene else _ground_axes_of(scene)
-            changes["translation"] = objects.translation + (part.translate[:, None] @ axes)[:, 0]
+            changes["translation"] = objects.translation + self._shift(scene, part.translate)
         if part.rotate is not None:
             changes["yaw"] = objects.yaw + part.rotate[:, 0]
         if part.mesh is not None:
@@ -278,6 +296,13 @@ class ParameterSpace(ThetaSpace[Parameter]):
             codes["light"] = _within(light, part.sun, -self.budget.sun, self.budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
+    def _shift(self, scene: SceneIR, translate: Tensor) -> Tensor:
+        """What translate's block moves, (N, 3) m."""
+        if self.regions is not None:
+            return (self.regions if scene is self.scene else Regions.of(scene)).shift(translate)
+        axes = self._axes if scene is self.scene else _ground_axes_of(scene)
+        return (translate[:, None] @ axes)[:, 0]
+
     def carried(self, other: ParameterSpace, theta: Tensor) -> Tensor:
         """theta (D',) of another space of the same parameters, as one (D,) of this one, whose scene has the same
         vehicles, and perhaps more after them.
@@ -293,6 +318,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
         """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a bare code."""
         parameter, owner, k = self._locate(i)
         size_lhw = self.scene.objects.size_lhw
+        if parameter is Parameter.TRANSLATE and self.regions is not None:
+            return 100 * (math.expm1(value / 2) if k == ROI_DIM - 1 else value), "%"
         if parameter is Parameter.TRANSLATE:
             return value * float(size_lhw[owner, 0]), "m"
         if parameter is Parameter.ROTATE:
@@ -314,7 +341,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
             start, low = self.scene.environment.foliage, -limit
         elif parameter is Parameter.SUN:
             start, low = self.scene.environment.light.to(self.scene.objects.yaw), -limit
-        elif parameter is Parameter.TRANSLATE:
+        elif parameter is Parameter.TRANSLATE and self.parametrisation == "ground":
             budget, objects = self.budget, self.scene.objects
             length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()
             most_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])

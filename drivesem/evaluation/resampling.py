@@ -144,6 +144,11 @@ class Difference:
     high: float | None
     p: float | None
 
+    @property
+    def interval(self) -> Interval:
+        """The difference and its bounds."""
+        return Interval(self.name, self.difference, self.low, self.high)
+
 
 def intervals(
     figures: Sequence[Figure], frames: int, draws: int, generator: np.random.Generator
@@ -158,11 +163,18 @@ def intervals(
 
 
 def differences(
-    first: Sequence[Figure], second: Sequence[Figure], frames: int, draws: int, generator: np.random.Generator
+    first: Sequence[Figure],
+    second: Sequence[Figure],
+    frames: int,
+    draws: int,
+    generator: np.random.Generator,
+    test: bool = True,
 ) -> list[Difference]:
-    """Paired differences of the same figures of two detectors on the same frames."""
+    """Paired differences of the same figures of two detectors on the same frames. test: with the permutation test,
+    which takes as long again.
+    """
     weights = _draws(frames, draws, generator)
-    swaps = generator.random((draws, frames)) < 0.5
+    swaps = generator.random((draws if test else 0, frames)) < 0.5
     found: list[Difference] = []
     for a, b in zip(first, second, strict=True):
         va, vb = a.value(), b.value()
@@ -178,7 +190,7 @@ def differences(
             )
             # a hair's breadth: the same sum in another order must count as equal
             extreme += swapped is not None and abs(swapped) >= abs(vb - va) - 1e-12
-        p = (1 + extreme) / (1 + draws) if draws else None
+        p = (1 + extreme) / (1 + len(swaps)) if len(swaps) else None
         found.append(Difference(a.name, va, vb, vb - va, low, high, p))
     return found
 
@@ -201,6 +213,17 @@ def _bounds(values: Sequence[float | None]) -> tuple[float | None, float | None]
         return None, None
     low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
+
+
+def holm(ps: Sequence[float | None]) -> list[float | None]:
+    """p values of one table, each as small as may be said when all are looked at (Holm 1979); None stays."""
+    known = sorted((p, i) for i, p in enumerate(ps) if p is not None)
+    found: list[float | None] = [None] * len(ps)
+    least = 0.0
+    for rank, (p, i) in enumerate(known):
+        least = max(least, min(1.0, p * (len(known) - rank)))
+        found[i] = least
+    return found
 
 
 def wilson(found: int, count: int) -> tuple[float, float]:

@@ -173,7 +173,7 @@ def _check_sight(worker: Worker, results: Sequence[FrameResult]) -> None:
 def params_of(config: Attack) -> tuple[Parameter, ...]:
     """What is to move. Raises FormatError where the budget holds it."""
     params = _named_params(config)
-    budget_of(config.budget).check(params)
+    budget_of(config.budget).check(params, config.parametrisation)
     return params
 
 
@@ -252,9 +252,10 @@ class Worker:
             t_star=config.t_star,
             budget=budget_of(config.budget),
             aim=aim,
-            grader=self.grader,
+            grader=self.grader if config.grade else None,
             keep_last=config.keep == "last",
             only_bounds=config.project == "bounds",
+            parametrisation=config.parametrisation,
             whole=config.whole,
             keep_mb=config.keep_mb,
             changes=self.changes,

@@ -17,7 +17,7 @@ from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.budgets import reach_of
 from drivesem.attack.changes import DRAWS, Changes, affordable, passes_of, proposals
-from drivesem.attack.feasibility_check import check_scene, judge_at_hand
+from drivesem.attack.feasibility_check import Reach, check_scene, judge_at_hand
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode, MovedLabels, shown_boxes, to_kitti_labels
@@ -27,7 +27,7 @@ from drivesem.attack.methods.given import Given
 from drivesem.attack.methods.margin_search import FRESH, OfMargins, value_of
 from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.objective import Objective, Rendered
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
 from drivesem.data import kitti
 from drivesem.evaluation.failures import Failures
 from drivesem.run.report import pictures
@@ -57,9 +57,9 @@ class FrameSettings:
     """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
     to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
     budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
-    how sure its failures are, None to leave them ungraded. keep_last,
-    only_bounds: as the paper's protocol has it, see `Problem` and `FeasibleSet`. whole, keep_mb: see `Objective`.
-    changes: what is proposed after a search on margins, None for nothing.
+    how sure its failures are, None to leave them ungraded. keep_last, only_bounds: as the paper's protocol has it,
+    see `Problem` and `FeasibleSet`. parametrisation: of translate. whole, keep_mb: see `Objective`. changes: what
+    is proposed after a search on margins, None for nothing.
     """
 
     attack: AttackMethod
@@ -74,6 +74,7 @@ class FrameSettings:
     grader: Grader | None = None
     keep_last: bool = False
     only_bounds: bool = False
+    parametrisation: Parametrisation = "ground"
     whole: bool = False
     keep_mb: float = KEEP_MB
     changes: Changes | None = None
@@ -154,7 +155,7 @@ class _Posed:
     def of(cls, identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> _Posed:
         objective = Objective(
             Compositor(scene, settings.render),
-            ParameterSpace(scene, settings.params, settings.budget),
+            ParameterSpace(scene, settings.params, settings.budget, parametrisation=settings.parametrisation),
             detector,
             settings.label_mode,
             settings.term,
@@ -235,7 +236,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
         active_constraints=search.active_constraints,
-        violations=tuple(check_scene(perturbed.at_rest(), perturbed, reach=reach_of(objective.space.budget))),
+        violations=tuple(check_scene(perturbed.at_rest(), perturbed, reach=_reach(objective.space))),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(attacked.benign, names),
@@ -255,6 +256,10 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         joint_weather=True,
         change=scene.provenance.get(CHANGE, "") if scene.before is not None else "",
     )
+
+
+def _reach(space: ParameterSpace) -> Reach:
+    return reach_of(space.budget, space.parametrisation)
 
 
 def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:

@@ -14,6 +14,7 @@ PROTOCOL = {
     "objective_labels": "paper",
     "keep": "last",
     "project": "bounds",
+    "parametrisation": "roi",
 }
 """Settings of configs/paper.yaml, but for the budget and for what moves."""
 _AS_EVER = ("rate", "momentum", "restarts", "scouts", "target_objects", "target_classes", "precision", "t_star")

@@ -36,7 +36,7 @@ def rebuilt(
     Raises FormatError.
     """
     scene = load_scene(folder / "scene").at_rest()
-    space = ParameterSpace(scene, params, budget_of(attack.budget))
+    space = ParameterSpace(scene, params, budget_of(attack.budget), parametrisation=attack.parametrisation)
     if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)

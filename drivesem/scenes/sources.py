@@ -74,9 +74,11 @@ class PhotographSource:
 
     def __init__(self, config: Scenes) -> None:
         from drivesem.data.registry import open_dataset
+        from drivesem.data.splits import chosen
 
         points = isinstance(config, Derender) and config.velodyne
-        self._dataset = open_dataset(config.dataset, config.root or "", with_points=points, focal_px=config.focal)
+        dataset = open_dataset(config.dataset, config.root or "", with_points=points, focal_px=config.focal)
+        self._dataset = dataset if config.split is None else chosen(dataset, config.split)
         self._settings = _settings(config)
         self._kept = _kept_scenes(config)
 

@@ -197,6 +197,9 @@ class DataSource(Seed, Limit):
 class Scenes(DataSource):
     """Frames, and how photographs are taken apart."""
 
+    split: str | None = None
+    """Of --root: the frames that 3D-SDN tests on (3d-sdn; Virtual KITTI) or trains on (3d-sdn-train); a share at
+    random (random:0.75) or all others (random:0.75:rest); or a file of names, one a line (docs/derender.md)."""
     fit: bool = True
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     cache: str | None = None
@@ -214,6 +217,8 @@ class Scenes(DataSource):
         beside = f"--dataset {self.dataset}"
         useless = self.cache is not None and self.dataset in (DEMO, SCENES)
         refuse(useless, "--cache", "a --dataset of photographs beside it", beside)
+        labelled = self.dataset in DATASETS
+        refuse(self.split is not None and not labelled, "--split", f"--dataset {', '.join(DATASETS)}", beside)
         self._check_photographs(beside)
 
     def _check_photographs(self, beside: str) -> None:
@@ -327,6 +332,9 @@ class Attacking(Regions, Threshold, Precision, Scenes):
     """How far parameters may go: paper; parking (0.5 m, 5 degrees); street (4 m along, 1 m across, 20 degrees,
     10 % in size, 15 degrees of sun); a YAML file; or translate=0.5m,rotate=5deg, also after a preset:
     street,translate=2m."""
+    parametrisation: Literal["ground", "roi"] = "ground"
+    """What a car's place is told in. ground: own lengths along and across its heading; roi: as 3D-SDN, which the
+    paper moved: the offset of its middle in sizes of its box in the picture, and log depth (docs/attacks.md)."""
     objective_labels: LabelMode = "moved"
     """Labels the attack aims at: moved with the cars, or the benign ones as in the paper."""
     objective: Literal["objectness", "confidence", "total", "failure", "hide", "phantom", "localisation"] = (

@@ -111,6 +111,8 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
     early_stop: Flag = False
     """Stop a frame at its first success instead of using all steps or queries."""
+    grade: bool = True
+    """See how sure failures are; without, all are by threshold, and certificates take no time."""
     changes: Annotated[str, Of(("climb", "corners"))] | None = None
     """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
     (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried on what was
@@ -169,19 +171,21 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
                 "samples",
                 "steps",
                 "labels",
+                "attribution",
                 "transfer",
                 "retrain",
                 "classification",
             ]
         ],
         tyro.conf.arg(
-            metavar="{single,multi,grades,searches,samples,steps,labels,transfer,retrain,classification}"
+            metavar="{single,multi,grades,searches,samples,steps,labels,attribution,transfer,retrain,classification}"
         ),
     ]
     """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
     gradient, sampling and placebo; searches: which method finds failures that hold, at as many passes each;
     samples: success against queries for each algorithm; steps: success against number and size of steps; labels:
-    what labels that stay behind make of an attack; transfer: counterexamples of combination 2 before other
+    what labels that stay behind make of an attack; attribution: which part of the paper's protocol takes how many
+    points; transfer: counterexamples of combination 2 before other
     detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
     counterexamples; classification: the paper's tables for image classifiers (docs/classify.md)."""
     out: Place = None
@@ -191,6 +195,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     retrain, which trains on other frames, in another."""
     detector: str = "squeezedet"
     """A shipped detector, a file, or another project's that has a gradient (docs/detectors.md)."""
+    bootstrap: NotNegative | None = None
+    """Draws of frames for intervals, by default 1000, of classification 200; 0 leaves them out."""
     steps: Count = 10
     """Steps of the attack; steps goes twice as far."""
     queries: Count = 64
@@ -209,9 +215,16 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's."""
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
+    seeds: Count | None = None
+    """Single, multi: seeds of random numbers for each control, by default 3, 1 with --quick."""
+    paper_protocol: bool = True
+    """Single, multi: beside each arm the same by the paper's exact protocol (--config paper), where the detector
+    has its loss."""
     confirm: Flag = False
     """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
     What is certain is drawn by it in any case."""
+    other_detector: str | None = None
+    """Attribution: a detector that is the paper's where ours is --detector, as one more factor."""
     detectors: str = "squeezedet,yolov3-slim"
     """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
     sources: str | None = None
@@ -250,7 +263,12 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         refuse(
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
-        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", f"study {self.name}")
+        beside = f"study {self.name}"
+        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
+        divided = self.split is not None and self.name == "retrain"
+        refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
+        other = self.other_detector is not None and self.name != "attribution"
+        refuse(other, "--other-detector", "study attribution", beside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -888,6 +906,11 @@ class Train(Training, FrameCommand):
     """Folder of the data set, or several with commas: their frames are joined."""
     held_out: str | None = None
     """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
+    split: str | None = None
+    """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), random:0.75 or random:0.75:rest, or a file of
+    names (docs/derender.md)."""
+    held_out_split: str | None = None
+    """The same of --held-out; where that is not given, of --root."""
     also: str | None = None
     """Folder of further frames whose figures go into the model card, KITTI layout."""
     frames: Annotated[int, POSITIVE] = 1000
@@ -944,6 +967,8 @@ class Train(Training, FrameCommand):
         made, given = self.dataset == SYNTH, (self.root, self.held_out) != (None, None)
         refuse(not made and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
         refuse(made and given, "--root, --held-out", "none with --dataset synth, which makes both", "one")
+        split = self.split or self.held_out_split
+        refuse(made and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,15 +42,27 @@ EXAMPLES = (
     ("drivesem doctor", "what this machine has, and what is missing"),
 )
 GROUPS: dict[str, tuple[str, ...]] = {
-    "what is attacked": (*("detector", "dataset", "root", "limit", "part", "focal", "finder", "tiles", "t_star"),),
+    "what is attacked": (
+        *("detector", "dataset", "root", "split", "limit", "part", "focal", "finder", "tiles", "t_star"),
+    ),
     "what may change": (
-        *("combo", "params", "budget", "changes", "mesh", "project", "target_objects", "target_classes"),
+        *(
+            "combo",
+            "params",
+            "budget",
+            "parametrisation",
+            "changes",
+            "mesh",
+            "project",
+            "target_objects",
+            "target_classes",
+        ),
     ),
     "how it is searched": (
         *("method", "steps", "queries", "passes", "early_stop", "objective", "objective_labels", "keep"),
         *("scouts", "restarts", "range", "rate", "momentum", "step_form", "norm", "like"),
     ),
-    "how sure a failure is": ("draws", "nuisances", "confirm", "witness", "peer", "bootstrap"),
+    "how sure a failure is": ("grade", "draws", "nuisances", "confirm", "witness", "peer", "bootstrap"),
     "results": ("out", "resume", "json", "keep_going", "seed", "trust"),
     "how it is computed": (
         *("workers", "engine", "address", "device", "precision", "backend", "whole", "incremental", "keep_mb"),

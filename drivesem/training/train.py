@@ -20,6 +20,7 @@ from detectors.registry import read_weights
 from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.data.joined import open_folders
+from drivesem.data.splits import chosen
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import SHARING, claim
@@ -187,12 +188,13 @@ def _data(
         distributed.barrier()
     name, root, held_out = _folders(config, out, rank, console)
     _warn_of_shared(config, console)
-    frames = _store(config, name, root, out / CACHES / "train", detector, console)
+    frames = _store(config, name, root, out / CACHES / "train", detector, console, split=config.split)
     if frames.objects() == 0:
         raise UsageError(str(root), f"frames with objects of {', '.join(detector.classes)}", "none")
     judged = None
     if held_out is not None:
-        store = _store(config, name, held_out, out / CACHES / "held_out", detector, console, whole=True)
+        cache, split = out / CACHES / "held_out", config.held_out_split
+        store = _store(config, name, held_out, cache, detector, console, whole=True, split=split)
         also = None
         if config.also is not None:
             also = _store(config, "kitti", Path(config.also), out / CACHES / "also", detector, console, whole=True)
@@ -204,6 +206,8 @@ def _data(
 
 def _warn_of_shared(config: Train, console: Console) -> None:
     """Say where frames to judge by are among those that are trained on."""
+    if config.split != config.held_out_split:
+        return  # parts of one folder
     trained = {Path(part).resolve() for part in (config.root or "").split(",") if part}
     judged = [part for part in (config.held_out or "").split(",") if part and Path(part).resolve() in trained]
     for part in judged:
@@ -214,7 +218,8 @@ def _warn_of_shared(config: Train, console: Console) -> None:
 def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
     """Layout, folder to train on, folder to judge by."""
     if config.dataset != SYNTH:
-        return config.dataset, Path(config.root or ""), Path(config.held_out) if config.held_out else None
+        held_out = config.held_out or (config.root if config.held_out_split else None)
+        return config.dataset, Path(config.root or ""), Path(held_out) if held_out else None
     from drivesem.synth.write import Order, synthesise
 
     root, held_out = out / "frames" / "train", out / "frames" / "held_out"
@@ -231,9 +236,18 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
 
 
 def _store(
-    config: Train, name: str, root: Path, cache: Path, detector: Detector, console: Console, whole: bool = False
+    config: Train,
+    name: str,
+    root: Path,
+    cache: Path,
+    detector: Detector,
+    console: Console,
+    whole: bool = False,
+    split: str | None = None,
 ) -> FrameStore:
     dataset = open_folders(name, str(root))
+    if split is not None:
+        dataset = chosen(dataset, split)
     names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
     if not names:
         raise UsageError(str(root), "at least one frame", "none")

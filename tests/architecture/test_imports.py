@@ -57,7 +57,7 @@ class Rule:
 
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
-_JOINED = ("drivesem.attack.theta", "drivesem.attack.space", "drivesem.attack.feasible", "drivesem.attack.methods")
+_JOINED = tuple(f"drivesem.attack.{name}" for name in ("theta", "regions", "space", "feasible", "methods"))
 _BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "store", "synth")
 _BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings", "store")
 _NOT_TO_SHOW = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster")

@@ -3,7 +3,8 @@ Feasible means: inside the bounds; the mesh is not inverted and only moderately 
 fixed vertically, nothing below its wheels; cars stay on the kind of surface they stood on, do not pass through
 each other, and stay in the picture and visible; weather is one that there is, and cars show through it. No
 constraint may be violated more than at theta = 0 (real labels overlap and park on kerbs), so theta = 0 is always
-feasible. The pose stays on the ground plane by construction of `ParameterSpace.apply`.
+feasible. The pose stays on the ground plane by construction of `ParameterSpace.apply`; where a car's place is told
+in the picture (`attack.regions`), its offset down follows the others.
 
 `drivesem.attack.feasibility_check` judges finished scenes a second time and shares no code with this module.
 """
@@ -59,6 +60,7 @@ class FeasibleSet:
         length_m = objects.size_lhw[:, 0].detach().cpu().double()
         # (N, 2, 3): what one own length along and one across move.
         self._shift = array(ground_axes(objects.yaw.detach().cpu().double(), length_m, ground))
+        self._regions = None if space.regions is None else space.regions.double()
         self._surface = CarSurfaces(space.scene)
         self._strain = StrainBound(self._surface.offsets, self.limits.strain)
         self._surroundings = Surroundings(space.scene)
@@ -104,6 +106,7 @@ class FeasibleSet:
         found += [] if self._weather is None else self._weather.violations(values)
         if self.space.count == 0:
             return tuple(found)
+        found += self._off_ground(values.copy())
         mesh = self._block(values, Parameter.MESH)
         if mesh is not None:
             found += [f"objects[{i}]: lowest layer" for i in np.flatnonzero((lowest(mesh) != 0).any(axis=(1, 2)))]
@@ -121,6 +124,7 @@ class FeasibleSet:
             active += self._weather.bound(boxed, values)
         if self.space.count == 0:
             return boxed, active
+        active += self._off_ground(boxed)
         mesh, surface = self._block(boxed, Parameter.MESH), None
         if mesh is not None:
             lowest(mesh)[:] = 0
@@ -133,6 +137,38 @@ class FeasibleSet:
             active += found.names()
             self._back_off(cars, boxed, surface, offenders)
         return boxed, active
+
+    def along(self, theta: Tensor, gradient: Tensor) -> Tensor:
+        """What a gradient (D,) at theta (D,) is of the coordinates that are free: where cars are held to the
+        ground, what the offset down adds to those that it follows, and nothing of its own.
+        """
+        where = self.space.slice_of(Parameter.TRANSLATE)
+        if self.only_bounds or self.space.count == 0 or self._regions is None or where is None:
+            return gradient
+        gradient = gradient.clone()
+        slope, change = (values[where].view(self.space.count, -1) for values in (gradient, theta))
+        slope[:, ::2] += slope[:, 1:2] * self._regions.slopes(change.cpu().double()).to(slope)
+        slope[:, 1] = 0
+        return gradient
+
+    def _off_ground(self, values: Values) -> list[str]:
+        """Put cars that are placed in the picture back onto the ground, in place; returns who was off it."""
+        translate = self._block(values, Parameter.TRANSLATE)
+        if self._regions is None or translate is None:
+            return []
+        before = translate.copy()
+        translate[:] = self._grounded(translate, self._everyone)
+        off = np.abs(translate - before).max(axis=1) > TOLERANCE
+        return [f"objects[{i}]: ground" for i in np.flatnonzero(off)]
+
+    def _grounded(self, translate: Values, rows: Indices) -> Values:
+        """Translations (M, k) of cars `rows` with what is not free."""
+        where = self.space.slice_of(Parameter.TRANSLATE)
+        if self._regions is None or where is None:
+            return translate
+        most = self._upper[where].reshape(self.space.count, -1)[rows, 1]
+        change = torch.from_numpy(translate.astype(np.float64))
+        return array(self._regions.double(torch.from_numpy(rows)).grounded(change, torch.from_numpy(most)))
 
     def _box(self, values: Values) -> Values:
         return np.minimum(np.maximum(values, self._lower), self._upper).astype(values.dtype)
@@ -177,11 +213,14 @@ class FeasibleSet:
         if size is not None:
             low, high = low * (1 + size), high * (1 + size)
         yaw = self._yaw if rotate is None else self._yaw + rotate[:, 0]
-        translation = self._translation if translate is None else self._moved(translate, slice(None))
+        translation = self._translation if translate is None else self._moved(translate, self._everyone)
         return Cars.of(low, high, yaw, translation.copy())
 
-    def _moved(self, translate: Values, rows: Indices | slice) -> Array:
-        """Where cars `rows` are (M, 3) m, moved by own lengths (M, 2)."""
+    def _moved(self, translate: Values, rows: Indices) -> Array:
+        """Where cars `rows` are (M, 3) m, moved by what theta has of them (M, k)."""
+        if self._regions is not None:
+            regions = self._regions.double(torch.from_numpy(rows))
+            return self._translation[rows] + array(regions.shift(torch.from_numpy(translate.astype(np.float64))))
         shift = self._shift[rows]
         return self._translation[rows] + translate[:, :1] * shift[:, 0] + translate[:, 1:] * shift[:, 1]
 
@@ -252,14 +291,16 @@ class FeasibleSet:
 
             self._take_up(cars, offenders, rotate, turn)
         if translate is not None:
+
+            def move(moved: Indices) -> None:
+                translate[moved] = self._grounded(translate[moved], moved)
+                cars.translation[moved] = self._moved(translate[moved], moved)
+
             # A kerb stops a car across its heading, not along: the two are found one after the other.
-            for column in range(2):
-                start = cars.translation.copy()
-
-                def move(moved: Indices, start: Array = start, column: int = column) -> None:
-                    shift = self._shift[moved, column]
-                    cars.translation[moved] = start[moved] + translate[moved, column, None] * shift
-
+            goal = translate.copy()
+            translate[offenders] = 0
+            for column in (0, goal.shape[1] - 1):
+                translate[offenders, column] = goal[offenders, column]
                 self._take_up(cars, offenders, translate[:, column : column + 1], move)
 
     def _take_up_mesh(self, cars: Cars, values: Values, surface: Array, offenders: Flags) -> None:

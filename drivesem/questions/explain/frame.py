@@ -232,7 +232,12 @@ def _least(
         norm=judge.size(small),
         outcome=judge.outcome(small, torch.ones_like(small, dtype=torch.bool)),
         violations=tuple(
-            check_scene(space.scene, rendered.scene, joint_weather=joint_weather, reach=reach_of(space.budget))
+            check_scene(
+                space.scene,
+                rendered.scene,
+                joint_weather=joint_weather,
+                reach=reach_of(space.budget, space.parametrisation),
+            )
         ),
         sizes=tuple(players.sizes(space, small)),
         failures=failure_records(

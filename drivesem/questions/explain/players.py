@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.space import SPECS, Parameter, ParameterSpace
+from drivesem.attack.space import Parameter, ParameterSpace
 
 Kind = Literal["parameter", "object"]
 SURROUNDINGS = "surroundings"
@@ -68,7 +68,7 @@ def cells(space: ParameterSpace) -> Iterator[Cell]:
     for parameter in space.params:
         where = space.slice_of(parameter)
         assert where is not None
-        spec = SPECS[parameter]
+        spec = space.specs[parameter]
         if not spec.per_object:
             yield Cell(parameter, None, where)
             continue
@@ -115,7 +115,7 @@ def _size(space: ParameterSpace, theta: Tensor, cell: Cell) -> Size:
         values.append(value if physical is None else physical[0])
         units.add("code" if physical is None else physical[1])
     (unit,) = units
-    if cell.parameter is Parameter.TRANSLATE:
+    if cell.parameter is Parameter.TRANSLATE and space.parametrisation == "ground":
         value = math.hypot(*values)
     elif cell.parameter is Parameter.MESH:
         value = max(math.hypot(*values[k : k + 3]) for k in range(0, len(values), 3))

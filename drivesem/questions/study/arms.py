@@ -8,12 +8,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from drivesem.attack.objective import GRADIENT_PASSES
 from drivesem.attack.space import SIX, Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.run.protocol import follows_paper
+from drivesem.run.protocol import PROTOCOL, follows_paper
 from drivesem.settings.blocks import Attacking, Grading, Sharing, shared
 from drivesem.settings.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
 from scene_ir import files
@@ -21,9 +22,14 @@ from scene_ir.errors import FormatError
 
 QUICK_FRAMES, FRAMES = 6, 200
 """Frames of a study with --quick, and without."""
+DRAWS = 1000
+"""Of frames, for a study's intervals."""
 RANDOM, PLACEBO = "random", "placebo"
 """Controls: the best of as many random samples as the attack takes steps, of the box that those steps reach; and
 one random edit as large as the attack's own."""
+SEEDS = 3
+"""Of random numbers, for each control of a full study."""
+PAPERS = "paper's protocol"
 _LONGER = 4
 """Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
 FIGURES = "study.json"
@@ -56,18 +62,24 @@ def attack_of(study: Study) -> Attack:
     return Attack(**alike | {"limit": limit, "method": study.method, "confirm": Attack.confirm})
 
 
+def draws_of(study: Study) -> int:
+    """Of frames, for intervals."""
+    return DRAWS if study.bootstrap is None else study.bootstrap
+
+
 def arms_of(study: Study, out: Path) -> list[Arm]:
     """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
     base = attack_of(study)
-    if study.name == "single":
-        single = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
-        return _controlled(single, out) if study.controls else single
-    if study.name == "multi":
-        multi = [_combo(base, number) for number in COMBO_NUMBERS]
-        if study.method == "si-fgsm":
+    if study.name in ("single", "multi"):
+        ours = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
+        if study.name == "multi":
+            ours = [_combo(base, number) for number in COMBO_NUMBERS]
+        arms = [*ours, *(_papers(ours) if _has_papers(study) else [])]
+        if study.name == "multi" and study.method == "si-fgsm":
             longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
-            multi.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
-        return _controlled(multi, out) if study.controls else multi
+            arms.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
+        seeds = study.seeds or (1 if study.quick else SEEDS)
+        return _controlled(arms, out, seeds=seeds) if study.controls else arms
     if study.name == "grades":
         return _grades(base, out)
     if study.name == "searches":
@@ -94,8 +106,30 @@ def _combo(base: Attack, number: int) -> Arm:
     return _arm(f"combo {number}", replace(base, combo=number), PAPER_COMBOS[number])
 
 
-def _controlled(arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO)) -> list[Arm]:
-    """Each arm, followed by its controls."""
+def _has_papers(study: Study) -> bool:
+    """Whether the paper's protocol can stand beside: its loss is that of this project's own architectures."""
+    elsewhere = ":" in study.detector or study.detector.endswith(".onnx")
+    return study.paper_protocol and not elsewhere and not follows_paper(attack_of(study))
+
+
+def _papers(arms: Sequence[Arm]) -> list[Arm]:
+    """The same by the paper's exact protocol."""
+    papers: dict[str, Any] = PROTOCOL
+    references = {f"combo {number}": value for number, value in PAPER_COMBOS.items()} | PAPER_SINGLE
+    return [_arm(f"{a.name}, {PAPERS}", replace(a.config, **papers), references[a.name]) for a in arms]
+
+
+def matching(config: Attack) -> str:
+    """The control that has as many chances as an attack: one draw, or the best of as many where the best of all
+    iterates is kept.
+    """
+    return RANDOM if config.keep == "best" else PLACEBO
+
+
+def _controlled(
+    arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO), seeds: int = 1
+) -> list[Arm]:
+    """Each arm, followed by its controls, by so many seeds. Random samples are of attacks that keep the best."""
     found: list[Arm] = []
     for arm in arms:
         # As the run's own settings say it: relative to where the command is called.
@@ -105,9 +139,13 @@ def _controlled(arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, 
             PLACEBO: replace(arm.config, method="placebo", like=size_of),
         }
         found.append(arm)
-        for kind in kinds:
-            name, folder = f"{arm.name} {kind}", f"{arm.folder}-{kind}"
-            found.append(Arm(name, folder, configs[kind], control=kind, of=arm.name))
+        for kind in (kind for kind in kinds if kind == PLACEBO or matching(arm.config) == kind):
+            for number in range(seeds):
+                name, folder = f"{arm.name} {kind}", f"{arm.folder}-{kind}"
+                if number:
+                    name, folder = f"{name} {number + 1}", f"{folder}-{number + 1}"
+                config = replace(configs[kind], seed=arm.config.seed + number)
+                found.append(Arm(name, folder, config, control=kind, of=arm.name))
     return found
 
 

@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.confirm.asking import confirm_run
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study import report, retrain, retrain_report, transfer
-from drivesem.questions.study.arms import FIGURES, arms_of
+from drivesem.questions.study.arms import FIGURES, arms_of, attack_of, draws_of
+from drivesem.questions.study.attribution import Plan, attributed, write_waterfall
+from drivesem.questions.study.attribution import told as told_of_factors
 from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
@@ -35,10 +36,10 @@ from drivesem.truth.redraw.choose import SecondRenderers
 _PICTURE, _LARGEST = "study.png", "largest.jpg"
 _TABLES = (
     "study.md",
-    *(f"{name}.csv" for name in ("study", "curves", "label_sets", "grades", "searches", "standing")),
+    *(f"{name}.csv" for name in ("study", "curves", "label_sets", "grades", "searches", "standing", "arms")),
 )
 _WRITTEN = (*(_PICTURE, FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
-_FREE = (*PRESENTATION, "quick", "controls", "confirm", "bootstrap")
+_FREE = (*PRESENTATION, "quick", "controls", "seeds", "paper_protocol", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
 _FREE_IN_RETRAIN = (
     *(name for name in PRESENTATION if name != "limit"),
@@ -84,6 +85,16 @@ def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
     return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)))[0] for arm in arms}
 
 
+def _attribution(config: Study, out: Path, console: Console) -> _Found:
+    """What lies between ours and the paper's protocol."""
+    plan = Plan.of(config, attack_of(config))
+    arms = plan.arms()
+    workers = workers_of(arms)
+    claim(out, config, _WRITTEN, _FREE)
+    found = attributed(config, plan, run_arms(arms, workers, out), draws_of(config))
+    return found.to_json(), told_of_factors(found), partial(write_waterfall, found=found)
+
+
 def _transfer(config: Study, out: Path, console: Console) -> _Found:
     """Counterexamples before other detectors."""
     arms = arms_of(config, out)
@@ -102,12 +113,12 @@ def _retrain(config: Study, out: Path, console: Console) -> _Found:
     return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
 
 
-_STUDIES = {"transfer": _transfer, "retrain": _retrain}
+_STUDIES = {"attribution": _attribution, "transfer": _transfer, "retrain": _retrain}
 """Studies that are more than attacks side by side."""
 
 
 def _findings(config: Study, ran: Ran, out: Path) -> Findings:
-    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    draws = draws_of(config)
     grades = [grades_of(one, draws, config.seed) for one in ran.runs if not one.summary.frames_ungraded]
     found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
     if config.name == "labels":

@@ -73,7 +73,7 @@ def _falls(axes: Axes, rows: Sequence[StudyRow]) -> None:
         falls = [100 * (PAPER_BENIGN - reference) for _, reference in paper]
         axes.plot([i for i, _ in paper], falls, "D", color=_BLACK, label="the paper", markersize=6, zorder=4)
     axes.axhline(0, color=_BLACK, linewidth=0.8)
-    axes.set_xticks(range(len(rows)), [row.name for row in rows])
+    axes.set_xticks(range(len(rows)), [row.name.replace(", ", "\n") for row in rows])
     axes.set_ylabel("fall of AP50, points")
     axes.set_title("What the attack takes from AP50; lines: 95 % of draws of frames", loc="left", fontsize=11)
 

@@ -142,18 +142,21 @@ def _precision(rows: Sequence[StudyRow]) -> Sheet:
 
 def _controls(rows: Sequence[StudyRow]) -> Sheet:
     kinds = [kind for kind in (RANDOM, PLACEBO) if any(kind in row.controls for row in rows)]
+    tested = any(row.p is not None for row in rows)
     lines = []
     for row in rows:
         cells = [row.name]
         for kind in kinds:
             control = row.controls.get(kind)
-            falls = None if control is None else control.drops["moved"]["ap50"].value
-            cells.append("-" if falls is None else f"{100 * falls:.1f}")
-            cells.append("-" if control is None else bounded(row.effects[kind]["moved"]))
+            cells.append("-" if control is None else bounded(control.drops["moved"]["ap50"]))
+            effect = "-" if control is None else bounded(row.effects[kind]["moved"].interval)
+            cells.append(f"{effect} *" if kind == row.matching else effect)
         size = row.controls[PLACEBO].size if PLACEBO in row.controls else None
-        lines.append((*cells, "-" if size is None else f"{size:.2f}"))
+        cells.append("-" if size is None else f"{size:.2f}")
+        lines.append((*cells, *([] if not tested else ["-" if row.p is None else f"{row.p:.3f}"])))
     columns = [column for kind in kinds for column in (f"{kind} falls", f"attack less {kind}")]
-    return Sheet("Controls: AP50, moved labels, points", (_ARM, *columns, f"size of {PLACEBO}"), tuple(lines))
+    columns += [f"size of {PLACEBO}", *(["p of *"] if tested else [])]
+    return Sheet("Controls: AP50, moved labels, points", (_ARM, *columns), tuple(lines))
 
 
 def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
@@ -218,11 +221,7 @@ def _by_grade(counts: Sequence[int]) -> str:
 def _costs(costs: Sequence[SearchCost]) -> Sheet:
     lines = []
     for one in costs:
-        ahead = (
-            "-"
-            if one.ahead is None
-            else bounded(Interval(one.name, one.ahead.difference, one.ahead.low, one.ahead.high))
-        )
+        ahead = "-" if one.ahead is None else bounded(one.ahead.interval)
         lines.append((one.name, f"{one.seconds:.1f}", *map(_number, (one.per_100_passes, one.per_minute)), ahead))
     columns = (
         _ARM,
@@ -269,8 +268,9 @@ def _frames(rows: Sequence[StudyRow]) -> Sheet:
     for row in rows:
         flat = row.flat()
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
-        # An arm may have none of the controls that another has.
-        lines.append((row.name, *(str(flat.get(key, "-")) for key in ("frames", *keys, "queries"))))
+        counts = [flat.get(key) for key in ("frames", *keys, "queries")]
+        # An arm may have none of the controls that another has; of several seeds there is a mean.
+        lines.append((row.name, *("-" if count is None else f"{round(count, 1):.15g}" for count in counts)))
     columns = (_ARM, "frames", *MODES, *controls, "queries")
     return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
 
@@ -286,7 +286,7 @@ def _success(found: Findings) -> Sheet:
         cells = [curve.name, *shares, f"{last} of {curve.most}", mean]
         if found.beside is not None:
             one = found.beside[curve.name]
-            cells.append(bounded(Interval(one.name, one.difference, one.low, one.high)))
+            cells.append(bounded(one.interval))
         lines.append(tuple(cells))
     columns = [_ARM, *(f"{mark}" for mark in marks), "at the end", "mean queries"]
     if found.beside is not None:
@@ -321,8 +321,8 @@ def notes(found: Findings) -> list[str]:
     ]
     if any(row.run.arm.reference is not None for row in found.rows):
         told.append(
-            "Ours, under the paper's protocol. There: in the paper, with its own detector on Virtual KITTI; mAP "
-            f"{100 * PAPER_BENIGN:.1f} before."
+            "There: in the paper, with its own detector on Virtual KITTI, mAP "
+            f"{100 * PAPER_BENIGN:.1f} before; beside rows under the paper's protocol, and no others."
         )
     elif found.study.name in ("single", "multi"):
         told.append(OWN_PROTOCOL)
@@ -331,10 +331,14 @@ def notes(found: Findings) -> list[str]:
             "Random: the best of as many uniform samples as the attack takes steps, where those steps may lead."
         )
     if any(row.controls for row in found.rows):
+        seeds = max(len(control.runs) for row in found.rows for control in row.controls.values())
+        several = f" Controls are means of {seeds} seeds." if seeds > 1 else ""
         told.append(
             "Placebo: one random edit as large as the attack's, through the same pipeline; its size beside the "
-            "attack's, which projection onto what is feasible may lessen. The attack's effect is what it lowers "
-            "AP50 by more than the placebo."
+            "attack's, which projection onto what is feasible may lessen. *: the attack's effect, which is how "
+            "much further AP50 falls than with a control of as many chances: random where it keeps the best of "
+            "its iterates, the placebo where it keeps the last. p: permutation of frames, Holm's over the "
+            f"rows.{several}"
         )
     if found.curves:
         told.append(
@@ -370,7 +374,7 @@ def notes(found: Findings) -> list[str]:
         )
     unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
     if unknown:
-        told.append(f"Grades unknown, of an older version: {', '.join(unknown)}.")
+        told.append(f"Grades unknown, of an older version or without them: {', '.join(unknown)}.")
     share = feasible_fraction([result for run in found.ran.runs for result in run.results])
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
     if found.ran.without_vehicles:

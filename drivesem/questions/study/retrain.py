@@ -16,9 +16,9 @@ from detectors.types import Detections, Targets
 from drivesem.attack.judging import HEADLINE, t_star_of
 from drivesem.attack.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores, evaluate
-from drivesem.evaluation.resampling import DRAWS, Figure, Interval, differences, intervals
+from drivesem.evaluation.resampling import Figure, Interval, differences, intervals
 from drivesem.questions.study import lessons as plan
-from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.arms import Arm, draws_of
 from drivesem.questions.study.lessons import BENIGN, RETRAINED, Lesson, Parts
 from drivesem.questions.study.rows import MODES, Figures, StudyRow, feasible_fraction, rows_of
 from drivesem.questions.study.running import ARMS, ArmRun, Ran, run_arms, workers_of
@@ -188,7 +188,7 @@ def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
     if not judged.runs[0].results:
         raise UsageError("--held-out", "frames with vehicles that can be taken apart", "none")
     known = _known(study, names, out / ARMS / arms[0].folder, out)
-    draws = DRAWS if study.bootstrap is None else study.bootstrap
+    draws = draws_of(study)
     rows = rows_for(study, ready.lessons, seen, known, judged.runs, draws)
     shown = {
         lesson.name: (lesson, len(broken(frames, lesson.config.label_mode, "--limit"))) for lesson in ready.lessons
@@ -306,7 +306,7 @@ def rows_for(
                 spread=spread,
                 known=known[i],
                 fresh=fresh[i],
-                drops={d.name: Interval(d.name, d.difference, d.low, d.high) for d in fallen},
+                drops={d.name: d.interval for d in fallen},
                 gains=gains,
             )
         )
@@ -316,7 +316,7 @@ def rows_for(
 def _gain(before: Sequence[Figure], after: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:
     """How far the first figure, AP50, rises; paired over frames."""
     (one,) = differences(before[:1], after[:1], frames, draws, np.random.default_rng(study.seed))
-    return Interval(one.name, one.difference, one.low, one.high)
+    return one.interval
 
 
 def _spread(figures: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:

@@ -12,7 +12,8 @@ from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.coco import IOU_THRESHOLDS, ClassScores
 from drivesem.evaluation.outcome import Outcome
-from drivesem.evaluation.resampling import Averaged, Figure, Interval, Recalled, differences
+from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interval, Recalled, differences, holm
+from drivesem.questions.study.arms import matching
 from drivesem.questions.study.running import ArmRun
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.run.frame import as_detections, as_targets
@@ -26,19 +27,38 @@ _SINGLE_OVERLAPS = {"ap50": 0.5, "ap70": 0.7}
 
 @dataclass(frozen=True, slots=True)
 class StudyRow:
-    """One arm. benign, paper, moved: HEADLINE's figures in the photographs, and after the attack by either label
-    mode. drops: by mode and figure, from benign to attacked. effects: by control and mode, how far AP50 falls
-    below the control's. controls: their own rows. size: of a control's edits, relative to the arm's.
+    """One arm, or one control by its seeds. benign, paper, moved: HEADLINE's figures in the photographs, and after
+    the attack by either label mode. drops: by mode and figure, from benign to attacked. effects: by control and
+    mode, how far AP50 falls below the control's. controls: their own rows. size: of a control's edits, relative to
+    the arm's. p: of the effect by moved labels beside the matching control, Holm's over all rows. Of several
+    seeds AP50, its falls and what is counted are means, all else is the first's.
     """
 
-    run: ArmRun
+    runs: Sequence[ArmRun]
     benign: ClassScores
     paper: ClassScores
     moved: ClassScores
     drops: dict[str, dict[str, Interval]]
-    effects: dict[str, dict[str, Interval]]
+    effects: dict[str, dict[str, Difference]]
     controls: dict[str, StudyRow]
     size: float | None = None
+    p: float | None = None
+
+    @property
+    def run(self) -> ArmRun:
+        """Of the first seed."""
+        return self.runs[0]
+
+    @property
+    def matching(self) -> str | None:
+        """The control with as many chances, where it was run."""
+        kind = matching(self.run.arm.config)
+        return kind if kind in self.controls else None
+
+    def broken(self, mode: str) -> float:
+        """Frames in which something was lost or made up."""
+        found = [getattr(result, f"success_{mode}") for run in self.runs for result in run.results]
+        return sum(found) / len(self.runs)
 
     @property
     def name(self) -> str:
@@ -63,6 +83,8 @@ class StudyRow:
             "objects": self.benign.objects,
             "successes_paper": sum(r.success_paper for r in results),
             "successes_moved": sum(r.success_moved for r in results),
+            "control": self.matching,
+            "p": self.p,
             "queries": sum(r.queries for r in results),
             "feasible_fraction": feasible_fraction(results),
         }
@@ -75,25 +97,29 @@ class StudyRow:
                 found |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
         for name, row in self.controls.items():
             found |= {f"{name}_{mode}_ap50": getattr(row, mode).ap50 for mode in MODES}
-            found |= {f"{name}_drop_{mode}": row.drops[mode]["ap50"].value for mode in MODES}
-            found |= {f"{name}_successes_moved": sum(r.success_moved for r in row.run.results)}
+            found |= {f"{name}_successes_moved": row.broken("moved"), f"{name}_seeds": len(row.runs)}
             found |= {f"{name}_size": row.size}
-            for mode, one in self.effects[name].items():
-                key = f"over_{name}_{mode}"
-                found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
+            for mode in MODES:
+                told = {f"{name}_drop_{mode}": row.drops[mode]["ap50"]}
+                told[f"over_{name}_{mode}"] = self.effects[name][mode].interval
+                for key, one in told.items():
+                    found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
         return found
 
 
 def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[StudyRow]:
     """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
-    figures = {run.arm.name: Figures.of(run) for run in runs}
     rows = []
     for run in runs:
         if run.arm.control is not None:
             continue
-        beside = {other.arm.control: other for other in runs if other.arm.control and other.arm.of == run.arm.name}
-        rows.append(_row(run, beside, figures, draws, seed))
-    return rows
+        beside: dict[str, list[ArmRun]] = {}
+        for other in runs:
+            if other.arm.control and other.arm.of == run.arm.name:
+                beside.setdefault(other.arm.control, []).append(other)
+        rows.append(_row(run, beside, draws, seed))
+    effects = [None if row.matching is None else row.effects[row.matching]["moved"].p for row in rows]
+    return [replace(row, p=p) for row, p in zip(rows, holm(effects), strict=True)]
 
 
 def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
@@ -101,26 +127,33 @@ def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
     return sum(r.feasible for r in results) / len(results) if results else None
 
 
-def _row(
-    run: ArmRun, beside: Mapping[str, ArmRun], figures: Mapping[str, Figures], draws: int, seed: int
-) -> StudyRow:
-    mine, summary = figures[run.arm.name], run.summary
-    effects = {
-        name: {mode: mine.falls(figures[other.arm.name], mode, draws, seed) for mode in MODES}
-        for name, other in beside.items()
-    }
-    controls = {
-        name: replace(_row(other, {}, figures, draws, seed), size=relative_size(other.results, run.results))
-        for name, other in beside.items()
-    }
+def _row(run: ArmRun, beside: Mapping[str, Sequence[ArmRun]], draws: int, seed: int) -> StudyRow:
+    mine = Figures.of(run)
+    controls, effects = {}, {}
+    for name, others in beside.items():
+        theirs = Figures.of(*others).of_ap50()
+        sizes = [relative_size(other.results, run.results) for other in others]
+        known = [size for size in sizes if size is not None]
+        row = _told(others, theirs, draws, seed)
+        controls[name] = replace(row, size=float(np.mean(known)) if known else None)
+        effects[name] = {mode: mine.falls(theirs, mode, draws, seed) for mode in MODES}
+    return replace(_told([run], mine, draws, seed), controls=controls, effects=effects)
+
+
+def _told(runs: Sequence[ArmRun], figures: Figures, draws: int, seed: int) -> StudyRow:
+    """Without its controls."""
+    summary = runs[0].summary
+    after = {"paper": summary.attacked_paper.headline, "moved": summary.attacked_moved.headline}
+    if len(runs) > 1:
+        after = {mode: replace(one, ap50=figures.after[mode][0].value()) for mode, one in after.items()}
     return StudyRow(
-        run=run,
+        runs=runs,
         benign=summary.benign.headline,
-        paper=summary.attacked_paper.headline,
-        moved=summary.attacked_moved.headline,
-        drops={mode: mine.drops(mode, draws, seed) for mode in MODES},
-        effects=effects,
-        controls=controls,
+        paper=after["paper"],
+        moved=after["moved"],
+        drops={mode: figures.drops(mode, draws, seed) for mode in MODES},
+        effects={},
+        controls={},
     )
 
 
@@ -133,7 +166,14 @@ class Figures:
     frames: int
 
     @classmethod
-    def of(cls, run: ArmRun) -> Figures:
+    def of(cls, *runs: ArmRun) -> Figures:
+        """Of several, such as seeds, the means."""
+        each = [cls._of(run) for run in runs]
+        before = _means([one.before for one in each])
+        return cls(before, {mode: _means([one.after[mode] for one in each]) for mode in MODES}, each[0].frames)
+
+    @classmethod
+    def _of(cls, run: ArmRun) -> Figures:
         names, label = run.judged.names, run.judged.names.index(HEADLINE)
         benign = [run.judged.targets(as_targets(r.targets_benign, CLASSES)) for r in run.results]
         moved = [run.judged.targets(as_targets(r.targets_moved, CLASSES)) for r in run.results]
@@ -148,17 +188,31 @@ class Figures:
             frames=len(run.results),
         )
 
+    def of_ap50(self) -> Figures:
+        """That alone: of a control nothing else is told."""
+        return Figures(self.before[:1], {mode: figures[:1] for mode, figures in self.after.items()}, self.frames)
+
     def drops(self, mode: str, draws: int, seed: int) -> dict[str, Interval]:
         """How far each figure falls, by figure; paired over frames."""
         rng = np.random.default_rng(seed)
-        fallen = differences(self.after[mode], self.before, self.frames, draws, rng)
-        return {one.name: Interval(one.name, one.difference, one.low, one.high) for one in fallen}
+        fallen = differences(self.after[mode], self.before, self.frames, draws, rng, test=False)
+        return {one.name: one.interval for one in fallen}
 
-    def falls(self, control: Figures, mode: str, draws: int, seed: int) -> Interval:
+    def falls(self, control: Figures, mode: str, draws: int, seed: int) -> Difference:
         """How far AP50 falls below the control's; paired over frames."""
-        rng = np.random.default_rng(seed)
-        (one,) = differences(self.after[mode][:1], control.after[mode][:1], self.frames, draws, rng)
-        return Interval(one.name, one.difference, one.low, one.high)
+        mine, theirs = self.after[mode][0], control.after[mode][0]
+        # One attack beside each seed of the control.
+        mine = replace(mine, parts=mine.parts * (len(theirs.parts) // len(mine.parts)))
+        (one,) = differences([mine], [theirs], self.frames, draws, np.random.default_rng(seed))
+        return one
+
+
+def _means(figures: Sequence[Sequence[Figure]]) -> list[Figure]:
+    """The same figures of several runs, each as one."""
+    return [
+        replace(same[0], parts=tuple(part for one in same for part in one.parts))
+        for same in zip(*figures, strict=True)
+    ]
 
 
 def _figures(outcome: Outcome) -> list[Figure]:

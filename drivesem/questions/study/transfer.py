@@ -11,8 +11,8 @@ import numpy as np
 
 from detectors.yolov3.yolov3 import YoloV3
 from drivesem.attack.judging import HEADLINE
-from drivesem.evaluation.resampling import DRAWS, Interval, differences
-from drivesem.questions.study.arms import Arm
+from drivesem.evaluation.resampling import Interval, differences
+from drivesem.questions.study.arms import Arm, draws_of
 from drivesem.questions.study.report import OWN_PROTOCOL, Told
 from drivesem.questions.study.rows import MODES, feasible_fraction
 from drivesem.questions.study.running import ARMS, Ran, run_arms
@@ -111,7 +111,7 @@ def run(
     settings = _settings(study)
     rows, failed = rows_of(named, asked, settings)
     split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
-    draws = DRAWS if study.bootstrap is None else study.bootstrap
+    draws = draws_of(study)
     found: list[Before] = []
     for arm, one in zip(arms, named, strict=True):
         if arm.control is not None:
@@ -131,7 +131,7 @@ def run(
 def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
     after, theirs = (one.figures[mode][:1] for one in (row, placebo))
     (one,) = differences(after, theirs, row.frames, draws, np.random.default_rng(seed))
-    return Interval(one.name, one.difference, one.low, one.high)
+    return one.interval
 
 
 def _settings(study: Study) -> Asking:

@@ -146,7 +146,7 @@ def row(
 
 
 def _fall(one: Difference) -> Interval:
-    return Interval(one.name, one.difference, one.low, one.high)
+    return one.interval
 
 
 def figures_of(targets: Sequence[Targets], found: Sequence[Detections], label: int) -> list[Figure]:

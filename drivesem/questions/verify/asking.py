@@ -64,6 +64,7 @@ class VerifyWorker:
             backend=attack.backend,
             params=params_of(attack),
             budget=budget_of(attack.budget),
+            parametrisation=attack.parametrisation,
             aim=Aim.of(attack.target_objects, attack.target_classes),
             t_star=t_star_of(detector, attack.t_star),
             hashes=self.manifest.frames,

@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from drivesem.attack.budgets import reach_of
-from drivesem.attack.feasibility_check import check_reach, check_scene
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attack.feasibility_check import Reach, check_reach, check_scene
+from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
 from drivesem.questions.verify.differences import CheckLog
 from drivesem.run.results import FrameResult
 from scene_ir import files
@@ -34,6 +33,7 @@ def check_change(
     perturbed: SceneIR,
     params: Sequence[Parameter],
     budget: Budget,
+    parametrisation: Parametrisation,
 ) -> None:
     """theta of result.json against theta.json, the run's bounds, and the saved scene. Raises FormatError where
     theta.json is damaged.
@@ -46,7 +46,7 @@ def check_change(
         if c.name in written:
             expected = {"value": c.value, "unit": c.unit, "bounds": [c.lower, c.upper], "display": c.display}
             log.same("theta", f"{THETA}: {c.name}", expected, written[c.name])
-    space = ParameterSpace(base, params, budget)
+    space = ParameterSpace(base, params, budget, parametrisation=parametrisation)
     names = [space.name(i) for i in range(space.dim)]
     log.same("theta", "coordinates", [c.name for c in result.theta], names)
     if len(result.theta) != space.dim:
@@ -84,11 +84,8 @@ def _compare_tensors(log: CheckLog, name: str, expected: Tensor, found: Tensor) 
     log.told("theta", name, *pair, agrees=float(apart[worst]) <= SCENE)
 
 
-def check_feasibility(
-    log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, budget: Budget
-) -> None:
+def check_feasibility(log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, reach: Reach) -> None:
     """What the second check finds in the saved scene, and whether the poses in it lie within the run's budget."""
-    reach = reach_of(budget)
     found = check_scene(base, perturbed, result.checked_by, result.joint_weather, reach)
     log.same("feasibility", "violations", list(result.violations), found)
     log.same("feasibility", "budget", [], check_reach(base, perturbed, reach))

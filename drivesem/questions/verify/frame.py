@@ -14,9 +14,10 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import Aim
+from drivesem.attack.budgets import reach_of
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import Difficulty, Labeller, MovedLabels, to_kitti_labels
-from drivesem.attack.space import Budget, Parameter
+from drivesem.attack.space import Budget, Parameter, Parametrisation
 from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.questions.verify.change import check_change, check_feasibility
@@ -80,6 +81,7 @@ class Given:
     backend: str
     params: tuple[Parameter, ...]
     budget: Budget
+    parametrisation: Parametrisation
     aim: Aim
     t_star: float
     hashes: Mapping[str, Mapping[str, str]]
@@ -123,8 +125,8 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     known, found = given.hashes.get(identifier, {}), frame_hashes(folder)
     for name in sorted(known.keys() | found.keys()) if given.sealed else known:
         log.same("files", name, known.get(name, _NO_FILE), found.get(name, _NO_FILE))
-    check_change(log, folder, result, rest, perturbed, given.params, given.budget)
-    check_feasibility(log, result, rest, perturbed, given.budget)
+    check_change(log, folder, result, rest, perturbed, given.params, given.budget, given.parametrisation)
+    check_feasibility(log, result, rest, perturbed, reach_of(given.budget, given.parametrisation))
     size = (base.camera.height, base.camera.width)
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():

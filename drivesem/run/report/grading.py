@@ -25,7 +25,7 @@ _MEANINGS = {
     Kind.BACKGROUND: "reported where nothing is",
 }
 _NO_KIND_MEANS = "found as far as it shows; or reported where something is, or was suspected before"
-UNKNOWN = "grades unknown: run of an older version"
+UNKNOWN = "grades unknown: run of an older version, or without them"
 CHANCE = "each of which chance may explain"
 
 

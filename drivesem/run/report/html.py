@@ -262,7 +262,7 @@ def _graded_tile(run: ShownRun) -> list[_Tile]:
     if not failures:
         return []
     if not grading.is_known(run.summary, run.frames):
-        return [_Tile("certain failures", "unknown", "run of an older version")]
+        return [_Tile("certain failures", "unknown", "run of an older version, or without grades")]
     more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only"
     return [_Tile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 

@@ -181,3 +181,23 @@ def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture
         row["objects"] for row in found["standing"] if row["name"].startswith("distance")
     )
     assert (tmp_path / "a" / "standing.csv").is_file()
+
+
+@pytest.mark.slow
+def test_attribution_sums_to_the_difference_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "attribution"
+    words = ["study", "attribution", *WORDS[2:], "--json", "--out", str(out)]
+    data = study(words, capsys)
+    *factors, labels, total = data["rows"]
+    assert sum(row["points"] for row in factors) == pytest.approx(data["papers"] - data["ours"], abs=1e-9)
+    assert total["points"] == pytest.approx(data["papers"] - data["ours"], abs=1e-9)
+    assert labels["points"] == pytest.approx(factors[0]["points"] + factors[1]["points"], abs=1e-9)
+    assert {"study.md", "study.csv", "study.json", "study.png", "arms.csv"} <= {
+        path.name for path in out.iterdir()
+    }
+    done = {path: path.stat().st_mtime_ns for path in out.glob("arms/*/frames/*/result.json")}
+    assert len(done) == len(data["arms"]) == 13
+    assert study(words, capsys) == data
+    assert {path: path.stat().st_mtime_ns for path in done} == done

@@ -129,6 +129,35 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
     assert json.loads((run / "verify.json").read_text()) == data
 
 
+def test_a_run_of_places_in_the_picture_agrees_goes_on_and_may_leave_the_ground(
+    drifting: None, tmp_path: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("attack", *WORDS, "--parametrisation", "roi", "--project", "bounds")
+    words = (
+        *words,
+        "--method",
+        "random",
+        "--queries",
+        "1",
+        "--keep",
+        "last",
+        "--no-grade",
+        "--out",
+        str(tmp_path),
+    )
+    assert main([*words]) == 0
+    assert main([*words]) == 0  # with nothing left to do
+    assert verify(tmp_path, code=0)["differences"] == []
+    result = load_frame(tmp_path / FRAME / "result.json")
+    assert result.theta[4 + 2].name == "objects[0].translate.log_depth"
+    assert all(c.value for c in result.theta)
+    assert any("off the ground" in line for line in result.violations)
+    assert result.failures
+    assert not result.graded
+    assert main([*words, "--parametrisation", "ground"]) == 2
+    assert "parametrisation" in capsys.readouterr().err
+
+
 def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     drifting: None, tmp_path: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -339,7 +368,7 @@ def test_a_run_of_the_first_schema_has_no_grades_to_check(
     capsys.readouterr()
     assert main(["verify", "--run", str(run), "--workers", "1"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "1 frame: grades unknown: run of an older version" in said
+    assert "1 frame: grades unknown: run of an older version, or without them" in said
     assert "manifest.json is of an earlier version" in said
 
 

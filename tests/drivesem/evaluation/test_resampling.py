@@ -12,6 +12,7 @@ from drivesem.evaluation.resampling import (
     Recalled,
     Sampled,
     differences,
+    holm,
     intervals,
     newcombe,
     wilson,
@@ -140,3 +141,20 @@ def test_newcombes_own_examples(first: tuple[int, int], second: tuple[int, int],
     """Newcombe (1998), table II, method 10."""
     assert newcombe(first, second) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))
     assert newcombe(second, first) == (pytest.approx(-high, abs=5e-5), pytest.approx(-low, abs=5e-5))
+
+
+def test_holm_steps_down_keeps_the_order_and_leaves_out_what_was_not_tested() -> None:
+    """By hand: 0.01 * 4, then 0.02 * 3, then no less than that."""
+    assert holm([0.03, 0.01, None, 0.02, 0.9]) == pytest.approx([0.06, 0.04, None, 0.06, 0.9], nan_ok=True)
+    assert holm([0.6, 0.5]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_a_difference_without_its_test_is_the_same() -> None:
+    rng = np.random.default_rng(0)
+    sides = [[Figure("r", (Recalled(_tally(rng.integers(0, 6, 12), 12)),))] for _ in range(2)]
+    (with_p,), (without,) = (
+        differences(*sides, 12, 30, np.random.default_rng(1), test=test) for test in (True, False)
+    )
+    assert without.interval == with_p.interval
+    assert (without.p, with_p.p is None) == (None, False)

@@ -88,6 +88,7 @@ def test_shipped_presets_parse(preset: Path) -> None:
 
 def test_papers_preset_is_for_attacks_and_studies() -> None:
     theirs = {"objective": "confidence", "objective_labels": "paper", "keep": "last", "project": "bounds"}
+    theirs["parametrisation"] = "roi"
     attack = parse(["attack", "--config", str(CONFIGS / "paper.yaml")])
     study = parse(["study", "multi", "--config", str(CONFIGS / "paper.yaml"), "--steps", "3"])
     assert attack == Attack(combo=2, **theirs)

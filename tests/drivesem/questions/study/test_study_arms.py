@@ -3,16 +3,29 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from drivesem.questions.study.arms import FIGURES, FRAMES, PLACEBO, QUICK_FRAMES, RANDOM, SEARCHES, arms_of
+from drivesem.questions.study.arms import (
+    FIGURES,
+    FRAMES,
+    PAPERS,
+    PLACEBO,
+    QUICK_FRAMES,
+    RANDOM,
+    SEARCHES,
+    Arm,
+    arms_of,
+    matching,
+)
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.run.protocol import PROTOCOL
+from drivesem.run.protocol import PROTOCOL, follows_paper
 from drivesem.settings.commands import Study
 from scene_ir.errors import FormatError
 
 OUT = Path("out")
+THEIRS: dict[str, Any] = {k: v for k, v in PROTOCOL.items() if k != "early_stop"}
 NAMES = ("single", "multi", "samples", "steps", "labels")
 
 
@@ -23,7 +36,7 @@ def test_arms_are_attacks_that_the_command_takes(name: str, quick: bool, tmp_pat
     assert len({arm.folder for arm in arms}) == len(arms)
     for arm in arms:
         if arm.config.like is not None:
-            Path(arm.config.like).mkdir(parents=True)
+            Path(arm.config.like).mkdir(parents=True, exist_ok=True)
         arm.config.check()
         assert arm.config.limit == (QUICK_FRAMES if quick else FRAMES)
     assert arms[0].config.method == "si-fgsm"
@@ -37,28 +50,48 @@ def test_the_full_study_goes_on_where_the_quick_one_stopped(name: str) -> None:
         assert replace(arm.config, limit=FRAMES) == full[folder].config
 
 
-@pytest.mark.parametrize(("name", "count"), [("single", 6), ("multi", 5)])
+@pytest.mark.parametrize(("name", "count"), [("single", 6), ("multi", 4)])
 def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> None:
-    arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7), OUT)}
-    assert len(arms) == 3 * count
+    """Ours have random samples and placebos; those of the paper's protocol, which keeps the last, placebos."""
+    arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7, seeds=2), OUT)}
+    longer = name == "multi"
+    assert len(arms) == 5 * (count + longer) + 3 * count
     for arm in [a for a in arms.values() if a.control is None]:
-        assert arm.reference is None  # of another protocol than the paper's
-        samples, edit = arms[f"{arm.name} {RANDOM}"], arms[f"{arm.name} {PLACEBO}"]
-        assert samples.of == edit.of == arm.name
-        assert (samples.config.method, samples.config.range, samples.config.queries) == (
-            "random",
-            "steps",
-            arm.config.steps,
-        )
-        assert (edit.config.method, edit.config.like) == ("placebo", f"out/arms/{arm.folder}")
-        for control in (samples, edit):
+        theirs = arm.name.endswith(PAPERS)
+        assert (arm.reference is not None) == theirs
+        assert matching(arm.config) == (PLACEBO if theirs else RANDOM)
+        beside = [other for other in arms.values() if other.of == arm.name]
+        assert [other.config.seed for other in beside] == ([0, 1] if theirs else [0, 1, 0, 1])
+        for control in beside:
             assert (control.config.params, control.config.combo) == (arm.config.params, arm.config.combo)
             assert list(arms).index(control.name) > list(arms).index(arm.name)
-    assert len(arms_of(Study(name=name, controls=False), OUT)) == count
+            searched = (control.config.method, control.config.range, control.config.queries, control.config.like)
+            assert searched in (
+                ("random", "steps", arm.config.steps, None),
+                ("placebo", "bounds", None, f"out/arms/{arm.folder}"),
+            )
+            assert control.control == control.config.method
+    assert len(arms_of(Study(name=name, controls=False, paper_protocol=False), OUT)) == count + longer
+    first = [arm.folder for arm in arms_of(Study(name=name, seeds=1), OUT)]
+    assert set(first) < {arm.folder for arm in arms_of(Study(name=name), OUT)}  # three by default
+
+
+@pytest.mark.parametrize("name", ["single", "multi"])
+def test_the_papers_protocol_stands_beside_where_the_detector_has_its_loss(name: str) -> None:
+    def theirs(**settings: Any) -> list[Arm]:
+        arms = arms_of(Study(name=name, controls=False, **settings), OUT)
+        return [arm for arm in arms if arm.name.endswith(PAPERS)]
+
+    assert all(follows_paper(arm.config) for arm in theirs(method="apgd", steps=7))
+    assert [arm.reference for arm in theirs()] == list(
+        (PAPER_COMBOS if name == "multi" else PAPER_SINGLE).values()
+    )
+    assert len(theirs(detector="yolov3-slim")) == len(theirs())
+    assert theirs(detector="module:mine.py") == theirs(paper_protocol=False) == theirs(**THEIRS) == []
 
 
 def test_the_papers_figures_stand_beside_its_own_protocol_only() -> None:
-    theirs = {k: v for k, v in PROTOCOL.items() if k != "early_stop"} | {"controls": False}
+    theirs = THEIRS | {"controls": False, "paper_protocol": False}
     multi = arms_of(Study(name="multi", **theirs), OUT)  # pyright: ignore[reportArgumentType]
     assert [arm.reference for arm in multi] == [*PAPER_COMBOS.values(), None]  # the last is Auto-PGD's
     single = arms_of(Study(name="single", **theirs), OUT)  # pyright: ignore[reportArgumentType]
@@ -69,10 +102,10 @@ def test_the_papers_figures_stand_beside_its_own_protocol_only() -> None:
 
 
 def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
-    arms = arms_of(Study(name="multi", steps=7, controls=False), OUT)
+    arms = arms_of(Study(name="multi", steps=7, controls=False, paper_protocol=False), OUT)
     assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
     assert arms[-1].config.combo == 2
-    alone = arms_of(Study(name="multi", method="apgd", controls=False), OUT)
+    alone = arms_of(Study(name="multi", method="apgd", controls=False, paper_protocol=False), OUT)
     assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
 
 

@@ -78,7 +78,11 @@ def test_the_papers_figures_stand_beside(controlled: Findings) -> None:
     assert (row["benign"], row["mAP there"], row["falls there"]) == ("100.00", "98.20", "1.2")
     # 7 of 8 cars: 88 of 101 samples of recall
     assert row["falls, moved"].startswith(f"{100 * 13 / 101:.1f} [")
-    assert cells(controlled, "Controls", "mesh")["placebo falls"] == "0.0"
+    assert cells(controlled, "Controls", "mesh")["placebo falls"] == "0.0 [0.0, 0.0]"
+    beside = cells(controlled, "Controls", "rotate")
+    assert beside["attack less random"].endswith("] *")
+    assert not beside["attack less placebo"].endswith("*")
+    assert float(beside["p of *"]) == pytest.approx(controlled.rows[0].p, abs=1e-3)
     frames = cells(controlled, "Frames", "rotate")
     assert (frames["moved"], frames[RANDOM], frames[PLACEBO], frames["queries"]) == ("1", "0", "0", "40")
     text = " ".join(notes(controlled))

@@ -1,11 +1,15 @@
 """A study's table: what falls, by which labels, and beyond the controls."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from drivesem.evaluation.resampling import holm
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.rows import relative_size, rows_of
 from drivesem.report.paper import PAPER_BENIGN
+from drivesem.settings.commands import Attack
 
 FRAMES = 8
 FAR = 40.0
@@ -82,5 +86,40 @@ def test_equal_arms_have_no_effect_and_no_spread(frame, arm_run, arm) -> None:
     runs = [arm_run(arm("one"), results), arm_run(arm("two", control=(PLACEBO, "one")), results)]
     (row,) = rows_of(runs, draws=20, seed=3)
     effect = row.effects[PLACEBO]["moved"]
-    assert (effect.value, effect.low, effect.high) == (0.0, 0.0, 0.0)
+    assert (effect.difference, effect.low, effect.high, effect.p) == (0.0, 0.0, 0.0, 1.0)
     assert row.drops["moved"]["ap50"].value == pytest.approx(25 / 101)
+
+
+def test_seeds_of_a_control_count_as_their_mean(runs, frame, arm_run, arm) -> None:
+    """Beside one that is followed in all frames, a second seed loses a car in all of them."""
+    names = [f"{i:03d}" for i in range(FRAMES)]
+    lost = arm_run(
+        arm("rotate random 2", control=(RANDOM, "rotate"), seed=1),
+        [frame(n, moved_by=5.0, found=False, success=True, yaw=0.1) for n in names],
+    )
+    (one,), (two,) = (rows_of(these, draws=20, seed=0) for these in (runs, [*runs, lost]))
+    alone, both = one.flat(), two.flat()
+    # one of two cars: precision is 1 up to a recall of 0.5
+    drop = 1 - 51 / 101
+    assert both["random_drop_moved"] == pytest.approx(drop / 2)
+    assert both["random_moved_ap50"] == pytest.approx(1 - drop / 2)
+    assert both["over_random_moved"] == pytest.approx(alone["drop_moved"] - drop / 2)
+    assert both["over_random_moved_low"] < both["over_random_moved"] < both["over_random_moved_high"]
+    assert (both["random_successes_moved"], both["random_seeds"]) == (FRAMES / 2, 2)
+    assert both["random_size"] == pytest.approx((0.5 + 0.5) / 2)
+
+
+def test_the_effect_is_beside_the_control_with_as_many_chances(runs, arm_run, arm) -> None:
+    """Random where the best is kept, the placebo where the last is; p is Holm's over the rows."""
+    kept_last = [
+        arm_run(replace(run.arm, name=f"last {run.arm.name}", of=run.arm.of and f"last {run.arm.of}"), run.results)
+        for run in runs
+    ]
+    kept_last[0] = arm_run(replace(kept_last[0].arm, config=Attack(keep="last")), kept_last[0].results)
+    best, last = rows_of([*runs, *kept_last], draws=30, seed=0)
+    assert (best.matching, last.matching) == (RANDOM, PLACEBO)
+    ps = [best.effects[RANDOM]["moved"].p, last.effects[PLACEBO]["moved"].p]
+    assert [best.p, last.p] == holm(ps)
+    assert best.p >= ps[0]
+    (alone,) = rows_of(runs[:1], draws=20, seed=0)
+    assert (alone.matching, alone.p, alone.flat()["control"]) == (None, None, None)
