@@ -19,7 +19,7 @@ from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 
 TOPICS: dict[str, tuple[str, ...]] = {
-    "Find failures": ("attack", "report", "runs"),
+    "Find failures": ("attack", "drive", "report", "runs"),
     "Are they real, and why": (
         *("verify", "confirm", "explain", "plausibility", "realism"),
         *("survey", "survey-results"),
