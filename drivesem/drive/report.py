@@ -14,20 +14,21 @@ from drivesem.report.tables import Sheet
 
 WORDS = ("car",)
 NOTES = (
-    "lost: frames in which the detector misses the car, of those in which it counts; before: in the clip as it "
-    "was, after: with the change, random: with a random change as large.",
+    "counts: frames in which the car is judged; lost: of these, frames in which the detector misses it; before: "
+    "in the clip as it was, after: with the change, random: with a random change as large.",
     "longest: frames of the longest unbroken stretch of misses. unseen: metres by which the camera comes nearer "
-    "to the car while it is missed, of those while it counts.",
+    "to the car while it is missed, of the metres while it counts.",
     "certain: of the frames in which it is newly missed and that were looked at again in draws, those in which "
     "it is missed for certain (docs/grades.md).",
 )
+_LOOKS: dict[str, Any] = {"unbroken": WORDS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
 
 
 def answer_of(result: DriveResult) -> Answer:
     """The answer, in the result's folder."""
     title = f"{result.detector} on {result.clip}: {' + '.join(result.params)}, {result.method}"
     rows = [row_of(car) for car in result.cars]
-    sheet = Sheet(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), {"box": box.SIMPLE_HEAD})
+    sheet = Sheet(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _LOOKS)
     return Answer(
         out=Path(result.out),
         name="drive",
@@ -46,15 +47,15 @@ def row_of(car: CarResult) -> dict[str, str]:
     """A car's line of the table."""
     return {
         "car": f"{car.track} {car.kind}",
-        "frames": f"{car.frames}",
+        "counts": f"{car.frames}",
         "lost before": f"{car.lost_before}",
-        "after": f"{car.lost_after}",
-        "random": f"{car.lost_control}",
-        "longest before": f"{car.longest_before}",
-        "longest": f"{car.longest_after}",
-        "unseen before, m": f"{car.metres_lost_before:.1f}",
-        "unseen, m": f"{car.metres_lost_after:.1f} of {car.metres:.1f}",
-        "random, m": f"{car.metres_lost_control:.1f}",
+        "lost after": f"{car.lost_after}",
+        "lost random": f"{car.lost_control}",
+        "longest after": f"{car.longest_after}",
+        "unseen before": f"{car.metres_lost_before:.1f}",
+        "unseen after": f"{car.metres_lost_after:.1f}",
+        "unseen random": f"{car.metres_lost_control:.1f}",
+        "of metres": f"{car.metres:.1f}",
         "certain": f"{car.certain}/{car.graded}" if car.graded else "-",
     }
 

@@ -23,8 +23,9 @@ _INSIDE = 1 - 1e-5
 """Of a path's bounds: sums of its weights are rounded."""
 _SAME = 1e-6
 """Within which a frame's projection left theta as it was."""
-_ROUNDS = 6
-"""In which what a frame holds back is held back in the clip; after that, cars that still violate stay at rest."""
+_ROUNDS = 8
+"""In which what a frame holds back is held back in the clip, in the second half along whole paths; after that,
+cars that still violate something stay at rest."""
 
 
 class ClipSpace(ThetaSpace[Parameter]):
@@ -52,6 +53,12 @@ class ClipSpace(ThetaSpace[Parameter]):
         for bound in (self.lower, self.upper):
             bound[~bound.isfinite()] = 0  # of cars that no frame has, which there are none of
 
+    def name(self, i: int) -> str:
+        """The name of coordinate `i`, by the car's track: `cars[12].translate.along[0]`."""
+        parameter, owner, k = self._locate(i)
+        spec = self.specs[parameter]
+        return f"cars[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
+
     def of_frame(self, theta: Tensor, frame: int) -> Tensor:
         """theta (D,) as that of a frame's own space (D',); differentiable."""
         parts = []
@@ -66,8 +73,10 @@ class ClipSpace(ThetaSpace[Parameter]):
             parts.append(block.reshape(-1))
         return torch.cat(parts)
 
-    def held_back(self, theta: Tensor, frame: int, asked: Tensor, granted: Tensor) -> Tensor:
-        """theta (D,) with what a frame granted (D',) of what was asked of it (D',): of a path as large a part."""
+    def held_back(self, theta: Tensor, frame: int, asked: Tensor, granted: Tensor, whole: bool) -> Tensor:
+        """theta (D,) with what a frame granted (D',) of what was asked of it (D',). Of a path, those control
+        points that matter there give way, or, where `whole`, all of it by as large a part.
+        """
         theta, space = theta.clone(), self.spaces[frame]
         for parameter in self.params:
             block, there = self.block(theta, parameter), space.block(granted, parameter)
@@ -77,8 +86,10 @@ class ClipSpace(ThetaSpace[Parameter]):
             assert before is not None
             if parameter is Parameter.TRANSLATE:
                 share = torch.where(before.abs() > _SAME, there / before, 1.0).clamp(0, 1)
+                weights = self._weights[frame]
+                matter = torch.ones_like(weights) if whole else weights / weights.amax(1, keepdim=True)
                 path = block.reshape(len(block), self.points, 2)
-                path[self.rows[frame]] *= share[:, None]
+                path[self.rows[frame]] *= 1 - matter[:, :, None] * (1 - share[:, None])
             elif SPECS[parameter].per_object:
                 block[self.rows[frame]] = there
             else:
@@ -147,7 +158,7 @@ def project(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> Pro
                 continue
             held = True
             active += [_renamed(name, space, frame) for name in found.active]
-            theta = space.held_back(theta, frame, asked, found.theta)
+            theta = space.held_back(theta, frame, asked, found.theta, whole=attempt >= _ROUNDS // 2)
             offenders[space.rows[frame][_differing(space.spaces[frame], asked, found.theta)]] = True
         if not held:
             return Projected(theta, tuple(dict.fromkeys(active)))
