@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -42,9 +42,13 @@ class Missed:
             frames=sum(counted),
             lost=states.count(LOST),
             longest=longest,
-            metres=round(sum(way for way, counts in zip(nearer, counted, strict=True) if counts), 3),
-            metres_lost=round(sum(way for way, state in zip(nearer, states, strict=True) if state == LOST), 3),
+            metres=_metres(way for way, counts in zip(nearer, counted, strict=True) if counts),
+            metres_lost=_metres(way for way, state in zip(nearer, states, strict=True) if state == LOST),
         )
+
+
+def _metres(ways: Iterable[float]) -> float:
+    return round(sum(ways, 0.0), 3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from drivesem.drive.results import (
     DriveResult,
     State,
 )
-from drivesem.drive.taking import TakenClip, Taking, take_clip
+from drivesem.drive.taking import TakenClip, Taker, Taking, take_clip
 from drivesem.drive.video import write_video
 from drivesem.report import pictures
 from drivesem.report.answer import Answer
@@ -62,11 +62,12 @@ def drive_run(config: Drive) -> Answer:
     check_device(config.device)
     worker = attacks.Worker.of(asked)
     out = Path(config.out) if config.out else Path("runs") / _name(config, [str(p) for p in params])
+    taking = Taking(config.clip, config.sequence, config.limit, config.seed, config.fit)
+    taker = Taker(taking, out / SCENES)
     claim(out, config, _WRITTEN, _FREE)
     if config.resume and (out / RESULT).is_file():
         return answer_of(from_json(DriveResult, files.read_json(out / RESULT), str(out / RESULT)))
-    taking = Taking(config.clip, config.sequence, config.limit, config.seed, config.fit)
-    clip = take_clip(taking, out / SCENES, config)
+    clip = take_clip(taker, config)
     detector, budget = worker.detector, budget_of(asked.budget)
     objective = ClipObjective(clip, detector, params, budget, config)
     sys.stderr.write(f"attacking {len(clip.names)} frames with {objective.space.count} cars\n")

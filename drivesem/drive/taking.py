@@ -133,18 +133,18 @@ class Taker:
 
     def __init__(self, taking: Taking, out: Path) -> None:
         self.source = _Demo(taking) if taking.folder is None else _Labelled(taking)
-        self._out = out
+        self.taking, self.out = taking, out
 
     def __call__(self, name: str) -> None:
         """One frame to its folder. SceneError for one that cannot be used."""
-        save_scene(self.source.scene(name), self._out / name)
+        save_scene(self.source.scene(name), self.out / name)
 
 
-def take_clip(taking: Taking, out: Path, sharing: Sharing) -> TakenClip:
-    """The clip's frames, taken apart into folders of `out` as far as they are not there yet. Raises UsageError or
+def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
+    """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError or
     SceneError for a clip that cannot be read, or has no vehicle.
     """
-    work = Taker(taking, out)
+    taking, out = work.taking, work.out
     names = work.source.names
     todo = [name for name in names if not (out / name / RECORD).is_file()]
     if todo:
