@@ -141,8 +141,8 @@ class Taker:
 
 
 def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
-    """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError or
-    SceneError for a clip that cannot be read, or has no vehicle.
+    """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError
+    or SceneError for a clip that cannot be read, or has no vehicle.
     """
     taking, out = work.taking, work.out
     names = work.source.names
