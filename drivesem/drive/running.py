@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -139,7 +140,7 @@ class _Seen:
 
     def look(self, theta: Tensor, control: Tensor, certify: int, worker: attacks.Worker, reach: Reach) -> None:
         """Look at all frames, write their pictures, and grade what is newly missed in up to `certify` of them."""
-        newly: list[int] = []
+        newly: dict[int, list[int]] = {}
         for frame, name in enumerate(self.clip.names):
             scene = self.clip.scenes[frame]
             before = self.objective.judged(frame, self.objective.frames[frame].benign)
@@ -161,11 +162,12 @@ class _Seen:
             wrong = tuple(check_scene(scene, after.rendered.scene, reach=reach))
             if wrong:
                 self.violations[name] = wrong
-            newly += [frame] if after.lost else []
+            for row in after.lost:
+                newly.setdefault(self.clip.tracks[frame][row], []).append(frame)
             with files.whole_folder(self.out / FRAMES / name) as folder:
                 for state in ("before", "after"):
                     write_picture(folder / f"{state}.jpg", self._marked(frame, sights[state]))
-        for frame in _spread(newly, certify):
+        for frame in _of_all(newly, certify):
             self._grade(frame, theta, worker)
 
     def cars(self) -> tuple[CarResult, ...]:
@@ -212,6 +214,12 @@ class _Seen:
         found = detection_records(rendered.detections, objective.judged.names)
         shown = tuple(target for target in targets if target.index is not None)
         return pictures.overlay(to_uint8(rendered.render.image), shown, found, missed, objective.t_star)
+
+
+def _of_all(newly: Mapping[int, Sequence[int]], most: int) -> list[int]:
+    """At most so many frames of those in which cars are newly missed, some of each car as far as they go round."""
+    share = math.ceil(most / max(len(newly), 1))
+    return _spread(sorted({frame for frames in newly.values() for frame in _spread(frames, share)}), most)
 
 
 def _spread(frames: Sequence[int], most: int) -> list[int]:
