@@ -31,7 +31,6 @@ from drivesem.drive.results import (
 )
 from drivesem.drive.taking import TakenClip, Taker, Taking, take_clip
 from drivesem.drive.video import write_video
-from drivesem.report import pictures
 from drivesem.report.answer import Answer
 from drivesem.report.drawing import write_picture
 from drivesem.run import attack as attacks
@@ -39,6 +38,7 @@ from drivesem.run.folder import FRAMES, PRESENTATION, claim
 from drivesem.run.frame import State as Judged
 from drivesem.run.frame import case_of, detection_records, target_records
 from drivesem.run.records import from_json
+from drivesem.run.report import pictures
 from drivesem.run.results import Failure
 from drivesem.settings.commands import Attack, Drive
 from drivesem.settings.devices import check_device
