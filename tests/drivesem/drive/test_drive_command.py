@@ -25,7 +25,7 @@ from scene_ir.io import load_scene
 from scene_ir.types import SceneIR
 from tests.drivesem.drive.clips import clip_of
 
-WORDS = ["drive", "--params", "color,translate", "--steps", "1", "--keys", "2", "--certify", "1", "--json"]
+WORDS = ["drive", "--params", "color,translate", "--steps", "1", "--keys", "2", "--keep", "last", "--json"]
 
 
 @pytest.fixture(scope="module")
