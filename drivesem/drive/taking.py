@@ -15,7 +15,7 @@ from drivesem.settings.blocks import DEMO, Sharing
 from drivesem.settings.commands import Derender
 from drivesem.settings.errors import UsageError
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender, placements
-from scene_ir.derender.silhouette import Placement
+from scene_ir.derender.silhouette import Placement, candidates, placed
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene
 from scene_ir.types import Labels, SceneIR
@@ -78,16 +78,21 @@ class _Labelled:
 
     def scene(self, name: str) -> SceneIR:
         labels, tracks = _labels_of(self._clip, name), self._clip.tracks(name)
-        shapes = self._known()
-        known = [
-            replace(shapes[track], translation=labels.translation[row], yaw=labels.yaw[row])
-            if track in shapes and labels.kind[row] in VEHICLES
-            else None
-            for row, track in enumerate(tracks)
-        ]
+        known = [self._standing(labels, row, track) for row, track in enumerate(tracks)]
         frame = self._clip.dataset.frame(name)
         scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
+
+    def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
+        """A label's vehicle where the label says; None where it is none."""
+        kind, size = labels.kind[row], labels.size_lhw[row]
+        if kind not in VEHICLES or not bool((size > 0).all()):
+            return None
+        at = labels.translation[row], labels.yaw[row]
+        shape = self._known().get(track)
+        if shape is None:  # in no frame could it be told what it is
+            return placed(candidates(kind, size.tolist())[0], *at, size)
+        return replace(shape, translation=at[0], yaw=at[1])
 
     def _known(self) -> dict[int, Placement]:
         """The shape of each track, looked at once by each process."""
