@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -37,7 +37,7 @@ class Sight:
 
 class ClipObjective:
     """What an attack on a clip raises. keys: frames that a gradient step looks at, evenly spread; each step looks
-    at others, in turn. Raises as `Objective`.
+    at others, in turn. looked: is called for each frame that was looked at. Raises as `Objective`.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class ClipObjective:
             objective.feasible_set(only_bounds=config.project == "bounds") for objective in self.frames
         ]
         self._keys = max(min(config.keys, len(self.frames)), 1)
+        self.looked: Callable[[], object] = lambda: None
         self._steps = 0
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
@@ -104,6 +105,7 @@ class ClipObjective:
             gradient += torch.autograd.grad(here, leaf, along)[0]
             preview = objective.preview(here.detach())
             seen += [] if preview is None else [preview]
+            self.looked()
         self._previews[_key(theta)] = _summed(seen)
         return total / len(chosen), gradient / len(chosen)
 
@@ -125,6 +127,7 @@ class ClipObjective:
         objective, here = self.frames[frame], self.space.of_frame(theta, frame)
         scene = objective.space.apply(objective.space.scene, here)
         objective.passes += 1
+        self.looked()
         return self.judged(frame, objective.look(scene, objective.compositor.render(scene)))
 
     def judged(self, frame: int, rendered: Rendered) -> Sight:

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import jinja2
 from markupsafe import Markup
 
-from drivesem.drive.report import NOTES, row_of, summary
+from drivesem.drive.report import NOTES, row_of, summary, unfeasible
 from drivesem.drive.results import ABSENT, FOUND, LOST, UNCOUNTED, DriveResult
 from drivesem.report.policy import script_hash
 from drivesem.run.folder import FRAMES
@@ -43,7 +43,7 @@ def write_page(path: Path, result: DriveResult) -> None:
         pictures=pictures,
         columns=list(rows[0]),
         rows=[list(row.values()) for row in rows],
-        notes=(*NOTES, summary(result)),
+        notes=(*NOTES, summary(result), *unfeasible(result)),
         result=result,
     )
     files.write_text(path, text)

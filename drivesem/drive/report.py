@@ -36,10 +36,9 @@ def answer_of(result: DriveResult) -> Answer:
         data=asdict(result),
         tables={"drive": [figures(car) for car in result.cars]},
         sheets=[sheet],
-        notes=[*NOTES, summary(result)],
+        notes=[*NOTES, summary(result), *unfeasible(result)],
         words=WORDS,
-        failed={f"frame {name}: the change": "; ".join(lines) for name, lines in result.violations.items()},
-        failure="is not feasible",
+        failed={f"frame {name}": reason for name, reason in result.failed.items()},
     )
 
 
@@ -72,6 +71,11 @@ def summary(result: DriveResult) -> str:
         f"{result.feasible} of {result.frames} frames; {result.queries} queries, {result.passes} passes, "
         f"{result.seconds:.0f} s"
     )
+
+
+def unfeasible(result: DriveResult) -> list[str]:
+    """Frames in which the change is not feasible."""
+    return [f"not feasible in frame {name}: {'; '.join(lines)}" for name, lines in result.violations.items()]
 
 
 def figures(car: CarResult) -> dict[str, Any]:

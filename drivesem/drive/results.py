@@ -120,7 +120,7 @@ class DriveResult:
     """A whole clip. names: of its `frames`; feasible: frames in which the independent check finds nothing wrong;
     violations: what it finds, by frame; phantoms: by STATES, in all frames; queries: gradients, or clips judged by
     a search without; theta: coordinates that changed, in people's units; held_back: what was not feasible on the
-    way.
+    way; failed: why frames could not be used.
     """
 
     out: str
@@ -136,6 +136,7 @@ class DriveResult:
     feasible: int
     violations: dict[str, tuple[str, ...]]
     held_back: tuple[str, ...]
+    failed: dict[str, str]
     theta: dict[str, str]
     loss_trace: tuple[float, ...]
     queries: int

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -33,6 +32,8 @@ from drivesem.drive.taking import TakenClip, Taker, Taking, take_clip
 from drivesem.drive.video import write_video
 from drivesem.report.answer import Answer
 from drivesem.report.drawing import write_picture
+from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from drivesem.run import attack as attacks
 from drivesem.run.folder import FRAMES, PRESENTATION, claim
 from drivesem.run.frame import State as Judged
@@ -71,14 +72,17 @@ def drive_run(config: Drive) -> Answer:
     clip = take_clip(taker, config)
     detector, budget = worker.detector, budget_of(asked.budget)
     objective = ClipObjective(clip, detector, params, budget, config)
-    sys.stderr.write(f"attacking {len(clip.names)} frames with {objective.space.count} cars\n")
     problem, theta0 = objective.problem(config.keep == "last"), objective.space.theta0
-    search = method(problem, theta0, config.seed)
-    control = theta0
-    if bool(search.theta.any()):
-        control = Placebo(tuple(search.theta.tolist()))(problem, theta0, config.seed).theta
-    seen = _Seen(clip, objective, out)
-    seen.look(search.theta, control, config.certify, worker, reach=reach_of(budget))
+    seen, control = _Seen(clip, objective, out), theta0
+    with progress_bar(Console(stderr=True)) as progress:
+        task = progress.add_task(
+            f"looking at {len(clip.names)} frames with {objective.space.count} cars", total=None
+        )
+        objective.looked = lambda: progress.advance(task)
+        search = method(problem, theta0, config.seed)
+        if bool(search.theta.any()):
+            control = Placebo(tuple(search.theta.tolist()))(problem, theta0, config.seed).theta
+        seen.look(search.theta, control, config.certify, worker, reach=reach_of(budget))
     told = objective.space.theta_by_name(search.theta)
     result = DriveResult(
         out=str(out),
@@ -94,6 +98,7 @@ def drive_run(config: Drive) -> Answer:
         feasible=len(clip.names) - len(seen.violations),
         violations=seen.violations,
         held_back=search.active_constraints,
+        failed=clip.failed,
         theta={name: str(facts["display"]) for name, facts in told.items() if facts["value"]},
         loss_trace=search.loss_trace,
         queries=search.queries,

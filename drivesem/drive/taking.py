@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -41,12 +41,13 @@ class Taking:
 
 @dataclass(frozen=True, slots=True)
 class TakenClip:
-    """scenes, in order; tracks: of each scene's objects."""
+    """scenes, in order; tracks: of each scene's objects; failed: why others could not be used, by frame."""
 
     name: str
     names: tuple[str, ...]
     scenes: tuple[SceneIR, ...]
     tracks: tuple[tuple[int, ...], ...]
+    failed: dict[str, str] = field(default_factory=dict)
 
 
 class _Demo:
@@ -162,7 +163,7 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
     if not any(len(scene.objects) for scene in scenes):
         found = next(iter(failed.values()), f"none in {len(kept)} frames")
         raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
-    return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes))
+    return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes), failed)
 
 
 def tracks_of(scene: SceneIR) -> tuple[int, ...]:
