@@ -90,7 +90,8 @@ class KittiTracking(Frames[Path]):
         path = self._entry(identifier)
         labels, projection = self.labels(identifier), kitti.read_calib(self._calib).projection
         image = files.read_image(path)
-        camera = Camera(projection[:, :3].clone(), *image.shape[:2], projection)
+        height, width = image.shape[:2]
+        camera = Camera(projection[:, :3].clone(), height, width, projection)
         check_size(path, camera, labels)
         told = {"dataset": "kitti-tracking", "sequence": self._sequence, "image": path.name}
         return Frame(identifier, as_photograph(image), camera, labels, provenance=told)

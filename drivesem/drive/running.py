@@ -196,11 +196,11 @@ class _Seen:
         """Whether what is newly missed in a frame is missed for certain."""
         objective, benign = self.objective.frames[frame], self.objective.frames[frame].benign
         sight = self.objective.sight(theta, frame)
-        states = [
+        before, now = (
             Judged(seen.scene, seen.render, seen.moved, seen.detections) for seen in (benign, sight.rendered)
-        ]
+        )
         draw = CompositorDraw(objective.compositor, objective.labeller)
-        case = case_of(self.clip.names[frame], draw, objective.judged, *states)
+        case = case_of(self.clip.names[frame], draw, objective.judged, before, now)
         grades = worker.grader.grade(case, objective.failures(sight.rendered, "moved"))
         for row in sight.lost:
             graded = grades.lost.get(row)

@@ -89,7 +89,7 @@ def _without_hidden(frame: SynthFrame) -> SynthFrame:
     if not others.any():
         return replace(frame, truths=kept)
     height, width = frame.camera.height, frame.camera.width
-    shown = others.reshape(height, 2, width, 2).any(axis=(1, 3)).astype(np.uint8)
+    shown = np.asarray(others.reshape(height, 2, width, 2).any(axis=(1, 3)), np.uint8)
     shown = cv2.dilate(shown, np.ones((2 * _LENS_PX + 1,) * 2, np.uint8)).astype(bool)
     assert frame.background is not None
     background = np.where(shown[..., None], frame.image, frame.background)
