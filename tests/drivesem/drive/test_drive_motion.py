@@ -88,8 +88,8 @@ def test_cars_move_as_their_places_do(street: Callable[..., SceneIR]) -> None:
 @pytest.mark.slow
 def test_cars_of_the_embedded_drive_move_as_their_places_do() -> None:
     drive = drive_of(0, 30)
-    scenes = tuple(drive.scene(number) for number in range(8))
-    clip = TakenClip("drive", tuple(map(str, range(8))), scenes, tuple(tracks_of(scene) for scene in scenes))
+    scenes = tuple(drive.scene(number) for number in range(5))
+    clip = TakenClip("drive", tuple(map(str, range(5))), scenes, tuple(tracks_of(scene) for scene in scenes))
     watched, meant = Watched(clip), changed(clip)
     plain = (8, 20)  # in all of these frames, and hidden by nothing
     assert max(watched.trembling_px(meant, meant, *plain)) < STEADY_PX
