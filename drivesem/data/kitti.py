@@ -81,11 +81,11 @@ def _scene_labels(name: str, text: str, scored: bool) -> Labels:
     if text.count("\n") > _MOST_LINES:
         raise FormatError(name, f"at most {_MOST_LINES:,} lines", f"{text.count(chr(10)):,}")
     lines = Lines([name], [text], scored)
-    _check_scene(lines, scored)
+    check_scene(lines, scored)
     return lines.table([name], scored).labels()
 
 
-def _check_scene(lines: Lines, scored: bool) -> None:
+def check_scene(lines: Lines, scored: bool = False) -> None:
     """FormatError for what a scene cannot use: see `read_labels`."""
     for row, (kind, values) in enumerate(zip(lines.kinds, lines.values.tolist(), strict=True)):
 
@@ -250,6 +250,9 @@ _CALIBRATION_COUNTS = {
     "R0_rect": 9,
 }
 
+_WITHOUT_COLON = ("R_rect", "Tr_velo_cam", "Tr_imu_velo")
+"""Keys of the tracking benchmark's files, which nobody asks for."""
+
 
 def read_calib(path: Path) -> Calibration:
     """A calibration file. FormatError naming file and key: P2 missing, wrong count, not finite, said twice."""
@@ -258,6 +261,8 @@ def read_calib(path: Path) -> Calibration:
         if not line.strip():
             continue
         key, colon, rest = line.partition(":")
+        if not colon and line.split()[0] in _WITHOUT_COLON:
+            continue
         if not colon:
             raise FormatError(f"{path}:{number}: line", "'KEY: numbers'", repr(line[:40]))
         key = key.strip()

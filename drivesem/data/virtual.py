@@ -364,6 +364,20 @@ class VirtualDataset(Frames[Shot], ABC):
         """The labels of one frame, in file order, what is not labelled as regions; see `objects`."""
         return table_of((identifier,), [self.objects(identifier)]).labels()
 
+    def tracks(self, identifier: str) -> tuple[int, ...]:
+        """The track of each label of `labels` that is no region, in its order."""
+        return tuple(thing.track for thing in self.objects(identifier) if thing.labelled)
+
+    def clips(self) -> dict[str, tuple[str, ...]]:
+        """Frames of each drive by its name: scene, variation, and the camera where there are several."""
+        shots = {name: self._entry(name) for name in self.identifiers}
+        several = len({shot.camera for shot in shots.values()}) > 1
+        found: dict[str, list[str]] = {}
+        for name, shot in shots.items():
+            clip = f"{shot.scene}/{shot.variation}" + (f"/{shot.camera}" if several else "")
+            found.setdefault(clip, []).append(name)
+        return {clip: tuple(frames) for clip, frames in found.items()}
+
     def table(self) -> LabelTable:
         """The labels of all frames."""
         height, width = self.size_hw or (0, 0)

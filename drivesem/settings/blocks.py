@@ -320,8 +320,8 @@ class Regions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attacking(Regions, Threshold, Precision, Scenes):
-    """An attack, as far as a study gives it to all of its arms."""
+class Searching(Threshold, Precision):
+    """What is attacked, how far it may go, and what is raised."""
 
     detector: str = "squeezedet"
     """A shipped detector, a file, or another project's (docs/detectors.md); without a gradient, such as an ONNX
@@ -351,6 +351,11 @@ class Attacking(Regions, Threshold, Precision, Scenes):
     """What each step is brought back to: what is feasible; or the bounds alone, as in the paper."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """What the detector computes its gradients in; what counts as a failure is always judged in float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attacking(Regions, Searching, Scenes):
+    """An attack, as far as a study gives it to all of its arms."""
 
 
 @dataclass(frozen=True, kw_only=True)

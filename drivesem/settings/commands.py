@@ -37,6 +37,7 @@ from drivesem.settings.blocks import (
     Repeated,
     Run,
     Scenes,
+    Searching,
     Sharing,
     Threshold,
     Tiles,
@@ -155,6 +156,42 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
         unlike = self.method == "placebo" and self.like is None
         refuse(unlike, "--like", "a run of drivesem attack, for --method placebo", "nothing")
         refuse(subsets and self.queries == 1, "--queries", "at least 2 with subsets", self.queries)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive(Tiles, Searching, FrameCommand):
+    """Attack a whole clip: one change of each car over its whole track, and how long the detector misses it."""
+
+    clip: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="CLIP"), Anywhere()] = None
+    """A folder, or its URL: Virtual KITTI 1.3.1 or 2, KITTI's tracking benchmark, or what drivesem synth
+    --sequence wrote (kitti, vkitti2); by default an embedded drive, made by code."""
+    sequence: str | None = None
+    """Which clip of the folder, such as 0003 or 01/clone; by default the first."""
+    combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
+    """The paper's combinations, as of drivesem attack, instead of --params."""
+    params: str | None = None
+    """What may change, with commas, as of drivesem attack; by default color,translate,mesh. translate is a smooth
+    path aside; all else is the same in all frames."""
+    method: Literal["si-fgsm", "fgsm", "sgd", "random", "halton", "sobol", "cma-es"] = "si-fgsm"
+    """si-fgsm, fgsm, sgd follow the gradient; the others ask only what the detector finds in the whole clip."""
+    queries: Annotated[Count, Of(COUNTED)] | None = None
+    """Of methods without gradient: whole clips that are judged, by default 64."""
+    bend: Annotated[int, Within(0, 5, expected="0 to 5")] = 3
+    """Degree of the polynomial of a car's path over time; 0 sets it aside by the same in all frames."""
+    keys: Count = 8
+    """Frames that a gradient step looks at, evenly spread; each step looks at others, in turn."""
+    certify: NotNegative = 6
+    """Frames with new misses, evenly spread, that are looked at again in draws: are they missed for certain?"""
+    fit: bool = True
+    """Fit each car's shape in the frame that shows it best (photographs only)."""
+    limit: Count | None = None
+    """Take the first N frames; of the embedded drive N, by default 30."""
+
+    def check(self) -> None:
+        super().check()
+        both = self.combo is not None and self.params is not None
+        refuse(both, "--params", "no --combo beside it", f"--combo {self.combo}")
+        refuse(self.sequence is not None and self.clip is None, "--sequence", "a CLIP beside it", self.sequence)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -1118,6 +1155,7 @@ class Presets(Command):
 _ALL: tuple[type[Command], ...] = (
     *(
         Attack,
+        Drive,
         Transfer,
         Study,
         Explain,

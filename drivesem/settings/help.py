@@ -19,7 +19,7 @@ from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 
 TOPICS: dict[str, tuple[str, ...]] = {
-    "Find failures": ("attack", "report", "runs"),
+    "Find failures": ("attack", "drive", "report", "runs"),
     "Are they real, and why": (
         *("verify", "confirm", "explain", "plausibility", "realism"),
         *("survey", "survey-results"),
@@ -36,6 +36,7 @@ EXAMPLES = (
     ("drivesem attack --dataset kitti --root PATH_TO_KITTI --limit 20 --out runs/a", "on photographs of yours"),
     ("drivesem attack --dataset photographs --root holiday.jpg", "on a photograph without labels"),
     ("drivesem attack --config quick", "a preset; drivesem presets lists them"),
+    ("drivesem drive", "one change of each car over a whole clip: for how long is it missed?"),
     ("drivesem explain runs/a", "why it fails"),
     ("drivesem view runs/a", "move the cars yourself, in the browser, and see what the detector says"),
     ("drivesem export runs/a --to coco --out for-training", "the counterexamples as training data"),

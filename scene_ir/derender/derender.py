@@ -68,7 +68,8 @@ class DerenderSettings:
     seed: of the fill's random search. shrink: fill what vehicles hid at one over so much of the photograph's size.
     backend: of the renderer. meshes: a user's, to choose from beside the templates. segmenter: a user's, instead
     of the shipped network. withheld: for each label a kind of template that it may not be, "" for none; empty:
-    none for all.
+    none for all. known: for each label the vehicle as it stands there, None to find out, and nothing is fitted;
+    empty: none is known.
     """
 
     fit: bool = True
@@ -83,6 +84,7 @@ class DerenderSettings:
     meshes: tuple[silhouette.OwnMesh, ...] = ()
     segmenter: segment.Segmenter | None = None
     withheld: tuple[str, ...] = ()
+    known: tuple[Placement | None, ...] = ()
 
     @classmethod
     def fast(cls) -> DerenderSettings:
@@ -394,7 +396,10 @@ def _cut_out(
         mine = unknown[row] | _union(masks, image.shape[:2])
         box = boxes.row(rows.index(row)) if told[row] else None
         view = stand.View(bytes_image, mine, camera, settings.backend)
-        options, edges = stand.likely(options, box, view, by_laser)
+        if settings.known and settings.known[row] is not None:
+            edges = np.zeros(1)
+        else:
+            options, edges = stand.likely(options, box, view, by_laser)
         outlines = silhouette.silhouettes(options, camera, settings.backend)
         likeliest = int(np.argmin(edges))
         if not outlines[likeliest].any():
@@ -415,7 +420,7 @@ def _cut_out(
         masks.append(mask)
         hidden.append(mine)
         outlined.append(outlines[best])
-    if settings.fit:
+    if settings.fit and not settings.known:
         reliable, beside = _boxes(labels, kept, camera), silhouette.Evidence(bytes_image, held)
         fitting, backend = settings.fitting, settings.backend
         fitted = silhouette.fit(chosen, masks, hidden, reliable, camera, fitting, backend, beside)
@@ -439,6 +444,9 @@ def _cut_out(
 def _options(frame: Frame, labels: Labels, row: int, settings: DerenderSettings) -> tuple[list[Placement], bool]:
     """The meshes that may stand for a label, where it says or, with enough of a laser's points, where those are;
     and whether it was those."""
+    known = settings.known[row] if settings.known else None
+    if known is not None:
+        return [known], False
     size = labels.size_lhw[row]
     withheld = settings.withheld[row] if settings.withheld else ""
     kinds = silhouette.candidates(labels.kind[row], size.tolist(), withheld)

@@ -25,7 +25,7 @@ _WORTH = 32768
 
 
 @contextmanager
-def _without_stderr() -> Iterator[None]:
+def without_stderr() -> Iterator[None]:
     """Drops what native code writes to the standard error stream meanwhile."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -46,7 +46,7 @@ def start_warp() -> None:
     # one static variable: with several threads one finds another's pointer, or none, and crashes (Warp 1.19).
     wp.config.enable_tiles_in_stack_memory = None
     # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
-    with nullcontext() if torch.cuda.is_available() else _without_stderr():
+    with nullcontext() if torch.cuda.is_available() else without_stderr():
         wp.init()
 
 

@@ -101,6 +101,11 @@ RULES = (
         None,
     ),
     Rule(
+        "drivesem.drive",
+        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run", "synth"))),
+        None,
+    ),
+    Rule(
         "drivesem.viewer",
         ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run"))),
         None,

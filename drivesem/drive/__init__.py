@@ -1,0 +1,1 @@
+"""A change of cars over a whole clip: `drivesem drive`."""

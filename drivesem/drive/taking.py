@@ -1,0 +1,172 @@
+"""A clip taken apart, frame by frame, so that a car has one mesh and one size in all of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from drivesem.data.clips import Clip, clip_of, clips_in
+from drivesem.run.ask import Bar, ask
+from drivesem.run.derender import RECORD
+from drivesem.scenes.sources import derender_settings, make_ready
+from drivesem.settings.blocks import DEMO, Sharing
+from drivesem.settings.commands import Derender
+from drivesem.settings.errors import UsageError
+from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender, placements
+from scene_ir.derender.silhouette import Placement, candidates, placed
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene, save_scene
+from scene_ir.types import Labels, SceneIR
+
+DEMO_FRAMES = 30
+"""Of the embedded drive: three seconds."""
+_TRACKS = "tracks"
+"""Key of a scene's provenance: the tracks of its labels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taking:
+    """What is taken apart. folder: of clips, None for the embedded drive; name: of the clip, None for the first;
+    limit: frames, from the first on; fit: whether shapes are fitted.
+    """
+
+    folder: str | None
+    name: str | None
+    limit: int | None
+    seed: int
+    fit: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TakenClip:
+    """scenes, in order; tracks: of each scene's objects; failed: why others could not be used, by frame."""
+
+    name: str
+    names: tuple[str, ...]
+    scenes: tuple[SceneIR, ...]
+    tracks: tuple[tuple[int, ...], ...]
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+class _Demo:
+    """The embedded drive's frames."""
+
+    def __init__(self, taking: Taking) -> None:
+        from drivesem.synth.drives import drive_of
+
+        self._drive = drive_of(taking.seed, taking.limit or DEMO_FRAMES)
+        self.name = DEMO
+        self.names = tuple(f"drive-{number:03d}" for number in range(self._drive.frames))
+
+    def scene(self, name: str) -> SceneIR:
+        return self._drive.scene(self.names.index(name))
+
+
+class _Labelled:
+    """The frames of a labelled clip. A car's shape and size are those of the frame in which it is seen best; it
+    stands where each frame's label says, whatever the photograph shows: what is found frame by frame differs from
+    frame to frame, and cars would tremble.
+    """
+
+    def __init__(self, taking: Taking) -> None:
+        self._clip = clip_of(clips_in(taking.folder or ""), taking.name)
+        self.name = self._clip.name
+        self.names = self._clip.frames[: taking.limit]
+        self._fit = taking.fit
+        self._shapes: dict[int, Placement] | None = None
+
+    def scene(self, name: str) -> SceneIR:
+        labels, tracks = _labels_of(self._clip, name), self._clip.tracks(name)
+        known = [self._standing(labels, row, track) for row, track in enumerate(tracks)]
+        frame = self._clip.dataset.frame(name)
+        scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
+        return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
+
+    def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
+        """A label's vehicle where the label says; None where it is none."""
+        kind, size = labels.kind[row], labels.size_lhw[row]
+        if kind not in VEHICLES or not bool((size > 0).all()):
+            return None
+        at = labels.translation[row], labels.yaw[row]
+        shape = self._known().get(track)
+        if shape is None:  # in no frame could it be told what it is
+            return placed(candidates(kind, size.tolist())[0], *at, size)
+        return replace(shape, translation=at[0], yaw=at[1])
+
+    def _known(self) -> dict[int, Placement]:
+        """The shape of each track, looked at once by each process."""
+        if self._shapes is None:
+            best = _best_views(self._clip, self.names)
+            settings = derender_settings(self._fit)
+            self._shapes = {}
+            for name in sorted(set(best.values())):
+                rows = self._clip.tracks(name)
+                found = placements(self._clip.dataset.frame(name), settings)
+                for row, placement in found.items():
+                    if best.get(rows[row]) == name:
+                        self._shapes[rows[row]] = placement
+        return self._shapes
+
+
+def _labels_of(clip: Clip, name: str) -> Labels:
+    labels = clip.dataset.labels(name)
+    if labels is None or len(labels.kind) != len(clip.tracks(name)):
+        found = "none" if labels is None else f"{len(labels.kind)}"
+        raise FormatError(f"frame {name}: labels", f"one for each of {len(clip.tracks(name))} tracks", found)
+    return labels
+
+
+def _best_views(clip: Clip, names: Sequence[str]) -> dict[int, str]:
+    """For each vehicle's track the frame that shows it largest, of those in which it is hidden and cut least."""
+    found: dict[int, tuple[tuple[bool, bool, float], str]] = {}
+    for name in names:
+        labels = _labels_of(clip, name)
+        heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+        for row, track in enumerate(clip.tracks(name)):
+            if labels.kind[row] not in VEHICLES:
+                continue
+            plain = int(labels.occlusion[row]) <= 1, float(labels.truncation[row]) < 0.1
+            rank = (*plain, float(heights[row]))
+            if track not in found or rank > found[track][0]:
+                found[track] = rank, name
+    return {track: name for track, (_, name) in found.items()}
+
+
+class Taker:
+    """What one process needs: built once, used for many frames."""
+
+    def __init__(self, taking: Taking, out: Path) -> None:
+        self.source = _Demo(taking) if taking.folder is None else _Labelled(taking)
+        self.taking, self.out = taking, out
+
+    def __call__(self, name: str) -> None:
+        """One frame to its folder. SceneError for one that cannot be used."""
+        save_scene(self.source.scene(name), self.out / name)
+
+
+def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
+    """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError
+    or SceneError for a clip that cannot be read, or has no vehicle.
+    """
+    taking, out = work.taking, work.out
+    names = work.source.names
+    todo = [name for name in names if not (out / name / RECORD).is_file()]
+    if todo:
+        make_ready(Derender(dataset=DEMO if taking.folder is None else "kitti", root=taking.folder))
+    failed = ask(
+        todo, work, partial(Taker, taking, out), sharing, Bar("taking frames apart", remaining=True)
+    ).failed
+    kept = tuple(name for name in names if name not in failed)
+    scenes = tuple(load_scene(out / name) for name in kept)
+    if not any(len(scene.objects) for scene in scenes):
+        found = next(iter(failed.values()), f"none in {len(kept)} frames")
+        raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
+    return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes), failed)
+
+
+def tracks_of(scene: SceneIR) -> tuple[int, ...]:
+    """The tracks of a scene's objects."""
+    told = scene.provenance[_TRACKS].split(",")
+    return tuple(int(told[int(scene.provenance[f"objects[{i}].label"])]) for i in range(len(scene.objects)))
