@@ -214,6 +214,17 @@ def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable
     assert message in refused("study", "retrain", *words)
 
 
+def test_without_new_attacks_there_is_no_table_of_them(found: Taught) -> None:
+    rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
+    less = replace(found, rows=rows, left_out={"the same, consistently": "no failure"})
+    assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
+    assert less.rows[1].flat()["fresh_moved_ap50"] is None
+    told = retrain_report.told(less)
+    assert not any("Fresh" in sheet.title for sheet in told.sheets)
+    assert any("Fresh" in sheet.title for sheet in retrain_report.told(found).sheets)
+    assert "Left out: the same, consistently: no failure." in told.notes
+
+
 @pytest.mark.slow
 def test_the_whole_study_and_going_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
