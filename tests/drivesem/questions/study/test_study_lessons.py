@@ -124,7 +124,7 @@ def test_arms_differ_in_their_pictures_alone() -> None:
         "benign",
         "certain",
     ]
-    with pytest.raises(UsageError, match="--arms: expected some of benign, re-rendered, .* found 'certian'"):
+    with pytest.raises(UsageError, match=r"--arms: expected some of benign, re-rendered, .* found 'certian'"):
         lessons_of(replace(study, arms="certian"))
 
 
