@@ -112,36 +112,54 @@ def failures_in(frames: Sequence[AttackedFrame]) -> list[tuple[AttackedFrame, in
 
 class Consistency:
     """What a detector says of an object is to be the same in the photograph and in a state around a failure: a
-    term of the loss, by margins, on a pair of pictures a step. weight: of the term; t_star: of margins.
+    term of the loss, by margins, on a pair of pictures a step. weight: of the term; t_star: of margins; window_hw:
+    of the part of both pictures that is seen, with the object that fails in its middle.
     """
 
     name = "consistency"
 
-    def __init__(self, around: AroundFailures, weight: float, t_star: float, seed: int) -> None:
+    def __init__(
+        self, around: AroundFailures, weight: float, t_star: float, seed: int, window_hw: tuple[int, int]
+    ) -> None:
         self._around, self._weight, self._t_star, self._seed = around, weight, t_star, seed
+        self._window_hw = window_hw
 
     def images(self, step: int) -> Tensor:
-        """The photograph and the state: (2, 3, H, W)."""
-        frame, (sample, _) = self._pair(step)
-        both = [np.array(frame.image("benign")), np.array(sample[0])]
-        return torch.stack([torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in both])
+        """Of the photograph and of the state: (2, 3, h, w)."""
+        index, (sample, state) = self._pair(step)
+        y0, x0, y1, x1 = self._window(index, sample, state)
+        both = [self._around.failures[index][0].image("benign"), sample[0]]
+        parts = [np.array(image[y0:y1, x0:x1]) for image in both]
+        return torch.stack([torch.from_numpy(part).permute(2, 0, 1).float() / 255 for part in parts])
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the objects that are judged in both pictures."""
-        frame, (_, state) = self._pair(step)
+        """Of the objects that are judged in both pictures, and lie in the part that is seen."""
+        index, (sample, state) = self._pair(step)
+        y0, x0, y1, x1 = self._window(index, sample, state)
+        frame = self._around.failures[index][0]
         known = [box for box in frame.result.targets_benign if box.index is not None]
         still = as_targets(tuple(known), CLASSES)
         names = [detector.classes.index(n) if n in detector.classes else -1 for n in CLASSES]
         labels = torch.tensor(names)[still.labels]
-        rows = (~still.ignore & ~state.ignore[: len(known)] & (labels >= 0)).nonzero()[:, 0]
+        both = torch.stack([still.boxes_xyxy, state.boxes_xyxy[: len(known)]]) - torch.tensor([x0, y0, x0, y0])
+        inside = (both[..., :2] >= 0).all(-1) & (both[..., 2:] < torch.tensor([x1 - x0, y1 - y0])).all(-1)
+        judged = ~still.ignore & ~state.ignore[: len(known)] & (labels >= 0) & inside.all(0)
+        rows = judged.nonzero()[:, 0]
         before, after = (detector.candidates(raw.one(i)) for i in (0, 1))
-        boxes = still.boxes_xyxy[rows], state.boxes_xyxy[rows]
-        return self._weight * apart(before, after, boxes, labels[rows], self._t_star)
+        return self._weight * apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
 
-    def _pair(self, step: int) -> tuple[AttackedFrame, tuple[Sample, Targets]]:
+    def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
         generator = np.random.default_rng([self._seed, 8, step])
         index = int(generator.integers(len(self._around)))
-        return self._around.failures[index][0], self._around.state(index, self._around.number(step, generator))
+        return index, self._around.state(index, self._around.number(step, generator))
+
+    def _window(self, index: int, sample: Sample, state: Targets) -> tuple[int, int, int, int]:
+        """First row and column of the part, and those after the last."""
+        left, top, right, bottom = state.boxes_xyxy[self._around.failures[index][1]].tolist()
+        middle, size = np.array([top + bottom, left + right]) / 2, np.array(sample[0].shape[:2])
+        side = np.minimum(self._window_hw, size)
+        y0, x0 = np.clip(np.round(middle - side / 2), 0, size - side).astype(int).tolist()
+        return y0, x0, y0 + int(side[0]), x0 + int(side[1])
 
 
 def apart(

@@ -25,6 +25,7 @@ from drivesem.scenes.sources import SceneSource
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
 from drivesem.settings.errors import UsageError
+from drivesem.settings.values import size_hw
 from drivesem.training.around import AroundFailures, Consistency, failures_in
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, RedrawnSamples, Stage
 from drivesem.training.frames import FrameStore
@@ -158,6 +159,7 @@ def lessons_of(study: Study) -> list[Lesson]:
         device=study.device,
         mix=study.mix,
         label_mode=study.label_mode,
+        precision=study.precision,
         # another's weights may have been trained by the published loss: it is what they know
         loss="quality" if study.detector in SHIPPED else "published",
         **(_QUICK if study.quick else {}),
@@ -377,7 +379,8 @@ def learn(
     mixture = Mixture(benign(detector.classes), shown, shares_of(lesson.config))
     beside = None
     if lesson.consistency and isinstance(shown, AroundFailures):
-        beside = Consistency(shown, lesson.consistency, detector.t_star, lesson.config.seed)
+        window_hw = size_hw("--window", lesson.config.window)
+        beside = Consistency(shown, lesson.consistency, detector.t_star, lesson.config.seed, window_hw)
     console.print(f"{lesson.name}: {lesson.config.steps} steps", soft_wrap=True)
     train_on(lesson.config, detector, mixture, weights.parent, console, beside)
     facts = {"retrained_from": Path(study.detector).name, "steps": str(lesson.config.steps)}

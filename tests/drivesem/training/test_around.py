@@ -107,9 +107,9 @@ def test_the_pool_is_another_once_all_of_it_may_have_been_shown(around: AroundFa
 def test_consistency_on_real_pictures(around: AroundFailures) -> None:
     """Its weight scales it, and its gradient reaches the detector's weights."""
     detector = load_detector("squeezedet").requires_grad_(True).eval()
-    once, twice = (Consistency(around, weight, detector.t_star, 0) for weight in (1.0, 2.0))
+    once, twice = (Consistency(around, weight, detector.t_star, 0, (224, 640)) for weight in (1.0, 2.0))
     images = once.images(0)
-    assert images.shape[:2] == (2, 3)
+    assert images.shape == (2, 3, 224, 640)
     assert torch.equal(images, once.images(0))
     raw = detector(images)
     value = once.term(detector, raw, 0)
