@@ -228,8 +228,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     arms: str | None = None
     """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
     paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
-    seeds: Count = 1
-    """Retrain: how often benign, random, certain and consistent are trained, each time by another seed."""
+    seeds: Count | None = None
+    """Retrain: seeds by which benign, random, certain and consistent are trained, by default one."""
     states: NotNegative = 16
     """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
     consistency: Annotated[float, POSITIVE] = 1.0

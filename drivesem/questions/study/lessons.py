@@ -173,7 +173,7 @@ def lessons_of(study: Study) -> list[Lesson]:
         title, pictures = TAUGHT[arm]
         config = paper if arm == "paper" else ours
         weight = study.consistency if arm == "consistent" else 0.0
-        for turn in range(study.seeds if arm in REPEATED else 1):
+        for turn in range(study.seeds or 1 if arm in REPEATED else 1):
             name, folder = (f"{title}, seed {study.seed + turn}", f"{arm}-seed{turn}") if turn else (title, arm)
             own = replace(config, seed=study.seed + turn)
             lessons.append(Lesson(name, folder, pictures, own, references.get(arm), arm, weight))

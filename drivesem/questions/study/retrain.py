@@ -112,7 +112,8 @@ class Judged:
 class Taught:
     """All that the study found. learned, judged: attacks on frames to train on, and on held-out ones; lessons with
     how many different counterexamples were shown in each; benign: frames to train on beside them; left_out: arms
-    that could not be trained, and why; robust: how likely each arm fails a car, in states of so many frames.
+    that could not be trained, what could not be judged, and why; chances: how likely each arm fails a car, in
+    states of so many frames.
     """
 
     study: Study
@@ -123,8 +124,8 @@ class Taught:
     benign: int
     rows: Sequence[Judged]
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
-    robust: Sequence[robust.RobustRow] = ()
-    robust_frames: int = 0
+    chances: Sequence[robust.RobustRow] = ()
+    state_frames: int = 0
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -146,9 +147,9 @@ class Taught:
             },
             "rows": [row.flat() for row in self.rows],
             "left_out": dict(self.left_out),
-            "robust_frames": self.robust_frames,
+            "state_frames": self.state_frames,
             "states": self.study.states,
-            "robust": [row.flat() for row in self.robust],
+            "robust": [row.flat() for row in self.chances],
         }
 
 
@@ -214,12 +215,15 @@ def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
     draws = DRAWS if study.bootstrap is None else study.bootstrap
     rows = rows_for(study, lessons, seen, known, judged.runs, draws)
     states: Sequence[robust.FrameStates] = ()
+    failed: Mapping[str, str] = {}
     if study.states:
         (held_out,) = load_runs([str(out / ARMS / arms[0].folder)])
-        states, _ = robust.states_of(held_out, arms[0].config, list(names.values()), study, out)
+        states, failed = robust.states_of(held_out, arms[0].config, list(names.values()), study, out)
     shown = {lesson.name: (lesson, len(taken.shown(lesson, CLASSES))) for lesson in lessons}
     trained_on = len(frames) if parts.benign is None else len(parts.benign[1])
     left_out = {name: reason for name, reason in reasons.items() if reason is not None}
+    left_out |= {f"states of frame {name}": reason for name, reason in failed.items()}
+    left_out |= {f"second pictures of frame {one.identifier}": one.note for one in states if one.note}
     chances = robust_rows(lessons, rows, states, draws, study.seed)
     return Taught(study, draws, learned, judged, shown, trained_on, rows, left_out, chances, len(states))
 

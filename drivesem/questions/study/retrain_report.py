@@ -41,12 +41,12 @@ _GROUPS = {
 
 def told(found: Taught) -> Told:
     """The study as text."""
-    short = [_robust(found)] if found.robust else []
+    short = [_robust(found)] if found.chances else []
     short += [_benign(found.rows), _known(found.rows)]
     short += [_fresh(found.rows)] if _attacked_again(found.rows) else []
     whole = [*short, _further(found.rows), _training(found)]
     tables = {"study": [row.flat() for row in found.rows]}
-    tables |= {"robust": [row.flat() for row in found.robust]} if found.robust else {}
+    tables |= {"robust": [row.flat() for row in found.chances]} if found.chances else {}
     return Told(found.study.name, whole, short, notes(found), tables, _WORDS)
 
 
@@ -58,7 +58,7 @@ def _attacked_again(rows: Sequence[Judged]) -> bool:
 def _robust(found: Taught) -> Sheet:
     """How likely each arm fails a car."""
     lines = []
-    for row in found.robust:
+    for row in found.chances:
         cells = [row.title.partition(", seed ")[0], bounded(row.failures[ANYWHERE])]
         cells += [bounded(row.fewer[ANYWHERE, arm]) if (ANYWHERE, arm) in row.fewer else "-" for arm in CONTROLS]
         for kind in (REDRAWN, AROUND):
@@ -71,7 +71,7 @@ def _robust(found: Taught) -> Sheet:
         *(_DETECTOR, "anywhere", "fewer than benign", "fewer than random", "second renderer", "fewer than benign"),
         *("around failures", "fewer than benign", "phantoms", "AP50 falls", _GOAL),
     )
-    title = f"Failures a car, {found.robust_frames} held-out frames, {found.study.states} states each, %"
+    title = f"Failures a car, {found.state_frames} held-out frames, {found.study.states} states each, %"
     return Sheet(title, columns, tuple(lines))
 
 
@@ -181,7 +181,7 @@ def notes(found: Taught) -> list[str]:
         + ". A retrained detector's t* was chosen on "
         + ("the frames of --validation." if found.study.validation else "the benign frames that judge it."),
     ]
-    if found.robust:
+    if found.chances:
         lines.append(_of_robust(found))
     lines += [f"Left out: {name}: {reason}." for name, reason in found.left_out.items()]
     results = [r for ran in (found.learned, found.judged) for run in ran.runs for r in run.results]
@@ -206,7 +206,7 @@ def _of_robust(found: Taught) -> str:
         "failure. Fewer: the share of that arm's failures that a detector is without, paired over frames. "
         "Phantoms: pictures with any, of states anywhere. Seeds count together."
     )
-    if any(row.short_of is not None for row in found.robust):
+    if any(row.short_of is not None for row in found.chances):
         text += f" The goal: {'; '.join(GOAL)}; the column says what is not so."
     return text
 

@@ -17,7 +17,8 @@ from drivesem.attack.space import parse_params
 from drivesem.run.folder import attack_of
 from drivesem.run.results import Failure
 from drivesem.training.around import AT_ONCE, AroundFailures, Consistency, apart, failures_in
-from drivesem.training.attacked import AttackedFrame, frames_of
+from drivesem.training.attacked import AttackedFrame, RedrawnSamples, frames_of
+from drivesem.truth.redraw.choose import SecondRenderers
 
 BOX = torch.tensor([[10.0, 20.0, 60.0, 50.0]], dtype=torch.float64)
 CAR = torch.zeros(1, dtype=torch.int64)
@@ -102,6 +103,20 @@ def test_the_pool_is_another_once_all_of_it_may_have_been_shown(around: AroundFa
     seen = [{around.number(step, np.random.default_rng(i)) for i in range(40)} for step in range(2 * AT_ONCE)]
     assert seen[0] == seen[AT_ONCE - 1] == set(range(AT_ONCE))
     assert seen[AT_ONCE] == seen[-1] == set(range(AT_ONCE, 2 * AT_ONCE))
+
+
+@pytest.mark.slow
+def test_changes_are_drawn_by_the_generator(small_run: Path, tmp_path: Path) -> None:
+    """With its own labels of everything, people included; once."""
+    frames = frames_of(small_run)
+    samples = RedrawnSamples(frames, SecondRenderers("demo", None), tmp_path, CLASSES)
+    image, targets = samples[0]
+    assert image.shape == frames[0].image("benign").shape
+    assert (image != frames[0].image("benign")).any()
+    assert len(targets) > 0
+    written = (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns
+    assert np.array_equal(samples[0][0], image)
+    assert (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns == written
 
 
 def test_consistency_on_real_pictures(around: AroundFailures) -> None:

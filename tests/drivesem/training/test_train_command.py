@@ -34,6 +34,7 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
     return {name: value for name, value in read_weights(path)[1].items() if name.startswith("weights.")}
 
 
+@pytest.mark.slow
 def test_validation_chooses_and_held_out_frames_judge(
     tmp_path: Path, frames: list[str], kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

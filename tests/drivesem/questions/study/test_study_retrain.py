@@ -232,6 +232,7 @@ def test_the_whole_study_and_going_on(
     out = tmp_path / "out"
     words = ["study", "retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
     words += ["--train-steps", "2", "--workers", "1", "--bootstrap", "5", "--out", str(out), "--json"]
+    words += ["--states", "2"]
     assert main(words) == 0
     data = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in data["rows"]] == [
@@ -241,6 +242,10 @@ def test_the_whole_study_and_going_on(
     ]
     assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (1, 2, 1.0)
     assert json.loads((out / "study.json").read_text()) == data
+    assert (data["state_frames"], [row["arm"] for row in data["robust"]]) == (1, [BENIGN, "re-rendered", "ours"])
+    assert data["robust"][0]["failures_anywhere"] is not None
+    assert {row["goal"] for row in data["robust"]} == {None}
+    assert (out / "robust.csv").is_file()
     folders = {path.name for path in (out / "arms").iterdir()}
     assert folders == {"combo-2", "held-out", "held-out-re-rendered", "held-out-ours"}
     learned, judged = ((out / "arms" / n / "frames" / "demo-000" / "benign.png") for n in ("combo-2", "held-out"))

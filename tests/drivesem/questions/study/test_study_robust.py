@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +17,14 @@ from drivesem.questions.study.robust import (
     REDRAWN,
     Counted,
     FrameStates,
+    Judge,
     redrawn_of,
     rows_of,
+    states_of,
 )
+from drivesem.run.finished import load_runs
+from drivesem.run.folder import attack_of
+from drivesem.settings.commands import Study
 
 ARMS = [
     ("benign detector", "benign detector"),
@@ -115,6 +121,28 @@ def test_frames_without_a_second_renderer_are_left_out_of_its_share_alone() -> N
     rows = {row.arm: row for row in rows_of(some, ARMS, FALLS, DRAWS, 0)}
     assert rows["certain"].failures[REDRAWN].value == pytest.approx(10.5 / CARS)
     assert np.isfinite(rows["certain"].failures[REDRAWN].high or np.nan)
+
+
+@pytest.mark.slow
+def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> None:
+    """The same detector twice loses the same cars; going on asks nothing again."""
+    study, attack = Study(name="retrain", states=4, workers=1), attack_of(small_run)
+    (run,) = load_runs([str(small_run)])
+    asked = ["squeezedet", "squeezedet", "yolov3-slim"]
+    (one,), failed = states_of(run, attack, asked, study, tmp_path)
+    assert not failed
+    assert one.note == ""
+    anywhere, redrawn = one.counts[ANYWHERE], one.counts[REDRAWN]
+    assert (anywhere.pictures, redrawn.pictures, one.counts[AROUND].pictures) == (4, 1, 0)
+    assert 0 < redrawn.cars < anywhere.cars
+    assert anywhere.lost[0] == anywhere.lost[1] <= anywhere.cars
+    assert redrawn.lost[0] == redrawn.lost[1]
+    assert len(anywhere.lost) == len(anywhere.phantoms) == 3
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Judge, "__call__", None)
+        assert states_of(run, attack, asked, study, tmp_path)[0] == [one]
+        with pytest.raises(TypeError):
+            states_of(run, attack, asked[:2], study, tmp_path)
 
 
 def test_as_many_are_drawn_again_as_grading_has_drawn() -> None:
