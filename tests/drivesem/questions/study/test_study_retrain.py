@@ -27,11 +27,12 @@ from drivesem.questions.study.lessons import BENIGN, lessons_of, reference_of
 from drivesem.questions.study.report import OWN_PROTOCOL, answer_of
 from drivesem.questions.study.retrain import Taught
 from drivesem.questions.study.running import Ran
-from drivesem.questions.transfer.matrix import Target, TransferRow, row
+from drivesem.questions.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, Target, TransferRow, row
+from drivesem.questions.transfer.report import sheets as transfer_sheets
 from drivesem.run.finished import Run
 from drivesem.run.frame import as_detections
 from drivesem.run.protocol import PROTOCOL
-from drivesem.run.results import FrameResult
+from drivesem.run.results import Failure, FrameResult
 from drivesem.settings.commands import Study
 
 FRAMES, DRAWS = 8, 40
@@ -70,6 +71,22 @@ def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferRow:
         ],
     }
     return row(run, target, results, found, DRAWS, 0)
+
+
+def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
+    """Four frames whose first car is lost, in one of them for certain; the target loses it in that one alone."""
+    lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, grade="threshold")
+    results = [
+        replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
+        for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
+    ]
+    told = known("target", results, 3)
+    assert told.counts[CERTAIN] == (1, 1)
+    assert told.counts[THRESHOLD] == (0, 3)
+    assert told.counts[TRANSFER] == (1, 4)
+    assert told.flat()["certain_rate"] == 1.0
+    shares = transfer_sheets([told])[1]
+    assert [cell.split("\n")[-1] for cell in shares.rows[0][5:7]] == ["1 of 1", "0 of 3"]
 
 
 @pytest.fixture
