@@ -78,14 +78,13 @@ class Counted:
 @dataclass(frozen=True, slots=True)
 class FrameStates:
     """One frame. source: digest of the run's result; counts: by kind of states; note: why no second renderer drew,
-    empty where one did. `seconds` alone may differ between two calls.
+    empty where one did.
     """
 
     identifier: str
     source: str
     counts: dict[str, Counted]
     note: str
-    seconds: float
 
 
 class Judge:
@@ -96,7 +95,8 @@ class Judge:
     def __init__(self, run: Run, attack: Attack, detectors: Sequence[str], states: int, out: Path) -> None:
         self.run, self.attack, self.states, self.out = run, attack, states, out
         self.params: tuple[Parameter, ...] = params_of(attack)
-        self.detectors: list[Predictor] = [load_detector(name, attack.device) for name in detectors]
+        # A run's scenes are read to the CPU.
+        self.detectors: list[Predictor] = [load_detector(name) for name in detectors]
         self.second = SecondRenderers(attack.dataset, attack.root)
         self._cameras: list[Camera] = []
 
@@ -111,7 +111,8 @@ class Judge:
         anywhere = Everywhere(objective, feasible, nuisances, stream)
         counts, note = {}, ""
         cars = anywhere.judged
-        self._cameras = [replace(anywhere.camera, detector=d, t_star=t_star_of(d)) for d in self.detectors]
+        asked = self.attack.t_star
+        self._cameras = [replace(anywhere.camera, detector=d, t_star=t_star_of(d, asked)) for d in self.detectors]
         seen = [self._seen(anywhere.exposed(number), cars) for number in range(self.states)]
         counts[ANYWHERE] = self._counted(seen)
         try:
@@ -126,7 +127,7 @@ class Judge:
             samples = (near.sample(n, 1.0 if n % 2 == 0 else NEAR) for n in range(self.states))
             around += [self._seen(one.exposure, [index]) for one in samples if one is not None]
         counts[AROUND] = self._counted(around)
-        kept = FrameStates(name, files.digest(source / RESULT), counts, note, 0.0)
+        kept = FrameStates(name, files.digest(source / RESULT), counts, note)
         with files.whole_folder(self.out / FRAMES / name) as part:
             files.write_text(part / ROBUST, dump_record(kept, SCHEMA))
 
@@ -160,8 +161,7 @@ def states_of(
     """Show states of a run's frames to detectors, or go on with it; and frames that could not be used, with
     reasons. What is kept belongs to these detectors, as they are.
     """
-    known = [load_detector(name, study.device) for name in detectors]
-    seen = [(weights_digest(one), t_star_of(one)) for one in known]
+    seen = [(weights_digest(one), t_star_of(one, attack.t_star)) for one in map(load_detector, detectors)]
     name = hashlib.sha256(repr((seen, study.states)).encode()).hexdigest()[:16]
     folder = out / STATES / name
     build = partial(Judge, run, attack, detectors, study.states, folder)

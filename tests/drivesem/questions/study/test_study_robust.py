@@ -48,7 +48,6 @@ def frames(lost: dict[str, tuple[int, ...]], count: int = 12) -> list[FrameState
                 for kind, own in lost.items()
             },
             "",
-            0.0,
         )
         for i in range(count)
     ]
