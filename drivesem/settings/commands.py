@@ -222,7 +222,7 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Retrain: folders of further benign frames to train on, with commas; by default all of --root."""
     held_out: str | None = None
     """Retrain: folder of frames that are never trained on; by default a quarter of --root's."""
-    validation: Annotated[str, Folder()] | None = None
+    validation: str | None = None
     """Retrain: folder of further frames, of the same layout, on which retrained detectors' t* is chosen; by
     default the benign frames that judge them."""
     arms: str | None = None
@@ -909,7 +909,7 @@ class Train(Training, FrameCommand):
     """Folder of the data set, or several with commas: their frames are joined."""
     held_out: str | None = None
     """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
-    validation: Annotated[str, Folder()] | None = None
+    validation: str | None = None
     """Folder of the same layout that chooses the best weights and t* in the place of --held-out, which then only
     judges them: its figures are of frames that had no say."""
     also: str | None = None
