@@ -236,6 +236,8 @@ def parts_of(study: Study) -> Parts:
     held_out_too = [*trained_on, Path(study.held_out or study.root or "").resolve()]
     if study.validation is not None and Path(study.validation).resolve() in held_out_too:
         raise UsageError("--validation", "a folder that is neither trained on nor judged by", study.validation)
+    if study.validation is not None and not open_dataset(study.dataset, Path(study.validation)).identifiers:
+        raise UsageError("--validation", "at least one frame", "none")
     dataset = open_dataset(study.dataset, Path(study.root or ""))
     learned = judged = None
     if study.held_out is not None:

@@ -40,6 +40,7 @@ from drivesem.training.attacked import AttackedFrame
 from drivesem.training.mixture import Mixture
 from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
+from scene_ir.errors import SceneError
 from scene_ir.types import Labels
 
 PRESETS = Path(__file__).parents[4] / "configs"
@@ -310,6 +311,8 @@ def test_validation_is_neither_trained_on_nor_judged_by(tmp_path: Path) -> None:
     for name in ("root", "held_out"):
         with pytest.raises(UsageError, match="--validation: expected a folder that is neither"):
             parts_of(replace(study, validation=folders[name]))
+    with pytest.raises(SceneError, match="nowhere"):
+        parts_of(replace(study, validation=str(tmp_path / "nowhere")))
 
 
 def test_without_counterexamples_there_is_nothing_to_learn(attacked: list[AttackedFrame], tmp_path: Path) -> None:
