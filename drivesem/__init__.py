@@ -18,13 +18,14 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from drivesem.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from detectors.registry import load_predictor as load_detector
     from drivesem.run.counterexample import Counterexample, attack
     from drivesem.run.finished import Run, load_run
     from drivesem.scenes.scene import Frames, Scene, demo_scene, derender, load_scene, open_dataset
 
-__version__ = "0.1.0"
 __all__ = [
     "Counterexample",
     "Frames",

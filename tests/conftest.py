@@ -37,7 +37,7 @@ QUICK = [
     "drivesem/data/test_label_table.py",
     "drivesem/evaluation/test_voc_matching.py",
     "drivesem/evaluation/test_resampling.py",
-    "drivesem/report/test_report_charts.py",
+    "drivesem/run/report/test_report_charts.py",
     "drivesem/synth/test_synth_variations.py",
     "drivesem/attack/test_budgets.py",
     "drivesem/attack/test_space.py",

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivesem.report import pictures
+from drivesem.run.report import pictures
 from drivesem.run.results import load_frame
 from scene_ir import files
 

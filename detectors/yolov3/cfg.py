@@ -219,6 +219,8 @@ class _Reader:
             if default is None:
                 raise self.fail(key, "an integer", "none")
             return default
+        if not text.strip():
+            raise self.fail(key, "an integer", "nothing")
         (value,) = self._integers(key, [text])
         if value < least:
             raise self.fail(key, f"an integer of at least {least}", value)

@@ -17,12 +17,12 @@ from drivesem.classify.networks.base import Scorer
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.objective import ClassifierObjective, Seen
+from drivesem.classify.page import write_page
 from drivesem.classify.pictures import Shown, Studio, views_of
 from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of, steps_of
 from drivesem.classify.results import SCHEMA, ClassifiedFrame, ClassifiedRun, Verdict
 from drivesem.classify.scenes import ObjectScene, in_turn
 from drivesem.classify.space import ObjectSpace
-from drivesem.report.classified import write_page
 from drivesem.report.tables import csv_text
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import METRICS

@@ -13,10 +13,10 @@ import torch
 from drivesem.classify.attack import Attacker, report_run
 from drivesem.classify.finished import ClassifyRun
 from drivesem.classify.objective import as_written
+from drivesem.classify.page import SECOND_PICTURE
 from drivesem.classify.redraw.base import Redraw, Solid, likeness
 from drivesem.classify.results import SCHEMA, ClassifiedRun, SecondLook
 from drivesem.classify.scenes import camera
-from drivesem.report.classified import SECOND_PICTURE
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES

@@ -8,9 +8,9 @@ from rich.table import Table
 
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.report.answer import print_json
-from drivesem.report.grading import KINDS, NO_KIND
 from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_run
+from drivesem.run.report.grading import KINDS, NO_KIND
 from drivesem.run.results import RunSummary
 from drivesem.settings.commands import Attack
 from drivesem.truth.grades import Grade, Kind

@@ -10,11 +10,11 @@ from drivesem.classify.confirm import confirm_run
 from drivesem.classify.gate import gate_run
 from drivesem.classify.holes import holes_run
 from drivesem.classify.least import explain_run
+from drivesem.classify.page import share
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun
 from drivesem.classify.training import train_run
 from drivesem.report.answer import print_json
-from drivesem.report.classified import share
 from drivesem.report.tables import Sheet, percent
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say

@@ -6,10 +6,10 @@ from typing import Any
 
 from drivesem.questions.verify.asking import verify_run
 from drivesem.report.answer import print_json
-from drivesem.report.grading import UNKNOWN
 from drivesem.report.tables import Sheet
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say_end
+from drivesem.run.report.grading import UNKNOWN
 from drivesem.settings.commands import Verify
 from drivesem.settings.devices import check_device
 

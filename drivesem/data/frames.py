@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from scene_ir import files
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError, RangeError, shown
 from scene_ir.types import Camera, Labels
 
 T = TypeVar("T")
@@ -52,7 +52,11 @@ class Frames(Generic[T]):
 
 def images_of(folder: Path) -> list[Path]:
     """The images in a folder, sorted. FormatError where there is no such folder."""
-    if not folder.is_dir():
+    try:
+        there = folder.is_dir()
+    except OSError as error:  # such as a name that is too long
+        raise FormatError(shown(str(folder)), "a folder of images", f"{error.strerror}") from None
+    if not there:
         raise FormatError(str(folder), "a folder of images", "no such folder")
     return [p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."]
 

@@ -1,1 +1,1 @@
-"""Results as one HTML page; sees result files only."""
+"""How things are shown: words and bars in a terminal, tables, plots, drawn pictures, one question's answer."""

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Predictor
-from drivesem.report import grading, pictures
 from drivesem.run.attack import Worker
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
+from drivesem.run.report import grading, pictures
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.tally import graded
 from drivesem.scenes.scene import Scene, png

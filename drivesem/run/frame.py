@@ -30,7 +30,7 @@ from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.data import kitti
 from drivesem.evaluation.failures import Failures
-from drivesem.report import pictures
+from drivesem.run.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from drivesem.settings.blocks import KEEP_MB
 from drivesem.truth.certificate import with_regions

@@ -14,14 +14,14 @@ from drivesem.attack.space import combo
 from drivesem.data.label_table import WEATHERS
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.outcome import Outcome
-from drivesem.report.grading import GradesAsked
-from drivesem.report.html import render_report
-from drivesem.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
 from drivesem.run.protocol import follows_paper
 from drivesem.run.records import from_json
+from drivesem.run.report.grading import GradesAsked
+from drivesem.run.report.html import render_report
+from drivesem.run.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, graded, tally
 from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report

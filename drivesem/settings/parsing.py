@@ -15,12 +15,12 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from drivesem import __version__
 from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 from drivesem.settings.help import command_help, overview
 from drivesem.settings.presets import preset_path, presets
+from drivesem.version import __version__
 from scene_ir import files
 from scene_ir.errors import FormatError
 

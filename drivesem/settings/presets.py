@@ -6,8 +6,6 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-import drivesem
-
 _INSTALLED = "share/drivesem/configs/"
 """Where pyproject.toml has a wheel put them."""
 
@@ -15,7 +13,7 @@ _INSTALLED = "share/drivesem/configs/"
 @cache
 def presets() -> dict[str, Path]:
     """The presets by name: of the clone that this code is from, else of what is installed."""
-    clone = Path(drivesem.__file__).resolve().parents[1]
+    clone = Path(__file__).resolve().parents[2]
     if (clone / "pyproject.toml").is_file() and (clone / "configs").is_dir():
         found = sorted((clone / "configs").glob("*.yaml"))
     else:

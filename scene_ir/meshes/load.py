@@ -31,6 +31,8 @@ _MOST_FACES = 2_000_000
 """Of all that a file places: vehicles made by hand have some thousand, scans some hundred thousand."""
 _MOST_CLAIMED = 20_000_000
 """Of all that a header says there is: a face may have vertices, normals and more of its own."""
+_MOST_COORDINATE = 1e9
+"""In a file's own units: a car in micrometres has less."""
 _MOST_NODES = 10_000
 _MOST_TEXELS = 1 << 26
 _PLY_HEAD = 1 << 16
@@ -296,6 +298,8 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
         total += len(shape.faces)
         if total > _MOST_FACES:
             raise FormatError(f"{file}: faces", f"at most {_MOST_FACES:,}", "more")
+        if shape.vertices.shape[1] != 3:
+            raise FormatError(f"{file}: vertices", "three coordinates each", shape.vertices.shape[1])
         placed = trimesh.transform_points(shape.vertices, transform)
         index = np.asarray(shape.faces, dtype=np.int64)
         if index.min() < 0 or index.max() >= len(placed):
@@ -320,6 +324,8 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
     everything = np.concatenate(vertices)
     if not np.isfinite(everything).all():
         raise FormatError(f"{file}: vertices", "finite coordinates", "NaN or infinity")
+    if (most := float(np.abs(everything).max())) > _MOST_COORDINATE:
+        raise FormatError(f"{file}: vertices", f"coordinates up to {_MOST_COORDINATE:g}", f"{most:g}")
     forward = np.zeros(3)
     if {sign for sign, _ in sides} == {1.0, -1.0}:
         for sign in (1.0, -1.0):

@@ -10,8 +10,8 @@ import numpy as np
 from drivesem.questions.confirm.judge import RendererFailure
 from drivesem.questions.confirm.results import Confirmed
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, text_extent, write_text
-from drivesem.report.pictures import overlay
 from drivesem.run.finished import Frame
+from drivesem.run.report.pictures import overlay
 from drivesem.run.results import BoxRecord, Failure
 from scene_ir import files
 

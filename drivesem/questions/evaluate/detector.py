@@ -20,7 +20,7 @@ from drivesem.data.registry import Dataset, open_dataset
 from drivesem.evaluation import coco
 from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.report.mistakes import marked
+from drivesem.questions.evaluate.mistakes import marked
 from drivesem.report.tables import percent
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask

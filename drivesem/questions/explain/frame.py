@@ -34,9 +34,9 @@ from drivesem.questions.explain.results import (
     write_explanation,
 )
 from drivesem.questions.explain.shapley import MOST_EXACT, Flags, Floats, shapley
-from drivesem.report import pictures
 from drivesem.run.frame import RESULT, detection_records, failure_records, target_records
 from drivesem.run.rebuilt import rebuilt
+from drivesem.run.report import pictures
 from drivesem.run.results import Coordinate, load_frame
 from drivesem.settings.commands import Attack
 from scene_ir import files

@@ -130,6 +130,7 @@ def test_heads_agree_on_classes_and_there_is_one() -> None:
     ("old", "new", "message"),
     [
         ("filters=16", "filters=1000000000", r"filters: expected at most 1048576, found 1000000000"),
+        ("filters=16", "filters=", r"filters: expected an integer, found nothing"),
         ("filters=16", f"filters={'9' * 5000}", r"filters: expected integers"),
         (
             "filters=4",

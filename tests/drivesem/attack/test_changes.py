@@ -57,6 +57,7 @@ def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR
         assert torch.equal(made.objects.occlusion, labels.occlusion)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_not_proposed(scene: SceneIR) -> None:
     found = proposals(scene, Changes((Change.PARK,)), 6, 3)
     assert found

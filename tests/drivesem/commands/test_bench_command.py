@@ -274,6 +274,7 @@ def test_boxes_without_an_archive_and_elsewhere(capsys: pytest.CaptureFixture[st
     assert "--boxes: expected bench step, found bench render" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_climb(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(climb, "PRECISIONS", {"float32": None})
     words = ["bench", "climb", "--quick", "--cars", "1", "--params", "color,weather", "--passes", "24", "--json"]

@@ -55,6 +55,7 @@ def test_a_run_can_be_asked(runs: Runs, kind: str, tmp_path: Path) -> None:
     assert main(["plausibility", "--run", str(folder), "--out", str(tmp_path / "out")]) == 0
 
 
+@pytest.mark.slow
 def test_the_same_from_python(monkeypatch: pytest.MonkeyPatch) -> None:
     worse = count(0, -1)
     monkeypatch.setattr(run_frame, "value_of", lambda *_: next(worse))

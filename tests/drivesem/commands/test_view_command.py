@@ -124,7 +124,15 @@ def test_the_next_port_that_is_free(two_scenes: Path, monkeypatch: pytest.Monkey
 
 def test_it_serves_until_ctrl_c(small_run: Path) -> None:
     words = [sys.executable, "-m", "drivesem.cli", "view", str(small_run), "--port", "0", "--no-browser", "--json"]
-    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ})
+    child = subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ},
+        # A shell's job in the background, as these tests may be, ignores Ctrl-C, and so would what it starts.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     assert child.stdout is not None
     try:
         told = json.loads(child.stdout.readline())

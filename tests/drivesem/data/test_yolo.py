@@ -150,6 +150,7 @@ def test_a_bad_line_is_named(line: str, message: str, folder: Path) -> None:
         ("train: images/train\n", r"data\.yaml: names: expected a list of classes, .*found None"),
         ("names: [a]\n", r"data\.yaml: train: expected a folder of images, found none"),
         ("names: [a]\ntrain: a.txt\n", r"data\.yaml: train: expected a folder of images, or a list"),
+        (f"names: [a]\ntrain: {'t' * 400}\n", "tt: expected a folder of images, found File name too long"),
         ("names: [a]\ntrain: no\n", "no: expected a folder of images, found no such folder"),
         ("names: [a]\ntrain: calib/train\n", r"calib/train: expected at least one \.png or \.jpg, found none"),
         ("names: [a]\ntrain: ../images\n", r"data\.yaml: train: expected a folder in .*, found '\.\./images'"),

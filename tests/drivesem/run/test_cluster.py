@@ -66,6 +66,7 @@ def found_by(jobs: list[int], folder: Path, address: str) -> Iterator[tuple[int,
             yield job, str(error)
 
 
+@pytest.mark.slow
 def test_nodes_share_jobs_and_a_process_that_ends_costs_what_it_had_in_hand(tmp_path: Path, cluster: Any) -> None:
     found = dict(found_by(list(range(12)), tmp_path, cluster.address))
     assert found[3] == "three: expected another number, found 3"
@@ -79,6 +80,7 @@ def test_nodes_share_jobs_and_a_process_that_ends_costs_what_it_had_in_hand(tmp_
     assert tries == dict.fromkeys(range(12), 1) | {5: 2, 7: 3}, "nothing is done twice"
 
 
+@pytest.mark.slow
 def test_a_node_that_is_gone_costs_what_it_had_in_hand(tmp_path: Path, cluster: Any) -> None:
     found: dict[int, Any] = {}
     jobs, gone = list(range(10, 60)), False

@@ -102,7 +102,7 @@ def test_presets_of_a_wheel_are_found(tmp_path: Path, monkeypatch: pytest.Monkey
     (data / "mine.yaml").write_text("# Mine.\nfor: attack\ncombo: 3\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: drivesem\nVersion: 9\n")
     (info / "RECORD").write_text("../../share/drivesem/configs/mine.yaml,,\ndrivesem/__init__.py,,\n")
-    monkeypatch.setattr(preset_files.drivesem, "__file__", str(site / "drivesem" / "__init__.py"))
+    monkeypatch.setattr(preset_files, "__file__", str(site / "drivesem" / "settings" / "presets.py"))
     monkeypatch.setattr(sys, "path", [str(site)])
     presets.cache_clear()
     try:

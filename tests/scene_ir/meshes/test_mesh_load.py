@@ -242,6 +242,8 @@ BROKEN = {
     "empty.obj": b"",
     "points.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
     "flat.obj": b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n",
+    "plane.obj": b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
+    "wide.obj": b"v 0 0 0\nv 1e180 0 0\nv 0 1e180 1\nf 1 2 3\n",
     "nan.obj": b"v 0 nan 0\nv 1 0 0\nv 0 1 1\nf 1 2 3\n",
     "cut.glb": b"glTF\x02\x00\x00\x00\xff\x00\x00\x00",
     "notes.txt": b"hello",

@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from drivesem.report import grading
-from drivesem.report.page import ShownRun
+from drivesem.run.report import grading
+from drivesem.run.report.page import ShownRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
 from scene_ir import files
 from scene_ir.errors import FormatError

@@ -7,8 +7,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from drivesem.report.charts import SERIES, Fall, curve_chart, fall_chart, key_of, trace
-from drivesem.report.page import Chart, Line
+from drivesem.run.report.charts import SERIES, Fall, curve_chart, fall_chart, key_of, trace
+from drivesem.run.report.page import Chart, Line
 
 
 def chart(lines: list[Line], **of: object) -> ET.Element:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.outcome import Marks
-from drivesem.report.pictures import DETECTED_COLOUR, IGNORED_COLOUR, LOST_COLOUR, PHANTOM_COLOUR, TRUE_COLOUR
+from drivesem.run.report.pictures import DETECTED_COLOUR, IGNORED_COLOUR, LOST_COLOUR, PHANTOM_COLOUR, TRUE_COLOUR
 
 _LEGEND = (
     ("hit", TRUE_COLOUR),

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
-from drivesem.report import grading
-from drivesem.report.frames import cards_of
 from drivesem.run.page import load_shown
+from drivesem.run.report import grading
+from drivesem.run.report.frames import cards_of
 from drivesem.run.results import Failure, FrameResult
 from drivesem.truth.grades import Agreement, Count
 

@@ -36,15 +36,18 @@ def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]
     worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
     cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    part = resources.files("drivesem.report")
-    template = environment.from_string(part.joinpath("classified.html").read_text(encoding="utf-8"))
-    style = Markup(part.joinpath("style.css").read_text(encoding="utf-8"))
+    template = environment.from_string(_part("drivesem.classify", "page.html"))
+    style = Markup(_part("drivesem.report", "style.css"))
     rows = [
         (one, percent(share(one.benign, one.pictures)), percent(share(one.attacked, one.pictures)))
         for one in run.classes
     ]
     text = template.render(run=run, cards=cards, style=style, percent=percent, rows=rows)
     files.write_text(path, text)
+
+
+def _part(package: str, name: str) -> str:
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def share(part: int, whole: int) -> float | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-from drivesem.report.page import Chart, Line, Point
+from drivesem.run.report.page import Chart, Line, Point
 
 SERIES = 7
 """Colours in the style sheet; more lines repeat them with other dashes."""

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.report import grading
+from drivesem.run.report import grading
 from drivesem.run.results import BoxRecord, Failure
 
 Image = NDArray[np.uint8]

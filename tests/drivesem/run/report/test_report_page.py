@@ -17,10 +17,10 @@ import pytest
 from PIL import Image
 
 from drivesem.cli import main
-from drivesem.report.frames import cards_of
 from drivesem.report.plots import COLOURS
 from drivesem.run.page import load_shown
 from drivesem.run.protocol import PROTOCOL
+from drivesem.run.report.frames import cards_of
 from drivesem.run.results import load_frame
 from drivesem.settings.commands import Attack
 from scene_ir import files
@@ -56,7 +56,7 @@ def test_nothing_comes_from_outside(page: Path, parse: Callable[[Path], Any]) ->
         f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
     )
     assert text.count("<script") == 1
-    assert script == resources.files("drivesem.report").joinpath("page.js").read_text(encoding="utf-8")
+    assert script == resources.files("drivesem.run.report").joinpath("page.js").read_text(encoding="utf-8")
 
 
 def test_every_picture_has_a_text(page: Path, parse: Callable[[Path], Any]) -> None:

@@ -13,9 +13,9 @@ import pytest
 
 from drivesem.cli import main
 from drivesem.evaluation.coco import ClassScores, Scores
-from drivesem.report.frames import cards_of
 from drivesem.run.page import load_shown, query_curves, write_run
 from drivesem.run.protocol import PROTOCOL
+from drivesem.run.report.frames import cards_of
 from drivesem.settings.commands import Attack
 from scene_ir import files
 
@@ -170,7 +170,7 @@ def test_frames_without_failure(tmp_path: Path, frame: Callable[..., Any], make_
 def test_large_pictures_are_made_smaller(
     tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivesem.report.frames.LARGEST_PX", 100)
+    monkeypatch.setattr("drivesem.run.report.frames.LARGEST_PX", 100)
     run = make_run(tmp_path / "run", [frame("1", lost=True)])
     shown, _ = load_shown([str(run)])
     (card,) = cards_of(shown, 1)

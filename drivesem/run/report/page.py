@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.report.grading import GradesAsked
+from drivesem.run.report.grading import GradesAsked
 from drivesem.run.results import FrameResult, RunSummary
 
 Point = tuple[float, float]

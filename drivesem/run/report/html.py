@@ -14,11 +14,11 @@ from urllib.parse import quote
 import jinja2
 from markupsafe import Markup
 
-from drivesem.report import grading
-from drivesem.report.charts import Fall, curve_chart, fall_chart, key_of, trace
-from drivesem.report.frames import Card, CloseUp, cards_of, in_units, told
-from drivesem.report.page import Page, ShownRun
 from drivesem.report.policy import script_hash
+from drivesem.run.report import grading
+from drivesem.run.report.charts import Fall, curve_chart, fall_chart, key_of, trace
+from drivesem.run.report.frames import Card, CloseUp, cards_of, in_units, told
+from drivesem.run.report.page import Page, ShownRun
 from drivesem.run.results import RunSummary
 from drivesem.truth.grades import Grade
 
@@ -65,11 +65,11 @@ def render_report(page: Page, at: Path) -> str:
         "shown_folder": lambda folder: folder.as_posix(),
     }
     environment.globals |= {"told": told, "in_units": in_units, "trace": trace}
-    template = environment.from_string(_part("template.html"))
+    template = environment.from_string(_part("drivesem.run.report", "template.html"))
     first = runs[0]
     return template.render(
-        style=Markup(_part("style.css")),
-        script=Markup(script := _part("page.js")),
+        style=Markup(_part("drivesem.report", "style.css")),
+        script=Markup(script := _part("drivesem.run.report", "page.js")),
         script_hash=Markup(script_hash(script)),
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
@@ -110,8 +110,8 @@ def render_report(page: Page, at: Path) -> str:
     )
 
 
-def _part(name: str) -> str:
-    return resources.files("drivesem.report").joinpath(name).read_text(encoding="utf-8")
+def _part(package: str, name: str) -> str:
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def _link(at: Path, folder: Path, frame: str | None) -> str:
