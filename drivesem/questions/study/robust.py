@@ -208,7 +208,8 @@ def rows_of(
     """A row an arm. arms: arm and title of each detector, in the order in which they were asked; falls: of AP50,
     by arm, of each seed.
     """
-    weights = np.random.default_rng(seed).multinomial(len(frames), np.full(len(frames), 1 / len(frames)), draws)
+    even = np.full(len(frames), 1 / len(frames))
+    weights = np.random.default_rng(seed).multinomial(len(frames), even, draws).astype(np.float64)
     columns: dict[str, list[int]] = {}
     for column, (arm, _) in enumerate(arms):
         columns.setdefault(arm, []).append(column)
