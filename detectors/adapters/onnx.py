@@ -133,7 +133,12 @@ def session_of(path: Path) -> Any:
     # A thread that waits by spinning takes its core from torch's.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # A name that is no text is told only where it is read, as UnicodeDecodeError.
+        for told in (*session.get_inputs(), *session.get_outputs()):
+            _ = told.name, told.shape
+        _ = session.get_modelmeta().custom_metadata_map
+        return session
     except Exception as error:  # ONNX Runtime's own classes differ from version to version
         raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
 

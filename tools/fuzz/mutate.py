@@ -127,6 +127,7 @@ def mutated(name: str, data: bytes, rng: random.Random) -> bytes:
             TypeError,
             struct.error,
             zipfile.BadZipFile,
+            NotImplementedError,
             zlib.error,
             OSError,
             OverflowError,

@@ -122,6 +122,15 @@ def test_files_that_are_none(content: bytes | None, message: str, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
+def test_names_that_are_no_text(graph: Make) -> None:
+    path = graph({"scores": np.zeros((1, 4, 80))})
+    data = path.read_bytes()
+    assert b"image" in data
+    path.write_bytes(data.replace(b"image", b"im\xffge"))
+    with pytest.raises(DetectorError, match=r"tiny\.onnx: expected an ONNX graph, found 'utf-8'"):
+        load_predictor(f"onnx:{path}")
+
+
 def test_graphs_of_no_known_kind(graph: Make) -> None:
     with pytest.raises(DetectorError, match=r"expected the outputs of nanodet or .* or ssd, found \[1, 5\]"):
         OnnxPredictor(graph({"y": np.zeros((1, 5))}))
