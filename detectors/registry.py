@@ -12,7 +12,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from detectors import planted
+from detectors import ensemble, planted
 from detectors.adapters import choose
 from detectors.base import Detector, DetectorError, Predictor
 from detectors.reading import read_file, read_text
@@ -47,6 +47,8 @@ def code_of(name_or_path: str | Path) -> str | None:
     name = str(name_or_path)
     if name.startswith(planted.PREFIX):
         return code_of(planted.parts_of(name)[1])
+    if name.startswith(ensemble.PREFIX):
+        return next(filter(None, map(code_of, ensemble.names_of(name))), None)
     return name.partition(":")[2] if choose.kind_of(name) in choose.RUNS_CODE else None
 
 
@@ -74,7 +76,8 @@ def load_detector(
 ) -> Detector:
     """The shipped detector of that name, or the one in a `.safetensors` file, or `darknet:FILE.cfg,FILE.weights`;
     frozen, eval mode, channels-last. Or one from elsewhere (see `detectors.adapters.choose`), always in float32;
-    or any of these with a fault that is known, `planted:FAULT@DETECTOR` (see `detectors.planted`).
+    any of these with a fault that is known, `planted:FAULT@DETECTOR` (see `detectors.planted`); or several with
+    the same classes as one, `ensemble:A+B` (see `detectors.ensemble`).
 
     gradient_precision: torch.bfloat16 or, on GPUs, torch.float16, for passes that a gradient follows; without it,
     all compute in float32. Detections and losses that are judged always do.
@@ -87,6 +90,10 @@ def load_detector(
         return planted.PlantedDetector(load_detector(inner, device, gradient_precision), fault).requires_grad_(
             False
         )
+    if str(name_or_path).startswith(ensemble.PREFIX):
+        names = ensemble.names_of(str(name_or_path))
+        members = [load_detector(name, device, gradient_precision) for name in names]
+        return ensemble.Ensemble(members).requires_grad_(False)
     if choose.kind_of(str(name_or_path)) is not None:
         if gradient_precision is not None:
             raise DetectorError(f"{name_or_path}: expected float32 for its gradients, found {gradient_precision}")

@@ -64,6 +64,20 @@ class Drawn(Protocol):
         ...
 
 
+class Beside(Protocol):
+    """A further term of the loss, on pictures of its own. name: of its column in the log."""
+
+    name: str
+
+    def images(self, step: int) -> Tensor:
+        """What the detector is to see in a step for it: (K, 3, H, W) in [0, 1]; a function of the step alone."""
+        ...
+
+    def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
+        """The term (), weighted, of what the detector says of these images; differentiable."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class TrainingSettings:
     """How to train; the published schedules are presets in configs/."""
@@ -119,6 +133,7 @@ def train(
     stop_after: int | None = None,
     progress: Progress | None = None,
     loaders: int = 0,
+    beside: Beside | None = None,
 ) -> Detector:
     """Train in place, from the checkpoint in `folder` where there is one; the detector returned holds the averaged
     weights, in eval mode.
@@ -126,7 +141,7 @@ def train(
     `stop_after` leaves the schedule at that step, as a killed run does. `loaders`: threads that make views ready
     ahead, each with one of torch's threads; without any, views are made between the steps. In a process group of
     torch.distributed each process computes its share of every batch, and the first one alone writes, evaluates and
-    tells progress.
+    tells progress. `beside`: a term that each step adds to the loss.
 
     Raises ValueError for an empty dataset, or a batch that the processes cannot share evenly; DetectorError for a
     checkpoint of another detector or of other settings; FloatingPointError (with the step) where the loss is no
@@ -137,7 +152,7 @@ def train(
     rank, ranks = _place()
     if settings.batch % ranks:
         raise ValueError(f"batch: expected a multiple of the {ranks} processes, found {settings.batch}")
-    run = _Run(detector, settings)
+    run = _Run(detector, settings, beside)
     step = run.load(folder / CHECKPOINT) if (folder / CHECKPOINT).is_file() else 0
     _wait_for_all()
     started, before = time.monotonic(), run.seconds
@@ -247,8 +262,8 @@ class _Batches:
 class _Run:
     """Weights and buffers, their average and the optimiser's state."""
 
-    def __init__(self, detector: Detector, settings: TrainingSettings) -> None:
-        self.detector, self.settings = detector.train(), settings
+    def __init__(self, detector: Detector, settings: TrainingSettings, beside: Beside | None = None) -> None:
+        self.detector, self.settings, self.beside = detector.train(), settings, beside
         self.seconds = 0.0
         self.generator = torch.Generator()
         for module in detector.modules():
@@ -286,6 +301,8 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
         values = self._backward(images, targets, dtype)
+        if self.beside is not None:
+            values |= self._backward_beside(self.beside, step, values["total"], dtype)
         self.scaler.unscale_(self.optimiser)
         norm = torch.nn.utils.clip_grad_norm_(self.detector.parameters(), self.settings.clip_norm)
         overflown = self.scaler.is_enabled() and math.isfinite(values["total"])
@@ -333,6 +350,15 @@ class _Run:
                 if name != NO_LOSS:
                     values[name] = values.get(name, 0.0) + share * float(value.detach())
         return values
+
+    def _backward_beside(self, beside: Beside, step: int, total: float, dtype: torch.dtype) -> dict[str, float]:
+        """Add the gradients of the further term; it and the sum of all terms."""
+        with torch.autocast(self.device.type, dtype, enabled=dtype != torch.float32):
+            raw = self.forward(beside.images(step).to(self.device))
+        term = beside.term(self.detector, raw, step)
+        if term.requires_grad:  # else there is no object to compare
+            self.scaler.scale(term).backward()
+        return {beside.name: float(term.detach()), "total": total + float(term.detach())}
 
     @contextmanager
     def averaged(self) -> Iterator[Detector]:

@@ -10,25 +10,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from drivesem.training.known import describe
 from scene_ir import files
-
-SHARED = ("split", "seed", "vehicles", "building", "tree", "bush", "surface")
-"""What a frame's manifest says of its origin and of the shapes it shows."""
-
-
-def describe(folders: Sequence[Path], frames: int | None = None) -> dict[str, Any]:
-    """Splits, seeds and the union of shapes over folders of `drivesem synth`, the first `frames` of each."""
-    manifests = [files.read_json(folder / "manifest.json")["frames"] for folder in folders]
-    entries = [entry for manifest in manifests for entry in manifest[:frames]]
-    union: dict[str, Any] = {"frames": len(entries)}
-    for key in SHARED:
-        values = [entry[key] for entry in entries]
-        union[key] = sorted({v for value in values for v in (value if isinstance(value, list) else [value])})
-    return union
 
 
 def main() -> None:

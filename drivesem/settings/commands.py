@@ -239,21 +239,24 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     queries: Count = 64
     """Samples: queries of each method without gradient."""
     passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
-    """Searches: passes of the detector that each method may take for a frame, a gradient counted as 3."""
+    """Searches, and retrain with climb: passes of the detector that each method may take for a frame, a gradient
+    counted as 3."""
     pace: Annotated[str | None, Folder()] = None
     """Searches: folder of such a study; each method takes as many more passes as fit into the seconds that the
     slowest took there for a frame."""
     params: str | None = None
-    """Searches: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by default as
-    combination 2."""
+    """Searches, retrain: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by
+    default as combination 2."""
     objective_labels: LabelMode = "moved"
     """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
-    method: Literal["si-fgsm", "apgd"] = "si-fgsm"
-    """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's."""
+    method: Literal["si-fgsm", "apgd", "climb"] = "si-fgsm"
+    """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's; climb, of retrain
+    alone, finds failures that hold."""
     controls: bool = True
     """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
     seeds: Count | None = None
-    """Single, multi: seeds of random numbers for each control, by default 3, 1 with --quick."""
+    """Single, multi: seeds of random numbers for each control, by default 3, 1 with --quick. Retrain: seeds by
+    which benign, random, certain and consistent are trained, by default one."""
     paper_protocol: bool = True
     """Single, multi: beside each arm the same by the paper's exact protocol (--config paper), where the detector
     has its loss."""
@@ -270,6 +273,19 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     """Retrain: folders of further benign frames to train on, with commas; by default all of --root."""
     held_out: str | None = None
     """Retrain: folder of frames that are never trained on; by default a quarter of --root's."""
+    validation: str | None = None
+    """Retrain: folder of further frames, of the same layout, on which retrained detectors' t* is chosen; by
+    default the benign frames that judge them."""
+    arms: str | None = None
+    """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
+    paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
+    states: NotNegative = 16
+    """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
+    consistency: Annotated[float, POSITIVE] = 1.0
+    """Retrain: weight of the term of consistent, which compares an object's margins in both of its pictures."""
+    reattack: bool = True
+    """Retrain: attack held-out frames against each retrained detector too, not against the detector as it was
+    alone."""
     benign_frames: Count | None = None
     """Retrain: the first so many of these judge what is benign; by default 1000, 12 with --quick."""
     fresh: Count | None = None
@@ -306,6 +322,10 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
         other = self.other_detector is not None and self.name != "attribution"
         refuse(other, "--other-detector", "study attribution", beside)
+        climbs = self.method == "climb" and self.name != "retrain"
+        refuse(climbs, "--method", "si-fgsm or apgd; climb with study retrain alone", self.method)
+        made = self.dataset == DEMO and self.validation is not None
+        refuse(made, "--validation", "none with the embedded frames", self.validation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -948,6 +968,9 @@ class Train(Training, FrameCommand):
     names (docs/derender.md)."""
     held_out_split: str | None = None
     """The same of --held-out; where that is not given, of --root."""
+    validation: str | None = None
+    """Folder of the same layout that chooses the best weights and t* in the place of --held-out, which then only
+    judges them: its figures are of frames that had no say."""
     also: str | None = None
     """Folder of further frames whose figures go into the model card, KITTI layout."""
     frames: Annotated[int, POSITIVE] = 1000
@@ -1001,11 +1024,14 @@ class Train(Training, FrameCommand):
 
     def check(self) -> None:
         super().check()
-        made, given = self.dataset == SYNTH, (self.root, self.held_out) != (None, None)
+        made, given = self.dataset == SYNTH, (self.root, self.held_out, self.validation) != (None,) * 3
         refuse(not made and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
-        refuse(made and given, "--root, --held-out", "none with --dataset synth, which makes both", "one")
+        both = "--root, --held-out, --validation"
+        refuse(made and given, both, "none with --dataset synth, which makes what it needs", "one")
         split = self.split or self.held_out_split
         refuse(made and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
+        alone = self.validation is not None and self.held_out is None
+        refuse(alone, "--held-out", "frames to judge by, beside --validation", "none")
 
 
 @dataclass(frozen=True, kw_only=True)

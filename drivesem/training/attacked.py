@@ -21,8 +21,11 @@ from drivesem.run.frame import RESULT, as_targets
 from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.training.targets import TRAINED, training_targets
+from drivesem.truth.redraw.choose import SecondRenderers
+from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
 
 Stage = Literal["benign", "rerender", "counterexample"]
 """The photograph, the same rendered again without any change, and what the attack made of it."""
@@ -68,6 +71,35 @@ class AttackedSamples(Sequence[Sample]):
 
     def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self._frames[index].image(self._stage), self._targets[index]
+
+
+class RedrawnSamples(Sequence[Sample]):
+    """To train on: the changes of a run of generated frames, as the generator draws and labels them. Drawn when
+    they are first asked for, and kept in `folder`.
+    """
+
+    def __init__(
+        self, frames: Sequence[AttackedFrame], second: SecondRenderers, folder: Path, classes: Sequence[str]
+    ) -> None:
+        self._frames, self._second, self._folder, self._classes = frames, second, folder, classes
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
+        frame = self._frames[index]
+        folder = self._folder / frame.name.replace("/", "_")
+        if not folder.is_dir():
+            changed = load_scene(frame.folder / "scene")
+            renderer = self._second.of(frame.name, changed)
+            if not isinstance(renderer, GeneratorRedraw):
+                raise FormatError(f"frame {frame.name}", "a frame that the generator made", "another one")
+            drawn = renderer.drawn(changed)
+            with files.whole_folder(folder) as part:
+                files.write_png(part / "picture.png", drawn.image)
+                kitti.write_labels(part / "labels.txt", drawn.labels)
+        labels = kitti.read_labels(folder / "labels.txt")
+        return files.read_image(folder / "picture.png"), training_targets(labels, TRAINED, self._classes)
 
 
 def frames_of(run: Path) -> list[AttackedFrame]:

@@ -64,9 +64,10 @@ def card(
     done: tuple[int, float],
     held_out: tuple[int, Marks] | None,
     also: tuple[int, ClassScores] | None,
+    chosen_on: int | None = None,
 ) -> str:
     """The card as Markdown. weights: their file, written; done: steps and seconds; held_out, also: how many
-    frames, and their figures.
+    frames, and their figures; chosen_on: how many others chose step and t*, None where those of held_out did.
     """
     step, seconds = done
     return _CARD.format(
@@ -85,7 +86,7 @@ def card(
         machine=recipe.machine,
         seed=recipe.seed,
         note=f"\n  {recipe.note}" if recipe.note else "",
-        figures=_figures(recipe, held_out, also),
+        figures=_figures(recipe, held_out, also, chosen_on),
         commands="\n".join(recipe.commands),
         repeatable=(
             "The schedule follows the clock, so another run gives other weights of the same quality, not the same "
@@ -96,7 +97,12 @@ def card(
     )
 
 
-def _figures(recipe: Recipe, held_out: tuple[int, Marks] | None, also: tuple[int, ClassScores] | None) -> str:
+def _figures(
+    recipe: Recipe,
+    held_out: tuple[int, Marks] | None,
+    also: tuple[int, ClassScores] | None,
+    chosen_on: int | None,
+) -> str:
     if held_out is None:
         return "None: no frames were held out. t* = 0.5 was not chosen on any.\n"
     frames, marks = held_out
@@ -114,13 +120,11 @@ def _figures(recipe: Recipe, held_out: tuple[int, Marks] | None, also: tuple[int
         for name, s in marks.scores.per_class.items()
         if s.objects
     ]
-    lines += [
-        "",
-        f"t* = {marks.t_star:.3f}: the score of best F1 ({marks.f1:.3f}) over all classes on these frames. The "
-        "step was chosen on",
-        "them too, so their figures are slightly optimistic.",
-        "",
-    ]
+    best = f"t* = {marks.t_star:.3f}: the score of best F1 ({marks.f1:.3f}) over all classes on"
+    told = [f"{best} these frames. The step was chosen on", "them too, so their figures are slightly optimistic."]
+    if chosen_on is not None:
+        told = [f"{best} {chosen_on} further frames,", "which chose the step too: these had no say."]
+    lines += ["", *told, ""]
     if also is not None and also[1].objects:
         count, s = also
         lines += [

@@ -6,12 +6,13 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from detectors.base import Detector
 from detectors.registry import save_detector
 from detectors.training import LOG
+from drivesem.evaluation.coco import evaluate
 from drivesem.training.card import Recipe, card
 from drivesem.training.curves import draw, read_columns
 from drivesem.training.frames import FrameStore
@@ -24,13 +25,15 @@ _COLUMNS: tuple[str, ...] = ("step", "mark", "car_ap50", "car_recall", "car_ap",
 
 @dataclass(frozen=True)
 class HeldOut:
-    """frames: to judge by; thin: every so-and-so-many-th of them while training goes on, all for the card; also:
-    further frames whose figures go into the card.
+    """frames: to choose and to judge by; thin: every so-and-so-many-th of them while training goes on, all for the
+    card; also: further frames whose figures go into the card; test: what is judged by in the place of `frames`,
+    which then only choose.
     """
 
     frames: FrameStore
     thin: int = 1
     also: FrameStore | None = None
+    test: FrameStore | None = None
 
 
 class Keeper:
@@ -95,10 +98,15 @@ class Keeper:
             also = len(frames), self._judge(detector, frames, range(len(frames))).scores.headline
         log = read_columns(self.run / LOG)
         seconds = float(log["seconds"][-1]) if log else 0.0
-        told = None if marks is None else (len(self.wanted), marks)
+        told, chosen_on = None if marks is None else (len(self.wanted), marks), None
+        if marks is not None and self.held_out is not None and self.held_out.test is not None:
+            test, chosen_on = self.held_out.test, len(self.wanted)
+            found, wanted = detect(detector, test, range(len(test)), self.device), test.judged(self.recipe.judged)
+            scores = evaluate(wanted, found, detector.classes, marks.t_star, "Car")
+            told = len(test), replace(marks, scores=scores)
         files.write_text(
             self.weights.with_suffix(".md"),
-            card(detector, self.recipe, self.weights, (step, seconds), told, also),
+            card(detector, self.recipe, self.weights, (step, seconds), told, also, chosen_on),
         )
         self.tell(f"step {step}: wrote {self.weights}")
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from detectors.training import Sample
+from detectors.training import Drawn, Sample
 
 Mix = Literal["replace", "add"]
 
@@ -58,7 +58,11 @@ class Mixture(Sequence[Sample]):
         return self._counterexamples[int(self.shown[index - len(self.places)])]
 
     def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
-        """Entry `index`; while counterexamples come in, now and then any benign frame in its place."""
+        """Entry `index`; while counterexamples come in, now and then any benign frame in its place.
+        Counterexamples that are drawn look otherwise each time.
+        """
         if index >= len(self.places) and generator.random() * self._shares.ramp_steps > step:
             return self._benign[int(generator.integers(len(self._benign)))]
+        if index >= len(self.places) and isinstance(self._counterexamples, Drawn):
+            return self._counterexamples.draw(int(self.shown[index - len(self.places)]), step, generator)
         return self[index]

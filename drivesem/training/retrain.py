@@ -28,6 +28,7 @@ from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, fi
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore
 from drivesem.training.judging import judge
+from drivesem.training.known import warn_of_overlaps
 from drivesem.training.mixture import Mixture
 from drivesem.training.retraining import WEIGHTS, broken, forget_other_weights, shares_of, startable, train_on
 from scene_ir import files
@@ -69,6 +70,8 @@ def retrain_run(config: Retrain, console: Console) -> tuple[dict[str, Any], list
     kept_out, learned = _divided(frames, config)
     start = config.start or attack.detector
     before, after = startable(start, config.device), startable(start, config.device)
+    if attack.dataset == "kitti":
+        warn_of_overlaps([start], attack.root, console)
     out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
     claim(out, config, _WRITTEN, _FREE)
     mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)

@@ -10,7 +10,7 @@ from detectors.augment import AugmentSettings
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
-from detectors.training import Sample, TrainingSettings, train
+from detectors.training import Beside, Sample, TrainingSettings, train
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
 from drivesem.report.progress import training_bar
@@ -48,8 +48,17 @@ def shares_of(config: Retrain) -> Shares:
     return Shares(config.fraction, config.mix, round(config.ramp * config.steps), config.seed)
 
 
-def train_on(config: Retrain, detector: Detector, frames: Sequence[Sample], out: Path, console: Console) -> None:
-    """Train in place, or go on with it, with checkpoints in `out`; frozen again at the end. Raises UsageError."""
+def train_on(
+    config: Retrain,
+    detector: Detector,
+    frames: Sequence[Sample],
+    out: Path,
+    console: Console,
+    beside: Beside | None = None,
+) -> None:
+    """Train in place, or go on with it, with checkpoints in `out`; frozen again at the end. beside: a further term
+    of the loss. Raises UsageError.
+    """
     settings = TrainingSettings(
         steps=config.steps,
         minutes=config.minutes,
@@ -74,7 +83,7 @@ def train_on(config: Retrain, detector: Detector, frames: Sequence[Sample], out:
             bar.update(task, completed=done, description=f"loss {row['total']:.3f}")
 
         try:
-            train(detector, frames, settings, out, progress=progress)
+            train(detector, frames, settings, out, progress=progress, beside=beside)
         except FloatingPointError as error:
             raise UsageError("--rate", "one at which the loss stays finite", error) from error
     detector.requires_grad_(False)

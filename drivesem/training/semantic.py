@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from detectors.training import Sample
+from detectors.types import Targets
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import SIX, Parameter, ParameterSpace
@@ -20,7 +22,7 @@ from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
 from scene_ir.errors import SceneError
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
-from scene_ir.types import Frame, Labels
+from scene_ir.types import Frame, Labels, SceneIR
 
 VARIANTS = 4
 """Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
@@ -93,11 +95,22 @@ def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Label
         # Cubed: most codes stay near the photograph, as most days are no storm.
         drawn = torch.from_numpy(generator.uniform(-1, 1, space.dim).astype(np.float32)) ** 3 * reach
         theta = torch.where(drawn < 0, -drawn * space.lower, drawn * space.upper)
-        moved = space.apply(scene, feasible.project(theta).theta)
-        render = compositor.render(moved)
-        labels = to_kitti_labels(labeller.moved(moved, render), scene, moved)
-        found.append((to_uint8(render.image), _with_others(labels, frame.labels)))
+        image, labels, _ = state_at(feasible.project(theta).theta, space, compositor, labeller, scene)
+        found.append((image, _with_others(labels, frame.labels)))
     return found
+
+
+@torch.no_grad()
+def state_at(
+    theta: Tensor, space: ParameterSpace, compositor: Compositor, labeller: Labeller, base: SceneIR
+) -> tuple[np.ndarray, Labels, Targets]:
+    """The scene at theta (D,): pixels (H, W, 3) uint8 RGB, its labels as a file holds them, and the same as
+    targets, whose first rows are all of the scene's objects. base: the scene of the labels that move along.
+    """
+    moved = space.apply(space.scene, theta)
+    render = compositor.render(moved)
+    labels = labeller.moved(moved, render)
+    return to_uint8(render.image), to_kitti_labels(labels, base, moved), labels.targets
 
 
 def _with_others(moved: Labels, original: Labels) -> Labels:

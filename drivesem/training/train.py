@@ -34,6 +34,7 @@ from drivesem.training import keeper
 from drivesem.training.card import Recipe
 from drivesem.training.frames import FrameStore
 from drivesem.training.keeper import HeldOut, Keeper
+from drivesem.training.known import describe, generated
 from drivesem.training.semantic import SemanticFrames
 from drivesem.training.start import architecture, begin, set_dropout
 from scene_ir import files
@@ -114,7 +115,10 @@ def train_run(config: Train) -> Trained | None:
         detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         weights = Path(config.weights or out / f"{config.detector}.safetensors")
         tell = partial(console.print, soft_wrap=True)
-        judge = Keeper(out, weights, _recipe(config, frames, start), held_out, device, tell)
+        recipe = _recipe(config, frames, start)
+        if rank == 0:
+            recipe = replace(recipe, data=f"{recipe.data}{_described(config, weights)}")
+        judge = Keeper(out, weights, recipe, held_out, device, tell)
         shown: Sequence[Sample] = frames
         if config.semantic:
             shown = SemanticFrames(frames, out / SEMANTIC, config.semantic, config.seed)
@@ -195,24 +199,36 @@ def _data(
     if held_out is not None:
         cache, split = out / CACHES / "held_out", config.held_out_split
         store = _store(config, name, held_out, cache, detector, console, whole=True, split=split)
+        test = None
+        if config.validation is not None:
+            chosen, cache = Path(config.validation), out / CACHES / "validation"
+            store, test = _store(config, name, chosen, cache, detector, console, whole=True), store
         also = None
         if config.also is not None:
             also = _store(config, "kitti", Path(config.also), out / CACHES / "also", detector, console, whole=True)
-        judged = HeldOut(store, config.thin, also)
+        judged = HeldOut(store, config.thin, also, test)
     if rank == 0 and distributed.is_initialized():
         distributed.barrier()
     return frames, judged
 
 
 def _warn_of_shared(config: Train, console: Console) -> None:
-    """Say where frames to judge by are among those that are trained on."""
-    if config.split != config.held_out_split:
-        return  # parts of one folder
-    trained = {Path(part).resolve() for part in (config.root or "").split(",") if part}
-    judged = [part for part in (config.held_out or "").split(",") if part and Path(part).resolve() in trained]
-    for part in judged:
-        told = f"--held-out: {part} is trained on too: its figures, and t*, say nothing of other pictures"
-        console.print(told, soft_wrap=True, markup=False, highlight=False)
+    """Say where frames to judge by are among those that are trained on, or that choose t*."""
+
+    def folders(of: str | None) -> dict[Path, str]:
+        return {Path(part).resolve(): part for part in (of or "").split(",") if part}
+
+    divided = config.split != config.held_out_split  # into parts of one folder
+    trained, judged, chosen = folders(config.root), folders(config.held_out), folders(config.validation)
+    for setting, own in (("--held-out", judged), ("--validation", chosen)):
+        for path, part in own.items():
+            told = None
+            if path in trained and not (setting == "--held-out" and divided):
+                told = "is trained on too: its figures, and t*, say nothing of other pictures"
+            elif path in chosen and setting == "--held-out":
+                told = "chooses the weights and t* too: its figures are optimistic"
+            if told is not None:
+                console.print(f"{setting}: {part} {told}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
@@ -275,9 +291,23 @@ def _recipe(config: Train, frames: FrameStore, start: str) -> Recipe:
     )
 
 
+def _described(config: Train, weights: Path) -> str:
+    """Write beside the weights which generated streets they have seen; a sentence for the card that names the
+    files, empty where the folders do not tell.
+    """
+    told = []
+    chosen = config.validation or config.held_out
+    for folders, kind, what in ((config.root, "", "of these frames"), (chosen, "_chosen", "of those that chose")):
+        if known := generated(folders):
+            path = weights.with_name(f"{weights.stem}{kind}_data.json")
+            files.write_json(path, describe(known))
+            told.append(f"`{path.name}` lists seeds and shapes {what}.")
+    return "".join(f"\n  {line}" for line in told)
+
+
 def _portable(config: Train) -> Train:
     """The configuration with folders and files by their names, not where they lay on this machine."""
-    names = {key: getattr(config, key) for key in ("root", "held_out", "also", "start")}
+    names = {key: getattr(config, key) for key in ("root", "held_out", "validation", "also", "start")}
     return replace(config, **{key: _names(value) for key, value in names.items() if value is not None})
 
 

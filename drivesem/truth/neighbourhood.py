@@ -134,7 +134,7 @@ class Everywhere:
         self._objective, self._feasible = objective, feasible
         self._box = UnitBox(objective.problem(feasible), objective.space.theta0)
         renderer = CompositorDraw(objective.compositor, objective.labeller)
-        self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"everywhere:{name}")
+        self.camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"everywhere:{name}")
         self.judged = DrawnViews.of(objective, nuisances, name).judged.nonzero()[:, 0].tolist()
         self._sequence = _halton(len(self._box.owner), name)
         self._places: list[Floats] = []
@@ -144,6 +144,12 @@ class Everywhere:
         place = torch.from_numpy(_nth(self._places, self._sequence, number))
         return self._feasible.project(self._box.theta(place.to(self._box.start))).theta
 
+    def exposed(self, number: int, camera: Camera | None = None) -> Exposure:
+        """The number-th state in a draw of that number, whoever draws it."""
+        scene = self._objective.space.apply(self._objective.space.scene, self.theta(number))
+        nothing = torch.zeros(len(scene.objects), dtype=torch.bool)
+        return (camera or self.camera).expose(scene, number, nothing)
+
     def sample(self, number: int) -> dict[int, Sample]:
         """The number-th state, by those judged objects that count there. No detector is asked."""
         return self.sample_of(self.theta(number), number)
@@ -151,7 +157,7 @@ class Everywhere:
     def sample_of(self, theta: Tensor, draw: int) -> dict[int, Sample]:
         """The same of a feasible theta (D,), in a draw by its number."""
         scene = self._objective.space.apply(self._objective.space.scene, theta)
-        exposure = self._camera.expose(scene, draw, torch.zeros(len(scene.objects), dtype=torch.bool))
+        exposure = self.camera.expose(scene, draw, torch.zeros(len(scene.objects), dtype=torch.bool))
         counts = [index for index in self.judged if not bool(exposure.targets.ignore[index])]
         return {index: Sample(exposure, described(self._objective, scene, exposure, index)) for index in counts}
 
@@ -161,7 +167,7 @@ class Everywhere:
         """
         if not samples:
             return {}
-        look = self._camera.see(next(iter(samples.values())).exposure)
+        look = self.camera.see(next(iter(samples.values())).exposure)
         return {index: margin_in(look, index) for index in samples}
 
 

@@ -237,6 +237,39 @@ def test_the_log_has_the_detectors_own_terms(tmp_path: Path) -> None:
     assert list(row) == ["step", "seconds", "rate", "boxes", "rest", "total", "norm"]
 
 
+class Pulls:
+    """A term on a picture of its own, which pulls its confidences to a value."""
+
+    name = "pull"
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+
+    def images(self, step: int) -> torch.Tensor:
+        return torch.rand(1, 3, 48, 64, generator=torch.Generator().manual_seed(step))
+
+    def term(self, detector: Any, raw: Any, step: int) -> torch.Tensor:
+        return self.weight * (raw.confidence_logits - 1).square().mean()
+
+
+def test_a_further_term_is_added_to_the_loss(tmp_path: Path) -> None:
+    """It has a column of its own, moves the weights by its gradient, and resumes to the bit."""
+    runs = {
+        name: train(fresh(), painted(3), SMALL, tmp_path / name, beside=beside)
+        for name, beside in (("alone", None), ("nothing", Pulls(0.0)), ("whole", Pulls(5.0)))
+    }
+    weights = {name: run.state_dict()["conv1.weight"] for name, run in runs.items()}
+    assert torch.equal(weights["alone"], weights["nothing"])
+    assert not torch.equal(weights["alone"], weights["whole"])
+    rows = list(csv.DictReader((tmp_path / "whole" / LOG).read_text().splitlines()))
+    terms = [float(rows[0][name]) for name in ("confidence", "box", "class", "pull")]
+    assert float(rows[0]["total"]) == pytest.approx(sum(terms), rel=1e-4)
+    assert terms[-1] > 0
+    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5, beside=Pulls(5.0))
+    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts", beside=Pulls(5.0))
+    assert torch.equal(parts.state_dict()["conv1.weight"], weights["whole"])
+
+
 def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
     detector = fresh()
     before = detector.convdet.weight.clone()

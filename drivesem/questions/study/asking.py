@@ -17,9 +17,10 @@ from drivesem.questions.study.attribution import told as told_of_factors
 from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
-from drivesem.questions.study.lessons import CACHE, FRAMES, RETRAINED
+from drivesem.questions.study.lessons import CACHE, FRAMES, POOL, RETRAINED
 from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, Told
+from drivesem.questions.study.robust import STATES
 from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
 from drivesem.questions.study.searches import costs_of, depths_of, standing_of
@@ -31,19 +32,28 @@ from drivesem.report.terminal import Console
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line
+from drivesem.training.known import warn_of_overlaps
 from drivesem.truth.redraw.choose import SecondRenderers
 
 _PICTURE, _LARGEST = "study.png", "largest.jpg"
 _TABLES = (
     "study.md",
-    *(f"{name}.csv" for name in ("study", "curves", "label_sets", "grades", "searches", "standing", "arms")),
+    *(
+        f"{name}.csv"
+        for name in ("study", "curves", "label_sets", "grades", "searches", "standing", "arms", "robust")
+    ),
 )
-_WRITTEN = (*(_PICTURE, FIGURES, _LARGEST), *_TABLES, *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES))
+_WRITTEN = (
+    *(_PICTURE, FIGURES, _LARGEST),
+    *_TABLES,
+    *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES, POOL, STATES),
+)
 _FREE = (*PRESENTATION, "quick", "controls", "seeds", "paper_protocol", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
 _FREE_IN_RETRAIN = (
     *(name for name in PRESENTATION if name != "limit"),
     *("bootstrap", "benign_frames", "fresh", "controls", "detectors", "sources"),
+    *("arms", "seeds", "states", "reattack", "validation"),
 )
 """Of retrain: other frames to train on would make other detectors."""
 _NOT_TOLD = ("out", "json", "resume", "workers", "name")
@@ -52,7 +62,9 @@ _NOT_TOLD = ("out", "json", "resume", "workers", "name")
 def study_run(config: Study) -> Answer:
     """Run or continue a study, and write what is said of it. Raises UsageError or SceneError for bad input."""
     out = Path(config.out or f"runs/study-{config.name}-{config.dataset}-seed{config.seed}")
-    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, Console(stderr=True))
+    console = Console(stderr=True)
+    warn_of_overlaps([config.detector], config.held_out or config.root, console)
+    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, console)
     command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
     answer = report.answer_of(told, out, data, command, draw)
     answer.write()
@@ -107,7 +119,7 @@ def _transfer(config: Study, out: Path, console: Console) -> _Found:
 
 def _retrain(config: Study, out: Path, console: Console) -> _Found:
     """Detectors trained on with counterexamples."""
-    ready = retrain.prepare(config)
+    ready = retrain.prepare(config, out)
     claim(out, config, _WRITTEN, _FREE_IN_RETRAIN)
     found = retrain.run(config, ready, out, console)
     return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.progress import track
@@ -13,7 +14,8 @@ from detectors.registry import SHIPPED, save_detector
 from detectors.training import Sample
 from drivesem.data.joined import open_folders
 from drivesem.data.registry import Dataset, open_dataset
-from drivesem.questions.study.arms import Arm, attack_of
+from drivesem.questions.study.arms import PLACEBO, Arm, attack_of
+from drivesem.questions.study.running import ARMS
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker
@@ -23,15 +25,35 @@ from drivesem.scenes.sources import SceneSource
 from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
 from drivesem.settings.errors import UsageError
-from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage
+from drivesem.settings.values import size_hw
+from drivesem.training.around import AroundFailures, Consistency, failures_in
+from drivesem.training.attacked import AttackedFrame, AttackedSamples, RedrawnSamples, Stage
 from drivesem.training.frames import FrameStore
 from drivesem.training.mixture import Mixture
 from drivesem.training.retraining import WEIGHTS, broken, shares_of, startable, train_on
+from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir.types import SceneIR
 
 BENIGN = "benign detector"
-RETRAINED, CACHE, FRAMES = "retrained", "cache", "frames"
-"""Folders: trained detectors, decoded frames, frames that were made."""
+RETRAINED, CACHE, FRAMES, POOL = "retrained", "cache", "frames", "pool"
+"""Folders: trained detectors, decoded frames, frames that were made, pictures that are trained on."""
+Pictures = Stage | Literal["random", "generator", "around"]
+"""Of an attacked frame; random edits of the same size, by the compositor or the generator; states around a certain
+failure."""
+TAUGHT: dict[str, tuple[str, Pictures]] = {
+    "benign": ("retrained on benign frames alone", "benign"),
+    "re-rendered": ("retrained on benign re-rendered images", "rerender"),
+    "random": ("retrained on random edits", "random"),
+    "generator": ("retrained on random edits, by the generator", "generator"),
+    "ours": ("retrained, ours", "counterexample"),
+    "certain": ("retrained on certain failures and around them", "around"),
+    "consistent": ("the same, consistently", "around"),
+    "paper": ("retrained, paper's protocol", "counterexample"),
+}
+"""Arms by name: what they are called, and what is shown beside benign frames."""
+_BY_DEFAULT = ("re-rendered", "ours", "paper")
+REPEATED = ("benign", "random", "certain", "consistent")
+"""Arms that are trained by several seeds."""
 _ATTACKED, _QUICK_ATTACKED = 400, 4
 """Frames whose counterexamples are trained on."""
 _HELD_OUT_SHARE = 0.25
@@ -60,14 +82,17 @@ _QUICK = {"steps": 40, "window": "640x224", "warmup": 10}
 @dataclass(frozen=True, slots=True)
 class Lesson:
     """One retraining. folder: short name; pictures: what is shown among benign frames; reference: the paper's mAP
-    on counterexamples and on benign frames, of what the paper has, too.
+    on counterexamples and on benign frames, of what the paper has, too; arm: of TAUGHT, whose seeds are told
+    together; consistency: weight of that term, 0 for none.
     """
 
     name: str
     folder: str
-    pictures: Stage
+    pictures: Pictures
     config: Retrain
     reference: tuple[float, float] | None
+    arm: str
+    consistency: float = 0.0
 
     @property
     def run(self) -> str:
@@ -77,7 +102,9 @@ class Lesson:
     @property
     def labels(self) -> str:
         """Of its pictures: benign, or moved with the cars."""
-        moved = self.pictures == "counterexample" and self.config.label_mode == "moved"
+        if self.pictures in ("generator", "around"):
+            return "moved"
+        moved = self.pictures in ("counterexample", "random") and self.config.label_mode == "moved"
         return "moved" if moved else "benign"
 
 
@@ -114,14 +141,25 @@ class Among:
         return self.source.scene(identifier)
 
 
+def arms_asked(study: Study) -> tuple[str, ...]:
+    """The arms that are trained, in the order of TAUGHT. UsageError for a name that is none of them."""
+    if study.arms is None:
+        return tuple(name for name in _BY_DEFAULT if not (study.quick and name == "paper"))
+    asked = [part.strip() for part in study.arms.split(",") if part.strip()]
+    if not asked or not set(asked) <= set(TAUGHT):
+        raise UsageError("--arms", f"some of {', '.join(TAUGHT)}, with commas", repr(study.arms))
+    return tuple(name for name in TAUGHT if name in asked)
+
+
 def lessons_of(study: Study) -> list[Lesson]:
-    """What is trained: the ablation, ours and, in the full study, the paper's protocol."""
+    """What is trained. All but the paper's protocol differ in their pictures alone, and in consistency's term."""
     ours = replace(
         OURS,
         seed=study.seed,
         device=study.device,
         mix=study.mix,
         label_mode=study.label_mode,
+        precision=study.precision,
         # another's weights may have been trained by the published loss: it is what they know
         loss="quality" if study.detector in SHIPPED else "published",
         **(_QUICK if study.quick else {}),
@@ -129,12 +167,16 @@ def lessons_of(study: Study) -> list[Lesson]:
     paper = Retrain(run="", seed=study.seed, device=study.device)
     if study.train_steps is not None:
         ours, paper = (replace(one, steps=study.train_steps) for one in (ours, paper))
-    lessons = [
-        Lesson("retrained on benign re-rendered images", "re-rendered", "rerender", ours, _PAPER_BEFORE),
-        Lesson("retrained, ours", "ours", "counterexample", ours, None),
-    ]
-    if not study.quick:
-        lessons.append(Lesson("retrained, paper's protocol", "paper", "counterexample", paper, _PAPER_AFTER))
+    references = {"re-rendered": _PAPER_BEFORE, "paper": _PAPER_AFTER}
+    lessons = []
+    for arm in arms_asked(study):
+        title, pictures = TAUGHT[arm]
+        config = paper if arm == "paper" else ours
+        weight = study.consistency if arm == "consistent" else 0.0
+        for turn in range(study.seeds or 1 if arm in REPEATED else 1):
+            name, folder = (f"{title}, seed {study.seed + turn}", f"{arm}-seed{turn}") if turn else (title, arm)
+            own = replace(config, seed=study.seed + turn)
+            lessons.append(Lesson(name, folder, pictures, own, references.get(arm), arm, weight))
     return lessons
 
 
@@ -150,8 +192,17 @@ def reference_of(name: str, lessons: Sequence[Lesson], study: Study) -> tuple[fl
 def learning_arm(study: Study) -> Arm:
     """The attack on the frames to train on."""
     limit = study.limit or (_QUICK_ATTACKED if study.quick else _ATTACKED)
-    config = replace(attack_of(study), combo=DEFAULT_COMBO, limit=limit)
-    return Arm(f"combo {DEFAULT_COMBO}", f"combo-{DEFAULT_COMBO}", config)
+    passes = study.passes if study.method == "climb" else None
+    config = replace(attack_of(study), params=study.params, limit=limit, passes=passes)
+    if study.params is not None:
+        return Arm(study.params, "attacked", config)
+    return Arm(f"combo {DEFAULT_COMBO}", f"combo-{DEFAULT_COMBO}", replace(config, combo=DEFAULT_COMBO))
+
+
+def placebo_arm(arm: Arm, out: Path) -> Arm:
+    """Random edits of the same frames, each as large as the attack's."""
+    config = replace(arm.config, method="placebo", passes=None, like=str(out / ARMS / arm.folder))
+    return Arm(f"{arm.name} {PLACEBO}", f"{arm.folder}-{PLACEBO}", config, control=PLACEBO, of=arm.name)
 
 
 def judging_arms(study: Study, lessons: Sequence[Lesson], out: Path) -> list[Arm]:
@@ -162,7 +213,7 @@ def judging_arms(study: Study, lessons: Sequence[Lesson], out: Path) -> list[Arm
     else:
         base = replace(base, root=study.held_out or study.root)
     arms = [Arm(BENIGN, "held-out", base)]
-    for lesson in lessons:
+    for lesson in lessons if study.reattack else ():
         retrained = replace(base, detector=str(weights_of(out, lesson)))
         arms.append(Arm(lesson.name, lesson.run, retrained))
     return arms
@@ -182,6 +233,11 @@ def parts_of(study: Study) -> Parts:
     ]
     if study.held_out is not None and Path(study.held_out).resolve() in trained_on:
         raise UsageError("--held-out", "a folder of which nothing is trained on", study.held_out)
+    held_out_too = [*trained_on, Path(study.held_out or study.root or "").resolve()]
+    if study.validation is not None and Path(study.validation).resolve() in held_out_too:
+        raise UsageError("--validation", "a folder that is neither trained on nor judged by", study.validation)
+    if study.validation is not None and not open_dataset(study.dataset, Path(study.validation)).identifiers:
+        raise UsageError("--validation", "at least one frame", "none")
     dataset = open_dataset(study.dataset, Path(study.root or ""))
     learned = judged = None
     if study.held_out is not None:
@@ -244,6 +300,14 @@ def held_out_frames(study: Study, parts: Parts, classes: Sequence[str], out: Pat
     return FrameStore(made, made.identifiers[: order.frames], out / CACHE / "held_out", classes)
 
 
+def validation_frames(study: Study, classes: Sequence[str], out: Path) -> FrameStore | None:
+    """What retrained detectors' t* is chosen on, decoded; None where no such frames were named."""
+    if study.validation is None:
+        return None
+    chosen = open_dataset(study.dataset, Path(study.validation))
+    return FrameStore(chosen, chosen.identifiers, out / CACHE / "validation", classes)
+
+
 def benign_samples(
     parts: Parts, frames: Sequence[AttackedFrame], classes: Sequence[str], out: Path
 ) -> Sequence[Sample]:
@@ -254,24 +318,72 @@ def benign_samples(
     return FrameStore(dataset, names, out / CACHE / "train", classes)
 
 
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """Where the pictures of lessons come from. frames: of the attack; random: the same of its placebo, where there
+    is one; worker: that attacked; second: second renderers; folder: keeps what is drawn.
+    """
+
+    frames: Sequence[AttackedFrame]
+    random: Sequence[AttackedFrame]
+    worker: Worker
+    second: SecondRenderers
+    folder: Path
+    seed: int
+
+    def around(self, config: Retrain, classes: Sequence[str]) -> AroundFailures:
+        """Certain failures and what lies around them."""
+        attack, params, detector = self.worker.config, self.worker.params, self.worker.detector
+        pace, folder = config.batch * config.fraction, self.folder / "around"
+        return AroundFailures(self.frames, attack, params, detector, folder, classes, pace, self.seed)
+
+    def missing(self, lesson: Lesson) -> str | None:
+        """Why a lesson cannot be held; None where it can. Raises UsageError where no counterexample breaks the
+        detector.
+        """
+        broken(self.frames, lesson.config.label_mode, "--limit")
+        if lesson.pictures == "around" and not failures_in(self.frames):
+            return "no attacked frame has a certain failure of an object"
+        if lesson.pictures == "generator" and not self.second.generated:
+            return "no generator made these frames"
+        return None
+
+    def shown(self, lesson: Lesson, classes: Sequence[str]) -> Sequence[Sample]:
+        """What a lesson shows among benign frames: of the frames that break the detector, or around failures."""
+        mode = lesson.config.label_mode
+        failed = broken(self.frames, mode, "--limit")
+        if lesson.pictures == "around":
+            return self.around(lesson.config, classes)
+        if lesson.pictures in ("random", "generator"):
+            names = {frame.name for frame in failed}
+            edited = [frame for frame in self.random if frame.name in names]
+            if lesson.pictures == "generator":
+                return RedrawnSamples(edited, self.second, self.folder / "generator", classes)
+            return AttackedSamples(edited, "counterexample", mode, classes)
+        return AttackedSamples(failed, lesson.pictures, mode, classes)
+
+
 def learn(
     study: Study,
     lesson: Lesson,
-    frames: Sequence[AttackedFrame],
+    taken: Taken,
     benign: Callable[[Sequence[str]], Sequence[Sample]],
     weights: Path,
     console: Console,
 ) -> None:
-    """Train a lesson's detector and write its weights, unless they are there. frames: of the attack's run; benign:
-    frames to train on, for a detector's classes. Raises UsageError where no counterexample breaks the detector.
+    """Train a lesson's detector and write its weights, unless they are there. benign: frames to train on, for a
+    detector's classes. Raises UsageError where no counterexample breaks the detector.
     """
-    failed = broken(frames, lesson.config.label_mode, "--limit")
     if weights.is_file():
         return
     detector = startable(study.detector, study.device, "--detector")
-    shown = AttackedSamples(failed, lesson.pictures, lesson.config.label_mode, detector.classes)
+    shown = taken.shown(lesson, detector.classes)
     mixture = Mixture(benign(detector.classes), shown, shares_of(lesson.config))
+    beside = None
+    if lesson.consistency and isinstance(shown, AroundFailures):
+        window_hw = size_hw("--window", lesson.config.window)
+        beside = Consistency(shown, lesson.consistency, detector.t_star, lesson.config.seed, window_hw)
     console.print(f"{lesson.name}: {lesson.config.steps} steps", soft_wrap=True)
-    train_on(lesson.config, detector, mixture, weights.parent, console)
+    train_on(lesson.config, detector, mixture, weights.parent, console, beside)
     facts = {"retrained_from": Path(study.detector).name, "steps": str(lesson.config.steps)}
     save_detector(detector, weights, facts)

@@ -12,6 +12,7 @@ from drivesem.questions.study.lessons import BENIGN
 from drivesem.questions.study.plots import DPI, bars, place_of
 from drivesem.questions.study.report import OWN_PROTOCOL, Told
 from drivesem.questions.study.retrain import Judged, Taught
+from drivesem.questions.study.robust import ANYWHERE, AROUND, CONTROLS, GOAL, REDRAWN, redrawn_of
 from drivesem.questions.study.rows import FIGURES, MODES, feasible_fraction
 from drivesem.questions.transfer.matrix import AP50, BROKEN, LOST
 from drivesem.questions.transfer.report import bounded
@@ -20,8 +21,16 @@ from drivesem.report.tables import Sheet, percent
 from scene_ir import files
 
 _DETECTOR, _LABELS, _PICTURES, _MIX, _WINDOW = "detector", "labels", "pictures", "mix", "window"
-_WORDS = (_DETECTOR, _LABELS, _PICTURES, _MIX, _WINDOW)
-_SHOWN = {"rerender": "re-rendered", "counterexample": "counterexamples"}
+_GOAL = "short of the goal"
+_WORDS = (_DETECTOR, _LABELS, _PICTURES, _MIX, _WINDOW, _GOAL)
+_SHOWN = {
+    "benign": "photographs",
+    "rerender": "re-rendered",
+    "counterexample": "counterexamples",
+    "random": "random edits",
+    "generator": "random edits, by the generator",
+    "around": "certain failures, drawn anew",
+}
 _SIZE_IN = (9.6, 4.8)
 _GROUPS = {
     "benign": "benign frames",
@@ -32,10 +41,38 @@ _GROUPS = {
 
 def told(found: Taught) -> Told:
     """The study as text."""
-    short = [_benign(found.rows), _known(found.rows), _fresh(found.rows)]
+    short = [_robust(found)] if found.chances else []
+    short += [_benign(found.rows), _known(found.rows)]
+    short += [_fresh(found.rows)] if _attacked_again(found.rows) else []
     whole = [*short, _further(found.rows), _training(found)]
     tables = {"study": [row.flat() for row in found.rows]}
+    tables |= {"robust": [row.flat() for row in found.chances]} if found.chances else {}
     return Told(found.study.name, whole, short, notes(found), tables, _WORDS)
+
+
+def _attacked_again(rows: Sequence[Judged]) -> bool:
+    """Whether the retrained detectors were attacked too."""
+    return any(row.fresh is not None for row in rows[1:])
+
+
+def _robust(found: Taught) -> Sheet:
+    """How likely each arm fails a car."""
+    lines = []
+    for row in found.chances:
+        cells = [row.title.partition(", seed ")[0], bounded(row.failures[ANYWHERE])]
+        cells += [bounded(row.fewer[ANYWHERE, arm]) if (ANYWHERE, arm) in row.fewer else "-" for arm in CONTROLS]
+        for kind in (REDRAWN, AROUND):
+            beside = row.fewer.get((kind, CONTROLS[0]))
+            cells += [bounded(row.failures[kind]), "-" if beside is None else bounded(beside)]
+        falls = "-" if row.title == BENIGN else percent(row.ap50_falls)
+        goal = "-" if row.short_of is None else "; ".join(row.short_of) or "met"
+        lines.append((*cells, bounded(row.phantoms), falls, goal))
+    columns = (
+        *(_DETECTOR, "anywhere", "fewer than benign", "fewer than random", "second renderer", "fewer than benign"),
+        *("around failures", "fewer than benign", "phantoms", "AP50 falls", _GOAL),
+    )
+    title = f"Failures a car, {found.state_frames} held-out frames, {found.study.states} states each, %"
+    return Sheet(title, columns, tuple(lines))
 
 
 def _benign(rows: Sequence[Judged]) -> Sheet:
@@ -73,6 +110,8 @@ def _there(rows: Sequence[Judged], row: Judged, which: int) -> tuple[str, ...]:
 def _fresh(rows: Sequence[Judged]) -> Sheet:
     lines = []
     for row in rows:
+        if row.fresh is None:
+            continue
         gains = ["-" if row.name == BENIGN else bounded(row.gains["fresh"][mode]) for mode in MODES]
         flat = row.flat()
         figures = [percent(getattr(row.fresh, mode).ap50) for mode in MODES]
@@ -91,9 +130,10 @@ def _further(rows: Sequence[Judged]) -> Sheet:
             "photographs of the attacked frames": known.benign.headline,
             "known counterexamples, paper": known.paper.headline,
             "known counterexamples, moved": known.moved.headline,
-            "fresh counterexamples, paper": row.fresh.paper,
-            "fresh counterexamples, moved": row.fresh.moved,
         }
+        if row.fresh is not None:
+            fresh = {f"fresh counterexamples, {mode}": getattr(row.fresh, mode) for mode in MODES}
+            scores |= fresh
         for name, one in scores.items():
             seen = f"{percent(shares[BROKEN].value)}; {lost} of {of} lost" if name.startswith("known") else "-"
             lines.append((row.name, name, *(percent(getattr(one, key)) for key in FIGURES), seen))
@@ -122,7 +162,8 @@ def notes(found: Taught) -> list[str]:
     rows = found.rows
     attacked, frames = len(found.learned.runs[0].results), rows[0].known.frames
     lines = [
-        f"{attacked} frames were attacked by combination 2 to train on, beside {found.benign} benign frames; "
+        f"{attacked} frames were attacked by {found.learned.runs[0].arm.name} to train on, beside {found.benign} "
+        f"benign frames; "
         f"{frames} others, which no detector was trained on, to judge by.",
         f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
         "Gain: over the detector as it was, on the same pictures, and for fresh ones over what the attack on it "
@@ -137,8 +178,12 @@ def notes(found: Taught) -> list[str]:
         else OWN_PROTOCOL,
         "Frames broken: by a lost object or a phantom, moved labels, from each detector's t* on: "
         + "; ".join(f"{row.name} {row.t_star:.3f}" for row in rows)
-        + ". A retrained detector's t* was chosen on the benign frames.",
+        + ". A retrained detector's t* was chosen on "
+        + ("the frames of --validation." if found.study.validation else "the benign frames that judge it."),
     ]
+    if found.chances:
+        lines.append(_of_robust(found))
+    lines += [f"Left out: {name}: {reason}." for name, reason in found.left_out.items()]
     results = [r for ran in (found.learned, found.judged) for run in ran.runs for r in run.results]
     lines.append(
         f"Feasible by the independent check: {percent(feasible_fraction(results))} % of all attacked frames."
@@ -151,13 +196,28 @@ def notes(found: Taught) -> list[str]:
     return lines
 
 
+def _of_robust(found: Taught) -> str:
+    states = found.study.states
+    text = (
+        "Failures: share of the cars that the benign detector finds in the photograph which a detector does not "
+        f"find in {states} states of each frame, anywhere that the attack was allowed to go; all see the "
+        f"same states in the same draws. Second renderer: {redrawn_of(states)} of these states, drawn by it. "
+        "Around failures: the cars that the attack on the benign detector lost for certain, in states around that "
+        "failure. Fewer: the share of that arm's failures that a detector is without, paired over frames. "
+        "Phantoms: pictures with any, of states anywhere. Seeds count together."
+    )
+    if any(row.short_of is not None for row in found.chances):
+        text += f" The goal: {'; '.join(GOAL)}; the column says what is not so."
+    return text
+
+
 def write_plot(path: Path, found: Taught) -> None:
     """AP50 of each detector on benign frames, known and fresh counterexamples; the paper's as marks."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     series: dict[str, list[Interval | None]] = {
-        row.name: [row.spread[group] for group in _GROUPS] for row in found.rows
+        row.name: [row.spread.get(group) for group in _GROUPS] for row in found.rows
     }
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=_SIZE_IN, layout="constrained")

@@ -17,6 +17,8 @@ from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interva
 from drivesem.run.finished import Run
 from drivesem.run.frame import as_targets
 from drivesem.run.results import FrameResult
+from drivesem.run.tally import at_least
+from drivesem.truth.grades import Grade
 
 AP50, RECALL = "AP50", "recall"
 
@@ -35,9 +37,9 @@ class Target:
 class TransferRow:
     """One run before one target. benign, rerendered, paper, moved: figures in the photographs, in these rendered
     again, and in the counterexamples by either label mode. drops: by how much HEADLINE's AP50 and recall fall from
-    benign to attacked, by label mode. shares: TRANSFER, LOST, FRAMES, BROKEN; counts: their numerators and
-    denominators; phantoms: by moved labels. figures: AP50 and RECALL in the photographs (benign) and in the
-    counterexamples by label mode, to be weighed by frames beside another row's.
+    benign to attacked, by label mode. shares: TRANSFER, CERTAIN, THRESHOLD, LOST, FRAMES, BROKEN; counts: their
+    numerators and denominators; phantoms: by moved labels. figures: AP50 and RECALL in the photographs (benign)
+    and in the counterexamples by label mode, to be weighed by frames beside another row's.
     """
 
     run: Run
@@ -89,9 +91,11 @@ class TransferRow:
 
 
 TRANSFER, LOST, FRAMES, BROKEN = "transfer_rate", "lost_rate", "frame_rate", "broken_rate"
-"""Of the objects that the source lost and the target found in the photograph: those that the target loses too. Of
-all that the target found in the photograph: those it loses. Of the frames that fail the source: those that fail
-the target, by a lost object or a phantom. Of all frames: those that fail the target. All by `moved` labels."""
+CERTAIN, THRESHOLD = "certain_rate", "threshold_rate"
+"""Of the objects that the source lost and the target found in the photograph: those that the target loses too
+(TRANSFER), the same of those that the source lost for certain, and of those it lost by threshold alone. Of all
+that the target found in the photograph: those it loses. Of the frames that fail the source: those that fail the
+target, by a lost object or a phantom. Of all frames: those that fail the target. All by `moved` labels."""
 
 
 def row(
@@ -163,7 +167,8 @@ def _tallies(
     t_star: float,
 ) -> tuple[dict[str, Tally], int]:
     """Hits and objects of each share, frame by frame, and how many phantoms there are."""
-    names = (TRANSFER, LOST, FRAMES, BROKEN)
+    names = (TRANSFER, CERTAIN, THRESHOLD, LOST, FRAMES, BROKEN)
+    sure = at_least(Grade.CERTAIN)
     hits, objects = ({name: np.zeros(len(results)) for name in names} for _ in range(2))
     phantoms = 0
     for i, result in enumerate(results):
@@ -171,8 +176,11 @@ def _tallies(
         failed = failures.find(benign, found["benign"][i], moved, found["attacked"][i], t_star)
         seen = failures.judge(benign, found["benign"][i], t_star).found & ~moved.ignore
         known = set(seen.nonzero()[:, 0].tolist())
-        theirs = known & {f.index for f in result.failures if f.kind == "lost"}
-        objects[TRANSFER][i], hits[TRANSFER][i] = len(theirs), len(theirs & set(failed.lost))
+        losses = [f for f in result.failures if f.kind == "lost"]
+        theirs = known & {f.index for f in losses}
+        certain = known & {f.index for f in losses if sure(f)}
+        for name, lost in ((TRANSFER, theirs), (CERTAIN, certain), (THRESHOLD, theirs - certain)):
+            objects[name][i], hits[name][i] = len(lost), len(lost & set(failed.lost))
         objects[LOST][i], hits[LOST][i] = len(known), len(failed.lost)
         objects[FRAMES][i], hits[FRAMES][i] = result.success_moved, result.success_moved and failed.success
         objects[BROKEN][i], hits[BROKEN][i] = 1, failed.success

@@ -10,12 +10,18 @@ from typing import Any
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Interval
-from drivesem.questions.transfer.matrix import AP50, FRAMES, LOST, TRANSFER, TransferRow
+from drivesem.questions.transfer.matrix import AP50, CERTAIN, FRAMES, LOST, THRESHOLD, TRANSFER, TransferRow
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, percent
 
-_SHARES = {TRANSFER: "transfer rate", LOST: "lost anyway", FRAMES: "frames"}
+_SHARES = {
+    TRANSFER: "transfer rate",
+    CERTAIN: "of certain",
+    THRESHOLD: "of others",
+    LOST: "lost anyway",
+    FRAMES: "frames",
+}
 _SIDES = ("source", "target")
 _LABELS = "labels"
 """Of the photographs (benign), or of the counterexamples by either label mode."""
@@ -51,8 +57,9 @@ def notes(rows: Sequence[TransferRow], draws: int) -> list[str]:
         "Labels: benign are the photographs, paper and moved the counterexamples by either label mode.",
         f"mAP50: mean over the target's classes; AP50 falls: benign less attacked.{spread}",
         "Transfer rate: of the objects that the source lost and the target found in the photograph, those that "
-        "the target loses too. Lost anyway: of all that it found in the photograph, those it loses. Frames: of "
-        "those that fail the source, those that fail the target. All by moved labels.",
+        "the target loses too; of certain, of others: the same of those that the source lost for certain, and of "
+        "those that it lost by threshold alone. Lost anyway: of all that it found in the photograph, those it "
+        "loses. Frames: of those that fail the source, those that fail the target. All by moved labels.",
         f"{stars}.",
     ]
 

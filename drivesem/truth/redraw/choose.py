@@ -59,9 +59,14 @@ class SecondRenderers:
             self._last = (*same, self._made(identifier, scene))
         return self._last[2]
 
+    @property
+    def generated(self) -> bool:
+        """Whether the generator made the data set's frames, and draws them again."""
+        return self._folder is not None or self._dataset == DEMO
+
     def check(self) -> None:
         """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
-        if self._folder is None and self._dataset != DEMO:
+        if not self.generated:
             shared_screen()
 
     def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:

@@ -64,10 +64,14 @@ class GeneratorRedraw:
         Ignored are objects without a counterpart, and those that are too hard in either picture. Regions: what the
         generator ignores in either, and labelled vehicles that the scene does not know.
         """
-        after = self._drawn(self.carried(changed).edit)
+        after = self.drawn(changed)
         exact = exact_labels(self._before.frame, after)
         tracks = self._planned.tracks
         return Redrawn(_picture(after.image), _of_objects(exact, tracks, changed), _shown(after, tracks))
+
+    def drawn(self, changed: SceneIR) -> SynthFrame:
+        """A state of the scene with all that the generator knows of it, its own labels of everything included."""
+        return self._drawn(self.carried(changed).edit)
 
     def _drawn(self, edit: FrameEdit) -> SynthFrame:
         """The picture of an edit. What stands in the street is made again only where its leaves changed."""

@@ -128,6 +128,7 @@ def test_what_another_detector_loses(
     assert (row["lost_rate"], row["lost_rate_of"]) == (1.0, known)
     assert row["transfer_rate_of"] == lost
     assert row["transfer_rate"] == (1.0 if lost else None)
+    assert row["certain_rate_of"] + row["threshold_rate_of"] == lost
     (high,) = transfer("--run", run, "--detectors", "onnx:some/blind.onnx", "--t-star", "0.6")["rows"]
     assert high["lost_rate_of"] == 0
     assert high["lost_rate"] is None

@@ -49,6 +49,19 @@ def test_counterexamples_come_in_little_by_little() -> None:
     assert mixture.draw(0, 0, np.random.default_rng(0))[0][0, 0, 0] < 100
 
 
+class Anew(list[Sample]):
+    """Frames that look otherwise in each step."""
+
+    def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
+        return np.full((2, 2, 3), 200 + 10 * index + step, np.uint8), NOTHING
+
+
+def test_counterexamples_may_be_drawn_anew() -> None:
+    mixture = Mixture(frames(0, 2), Anew(frames(100, 2)), Shares(0.5, "add", 0, 0))
+    drawn = [[int(mixture.draw(i, s, np.random.default_rng(0))[0][0, 0, 0]) for i in range(4)] for s in (1, 2)]
+    assert [sorted(one) for one in drawn] == [[0, 1, 201, 211], [0, 1, 202, 212]]
+
+
 @pytest.mark.parametrize(("benign", "counterexamples"), [(0, 1), (1, 0)])
 def test_either_without_frames_is_refused(benign: int, counterexamples: int) -> None:
     with pytest.raises(ValueError, match="expected at least one frame, found 0"):

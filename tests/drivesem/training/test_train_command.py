@@ -34,6 +34,31 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
     return {name: value for name, value in read_weights(path)[1].items() if name.startswith("weights.")}
 
 
+@pytest.mark.slow
+def test_validation_chooses_and_held_out_frames_judge(
+    tmp_path: Path, frames: list[str], kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """t* is that of the validation frames, whatever is judged by; the card says which figures are of which."""
+    validation = kitti_folder(tmp_path / "validation", 3, seed=2)
+    runs = []
+    for name, words in (("chosen", ["--held-out", str(validation)]), ("both", ["--validation", str(validation)])):
+        out = tmp_path / name
+        assert main(["train", *frames, *words, *STEPS, "--out", str(out), "--json"]) == 0
+        runs.append((json.loads(capsys.readouterr().out)["best"], (out / "squeezedet.md").read_text()))
+    (chosen, alone), (both, card) = runs
+    assert both == chosen
+    assert "2 held-out frames, judged at least" in card
+    assert "over all classes on 3 further frames," in card
+    assert "these had no say" in card
+    assert "3 held-out frames" in alone
+    assert "chosen on\nthem too" in alone
+    again = ["train", *frames, "--validation", frames[-1], *STEPS, "--out", str(tmp_path / "again")]
+    assert main(again) == 0
+    assert "chooses the weights and t* too: its figures are optimistic" in capsys.readouterr().err
+    assert main(["train", *frames[:2], "--validation", str(validation)]) == 2
+    assert "--held-out: expected frames to judge by, beside --validation" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("detector", ["squeezedet", "yolov3-slim"])
 def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[str], detector: str) -> None:
     out = tmp_path / "run"

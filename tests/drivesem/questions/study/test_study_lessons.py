@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +18,29 @@ from detectors.registry import load_detector, read_weights
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiWriter
 from drivesem.questions.study import lessons, retrain
-from drivesem.questions.study.lessons import OURS, Among, Lesson, learn, lessons_of, parts_of, weights_of
+from drivesem.questions.study.lessons import (
+    OURS,
+    REPEATED,
+    TAUGHT,
+    Among,
+    Lesson,
+    Taken,
+    learn,
+    learning_arm,
+    lessons_of,
+    parts_of,
+    placebo_arm,
+    weights_of,
+)
 from drivesem.run.results import dump_frame
 from drivesem.settings.commands import Retrain, Study
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.mixture import Mixture
+from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
+from scene_ir.errors import SceneError
 from scene_ir.types import Labels
 
 PRESETS = Path(__file__).parents[4] / "configs"
@@ -32,6 +48,8 @@ OUT = Path("out")
 COLOURS = {"benign": 10, "rerender": 20, "counterexample": 30}
 """Grey value of a frame's pictures."""
 QUIET = Console(file=io.StringIO())
+WORKER: Any = None
+"""Who attacked: nobody asks."""
 
 
 def labelled(x: float, kind: str = "Car") -> Labels:
@@ -88,6 +106,39 @@ def test_the_ablation_differs_in_its_pictures_alone() -> None:
             assert {lesson.config.steps for lesson in (ours, *further)} == {7}
             assert (ours.config.mix, further[0].config.mix) == ("replace", "replace")
     assert lessons_of(Study(name="retrain"))[1].config.mix == "add"
+
+
+def test_arms_differ_in_their_pictures_alone() -> None:
+    study = Study(name="retrain", arms=",".join(TAUGHT), seeds=2, consistency=0.5)
+    lessons = lessons_of(study)
+    alike = {replace(one.config, seed=0) for one in lessons if one.arm != "paper"}
+    assert len(alike) == 1
+    assert {one.arm: one.consistency for one in lessons if one.consistency} == {"consistent": 0.5}
+    seeds = {arm: [one.config.seed for one in lessons if one.arm == arm] for arm in TAUGHT}
+    assert seeds == {arm: [0, 1] if arm in REPEATED else [0] for arm in TAUGHT}
+    assert len({one.folder for one in lessons}) == len({one.name for one in lessons}) == len(lessons)
+    assert {one.arm: one.labels for one in lessons} == {
+        **dict.fromkeys(("random", "generator", "ours", "certain", "consistent"), "moved"),
+        **dict.fromkeys(("benign", "re-rendered", "paper"), "benign"),
+    }
+    assert [one.arm for one in lessons_of(replace(study, arms="certain, benign", seeds=1))] == [
+        "benign",
+        "certain",
+    ]
+    with pytest.raises(UsageError, match=r"--arms: expected some of benign, re-rendered, .* found 'certian'"):
+        lessons_of(replace(study, arms="certian"))
+
+
+def test_what_is_attacked_to_train_on() -> None:
+    usual = learning_arm(Study(name="retrain"))
+    assert (usual.folder, usual.config.combo, usual.config.passes) == ("combo-2", 2, None)
+    arm = learning_arm(Study(name="retrain", params="weather,rotate", method="climb", passes=40, limit=3))
+    assert (arm.config.params, arm.config.combo, arm.config.method, arm.config.passes) == (
+        *("weather,rotate", None, "climb", 40),
+    )
+    placebo = placebo_arm(arm, Path("out"))
+    assert (placebo.config.method, placebo.config.like) == ("placebo", "out/arms/attacked")
+    assert (placebo.config.params, placebo.config.passes, placebo.config.limit) == ("weather,rotate", None, 3)
 
 
 def test_weights_from_elsewhere_keep_their_loss() -> None:
@@ -150,10 +201,11 @@ def test_frames_without_vehicles_show_before_anything_is_done(tmp_path: Path) ->
     root, empty = kitti_folder(tmp_path / "root", 2), kitti_folder(tmp_path / "empty", 2, "Pedestrian")
     study = Study(name="retrain", dataset="kitti", root=str(root), held_out=str(empty))
     with pytest.raises(UsageError, match="--held-out: expected frames with vehicles, found none"):
-        retrain.prepare(study)
+        retrain.prepare(study, OUT)
     with pytest.raises(UsageError, match="--root: expected frames with vehicles, found none"):
-        retrain.prepare(replace(study, root=str(empty), held_out=str(root)))
-    ready = retrain.prepare(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))))
+        retrain.prepare(replace(study, root=str(empty), held_out=str(root)), OUT)
+    ready = retrain.prepare(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))), OUT)
+    assert [arm.folder for arm in ready.arms] == ["combo-2"]
     assert list(ready.workers[0].source.identifiers()) == ["000000", "000001"]
 
 
@@ -177,8 +229,9 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[Mixture]:
     return found
 
 
-def lesson(kind: int, **settings: object) -> Lesson:
-    one = lessons_of(Study(name="retrain", train_steps=2))[kind]
+def lesson(kind: int | str, **settings: object) -> Lesson:
+    arms, place = (kind, 0) if isinstance(kind, str) else (None, kind)
+    one = lessons_of(Study(name="retrain", train_steps=2, arms=arms))[place]
     return replace(one, config=replace(one.config, **settings))
 
 
@@ -188,7 +241,8 @@ def taught(one: Lesson, attacked: list[AttackedFrame], folder: Path) -> Path:
     def benign(classes: Sequence[str]) -> Sequence[object]:
         return lessons.benign_samples(lessons.Parts(None, None, None, None), attacked, classes, folder)
 
-    learn(study, one, attacked, benign, weights_of(folder, one), QUIET)  # pyright: ignore[reportArgumentType]
+    taken = Taken(attacked, attacked[1:], WORKER, SecondRenderers("demo", None), folder / "pool", 0)
+    learn(study, one, taken, benign, weights_of(folder, one), QUIET)  # pyright: ignore[reportArgumentType]
     return weights_of(folder, one)
 
 
@@ -204,11 +258,13 @@ def pictures(mixture: Mixture) -> set[tuple[int, float]]:
         (1, {}, {(31, 20.0), (32, 20.0)}),
         (1, {"label_mode": "paper"}, {(31, 10.0), (32, 10.0)}),
         (0, {"label_mode": "paper"}, {(21, 10.0), (22, 10.0)}),
+        ("benign", {}, {(11, 10.0), (12, 10.0)}),
+        ("random", {}, {(31, 20.0), (32, 20.0)}),
     ],
-    ids=["re-rendered", "moved", "paper", "re-rendered, paper"],
+    ids=["re-rendered", "moved", "paper", "re-rendered, paper", "benign", "random"],
 )
 def test_what_is_shown(
-    kind: int,
+    kind: int | str,
     settings: dict[str, object],
     expected: set[tuple[int, float]],
     attacked: list[AttackedFrame],
@@ -230,6 +286,33 @@ def test_what_is_learned_is_not_learned_twice(
     before = weights.stat().st_mtime_ns
     assert taught(lesson(1), attacked, tmp_path) == weights
     assert (len(shown), weights.stat().st_mtime_ns) == (1, before)
+
+
+def test_lessons_that_cannot_be_held_say_why(attacked: list[AttackedFrame], tmp_path: Path) -> None:
+    """No failure of these frames is certain, and no generator made them."""
+    taken = Taken(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0)
+    reasons = {one.arm: taken.missing(one) for one in lessons_of(Study(name="retrain", arms=",".join(TAUGHT)))}
+    none = "no attacked frame has a certain failure of an object"
+    assert reasons == {
+        **dict.fromkeys(TAUGHT),
+        **dict.fromkeys(("certain", "consistent"), none),
+        "generator": "no generator made these frames",
+    }
+
+
+def test_validation_is_neither_trained_on_nor_judged_by(tmp_path: Path) -> None:
+    folders = {name: str(kitti_folder(tmp_path / name, 3)) for name in ("root", "held_out", "validation")}
+    study = Study(name="retrain", dataset="kitti", **folders)  # pyright: ignore[reportArgumentType]
+    assert parts_of(study).held_out is not None
+    store = lessons.validation_frames(study, ("Car",), tmp_path)
+    assert store is not None
+    assert len(store) == 3
+    assert lessons.validation_frames(replace(study, validation=None), ("Car",), tmp_path) is None
+    for name in ("root", "held_out"):
+        with pytest.raises(UsageError, match="--validation: expected a folder that is neither"):
+            parts_of(replace(study, validation=folders[name]))
+    with pytest.raises(SceneError, match="nowhere"):
+        parts_of(replace(study, validation=str(tmp_path / "nowhere")))
 
 
 def test_without_counterexamples_there_is_nothing_to_learn(attacked: list[AttackedFrame], tmp_path: Path) -> None:

@@ -27,11 +27,12 @@ from drivesem.questions.study.lessons import BENIGN, lessons_of, reference_of
 from drivesem.questions.study.report import OWN_PROTOCOL, answer_of
 from drivesem.questions.study.retrain import Taught
 from drivesem.questions.study.running import Ran
-from drivesem.questions.transfer.matrix import Target, TransferRow, row
+from drivesem.questions.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, Target, TransferRow, row
+from drivesem.questions.transfer.report import sheets as transfer_sheets
 from drivesem.run.finished import Run
 from drivesem.run.frame import as_detections
 from drivesem.run.protocol import PROTOCOL
-from drivesem.run.results import FrameResult
+from drivesem.run.results import Failure, FrameResult
 from drivesem.settings.commands import Study
 
 FRAMES, DRAWS = 8, 40
@@ -70,6 +71,22 @@ def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferRow:
         ],
     }
     return row(run, target, results, found, DRAWS, 0)
+
+
+def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
+    """Four frames whose first car is lost, in one of them for certain; the target loses it in that one alone."""
+    lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, grade="threshold")
+    results = [
+        replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
+        for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
+    ]
+    told = known("target", results, 3)
+    assert told.counts[CERTAIN] == (1, 1)
+    assert told.counts[THRESHOLD] == (0, 3)
+    assert told.counts[TRANSFER] == (1, 4)
+    assert told.flat()["certain_rate"] == 1.0
+    shares = transfer_sheets([told])[1]
+    assert [cell.split("\n")[-1] for cell in shares.rows[0][5:7]] == ["1 of 1", "0 of 3"]
 
 
 @pytest.fixture
@@ -214,6 +231,17 @@ def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable
     assert message in refused("study", "retrain", *words)
 
 
+def test_without_new_attacks_there_is_no_table_of_them(found: Taught) -> None:
+    rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
+    less = replace(found, rows=rows, left_out={"the same, consistently": "no failure"})
+    assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
+    assert less.rows[1].flat()["fresh_moved_ap50"] is None
+    told = retrain_report.told(less)
+    assert not any("Fresh" in sheet.title for sheet in told.sheets)
+    assert any("Fresh" in sheet.title for sheet in retrain_report.told(found).sheets)
+    assert "Left out: the same, consistently: no failure." in told.notes
+
+
 @pytest.mark.slow
 def test_the_whole_study_and_going_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -221,6 +249,7 @@ def test_the_whole_study_and_going_on(
     out = tmp_path / "out"
     words = ["study", "retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
     words += ["--train-steps", "2", "--workers", "1", "--bootstrap", "5", "--out", str(out), "--json"]
+    words += ["--states", "2"]
     assert main(words) == 0
     data = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in data["rows"]] == [
@@ -230,6 +259,10 @@ def test_the_whole_study_and_going_on(
     ]
     assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (1, 2, 1.0)
     assert json.loads((out / "study.json").read_text()) == data
+    assert (data["state_frames"], [row["arm"] for row in data["robust"]]) == (1, [BENIGN, "re-rendered", "ours"])
+    assert data["robust"][0]["failures_anywhere"] is not None
+    assert {row["goal"] for row in data["robust"]} == {None}
+    assert (out / "robust.csv").is_file()
     folders = {path.name for path in (out / "arms").iterdir()}
     assert folders == {"combo-2", "held-out", "held-out-re-rendered", "held-out-ours"}
     learned, judged = ((out / "arms" / n / "frames" / "demo-000" / "benign.png") for n in ("combo-2", "held-out"))

@@ -1,0 +1,178 @@
+"""Certain failures and what lies around them, to train on: each time another state, rendered anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from detectors.base import Candidates, Detector, Predictor
+from detectors.training import Sample
+from detectors.types import CLASSES, Targets
+from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.space import Parameter
+from drivesem.data import kitti
+from drivesem.run.frame import as_targets
+from drivesem.run.rebuilt import rebuilt
+from drivesem.run.tally import certain_losses
+from drivesem.settings.commands import Attack
+from drivesem.training.attacked import AttackedFrame
+from drivesem.training.semantic import state_at
+from drivesem.training.targets import TRAINED, training_targets
+from drivesem.truth.margin import of_objects
+from drivesem.truth.neighbourhood import NEAR, Neighbourhood
+from drivesem.truth.nuisances import Nuisances
+from drivesem.truth.views import SHARPNESS
+from scene_ir import files
+
+AT_ONCE = 4
+"""States that are rendered together: a scene's reading costs more than a few renders of it."""
+
+
+class AroundFailures(Sequence[Sample]):
+    """A run's certain failures of objects, each shown as a state of its neighbourhood.
+
+    The pool holds `AT_ONCE` states of each failure, made when one is first drawn, and is another one as soon as
+    all of it may have been shown: after so many steps. Its states lie in `folder`, and follow from the failure,
+    the seed and their number alone; half of them lie near the failure, as a hole may be small.
+    attack, params, detector: of the run; pace: views of all failures a step.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[AttackedFrame],
+        attack: Attack,
+        params: Sequence[Parameter],
+        detector: Predictor,
+        folder: Path,
+        classes: Sequence[str],
+        pace: float,
+        seed: int,
+    ) -> None:
+        self.failures = failures_in(frames)
+        self._attack, self._params, self._detector = attack, params, detector
+        self._folder, self._classes, self._seed = folder, classes, seed
+        self._turns = pace / (AT_ONCE * max(len(self.failures), 1))
+
+    def __len__(self) -> int:
+        return len(self.failures)
+
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.state(index, 0)[0]
+
+    def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
+        """A state around failure `index` out of the pool of that step."""
+        return self.state(index, self.number(step, generator))[0]
+
+    def number(self, step: int, generator: np.random.Generator) -> int:
+        """Of one of the states in the pool of a step."""
+        return AT_ONCE * int(step * self._turns) + int(generator.integers(AT_ONCE))
+
+    def state(self, index: int, number: int) -> tuple[Sample, Targets]:
+        """The number-th state around a failure, to train on; and its targets as they are judged, whose first rows
+        are all of the scene's objects.
+        """
+        frame, target = self.failures[index]
+        folder = self._folder / f"{frame.name.replace('/', '_')}-{target}" / f"{number // AT_ONCE}"
+        if not folder.is_dir():
+            self._make(frame, target, number // AT_ONCE, folder)
+        labels = kitti.read_labels(folder / f"{number}.txt")
+        image = files.read_image(folder / f"{number}.png")
+        boxes_xyxy, names, ignore = files.read_json(folder / f"{number}.json")
+        judged = Targets(torch.tensor(boxes_xyxy), torch.tensor(names), torch.tensor(ignore))
+        return (image, training_targets(labels, TRAINED, self._classes)), judged
+
+    def _make(self, frame: AttackedFrame, target: int, turn: int, folder: Path) -> None:
+        objective, theta = rebuilt(frame.result, frame.folder, self._attack, self._params, self._detector)
+        limits = Limits(joint_weather=frame.result.joint_weather)
+        feasible = objective.feasible_set(limits, self._attack.project == "bounds")
+        name = f"training:{frame.name}:{target}:{self._seed}"
+        near = Neighbourhood(objective, feasible, theta, target, Nuisances.of("off"), name)
+        with files.whole_folder(folder) as part:
+            for number in range(AT_ONCE * turn, AT_ONCE * (turn + 1)):
+                at = near.theta(number, 1.0 if number % 2 == 0 else NEAR)
+                image, labels, judged = state_at(
+                    at, objective.space, objective.compositor, objective.labeller, objective.benign.scene
+                )
+                files.write_png(part / f"{number}.png", image)
+                kitti.write_labels(part / f"{number}.txt", labels)
+                told = [judged.boxes_xyxy.tolist(), judged.labels.tolist(), judged.ignore.tolist()]
+                files.write_json(part / f"{number}.json", told)
+
+
+def failures_in(frames: Sequence[AttackedFrame]) -> list[tuple[AttackedFrame, int]]:
+    """Certain failures of objects: the frame, and which object is lost."""
+    return [(f, one.index) for f in frames for one in certain_losses(f.result) if one.index is not None]
+
+
+class Consistency:
+    """What a detector says of an object is to be the same in the photograph and in a state around a failure: a
+    term of the loss, by margins, on a pair of pictures a step. weight: of the term; t_star: of margins; window_hw:
+    of the part of both pictures that is seen, with the object that fails in its middle.
+    """
+
+    name = "consistency"
+
+    def __init__(
+        self, around: AroundFailures, weight: float, t_star: float, seed: int, window_hw: tuple[int, int]
+    ) -> None:
+        self._around, self._weight, self._t_star, self._seed = around, weight, t_star, seed
+        self._window_hw = window_hw
+
+    def images(self, step: int) -> Tensor:
+        """Of the photograph and of the state: (2, 3, h, w)."""
+        index, (sample, state) = self._pair(step)
+        y0, x0, y1, x1 = self._window(index, sample, state)
+        both = [self._around.failures[index][0].image("benign"), sample[0]]
+        parts = [np.array(image[y0:y1, x0:x1]) for image in both]
+        return torch.stack([torch.from_numpy(part).permute(2, 0, 1).float() / 255 for part in parts])
+
+    def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
+        """Of the objects that are judged in both pictures, and lie in the part that is seen."""
+        index, (sample, state) = self._pair(step)
+        y0, x0, y1, x1 = self._window(index, sample, state)
+        frame = self._around.failures[index][0]
+        known = [box for box in frame.result.targets_benign if box.index is not None]
+        still = as_targets(tuple(known), CLASSES)
+        names = [detector.classes.index(n) if n in detector.classes else -1 for n in CLASSES]
+        labels = torch.tensor(names)[still.labels]
+        both = torch.stack([still.boxes_xyxy, state.boxes_xyxy[: len(known)]]) - torch.tensor([x0, y0, x0, y0])
+        inside = (both[..., :2] >= 0).all(-1) & (both[..., 2:] < torch.tensor([x1 - x0, y1 - y0])).all(-1)
+        judged = ~still.ignore & ~state.ignore[: len(known)] & (labels >= 0) & inside.all(0)
+        rows = judged.nonzero()[:, 0]
+        before, after = (detector.candidates(raw.one(i)) for i in (0, 1))
+        return self._weight * apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
+
+    def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
+        generator = np.random.default_rng([self._seed, 8, step])
+        index = int(generator.integers(len(self._around)))
+        return index, self._around.state(index, self._around.number(step, generator))
+
+    def _window(self, index: int, sample: Sample, state: Targets) -> tuple[int, int, int, int]:
+        """First row and column of the part, and those after the last."""
+        left, top, right, bottom = state.boxes_xyxy[self._around.failures[index][1]].tolist()
+        middle, size = np.array([top + bottom, left + right]) / 2, np.array(sample[0].shape[:2])
+        side = np.minimum(self._window_hw, size)
+        y0, x0 = np.clip(np.round(middle - side / 2), 0, size - side).astype(int).tolist()
+        return y0, x0, y0 + int(side[0]), x0 + int(side[1])
+
+
+def apart(
+    before: Candidates, after: Candidates, boxes_xyxy: tuple[Tensor, Tensor], labels: Tensor, t_star: float
+) -> Tensor:
+    """How far the margins of objects differ between two pictures: a mean (), quadratic up to a logit and linear
+    beyond; 0 without objects. boxes_xyxy: (M, 4) px in either; labels: (M,) among the detector's classes. What is
+    said of the first picture is the aim, and taken as constant.
+    """
+    if not len(labels):
+        return after.log_scores.new_zeros(())
+    margins = [
+        of_objects(seen, at, labels, at, t_star, SHARPNESS)
+        for seen, at in zip((before, after), boxes_xyxy, strict=True)
+    ]
+    return F.smooth_l1_loss(margins[1], margins[0].detach())

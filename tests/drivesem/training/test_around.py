@@ -1,0 +1,134 @@
+"""Certain failures to train on: states around them, drawn anew, and the term that compares their two pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from detectors.base import Candidates
+from detectors.registry import load_detector
+from detectors.types import CLASSES
+from drivesem.attack.space import parse_params
+from drivesem.run.folder import attack_of
+from drivesem.run.results import Failure
+from drivesem.training.around import AT_ONCE, AroundFailures, Consistency, apart, failures_in
+from drivesem.training.attacked import AttackedFrame, RedrawnSamples, frames_of
+from drivesem.truth.redraw.choose import SecondRenderers
+
+BOX = torch.tensor([[10.0, 20.0, 60.0, 50.0]], dtype=torch.float64)
+CAR = torch.zeros(1, dtype=torch.int64)
+T_STAR = 0.5
+
+
+def said(logits: Tensor, boxes_xyxy: Tensor = BOX) -> Candidates:
+    """Candidates of one class at these boxes."""
+    return Candidates(boxes_xyxy[:, None], torch.nn.functional.logsigmoid(logits)[:, None])
+
+
+def term(before: Tensor, after: Tensor) -> Tensor:
+    return apart(said(before), said(after), (BOX, BOX), CAR, T_STAR)
+
+
+def test_the_same_margins_are_not_apart() -> None:
+    one = torch.tensor([1.5], dtype=torch.float64)
+    assert float(term(one, one)) == pytest.approx(0, abs=1e-9)
+    assert float(term(one, one - 0.4)) == pytest.approx(0.5 * 0.4**2, rel=0.02)
+    assert float(term(one, one - 3)) == pytest.approx(3 - 0.5, rel=0.02)
+    assert float(apart(said(one), said(one), (BOX[:0], BOX[:0]), CAR[:0], T_STAR)) == 0
+
+
+def test_the_terms_gradient_is_that_of_differences() -> None:
+    """To scores and boxes of the second picture; the first one is the aim, and has none."""
+    before = torch.tensor([2.0, -1.0], dtype=torch.float64, requires_grad=True)
+    after = torch.tensor([0.8, -0.5], dtype=torch.float64, requires_grad=True)
+    placed = torch.cat([BOX + 3, BOX - 9]).requires_grad_(True)
+    two = torch.cat([BOX, BOX])
+
+    def loss(logits: Tensor, at: Tensor) -> Tensor:
+        return apart(said(before, two), said(logits, at), (BOX, BOX), CAR, T_STAR)
+
+    assert torch.autograd.gradcheck(loss, (after, placed), eps=1e-6, atol=1e-6)
+    loss(after, placed).backward()
+    assert before.grad is None
+    assert after.grad is not None
+    assert float(after.grad[0]) < 0, "more confidence brings the second picture closer"
+
+
+@pytest.fixture(scope="module")
+def frames(small_run: Path) -> list[AttackedFrame]:
+    """A run whose first object counts as lost for certain."""
+    (frame,) = frames_of(small_run)
+    lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, error="missed", grade="certain")
+    known = AttackedFrame(frame.folder)
+    known.__dict__["result"] = replace(frame.result, failures=(lost, replace(lost, index=1, grade="threshold")))
+    return [known]
+
+
+@pytest.fixture(scope="module")
+def around(
+    frames: list[AttackedFrame], small_run: Path, tmp_path_factory: pytest.TempPathFactory
+) -> AroundFailures:
+    folder = tmp_path_factory.mktemp("pool")
+    attack, detector = attack_of(small_run), load_detector("squeezedet")
+    return AroundFailures(frames, attack, parse_params("translate,rotate"), detector, folder, CLASSES, 1.0, 3)
+
+
+def test_certain_failures_are_what_is_shown(frames: list[AttackedFrame], around: AroundFailures) -> None:
+    assert [index for _, index in failures_in(frames)] == [0]
+    assert len(around) == 1
+
+
+def test_states_are_drawn_anew_and_again_the_same(around: AroundFailures) -> None:
+    """Each is a picture of its own with labels that moved along; the same step draws the same."""
+    (first, targets), (second, _) = around.state(0, 0)[0], around.state(0, 1)[0]
+    photograph = around.failures[0][0].image("benign")
+    assert first.shape == second.shape == photograph.shape
+    assert (first != second).any()
+    assert (first != photograph).any()
+    assert len(targets) > 0
+    judged = around.state(0, 0)[1]
+    still = torch.tensor([box.xyxy for box in around.failures[0][0].result.targets_benign])
+    assert not torch.equal(judged.boxes_xyxy[0], still[0])
+    again = around.draw(0, 0, np.random.default_rng(5))[0]
+    assert np.array_equal(around.draw(0, 0, np.random.default_rng(5))[0], again)
+
+
+def test_the_pool_is_another_once_all_of_it_may_have_been_shown(around: AroundFailures) -> None:
+    """One view a step, one failure: after as many steps as it has states."""
+    seen = [{around.number(step, np.random.default_rng(i)) for i in range(40)} for step in range(2 * AT_ONCE)]
+    assert seen[0] == seen[AT_ONCE - 1] == set(range(AT_ONCE))
+    assert seen[AT_ONCE] == seen[-1] == set(range(AT_ONCE, 2 * AT_ONCE))
+
+
+@pytest.mark.slow
+def test_changes_are_drawn_by_the_generator(small_run: Path, tmp_path: Path) -> None:
+    """With its own labels of everything, people included; once."""
+    frames = frames_of(small_run)
+    samples = RedrawnSamples(frames, SecondRenderers("demo", None), tmp_path, CLASSES)
+    image, targets = samples[0]
+    assert image.shape == frames[0].image("benign").shape
+    assert (image != frames[0].image("benign")).any()
+    assert len(targets) > 0
+    written = (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns
+    assert np.array_equal(samples[0][0], image)
+    assert (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns == written
+
+
+def test_consistency_on_real_pictures(around: AroundFailures) -> None:
+    """Its weight scales it, and its gradient reaches the detector's weights."""
+    detector = load_detector("squeezedet").requires_grad_(True).eval()
+    once, twice = (Consistency(around, weight, detector.t_star, 0, (224, 640)) for weight in (1.0, 2.0))
+    images = once.images(0)
+    assert images.shape == (2, 3, 224, 640)
+    assert torch.equal(images, once.images(0))
+    raw = detector(images)
+    value = once.term(detector, raw, 0)
+    assert float(value.detach()) > 0
+    assert float(twice.term(detector, raw, 0).detach()) == pytest.approx(2 * float(value.detach()))
+    value.backward()
+    assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())
