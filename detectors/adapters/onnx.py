@@ -167,7 +167,8 @@ def _input_hw(
     sides left open.
     """
     shape = inputs[0][1] if len(inputs) == 1 else []
-    if len(shape) in (3, 4) and (shape[-3] == 3 or not isinstance(shape[-3], int)):
+    one = len(shape) == 3 or (len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int)))
+    if one and (shape[-3] == 3 or not isinstance(shape[-3], int)):
         fixed = tuple(side if isinstance(side, int) else None for side in shape[-2:])
         if not all(side is None or 1 <= side <= MOST_SIDE for side in fixed):
             raise DetectorError(f"{path}: expected an input of 1 to {MOST_SIDE} px a side, found {shape}")

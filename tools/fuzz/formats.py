@@ -379,7 +379,7 @@ def _least_known(one: Exception | None, other: Exception) -> Exception:
     return one or other
 
 
-OWN_ERRORS = ("FormatError", "RangeError", "ShapeError", "DetectorError", "UsageError")
+OWN_ERRORS = ("FormatError", "RangeError", "ShapeError", "DetectorError", "UsageError", "WriteError")
 """What may be raised of a damaged file."""
 
 

@@ -128,6 +128,7 @@ def mutated(name: str, data: bytes, rng: random.Random) -> bytes:
             struct.error,
             zipfile.BadZipFile,
             NotImplementedError,
+            EOFError,
             zlib.error,
             OSError,
             OverflowError,

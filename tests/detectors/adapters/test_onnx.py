@@ -140,7 +140,7 @@ def test_graphs_of_no_known_kind(graph: Make) -> None:
         OnnxPredictor(graph(wrong))
 
 
-@pytest.mark.parametrize("shape", [(1, 3, "height", "width"), (1, 1, 64, 64), (64, 64)])
+@pytest.mark.parametrize("shape", [(1, 3, "height", "width"), (1, 1, 64, 64), (64, 64), (5, 3, 64, 64)])
 def test_inputs_that_are_no_image_of_one_size(shape: tuple[int | str, ...], graph: Make) -> None:
     with pytest.raises(
         DetectorError, match=r"expected one input \(1, 3, height, width\) of fixed size .*, found image"
