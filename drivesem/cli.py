@@ -21,7 +21,6 @@ from drivesem.settings.blocks import Command, option
 from drivesem.settings.commands import COMMANDS
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import parse
-from drivesem.store import stored
 from scene_ir.errors import shown
 
 _MODULES = "drivesem.commands.{}"
@@ -41,6 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
+        from drivesem.store import stored  # which needs numpy, and --help does not
+
         _tell_of_code(config)
         with _sigterm_interrupts(), let_go(), stored(config) as config:
             return _run(config)

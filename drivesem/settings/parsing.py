@@ -21,7 +21,6 @@ from drivesem.settings.errors import UsageError
 from drivesem.settings.help import command_help, overview
 from drivesem.settings.presets import preset_path, presets
 from drivesem.version import __version__
-from scene_ir import files
 from scene_ir.errors import FormatError
 
 _DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
@@ -175,6 +174,8 @@ def _presets_for(command: str) -> str:
 
 def _mapping(path: str) -> dict[Any, Any]:
     """What a YAML file holds. Raises UsageError where it cannot be read."""
+    from scene_ir import files  # which needs numpy, and --help does not
+
     try:
         loaded: Any = files.read_yaml(Path(path))
     except FormatError as error:

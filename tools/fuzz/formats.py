@@ -420,7 +420,9 @@ def _theta(root: Path) -> None:
     base = load_scene(root / "scene")
     frame = root / "frames" / "a"
     budget = budget_of("paper")
-    check_change(CheckLog(), frame, load_frame(frame / "result.json"), base.at_rest(), base, _PARAMS, budget)
+    check_change(
+        CheckLog(), frame, load_frame(frame / "result.json"), base.at_rest(), base, _PARAMS, budget, "ground"
+    )
 
 
 def _segment(root: Path) -> None:

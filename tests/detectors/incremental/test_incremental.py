@@ -236,6 +236,7 @@ def test_full_yolov3_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
     agree("yolov3", scene)
 
 
+@pytest.mark.slow
 def test_full_yolov3_gives_what_a_whole_pass_gives_at_all_borders() -> None:
     """With random weights: of the full size none ship."""
     agree("yolov3", BORDERS)

@@ -44,6 +44,7 @@ def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_parts_are_every_nth_frame_and_merge_into_the_whole(
     parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -99,6 +99,7 @@ THETAS = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2), THETAS)
 @settings(max_examples=25)
 def test_a_kept_compositor_draws_as_a_new_one(
