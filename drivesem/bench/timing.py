@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from drivesem.settings.devices import memory_gb
+
 _PACKAGES = {"torch": "torch", "warp": "warp-lang", "drivesem": "drivesem"}
 
 
@@ -102,7 +104,7 @@ def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
         "cpu": _processor(),
         "cores": _cores(),
         "threads": torch.get_num_threads(),
-        "ram": _ram_gb(),
+        "ram": memory_gb(),
     }
     if torch.device(device).type == "cuda":
         facts["gpu"] = torch.cuda.get_device_name(device)
@@ -128,10 +130,3 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _ram_gb() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-    except (AttributeError, OSError, ValueError):
-        return None

@@ -5,14 +5,12 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 import cv2
-import jinja2
-from markupsafe import Markup
 
 from drivesem.classify.results import ClassifiedFrame, ClassifiedRun
+from drivesem.report import web
 from drivesem.report.tables import percent
 from drivesem.truth.grades import Grade
 from scene_ir import files
@@ -35,19 +33,12 @@ def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]
     """Write the page beside the run's folder of frames. Raises FormatError where a picture is missing."""
     worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
     cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(_part("drivesem.classify", "page.html"))
-    style = Markup(_part("drivesem.report", "style.css"))
     rows = [
         (one, percent(share(one.benign, one.pictures)), percent(share(one.attacked, one.pictures)))
         for one in run.classes
     ]
-    text = template.render(run=run, cards=cards, style=style, percent=percent, rows=rows)
-    files.write_text(path, text)
-
-
-def _part(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+    shown = {"title": run.network, "run": run, "cards": cards, "percent": percent, "rows": rows}
+    files.write_text(path, web.render("drivesem.classify:page.html", **shown))
 
 
 def share(part: int, whole: int) -> float | None:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from importlib import resources
 from itertools import groupby
 from pathlib import Path
 from urllib.parse import quote
 
-import jinja2
 from markupsafe import Markup
 
 from drivesem.drive.report import NOTES, row_of, summary, unfeasible
 from drivesem.drive.results import ABSENT, FOUND, LOST, UNCOUNTED, DriveResult
-from drivesem.report.policy import script_hash
+from drivesem.report import web
 from drivesem.run.folder import FRAMES
 from scene_ir import files
 
@@ -23,18 +21,15 @@ _CLASSES = {FOUND: "f", LOST: "l", UNCOUNTED: "u"}
 
 def write_page(path: Path, result: DriveResult) -> None:
     """Write the page, which shows the pictures and the video beside it. Atomic."""
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.globals |= {"runs": _runs}
     pictures = [
         {"name": name} | {side: quote(f"{FRAMES}/{name}/{side}.jpg") for side in ("before", "after")}
         for name in result.names
     ]
     rows = [row_of(car) for car in result.cars]
-    script = _part("drivesem.drive", "page.js")
-    text = environment.from_string(_part("drivesem.drive", "page.html")).render(
-        style=Markup(_part("drivesem.report", "style.css")),
-        script=Markup(script),
-        script_hash=Markup(script_hash(script)),
+    text = web.render(
+        "drivesem.drive:page.html",
+        "drivesem.drive:page.js",
+        runs=_runs,
         data=Markup(json.dumps(pictures).replace("<", "\\u003c")),
         title=f"{result.detector} on {result.clip}",
         headline=_headline(result),
@@ -47,10 +42,6 @@ def write_page(path: Path, result: DriveResult) -> None:
         result=result,
     )
     files.write_text(path, text)
-
-
-def _part(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def _runs(states: str) -> Iterator[tuple[int, int, str]]:

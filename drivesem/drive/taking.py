@@ -13,17 +13,20 @@ from drivesem.run.derender import RECORD
 from drivesem.scenes.sources import derender_settings, make_ready
 from drivesem.settings.blocks import DEMO, Sharing
 from drivesem.settings.commands import Derender
+from drivesem.settings.devices import memory_gb
 from drivesem.settings.errors import UsageError
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender, placements
 from scene_ir.derender.silhouette import Placement, candidates, placed
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene
-from scene_ir.types import Labels, SceneIR
+from scene_ir.types import Camera, Labels, SceneIR
 
 DEMO_FRAMES = 30
 """Of the embedded drive: three seconds."""
 _TRACKS = "tracks"
 """Key of a scene's provenance: the tracks of its labels."""
+_BYTES_A_PIXEL = 180
+"""What an attack on a clip keeps of each frame: its maps, and what the detector made of the photograph."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,10 @@ class _Demo:
     def scene(self, name: str) -> SceneIR:
         return self._drive.scene(self.names.index(name))
 
+    def camera(self) -> Camera:
+        """Of the first frame."""
+        return self._drive.plan(0).setting.view.camera
+
 
 class _Labelled:
     """The frames of a labelled clip. A car's shape and size are those of the frame in which it is seen best; it
@@ -83,6 +90,10 @@ class _Labelled:
         frame = self._clip.dataset.frame(name)
         scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
+
+    def camera(self) -> Camera:
+        """Of the first frame."""
+        return self._clip.dataset.frame(self.names[0]).camera
 
     def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
         """A label's vehicle where the label says; None where it is none."""
@@ -152,6 +163,7 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
     """
     taking, out = work.taking, work.out
     names = work.source.names
+    _check_memory(work.source)
     todo = [name for name in names if not (out / name / RECORD).is_file()]
     if todo:
         make_ready(Derender(dataset=DEMO if taking.folder is None else "kitti", root=taking.folder))
@@ -164,6 +176,15 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
         found = next(iter(failed.values()), f"none in {len(kept)} frames")
         raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
     return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes), failed)
+
+
+def _check_memory(source: _Demo | _Labelled) -> None:
+    """UsageError where the clip's frames would not fit into memory together."""
+    camera = source.camera()
+    there, needed = memory_gb(), _BYTES_A_PIXEL * camera.width * camera.height / 2**30
+    if there is not None and len(source.names) * needed > there:
+        expected = f"at most {int(there / needed)} frames, as memory of {there:g} GB holds"
+        raise UsageError("CLIP: frames", f"{expected} (--limit takes the first)", f"{len(source.names)}")
 
 
 def tracks_of(scene: SceneIR) -> tuple[int, ...]:

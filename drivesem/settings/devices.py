@@ -1,6 +1,8 @@
-"""Whether a torch device is there."""
+"""What this machine has: torch devices, and memory."""
 
 from __future__ import annotations
+
+import os
 
 import torch
 
@@ -14,3 +16,11 @@ def check_device(device: str) -> None:
     except (RuntimeError, AssertionError) as error:
         found = f"{device!r}: {error}".split("\n")[0]
         raise UsageError("--device", "a torch device of this machine", found) from error
+
+
+def memory_gb() -> float | None:
+    """Gigabytes (2^30 bytes) of memory that this machine has; None where its system does not tell."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, OSError, ValueError):
+        return None

@@ -127,7 +127,7 @@ def mutated(name: str, data: bytes, rng: random.Random) -> bytes:
             TypeError,
             struct.error,
             zipfile.BadZipFile,
-            NotImplementedError,
+            NotImplementedError,  # what zipfile raises for a version or method that it does not know
             EOFError,
             zlib.error,
             OSError,

@@ -21,7 +21,7 @@ import numpy as np
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Figure, Interval, differences, holm
 from drivesem.questions.study.arms import PAPERS, Arm
-from drivesem.questions.study.report import Told
+from drivesem.questions.study.report import Told, heading
 from drivesem.questions.study.rows import Figures, feasible_fraction
 from drivesem.questions.study.running import Ran
 from drivesem.questions.transfer.report import bounded
@@ -139,15 +139,7 @@ class Attribution:
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        results = [result for run in self.ran.runs for result in run.results]
-        return {
-            "study": self.study.name,
-            "headline": HEADLINE,
-            "frames": len(self.ran.runs[0].results),
-            "frames_without_vehicles": self.ran.without_vehicles,
-            "frames_failed": self.ran.failed,
-            "feasible_fraction": feasible_fraction(results),
-            "bootstrap": self.draws,
+        return heading(self.study, self.draws, self.ran) | {
             "ours": self.ours,
             "papers": self.papers,
             "rows": [share.flat() for share in self.rows()],

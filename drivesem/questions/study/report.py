@@ -50,6 +50,19 @@ class Told:
     unbroken: Collection[str] = ()
 
 
+def heading(study: Study, draws: int, ran: Ran) -> dict[str, Any]:
+    """What the JSON object of a study of arms begins with."""
+    return {
+        "study": study.name,
+        "headline": HEADLINE,
+        "frames": len(ran.runs[0].results),
+        "frames_without_vehicles": ran.without_vehicles,
+        "frames_failed": ran.failed,
+        "feasible_fraction": feasible_fraction([result for run in ran.runs for result in run.results]),
+        "bootstrap": draws,
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Findings:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
@@ -73,17 +86,7 @@ class Findings:
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        results = [result for run in self.ran.runs for result in run.results]
-        data: dict[str, Any] = {
-            "study": self.study.name,
-            "headline": HEADLINE,
-            "frames": len(self.ran.runs[0].results),
-            "frames_without_vehicles": self.ran.without_vehicles,
-            "frames_failed": self.ran.failed,
-            "feasible_fraction": feasible_fraction(results),
-            "bootstrap": self.draws,
-            "rows": self.flat_rows(),
-        }
+        data = heading(self.study, self.draws, self.ran) | {"rows": self.flat_rows()}
         if self.curves:
             data["curves"] = [point for curve in self.curves for point in curve.to_json()]
         if self.label_sets:

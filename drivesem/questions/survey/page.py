@@ -10,14 +10,11 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
-from markupsafe import Markup
 
 from detectors.types import CLASSES
 from drivesem.evaluation.resampling import Figure, Interval, intervals
@@ -25,7 +22,7 @@ from drivesem.questions.realism.closeness import Picture
 from drivesem.questions.realism.comparison import vehicles
 from drivesem.questions.realism.frechet import Floats
 from drivesem.questions.survey.agreement import alpha, interval, nominal
-from drivesem.report.policy import script_hash
+from drivesem.report import web
 from drivesem.run.finished import Frame, Run
 from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
@@ -171,15 +168,9 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
     # "</" would end the script element, and "<!--" hide its end.
     told = {"survey": survey_name([item for item, _ in items]), "columns": COLUMNS, "items": shown}
     data = json.dumps(told).replace("<", "\\u003c")
-    script = _part("survey.js")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(_part("survey.html"))
     asked = {"count": len(items), "choices": CHOICES, "least": LEAST, "most": MOST}
-    return template.render(data=data, script=Markup(script), script_hash=Markup(script_hash(script)), **asked)
-
-
-def _part(name: str) -> str:
-    return resources.files("drivesem.questions.survey").joinpath(name).read_text(encoding="utf-8")
+    home = "drivesem.questions.survey"
+    return web.render(f"{home}:survey.html", f"{home}:survey.js", data=data, **asked)
 
 
 def _jpeg(image: Picture) -> str:

@@ -6,15 +6,13 @@ import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from itertools import islice, zip_longest
 from pathlib import Path
 from urllib.parse import quote
 
-import jinja2
 from markupsafe import Markup
 
-from drivesem.report.policy import script_hash
+from drivesem.report import web
 from drivesem.run.report import grading
 from drivesem.run.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.run.report.frames import Card, CloseUp, cards_of, in_units, told
@@ -58,19 +56,15 @@ def render_report(page: Page, at: Path) -> str:
     """
     runs, several = page.runs, len(page.runs) > 1
     cards = cards_of(runs, page.gallery)
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters |= {
-        "link_to": lambda folder, frame=None: _link(at, folder, frame),
-        "scene_of": lambda folder, frame: shlex.quote((folder / "frames" / frame / "scene").as_posix()),
-        "shown_folder": lambda folder: folder.as_posix(),
-    }
-    environment.globals |= {"told": told, "in_units": in_units, "trace": trace}
-    template = environment.from_string(_part("drivesem.run.report", "template.html"))
     first = runs[0]
-    return template.render(
-        style=Markup(_part("drivesem.report", "style.css")),
-        script=Markup(script := _part("drivesem.run.report", "page.js")),
-        script_hash=Markup(script_hash(script)),
+    return web.render(
+        "drivesem.run.report:template.html",
+        "drivesem.run.report:page.js",
+        link_to=lambda folder, frame=None: _link(at, folder, frame),
+        scene_of=lambda folder, frame: shlex.quote((folder / "frames" / frame / "scene").as_posix()),
+        told=told,
+        in_units=in_units,
+        trace=trace,
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,
@@ -108,10 +102,6 @@ def render_report(page: Page, at: Path) -> str:
         weathers=sorted({card.weather for card in cards if card.weather}),
         largest=_LARGEST_SIZE,
     )
-
-
-def _part(package: str, name: str) -> str:
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def _link(at: Path, folder: Path, frame: str | None) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import re
 import shutil
@@ -13,11 +15,10 @@ import cv2
 import pytest
 
 from drivesem.cli import main
-from drivesem.drive import running
+from drivesem.drive import running, taking
 from drivesem.drive.page import write_page
 from drivesem.drive.results import DriveResult
 from drivesem.drive.taking import TakenClip
-from drivesem.report.policy import script_hash
 from drivesem.run.records import from_json
 from drivesem.synth.write import Order, synthesise
 from scene_ir import files
@@ -88,6 +89,18 @@ def test_a_second_command_tells_what_is_there(finished: Path, capsys: pytest.Cap
     assert "other values of limit" in capsys.readouterr().err
 
 
+def test_a_clip_that_memory_cannot_hold_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(taking, "memory_gb", lambda: 0.5)
+    assert main(["drive", "--limit", "30", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.endswith(
+        "CLIP: frames: expected at most 6 frames, as memory of 0.5 GB holds (--limit takes the first), found 30"
+    )
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
 def test_the_table_names_cars(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert main([*(word for word in WORDS if word != "--json"), "--limit", "3", "--out", str(finished)]) == 0
@@ -106,7 +119,7 @@ def test_the_page_escapes_and_runs_one_script(finished: Path, tmp_path: Path) ->
     assert "<i>" not in page
     scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     assert len(scripts) == 1
-    assert script_hash(scripts[0]) in page
+    assert f"'sha256-{base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()}'" in page
     assert "default-src 'none'" in page
 
 

@@ -39,6 +39,18 @@ def test_the_overview_names_every_command_once(words: list[str], capsys: pytest.
     assert max(map(len, text.splitlines())) <= 100
 
 
+@pytest.mark.parametrize("words", [["--help"], ["attack", "--help"]])
+def test_help_imports_nothing_that_takes_long(words: list[str]) -> None:
+    code = (
+        "import atexit, sys\n"
+        "heavy = {'torch', 'cv2', 'numpy', 'warp', 'trimesh', 'PIL', 'scene_ir.files'}\n"
+        "atexit.register(lambda: print('imported:', *sorted(heavy & set(sys.modules))))\n"
+        f"from drivesem.cli import main; main({words!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.rstrip().endswith("\nimported:")
+
+
 def test_examples_parse(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for words, _ in EXAMPLES:
