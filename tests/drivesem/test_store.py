@@ -274,6 +274,7 @@ def test_an_attack_is_elsewhere_what_it_is_here(
     assert "expected the settings of this run" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_generated_frames_are_written_and_read_elsewhere(tmp_path: Path, machine: Any) -> None:
     words = ["synth", "--frames", "1", "--seed", "3", "--workers", "1", "--out"]
     assert main([*words, str(tmp_path / "here")]) == 0

@@ -68,6 +68,7 @@ def test_vehicles_stand_where_the_labels_have_them(tmp_path: Path) -> None:
         assert float((middle - (box[:2] + box[2:]) / 2).abs().max()) < 25
 
 
+@pytest.mark.slow
 def test_a_frame_is_measured(tmp_path: Path) -> None:
     detector = load_detector("squeezedet")
     assert isinstance(detector, Detector)

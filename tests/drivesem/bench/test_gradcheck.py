@@ -200,6 +200,7 @@ def small_street(street: Callable[..., SceneIR], monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(gradcheck_command, "open_source", lambda _: _Streets(scene))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_street")
 def test_a_whole_check_passes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["gradcheck", "--json", "--workers", "1", "--directions", "1", "--out", str(tmp_path / "out")]

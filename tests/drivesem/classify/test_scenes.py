@@ -57,7 +57,7 @@ def test_a_picture_has_its_background_around_the_object():
     assert float(middle[1]) > float(middle[0]) > 0.2
 
 
-@pytest.mark.parametrize("params", ["pose", "vertex", "lighting"])
+@pytest.mark.parametrize("params", ["pose", pytest.param("vertex", marks=pytest.mark.slow), "lighting"])
 def test_gradients_through_the_picture_and_through_a_score(params, colours):
     """512 px drawn, 224 seen, and what a network makes of it."""
     scene = ObjectScene("box", model("box"), "left", generated_background("box"))

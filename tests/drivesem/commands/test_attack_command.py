@@ -341,7 +341,14 @@ def test_methods_are_those_that_need_no_gradient() -> None:
     }  # the last takes gradients where there are any
 
 
-@pytest.mark.parametrize("objective", ["failure", "hide", "phantom", "localisation", "total"])
+@pytest.mark.parametrize(
+    "objective",
+    [
+        "failure",
+        "total",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("hide", "phantom", "localisation")),
+    ],
+)
 def test_objectives_are_recorded_and_raised(
     objective: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -354,6 +361,7 @@ def test_objectives_are_recorded_and_raised(
     assert f"objective: {objective}" in (tmp_path / "run" / "config.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     aimed = [*WORDS, "--limit", "2", "--target-objects", "0"]
     attack([*aimed, "--out", str(tmp_path / "one")], capsys)

@@ -183,6 +183,7 @@ def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert "4 attacks of 90 passes" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_planted_across(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -178,6 +178,7 @@ def test_a_second_call_goes_on_and_says_the_same(
     assert kept.stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_a_rule_is_checked_by_draws_of_its_own(
     attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +246,7 @@ def test_an_answer_of_an_older_version_is_refused_in_one_line(
     assert "holes.json" in said
 
 
+@pytest.mark.slow
 def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = []
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):

@@ -41,7 +41,9 @@ def answers(path: Path, name: str, person: str, *rows: tuple[str, str, object]) 
 
 def test_the_page_stands_alone_and_keeps_the_truth_to_itself(survey: Path) -> None:
     page = (survey / "survey.html").read_text()
-    assert not re.search(r"(src|href)=\"(?!data:)[^\"]+\"|https?://|@import|<link (?!rel=\"icon\" href=\"data:,\">)", page)
+    assert not re.search(
+        r"(src|href)=\"(?!data:)[^\"]+\"|https?://|@import|<link (?!rel=\"icon\" href=\"data:,\">)", page
+    )
     assert page.count("data:image/jpeg;base64,") == 6
     script = page.partition("<script>")[2].partition("</script>")[0]
     known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

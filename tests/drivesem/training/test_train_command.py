@@ -59,7 +59,7 @@ def test_validation_chooses_and_held_out_frames_judge(
     assert "--held-out: expected frames to judge by, beside --validation" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("detector", ["squeezedet", "yolov3-slim"])
+@pytest.mark.parametrize("detector", ["squeezedet", pytest.param("yolov3-slim", marks=pytest.mark.slow)])
 def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[str], detector: str) -> None:
     out = tmp_path / "run"
     command = ["train", "--detector", detector, *frames, *STEPS, "--evaluate-every", "2", "--out", str(out)]

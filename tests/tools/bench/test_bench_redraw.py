@@ -54,6 +54,7 @@ def test_counts_are_summed_and_the_rest_is_averaged() -> None:
     assert redraw.summary([row("empty", apart=None)]) == []
 
 
+@pytest.mark.slow
 def test_a_scene_by_both_renderers(tmp_path: Path) -> None:
     scene = demo_scene(0, 0)
     found = redraw.judge("demo/0", scene, Twice(scene.objects.box2d), np.random.default_rng(0), tmp_path)

@@ -21,6 +21,7 @@ def rows() -> list[weather.WeatherRow]:
         return weather.rows_of("train", 2, plan, load_predictor("squeezedet"))
 
 
+@pytest.mark.slow
 def test_without_weather_both_are_the_photograph(rows: list[weather.WeatherRow]) -> None:
     plain = rows[0]
     assert plain.weather == "none"
@@ -29,6 +30,7 @@ def test_without_weather_both_are_the_photograph(rows: list[weather.WeatherRow])
     assert (plain.mean, plain.contrast, plain.margin) == (plain.mean_true, plain.contrast_true, plain.margin_true)
 
 
+@pytest.mark.slow
 def test_fog_is_as_bright_and_as_flat_as_the_generators(rows: list[weather.WeatherRow]) -> None:
     """Blended in display values it would be a tenth darker, and half as contrasted again."""
     plain, fog, _ = rows
@@ -37,6 +39,7 @@ def test_fog_is_as_bright_and_as_flat_as_the_generators(rows: list[weather.Weath
     assert fog.contrast == pytest.approx(fog.contrast_true, rel=0.35)
 
 
+@pytest.mark.slow
 def test_the_summary_weighs_frames_by_their_vehicles(rows: list[weather.WeatherRow]) -> None:
     first = rows[0]
     second = replace(first, cars=3 * first.cars, margin=first.margin + 4.0)
