@@ -11,10 +11,10 @@ from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Difference, Interval
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import ArmGrades
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.rows import FIGURES, MODES, StudyRow, feasible_fraction
-from drivesem.questions.study.running import Ran
 from drivesem.questions.study.searches import SearchCost, Standing
 from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
@@ -60,7 +60,7 @@ class Findings:
 
     study: Study
     draws: int
-    ran: Ran
+    counts: StudyCounts
     rows: Sequence[StudyRow]
     curves: Sequence[Curve] = ()
     beside: Mapping[str, Difference] | None = None
@@ -73,14 +73,13 @@ class Findings:
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        results = [result for run in self.ran.runs for result in run.results]
         data: dict[str, Any] = {
             "study": self.study.name,
             "headline": HEADLINE,
-            "frames": len(self.ran.runs[0].results),
-            "frames_without_vehicles": self.ran.without_vehicles,
-            "frames_failed": self.ran.failed,
-            "feasible_fraction": feasible_fraction(results),
+            "frames": len(self.counts.arms[0].frames),
+            "frames_without_vehicles": self.counts.without_vehicles,
+            "frames_failed": {**self.counts.failed},
+            "feasible_fraction": feasible_fraction(self.counts.frames),
             "bootstrap": self.draws,
             "rows": self.flat_rows(),
         }
@@ -372,14 +371,14 @@ def notes(found: Findings) -> list[str]:
             "frame takes on this machine, certificates included. Found: objects that the detector finds in the "
             "photograph; in brackets Wilson's 95 %."
         )
-    unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
+    unknown = [one.arm.name for one in found.counts.arms if not one.graded]
     if unknown:
         told.append(f"Grades unknown, of an older version or without them: {', '.join(unknown)}.")
-    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
+    share = feasible_fraction(found.counts.frames)
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
-    if found.ran.without_vehicles:
-        told.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
-    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.ran.failed.items()]
+    if found.counts.without_vehicles:
+        told.append(f"{found.counts.without_vehicles} frames without vehicles passed over.")
+    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
     return told
 
 
