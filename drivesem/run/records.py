@@ -81,7 +81,7 @@ def load_record(path: Path, kind: type[T], schema: int) -> T:
 
 def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
     """Dataclasses of plain fields as CSV, a column a field: nothing for None, and true or false."""
-    columns = [field.name for field in dataclasses.fields(kind)]
+    columns = list(_hints(kind))
     return csv_table(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
@@ -92,7 +92,8 @@ def _cell(value: Any) -> Any:
 def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
     """What `dump_rows` wrote, each with its place. where: the file. Raises FormatError naming line and column."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    hints, columns = _hints(kind), [field.name for field in dataclasses.fields(kind)]
+    hints = _hints(kind)
+    columns = list(hints)
     try:
         heading = next(reader, [])
         _require(heading == columns, where, f"columns {', '.join(columns)}", ", ".join(heading) or None)

@@ -187,8 +187,9 @@ class _Measures:
         before, after = self.fall(one), self.fall(other)
         return None if before is None or after is None else after - before
 
-    def more(self, steps: Sequence[tuple[_Arms, _Arms]]) -> tuple[Interval, float | None]:
-        """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p.
+    def more(self, steps: Sequence[tuple[_Arms, _Arms]], test: bool) -> tuple[Interval, float | None]:
+        """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p, where a
+        test is asked for.
 
         A figure is the mean of its parts. Where the detector differs, so does what its AP50 falls from, and each
         pair has two parts a side.
@@ -205,7 +206,7 @@ class _Measures:
                 more.append(befores[1])
         first, second = (Figure("ap50", tuple(p for one in side for p in one.parts)) for side in (less, more))
         frames, rng = self._figures[OURS].frames, np.random.default_rng(self._seed)
-        (found,) = differences([first], [second], frames, self._draws, rng)
+        (found,) = differences([first], [second], frames, self._draws, rng, test)
         times = len(less) / len(steps)
         values = (found.difference, found.low, found.high)
         return Interval("ap50", *(None if value is None else times * value for value in values)), found.p
@@ -220,18 +221,18 @@ def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Att
     measures, ways = _Measures(plan, counts, draws, study.seed), plan.ways()
     none, everything = ways[0][0], ways[0][-1]
 
-    def share(name: str, factors: Sequence[str]) -> tuple[Share, float | None]:
+    def share(name: str, factors: Sequence[str], test: bool = False) -> tuple[Share, float | None]:
         size = len(factors)
         steps = [
             next((way[k], way[k + size]) for k in range(len(way) - size) if way[k + size] - way[k] == {*factors})
             for way in ways
         ]
-        points, p = measures.more(steps)
-        alone, _ = measures.more([(none, frozenset(factors))])
+        points, p = measures.more(steps, test)
+        alone, _ = measures.more([(none, frozenset(factors))], test=False)
         in_order, in_reverse = (measures.step(*step) for step in steps)
         return Share(name, alone, points, (in_order, in_reverse)), p
 
-    found = [share(factor, [factor]) for factor in plan.factors]
+    found = [share(factor, [factor], test=True) for factor in plan.factors]
     adjusted = holm([p for _, p in found])
     return Attribution(
         study=study,

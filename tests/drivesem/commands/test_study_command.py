@@ -104,9 +104,13 @@ def test_what_cannot_be_told_again(
     assert message in refused("study", *words, "--from", str(finished / "kept"))
 
 
-def test_a_folder_that_keeps_nothing(tmp_path: Path, refused: Callable[..., str]) -> None:
-    assert "study.json: expected a readable file" in refused("study", "multi", "--from", str(tmp_path))
-    assert "--kept: expected a folder" in refused("study", "multi", "--from", str(tmp_path / "none"))
+@pytest.mark.parametrize(
+    ("folder", "message"), [(".", "study.json: expected a readable"), ("none", "--kept: expected")]
+)
+def test_a_folder_that_keeps_nothing(
+    folder: str, message: str, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused("study", "multi", "--from", str(tmp_path / folder))
 
 
 def test_what_arms_have_in_common_takes_room_once(finished: Path) -> None:
