@@ -93,15 +93,18 @@ def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
     """What `dump_rows` wrote, each with its place. where: the file. Raises FormatError naming line and column."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     hints = _hints(kind)
-    columns = list(hints)
+    columns, known = list(hints), dict[tuple[str, str], Any]()
     try:
         heading = next(reader, [])
         _require(heading == columns, where, f"columns {', '.join(columns)}", ", ".join(heading) or None)
         for cells in reader:
             here = f"{where}:{reader.line_num}"
             _require(len(cells) == len(columns), here, f"{len(columns)} cells", len(cells))
-            values = zip(columns, cells, strict=True)
-            yield here, kind(**{n: from_json(hints[n], _value(hints[n], v), f"{here}: {n}") for n, v in values})
+            for one in zip(columns, cells, strict=True):
+                if one not in known:  # most cells are as one above
+                    hint = hints[one[0]]
+                    known[one] = from_json(hint, _value(hint, one[1]), f"{here}: {one[0]}")
+            yield here, kind(**{one[0]: known[one] for one in zip(columns, cells, strict=True)})
     except csv.Error as error:
         raise FormatError(f"{where}:{reader.line_num}", "CSV", error) from error
 

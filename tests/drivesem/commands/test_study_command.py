@@ -131,6 +131,7 @@ def test_the_generator_draws_again_on_request(
     assert row["survive_share"] == drawn["survive"]
     assert row["survive_failures"] == drawn["rows"][0]["failures"]
     assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
+    assert study(["study", "multi", "--from", str(out / "kept"), "--json"], capsys)["rows"] == [row]
 
 
 def test_without_a_second_renderer_nothing_is_attacked(
