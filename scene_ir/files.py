@@ -7,6 +7,7 @@ is in them is looked at before anything is made of it.
 from __future__ import annotations
 
 import filecmp
+import gzip
 import hashlib
 import io
 import json
@@ -248,8 +249,25 @@ def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
 
 def read_text(path: Path | str, most: int = _MOST_BYTES) -> str:
     """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
+    return text_of(read_bytes(path, most), path)
+
+
+def read_gzip(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """What a gzip file holds. FormatError as `read_bytes`, where it is none, or holds more than `most` bytes."""
     try:
-        return read_bytes(path, most).decode("utf-8")
+        with gzip.GzipFile(fileobj=io.BytesIO(read_bytes(path, most))) as stream:
+            data = stream.read(most + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise FormatError(str(path), "a gzip file", error) from error
+    if len(data) > most:
+        raise FormatError(str(path), f"at most {most:,} bytes, unpacked", "more")
+    return data
+
+
+def text_of(data: bytes, path: Path | str) -> str:
+    """UTF-8 text. FormatError naming the file where it is none."""
+    try:
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(
             str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x} at {error.start}"

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from drivesem.questions.study.asking import study_run
-from drivesem.run.ask import say
+from drivesem.run.ask import say, show
 from drivesem.settings.commands import Study
 from drivesem.settings.devices import check_device
 
 
 def run(config: Study) -> int:
-    """Run or continue a study; exit code 0. Raises UsageError or SceneError for bad input."""
+    """Run or continue a study, or tell one that was kept; exit code 0. Raises UsageError or SceneError for bad
+    input.
+    """
     check_device(config.device)
     if config.name == "classification":
         from drivesem.classify.study.asking import study_run as classification_run
 
         say(classification_run(config), config.json)
+    elif config.kept is not None and config.out is None:
+        show(study_run(config), config.json)
     else:
         say(study_run(config), config.json)
     return 0

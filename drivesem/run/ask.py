@@ -117,12 +117,16 @@ def say(answer: Answer, as_json: bool, end: Console | None = None) -> None:
     """Print an answer and where it was written. as_json: its data on standard output, and the tables elsewhere.
     end: for the last lines, by default standard error.
     """
-    errors = Console(stderr=True)
+    show(answer, as_json)
+    say_end(answer.out, end or Console(stderr=True), answer.failed, answer.failure)
+
+
+def show(answer: Answer, as_json: bool) -> None:
+    """Print an answer that is written nowhere. as_json: as of `say`."""
     if as_json:
         print_json(answer.data)
     if not (as_json and answer.only_json):
-        answer.print(errors if as_json else Console())
-    say_end(answer.out, end or errors, answer.failed, answer.failure)
+        answer.print(Console(stderr=as_json))
 
 
 def say_end(

@@ -1,15 +1,19 @@
-"""Dataclasses as JSON, and back from what `dataclasses.asdict` and JSON made of them."""
+"""Dataclasses as JSON and as rows of CSV, and back from these."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import functools
+import io
 import json
 import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from drivesem.report.tables import csv_table
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -73,3 +77,49 @@ def load_record(path: Path, kind: type[T], schema: int) -> T:
     if not isinstance(data, dict) or data.pop("schema", None) != schema:
         raise FormatError(f"{path}: schema", str(schema), "another one")
     return from_json(kind, data, str(path))
+
+
+def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
+    """Dataclasses of plain fields as CSV, a column a field: nothing for None, and true or false."""
+    columns = list(_hints(kind))
+    return csv_table(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
+
+
+def _cell(value: Any) -> Any:
+    return str(value).lower() if isinstance(value, bool) else value
+
+
+def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
+    """What `dump_rows` wrote, each with its place. where: the file. Raises FormatError naming line and column."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    hints = _hints(kind)
+    columns, known = list(hints), dict[tuple[str, str], Any]()
+    try:
+        heading = next(reader, [])
+        _require(heading == columns, where, f"columns {', '.join(columns)}", ", ".join(heading) or None)
+        for cells in reader:
+            here = f"{where}:{reader.line_num}"
+            _require(len(cells) == len(columns), here, f"{len(columns)} cells", len(cells))
+            for one in zip(columns, cells, strict=True):
+                if one not in known:  # most cells are as one above
+                    hint = hints[one[0]]
+                    known[one] = from_json(hint, _value(hint, one[1]), f"{here}: {one[0]}")
+            yield here, kind(**{one[0]: known[one] for one in zip(columns, cells, strict=True)})
+    except csv.Error as error:
+        raise FormatError(f"{where}:{reader.line_num}", "CSV", error) from error
+
+
+def _value(kind: Any, cell: str) -> Any:
+    """As JSON would have it; a text where that is none of the type's values, which `from_json` refuses."""
+    if not cell:
+        return None
+    for plain in (kind, *get_args(kind)):
+        if plain in _CELLS:
+            try:
+                return _CELLS[plain](cell)
+            except (ValueError, KeyError):
+                return cell
+    return cell
+
+
+_CELLS = {int: int, float: float, bool: {"true": True, "false": False}.__getitem__}

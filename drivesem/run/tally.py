@@ -4,15 +4,37 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.judging import JudgedClasses
 from drivesem.evaluation import coco
 from drivesem.run.frame import as_detections, as_targets
-from drivesem.run.results import Failure, FrameResult
+from drivesem.run.results import FrameResult
 from drivesem.truth.grades import Grade, Kind
 from drivesem.truth.kinds import OF_OBJECTS
+
+
+class Graded(Protocol):
+    """A failure, as `results.Failure`, or what is counted of one."""
+
+    @property
+    def index(self) -> int | None: ...
+    @property
+    def error(self) -> str | None: ...
+    @property
+    def grade(self) -> str | None: ...
+
+
+F = TypeVar("F", bound=Graded)
+F_co = TypeVar("F_co", bound=Graded, covariant=True)
+
+
+class Failing(Protocol[F_co]):
+    """A frame with failures."""
+
+    @property
+    def failures(self) -> Sequence[F_co]: ...
 
 
 def boxes_of(
@@ -23,13 +45,13 @@ def boxes_of(
     return targets, [as_detections(getattr(r, f"detections_{seen}"), judged.names) for r in results]
 
 
-def at_least(grade: Grade) -> Callable[[Failure], bool]:
+def at_least(grade: Grade) -> Callable[[Graded], bool]:
     """Whether a failure has that grade or a higher one; every failure has that of the threshold."""
     higher = list(Grade)[list(Grade).index(grade) :]
     return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
 
 
-def certain_losses(result: FrameResult) -> list[Failure]:
+def certain_losses(result: Failing[F]) -> list[F]:
     """Certain failures of objects; a phantom has no object whose states could be looked through."""
     certain = at_least(Grade.CERTAIN)
     return [f for f in result.failures if f.index is not None and f.error in OF_OBJECTS and certain(f)]

@@ -67,6 +67,11 @@ Search = Literal[
 ]  # fmt: skip
 """Attacks that look for failures; the placebo looks for none."""
 
+KEPT_STUDIES = ("single", "multi", "grades", "searches", "samples", "steps", "attribution")
+"""Studies that keep what their tables are computed from."""
+_AGAIN = ("name", "kept", "out", "bootstrap", "json")
+"""Settings of a study that is told again."""
+
 _RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
 RunFolders = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
 Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
@@ -227,6 +232,9 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     counterexamples; classification: the paper's tables for image classifiers (docs/classify.md)."""
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
+    kept: Annotated[str | None, Folder(), tyro.conf.arg(aliases=["--from"])] = None
+    """Single, multi, grades, searches, samples, steps, attribution: the folder OUT/kept of such a study, whose
+    tables are told again; it needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
@@ -317,6 +325,11 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
         beside = f"study {self.name}"
+        if self.kept is not None:
+            refuse(self.name not in KEPT_STUDIES, "--kept", f"study {', '.join(KEPT_STUDIES)}", beside)
+            for field in fields(self):
+                value, alone = getattr(self, field.name), "none beside --kept, which has the study's own settings"
+                refuse(field.name not in _AGAIN and value != field.default, option(field.name), alone, value)
         refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
         divided = self.split is not None and self.name == "retrain"
         refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)

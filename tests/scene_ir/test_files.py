@@ -1,6 +1,7 @@
 """Files that take no room twice, and files for which there is none."""
 
 import errno
+import gzip
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,7 +11,7 @@ from typing import NoReturn
 import pytest
 
 from scene_ir import files
-from scene_ir.errors import WriteError
+from scene_ir.errors import FormatError, WriteError
 
 
 @pytest.fixture
@@ -115,3 +116,10 @@ def test_a_file_that_is_longer_than_it_says_is_read_whole(tmp_path: Path, monkey
     monkeypatch.setattr(files, "_READ_AT_ONCE", 3)
     monkeypatch.setattr(files, "check_regular", lambda path, most: 4)
     assert files.read_bytes(tmp_path / "a") == b"0123456789"
+
+
+def test_a_gzip_file_gives_no_more_than_it_may(tmp_path: Path) -> None:
+    (tmp_path / "a.gz").write_bytes(gzip.compress(bytes(1000)))
+    assert files.read_gzip(tmp_path / "a.gz") == files.read_gzip(tmp_path / "a.gz", 1000) == bytes(1000)
+    with pytest.raises(FormatError, match=r"a\.gz: expected at most 999 bytes, unpacked, found more"):
+        files.read_gzip(tmp_path / "a.gz", 999)

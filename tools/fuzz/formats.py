@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,6 +28,17 @@ from drivesem.data.photographs import photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
 from drivesem.questions.realism import weights as realism_weights
+from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.asking import study_run
+from drivesem.questions.study.counts import (
+    ArmCounts,
+    CountedFailure,
+    FrameCounts,
+    Matches,
+    SeenObject,
+    StudyCounts,
+)
+from drivesem.questions.study.kept import keep
 from drivesem.questions.survey.page import Item, read_answers, read_key, write_key
 from drivesem.questions.verify.change import THETA, check_change
 from drivesem.questions.verify.differences import CheckLog
@@ -35,7 +47,7 @@ from drivesem.run.page import report_runs
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
 from drivesem.run.tally import tally
 from drivesem.scenes.segmenter import OnnxSegmenter
-from drivesem.settings.commands import Attack, Report
+from drivesem.settings.commands import Attack, Report, Study
 from drivesem.settings.edits import read_edits, read_frame_edit
 from drivesem.settings.parsing import parse
 from drivesem.settings.text import to_yaml
@@ -319,6 +331,18 @@ def _survey(root: Path) -> None:
     files.write_text(root / "answers.csv", f"{head}\n{name},me,0123abcd,1,Car,7,3.5\n")
 
 
+def _kept(root: Path) -> None:
+    """What a study of one arm and frame keeps; the packed table as text, too, so that its words are damaged."""
+    marks = np.array([[1] * 10, [0] * 9 + [2]])
+    found = Matches(np.zeros(2, np.int64), np.array([0.75, 0.5]), marks, np.ones(1))
+    lost = CountedFailure(0, "missed", "certain", True)
+    frame = FrameCounts("a", 10, 30, 1.5, True, True, True, 0.5, 2, (lost,))
+    one = ArmCounts(Arm("rotate", "rotate", Attack()), (frame,), found, {"paper": found, "moved": found})
+    seen = {"a": (SeenObject(0, 30.0, 12.0),)}
+    keep(root, Study(name="single"), StudyCounts((one,), 1, {"b": "no camera"}, seen), {})
+    files.write_bytes(root / "detections.csv", files.read_gzip(root / "detections.csv.gz"))
+
+
 def _weights(root: Path) -> None:
     save_detector(_net(), root / "net.safetensors")
 
@@ -439,6 +463,11 @@ def _answers(root: Path) -> None:
     read_answers(root / "answers.csv", name, items)
 
 
+def _told_again(root: Path) -> None:
+    files.write_bytes(root / "detections.csv.gz", gzip.compress((root / "detections.csv").read_bytes()))
+    study_run(Study(name="single", kept=str(root), bootstrap=0))
+
+
 def _report(root: Path) -> None:
     report_runs(Report(runs=(str(root),), frames=1, out=str(root.parent / "report.html")))
 
@@ -517,5 +546,6 @@ FORMATS: dict[str, Format] = {
         Format("state dict", _states, lambda root: realism_weights.read(root / "state.pth")),
         Format("onnx", _graphs, each(_predict, _segment)),
         Format("survey", _survey, _answers),
+        Format("kept study", _kept, _told_again, ("*.json", "*.csv"), share=0.25),
     )
 }

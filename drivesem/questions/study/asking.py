@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,9 @@ from drivesem.questions.study import report, retrain, retrain_report, transfer
 from drivesem.questions.study.arms import FIGURES, arms_of, attack_of, draws_of
 from drivesem.questions.study.attribution import Plan, attributed, write_waterfall
 from drivesem.questions.study.attribution import told as told_of_factors
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import grades_of
+from drivesem.questions.study.kept import KEPT, NOT_TOLD, keep, load_kept
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
 from drivesem.questions.study.lessons import CACHE, FRAMES, POOL, RETRAINED
@@ -23,14 +25,14 @@ from drivesem.questions.study.report import Findings, Told
 from drivesem.questions.study.robust import STATES
 from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
-from drivesem.questions.study.searches import costs_of, depths_of, standing_of
+from drivesem.questions.study.searches import costs_of, depths_of, seen_of, standing_of
 from drivesem.questions.study.success import against, curve_of
 from drivesem.questions.transfer.asking import DETECTIONS
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
 from drivesem.report.terminal import Console
-from drivesem.run.folder import PRESENTATION, claim
-from drivesem.settings.commands import Confirm, Study
+from drivesem.run.folder import PRESENTATION, claim, folder_of
+from drivesem.settings.commands import KEPT_STUDIES, Confirm, Study
 from drivesem.settings.text import command_line
 from drivesem.training.known import warn_of_overlaps
 from drivesem.truth.redraw.choose import SecondRenderers
@@ -46,7 +48,7 @@ _TABLES = (
 _WRITTEN = (
     *(_PICTURE, FIGURES, _LARGEST),
     *_TABLES,
-    *(ARMS, DETECTIONS, RETRAINED, CACHE, FRAMES, POOL, STATES),
+    *(ARMS, KEPT, DETECTIONS, RETRAINED, CACHE, FRAMES, POOL, STATES),
 )
 _FREE = (*PRESENTATION, "quick", "controls", "seeds", "paper_protocol", "confirm", "bootstrap")
 """Settings that may change on the way: they add frames, arms or draws, and alter none."""
@@ -56,23 +58,42 @@ _FREE_IN_RETRAIN = (
     *("arms", "seeds", "states", "reattack", "validation"),
 )
 """Of retrain: other frames to train on would make other detectors."""
-_NOT_TOLD = ("out", "json", "resume", "workers", "name")
 
 
 def study_run(config: Study) -> Answer:
-    """Run or continue a study, and write what is said of it. Raises UsageError or SceneError for bad input."""
+    """Run or continue a study, and write what is said of it; tell one that was kept, and write it where --out is
+    given. Raises UsageError or SceneError for bad input.
+    """
+    if config.kept is not None:
+        return _again(config, Path(config.kept))
     out = Path(config.out or f"runs/study-{config.name}-{config.dataset}-seed{config.seed}")
     console = Console(stderr=True)
     warn_of_overlaps([config.detector], config.held_out or config.root, console)
-    data, told, draw = _STUDIES.get(config.name, _arms)(config, out, console)
-    command = command_line("study", config, _NOT_TOLD).replace("study", f"study {config.name}", 1)
-    answer = report.answer_of(told, out, data, command, draw)
+    answer = _answer(config, out, _STUDIES.get(config.name, _arms)(config, out, console))
     answer.write()
+    return answer
+
+
+def _again(config: Study, folder: Path) -> Answer:
+    """The tables of a study that was kept."""
+    out = folder_of(config.out, folder)
+    kept = load_kept(folder, config.name)
+    draws = kept.settings.bootstrap if config.bootstrap is None else config.bootstrap
+    study = replace(kept.settings, bootstrap=draws)
+    answer = _answer(study, out, _found(study, kept.counts, kept.confirmed))
+    if config.out is not None:
+        answer.write()
     return answer
 
 
 _Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
 """A study's figures for JSON, its text, and what draws its picture."""
+
+
+def _answer(study: Study, out: Path, found: _Found) -> Answer:
+    data, told, draw = found
+    command = command_line("study", study, (*NOT_TOLD, "name")).replace("study", f"study {study.name}", 1)
+    return report.answer_of(told, out, data, command, draw)
 
 
 def _arms(config: Study, out: Path, console: Console) -> _Found:
@@ -83,8 +104,26 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
         SecondRenderers(workers[0].config.dataset, workers[0].config.root).check()
     ran = run_arms(arms, workers, out)
-    found = replace(_findings(config, ran, out), confirmed=_confirmed(config, ran, out))
+    first = ran.runs[0]
+    counts = StudyCounts.of(ran, seen_of(first, depths_of(first, out)) if config.name == "searches" else None)
+    confirmed = _confirmed(config, ran, out)
     write_largest(out / _LARGEST, largest(ran.runs, out))
+    if config.name in KEPT_STUDIES:
+        keep(out / KEPT, config, counts, confirmed)
+        return _found(config, counts, confirmed)
+    found = _findings(config, counts)
+    return _text(replace(found, confirmed=confirmed, label_sets=[label_sets(one) for one in ran.runs]))
+
+
+def _found(config: Study, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> _Found:
+    """What follows from what is kept."""
+    if config.name == "attribution":
+        found = attributed(config, Plan.of(config, attack_of(config)), counts, draws_of(config))
+        return found.to_json(), told_of_factors(found), partial(write_waterfall, found=found)
+    return _text(replace(_findings(config, counts), confirmed=confirmed))
+
+
+def _text(found: Findings) -> _Found:
     return found.to_json(), report.told(found), partial(write_plot, found=found)
 
 
@@ -99,12 +138,12 @@ def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
 
 def _attribution(config: Study, out: Path, console: Console) -> _Found:
     """What lies between ours and the paper's protocol."""
-    plan = Plan.of(config, attack_of(config))
-    arms = plan.arms()
+    arms = Plan.of(config, attack_of(config)).arms()
     workers = workers_of(arms)
     claim(out, config, _WRITTEN, _FREE)
-    found = attributed(config, plan, run_arms(arms, workers, out), draws_of(config))
-    return found.to_json(), told_of_factors(found), partial(write_waterfall, found=found)
+    counts = StudyCounts.of(run_arms(arms, workers, out))
+    keep(out / KEPT, config, counts, {})
+    return _found(config, counts, {})
 
 
 def _transfer(config: Study, out: Path, console: Console) -> _Found:
@@ -129,20 +168,17 @@ _STUDIES = {"attribution": _attribution, "transfer": _transfer, "retrain": _retr
 """Studies that are more than attacks side by side."""
 
 
-def _findings(config: Study, ran: Ran, out: Path) -> Findings:
-    draws = draws_of(config)
-    grades = [grades_of(one, draws, config.seed) for one in ran.runs if not one.summary.frames_ungraded]
-    found = Findings(config, draws, ran, rows_of(ran.runs, draws, config.seed), grades=grades)
-    if config.name == "labels":
-        return replace(found, label_sets=[label_sets(one) for one in ran.runs])
+def _findings(config: Study, counts: StudyCounts) -> Findings:
+    draws, arms = draws_of(config), counts.arms
+    grades = [grades_of(one, draws, config.seed) for one in arms if one.graded]
+    found = Findings(config, draws, counts, rows_of(arms, draws, config.seed), grades=grades)
     if config.name == "searches":
-        standing = standing_of(ran.runs, depths_of(ran.runs[0], out))
-        return replace(found, costs=costs_of(ran.runs, draws, config.seed), standing=standing)
+        costs, standing = costs_of(arms, counts.seen, draws, config.seed), standing_of(arms, counts.seen)
+        return replace(found, costs=costs, standing=standing)
     if config.name not in ("samples", "steps"):
         return found
-    found = replace(found, curves=[curve_of(one, draws, config.seed) for one in ran.runs])
+    found = replace(found, curves=[curve_of(one, draws, config.seed) for one in arms])
     if config.name == "steps":
         return found
-    first = ran.runs[0]
-    beside = {one.arm.name: against(first, config.steps, one, draws, config.seed) for one in ran.runs}
+    beside = {one.arm.name: against(arms[0], config.steps, one, draws, config.seed) for one in arms}
     return replace(found, beside=beside, within=config.steps)

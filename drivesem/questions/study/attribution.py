@@ -21,9 +21,9 @@ import numpy as np
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Figure, Interval, differences, holm
 from drivesem.questions.study.arms import PAPERS, Arm
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.report import Told, heading
 from drivesem.questions.study.rows import Figures, feasible_fraction
-from drivesem.questions.study.running import Ran
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.report.plots import COLOURS, STYLE
@@ -125,7 +125,7 @@ class Attribution:
 
     study: Study
     draws: int
-    ran: Ran
+    counts: StudyCounts
     falls: Mapping[str, Mapping[str, Interval]]
     ours: float | None
     papers: float | None
@@ -139,7 +139,7 @@ class Attribution:
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        return heading(self.study, self.draws, self.ran) | {
+        return heading(self.study, self.draws, self.counts) | {
             "ours": self.ours,
             "papers": self.papers,
             "rows": [share.flat() for share in self.rows()],
@@ -149,8 +149,8 @@ class Attribution:
     def flat_arms(self) -> list[dict[str, Any]]:
         """The falls of each arm."""
         found: list[dict[str, Any]] = []
-        for run in self.ran.runs:
-            line: dict[str, Any] = {"name": run.arm.name, "feasible_fraction": feasible_fraction(run.results)}
+        for run in self.counts.arms:
+            line: dict[str, Any] = {"name": run.arm.name, "feasible_fraction": feasible_fraction(run.frames)}
             for mode, one in self.falls[run.arm.name].items():
                 line |= {f"drop_{mode}": one.value, f"drop_{mode}_low": one.low, f"drop_{mode}_high": one.high}
             found.append(line)
@@ -160,10 +160,10 @@ class Attribution:
 class _Measures:
     """Falls of AP50 of all arms, and what they differ by: all of the same draws of frames."""
 
-    def __init__(self, plan: Plan, ran: Ran, draws: int, seed: int) -> None:
+    def __init__(self, plan: Plan, counts: StudyCounts, draws: int, seed: int) -> None:
         self._plan, self._draws, self._seed = plan, draws, seed
-        self._figures = {run.arm.name: Figures.of(run).of_ap50() for run in ran.runs}
-        self._detector = {run.arm.name: run.arm.config.detector for run in ran.runs}
+        self._figures = {run.arm.name: Figures.of(run).of_ap50() for run in counts.arms}
+        self._detector = {run.arm.name: run.arm.config.detector for run in counts.arms}
 
     def falls(self, name: str) -> dict[str, Interval]:
         """Of an arm, by the labels that count."""
@@ -180,8 +180,9 @@ class _Measures:
         before, after = self.fall(one), self.fall(other)
         return None if before is None or after is None else after - before
 
-    def more(self, steps: Sequence[tuple[_Arms, _Arms]]) -> tuple[Interval, float | None]:
-        """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p.
+    def more(self, steps: Sequence[tuple[_Arms, _Arms]], test: bool) -> tuple[Interval, float | None]:
+        """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p, where a
+        test is asked for.
 
         A figure is the mean of its parts. Where the detector differs, so does what its AP50 falls from, and each
         pair has two parts a side.
@@ -198,7 +199,7 @@ class _Measures:
                 more.append(befores[1])
         first, second = (Figure("ap50", tuple(p for one in side for p in one.parts)) for side in (less, more))
         frames, rng = self._figures[OURS].frames, np.random.default_rng(self._seed)
-        (found,) = differences([first], [second], frames, self._draws, rng)
+        (found,) = differences([first], [second], frames, self._draws, rng, test)
         times = len(less) / len(steps)
         values = (found.difference, found.low, found.high)
         return Interval("ap50", *(None if value is None else times * value for value in values)), found.p
@@ -208,29 +209,29 @@ class _Measures:
         return self._figures[self._plan.name(papers)].after[mode][0]
 
 
-def attributed(study: Study, plan: Plan, ran: Ran, draws: int) -> Attribution:
+def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Attribution:
     """What each factor takes, of the arms of a plan."""
-    measures, ways = _Measures(plan, ran, draws, study.seed), plan.ways()
+    measures, ways = _Measures(plan, counts, draws, study.seed), plan.ways()
     none, everything = ways[0][0], ways[0][-1]
 
-    def share(name: str, factors: Sequence[str]) -> tuple[Share, float | None]:
+    def share(name: str, factors: Sequence[str], test: bool = False) -> tuple[Share, float | None]:
         size = len(factors)
         steps = [
             next((way[k], way[k + size]) for k in range(len(way) - size) if way[k + size] - way[k] == {*factors})
             for way in ways
         ]
-        points, p = measures.more(steps)
-        alone, _ = measures.more([(none, frozenset(factors))])
+        points, p = measures.more(steps, test)
+        alone, _ = measures.more([(none, frozenset(factors))], test=False)
         in_order, in_reverse = (measures.step(*step) for step in steps)
         return Share(name, alone, points, (in_order, in_reverse)), p
 
-    found = [share(factor, [factor]) for factor in plan.factors]
+    found = [share(factor, [factor], test=True) for factor in plan.factors]
     adjusted = holm([p for _, p in found])
     return Attribution(
         study=study,
         draws=draws,
-        ran=ran,
-        falls={run.arm.name: measures.falls(run.arm.name) for run in ran.runs},
+        counts=counts,
+        falls={run.arm.name: measures.falls(run.arm.name) for run in counts.arms},
         ours=measures.fall(none),
         papers=measures.fall(everything),
         shares=[replace(one, p=p) for (one, _), p in zip(found, adjusted, strict=True)],
@@ -259,9 +260,9 @@ def _shares(found: Attribution) -> Sheet:
 
 def _arms(found: Attribution) -> Sheet:
     lines = []
-    for run in found.ran.runs:
+    for run in found.counts.arms:
         falls = found.falls[run.arm.name]
-        share = percent(feasible_fraction(run.results))
+        share = percent(feasible_fraction(run.frames))
         lines.append((run.arm.name, bounded(falls["moved"]), bounded(falls["paper"]), share))
     columns = ("the paper's", "falls, moved labels", "falls, benign labels", "feasible, %")
     return Sheet("Arms, by what in them is the paper's", columns, tuple(lines))
@@ -279,9 +280,9 @@ def notes(found: Attribution) -> list[str]:
         f"There the paper's SqueezeDet fell by {100 * (PAPER_BENIGN - PAPER_COMBOS[DEFAULT_COMBO]):.1f} points on "
         "Virtual KITTI.",
     ]
-    if found.ran.without_vehicles:
-        lines.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
-    return lines + [f"Frame {name} could not be used: {reason}" for name, reason in found.ran.failed.items()]
+    if found.counts.without_vehicles:
+        lines.append(f"{found.counts.without_vehicles} frames without vehicles passed over.")
+    return lines + [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
 
 
 def write_waterfall(path: Path, found: Attribution) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,7 @@ import numpy as np
 
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import Interval, intervals, rate
-from drivesem.questions.study.running import ArmRun
-from drivesem.run.results import Failure, FrameResult
+from drivesem.questions.study.counts import ArmCounts, CountedFailure
 from drivesem.run.tally import at_least
 from drivesem.truth.grades import Grade, Kind
 
@@ -59,36 +58,31 @@ class ArmGrades:
         }
 
 
-def grades_of(run: ArmRun, draws: int, seed: int) -> ArmGrades:
+def grades_of(run: ArmCounts, draws: int, seed: int) -> ArmGrades:
     """Of an arm all of whose frames are graded."""
-    results = run.results
-    objects = np.array([_judged(result, run.judged.names) for result in results], np.float64)
+    frames = run.frames
+    objects = np.array([frame.judged for frame in frames], np.float64)
 
-    def counted(rule: Callable[[Failure], bool]) -> Floats:
-        return np.array([sum(map(rule, result.failures)) for result in results], np.float64)
+    def counted(rule: Callable[[CountedFailure], bool]) -> Floats:
+        return np.array([sum(map(rule, frame.failures)) for frame in frames], np.float64)
 
     def of_kind(kind: Kind, grade: Grade) -> int:
-        return sum(f.error == kind and at_least(grade)(f) for result in results for f in result.failures)
+        return sum(f.error == kind and at_least(grade)(f) for frame in frames for f in frame.failures)
 
     hits = {grade: counted(at_least(grade)) for grade in Grade}
-    asked = counted(lambda failure: failure.second is not None)
+    asked = counted(lambda failure: failure.asked)
     figures = [rate(str(grade), hits[grade], objects) for grade in Grade]
     figures.append(rate(SURVIVE, hits[Grade.CONFIRMED], asked))
-    *rates, survive = intervals(figures, len(results), draws, np.random.default_rng(seed))
+    *rates, survive = intervals(figures, len(frames), draws, np.random.default_rng(seed))
     return ArmGrades(
         name=run.arm.name,
         control=run.arm.control,
-        frames=len(results),
+        frames=len(frames),
         objects=int(objects.sum()),
-        passes=sum(result.passes or 0 for result in results),
+        passes=sum(frame.passes for frame in frames),
         counts={grade: int(hits[grade].sum()) for grade in Grade},
         rates=dict(zip(Grade, rates, strict=True)),
         kinds={kind: {grade: of_kind(kind, grade) for grade in Grade} for kind in Kind},
         asked=int(asked.sum()),
         survive=survive,
     )
-
-
-def _judged(result: FrameResult, names: Sequence[str]) -> int:
-    """Objects of the scene that the detector is to find in the photograph."""
-    return sum(not box.ignore and box.index is not None and box.label in names for box in result.targets_benign)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivesem.questions.study.rows import size_of
+from drivesem.questions.study.counts import size_of
 from drivesem.questions.study.running import ARMS, ArmRun
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, write_picture, write_text
 from drivesem.run.results import FrameResult

@@ -11,10 +11,10 @@ from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Difference, Interval
 from drivesem.questions.confirm.report import Confirmation
 from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import ArmGrades
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.rows import FIGURES, MODES, StudyRow, feasible_fraction
-from drivesem.questions.study.running import Ran
 from drivesem.questions.study.searches import SearchCost, Standing
 from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
@@ -50,15 +50,15 @@ class Told:
     unbroken: Collection[str] = ()
 
 
-def heading(study: Study, draws: int, ran: Ran) -> dict[str, Any]:
+def heading(study: Study, draws: int, counts: StudyCounts) -> dict[str, Any]:
     """What the JSON object of a study of arms begins with."""
     return {
         "study": study.name,
         "headline": HEADLINE,
-        "frames": len(ran.runs[0].results),
-        "frames_without_vehicles": ran.without_vehicles,
-        "frames_failed": ran.failed,
-        "feasible_fraction": feasible_fraction([result for run in ran.runs for result in run.results]),
+        "frames": len(counts.arms[0].frames),
+        "frames_without_vehicles": counts.without_vehicles,
+        "frames_failed": {**counts.failed},
+        "feasible_fraction": feasible_fraction(counts.frames),
         "bootstrap": draws,
     }
 
@@ -73,7 +73,7 @@ class Findings:
 
     study: Study
     draws: int
-    ran: Ran
+    counts: StudyCounts
     rows: Sequence[StudyRow]
     curves: Sequence[Curve] = ()
     beside: Mapping[str, Difference] | None = None
@@ -86,7 +86,7 @@ class Findings:
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        data = heading(self.study, self.draws, self.ran) | {"rows": self.flat_rows()}
+        data = heading(self.study, self.draws, self.counts) | {"rows": self.flat_rows()}
         if self.curves:
             data["curves"] = [point for curve in self.curves for point in curve.to_json()]
         if self.label_sets:
@@ -375,14 +375,14 @@ def notes(found: Findings) -> list[str]:
             "frame takes on this machine, certificates included. Found: objects that the detector finds in the "
             "photograph; in brackets Wilson's 95 %."
         )
-    unknown = [run.arm.name for run in found.ran.runs if run.summary.frames_ungraded]
+    unknown = [one.arm.name for one in found.counts.arms if not one.graded]
     if unknown:
         told.append(f"Grades unknown, of an older version or without them: {', '.join(unknown)}.")
-    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
+    share = feasible_fraction(found.counts.frames)
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
-    if found.ran.without_vehicles:
-        told.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
-    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.ran.failed.items()]
+    if found.counts.without_vehicles:
+        told.append(f"{found.counts.without_vehicles} frames without vehicles passed over.")
+    told += [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
     return told
 
 

@@ -21,6 +21,7 @@ from drivesem.evaluation.resampling import Figure, Interval, differences, interv
 from drivesem.questions.study import lessons as plan
 from drivesem.questions.study import robust
 from drivesem.questions.study.arms import Arm, draws_of
+from drivesem.questions.study.counts import ArmCounts
 from drivesem.questions.study.lessons import BENIGN, RETRAINED, Lesson, Parts, Taken
 from drivesem.questions.study.rows import MODES, Figures, StudyRow, feasible_fraction, rows_of
 from drivesem.questions.study.running import ARMS, ArmRun, Ran, run_arms, workers_of
@@ -334,8 +335,9 @@ def rows_for(
     runs: Sequence[ArmRun],
     draws: int,
 ) -> list[Judged]:
-    fresh = rows_of(runs, draws, study.seed)
-    figures = [Figures.of(run).after for run in runs]
+    counts = [ArmCounts.of(run) for run in runs]
+    fresh = rows_of(counts, draws, study.seed)
+    figures = [Figures.of(one).after for one in counts]
     before = seen[BENIGN]
     found = []
     for i, (name, one) in enumerate(seen.items()):

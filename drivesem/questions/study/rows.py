@@ -4,25 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from detectors.types import CLASSES
-from drivesem.attack.judging import HEADLINE
-from drivesem.evaluation.coco import IOU_THRESHOLDS, ClassScores
-from drivesem.evaluation.outcome import Outcome
+from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interval, Recalled, differences, holm
 from drivesem.questions.study.arms import matching
-from drivesem.questions.study.running import ArmRun
+from drivesem.questions.study.counts import ArmCounts, FrameCounts, Matches
 from drivesem.report.paper import PAPER_BENIGN
-from drivesem.run.frame import as_detections, as_targets
-from drivesem.run.results import FrameResult
 
 FIGURES = {"ap50": "AP50", "ap70": "AP70", "ap": "AP50:95", "recall": "recall"}
-"""Fields of `ClassScores` whose fall is told, and their names for people."""
+"""Fields of `RowScores`, whose fall is told, and their names for people."""
 MODES = ("paper", "moved")
 _SINGLE_OVERLAPS = {"ap50": 0.5, "ap70": 0.7}
+
+
+@dataclass(frozen=True, slots=True)
+class RowScores:
+    """HEADLINE's figures, fractions of 1, as `coco.ClassScores` has them; None where there is no object to find,
+    or where they are not told.
+    """
+
+    ap50: float | None
+    ap70: float | None = None
+    ap: float | None = None
+    recall: float | None = None
+
+    @classmethod
+    def of(cls, figures: Sequence[Figure]) -> RowScores:
+        """Those of them that are there."""
+        return cls(**{figure.name: figure.value() for figure in figures})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +43,13 @@ class StudyRow:
     the attack by either label mode. drops: by mode and figure, from benign to attacked. effects: by control and
     mode, how far AP50 falls below the control's. controls: their own rows. size: of a control's edits, relative to
     the arm's. p: of the effect by moved labels beside the matching control, Holm's over all rows. Of several
-    seeds AP50, its falls and what is counted are means, all else is the first's.
+    seeds figures and what is counted are means, all else is the first's.
     """
 
-    runs: Sequence[ArmRun]
-    benign: ClassScores
-    paper: ClassScores
-    moved: ClassScores
+    runs: Sequence[ArmCounts]
+    benign: RowScores
+    paper: RowScores
+    moved: RowScores
     drops: dict[str, dict[str, Interval]]
     effects: dict[str, dict[str, Difference]]
     controls: dict[str, StudyRow]
@@ -45,7 +57,7 @@ class StudyRow:
     p: float | None = None
 
     @property
-    def run(self) -> ArmRun:
+    def run(self) -> ArmCounts:
         """Of the first seed."""
         return self.runs[0]
 
@@ -57,7 +69,7 @@ class StudyRow:
 
     def broken(self, mode: str) -> float:
         """Frames in which something was lost or made up."""
-        found = [getattr(result, f"success_{mode}") for run in self.runs for result in run.results]
+        found = [getattr(frame, f"success_{mode}") for run in self.runs for frame in run.frames]
         return sum(found) / len(self.runs)
 
     @property
@@ -67,7 +79,7 @@ class StudyRow:
 
     def flat(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
-        arm, results = self.run.arm, self.run.results
+        arm, frames = self.run.arm, self.run.frames
         found: dict[str, Any] = {
             "name": arm.name,
             "benign_ap50": self.benign.ap50,
@@ -79,14 +91,14 @@ class StudyRow:
             "recall_moved": self.moved.recall,
             "reference": arm.reference,
             "reference_drop": None if arm.reference is None else PAPER_BENIGN - arm.reference,
-            "frames": len(results),
-            "objects": self.benign.objects,
-            "successes_paper": sum(r.success_paper for r in results),
-            "successes_moved": sum(r.success_moved for r in results),
+            "frames": len(frames),
+            "objects": int(self.run.before.objects.sum()),
+            "successes_paper": sum(f.success_paper for f in frames),
+            "successes_moved": sum(f.success_moved for f in frames),
             "control": self.matching,
             "p": self.p,
-            "queries": sum(r.queries for r in results),
-            "feasible_fraction": feasible_fraction(results),
+            "queries": sum(f.queries for f in frames),
+            "feasible_fraction": feasible_fraction(frames),
         }
         for key in ("ap70", "ap", "recall"):
             found[f"benign_{key}"] = getattr(self.benign, key)
@@ -107,13 +119,13 @@ class StudyRow:
         return found
 
 
-def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[StudyRow]:
+def rows_of(runs: Sequence[ArmCounts], draws: int, seed: int) -> list[StudyRow]:
     """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
     rows = []
     for run in runs:
         if run.arm.control is not None:
             continue
-        beside: dict[str, list[ArmRun]] = {}
+        beside: dict[str, list[ArmCounts]] = {}
         for other in runs:
             if other.arm.control and other.arm.of == run.arm.name:
                 beside.setdefault(other.arm.control, []).append(other)
@@ -122,17 +134,22 @@ def rows_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[StudyRow]:
     return [replace(row, p=p) for row, p in zip(rows, holm(effects), strict=True)]
 
 
-def feasible_fraction(results: Sequence[FrameResult]) -> float | None:
+class _Checked(Protocol):
+    @property
+    def feasible(self) -> bool: ...
+
+
+def feasible_fraction(frames: Sequence[_Checked]) -> float | None:
     """Share of the frames in which the independent check finds nothing violated; None without frames."""
-    return sum(r.feasible for r in results) / len(results) if results else None
+    return sum(frame.feasible for frame in frames) / len(frames) if frames else None
 
 
-def _row(run: ArmRun, beside: Mapping[str, Sequence[ArmRun]], draws: int, seed: int) -> StudyRow:
+def _row(run: ArmCounts, beside: Mapping[str, Sequence[ArmCounts]], draws: int, seed: int) -> StudyRow:
     mine = Figures.of(run)
     controls, effects = {}, {}
     for name, others in beside.items():
         theirs = Figures.of(*others).of_ap50()
-        sizes = [relative_size(other.results, run.results) for other in others]
+        sizes = [relative_size(other.frames, run.frames) for other in others]
         known = [size for size in sizes if size is not None]
         row = _told(others, theirs, draws, seed)
         controls[name] = replace(row, size=float(np.mean(known)) if known else None)
@@ -140,17 +157,13 @@ def _row(run: ArmRun, beside: Mapping[str, Sequence[ArmRun]], draws: int, seed: 
     return replace(_told([run], mine, draws, seed), controls=controls, effects=effects)
 
 
-def _told(runs: Sequence[ArmRun], figures: Figures, draws: int, seed: int) -> StudyRow:
+def _told(runs: Sequence[ArmCounts], figures: Figures, draws: int, seed: int) -> StudyRow:
     """Without its controls."""
-    summary = runs[0].summary
-    after = {"paper": summary.attacked_paper.headline, "moved": summary.attacked_moved.headline}
-    if len(runs) > 1:
-        after = {mode: replace(one, ap50=figures.after[mode][0].value()) for mode, one in after.items()}
     return StudyRow(
         runs=runs,
-        benign=summary.benign.headline,
-        paper=after["paper"],
-        moved=after["moved"],
+        benign=RowScores.of(figures.before),
+        paper=RowScores.of(figures.after["paper"]),
+        moved=RowScores.of(figures.after["moved"]),
         drops={mode: figures.drops(mode, draws, seed) for mode in MODES},
         effects={},
         controls={},
@@ -166,27 +179,11 @@ class Figures:
     frames: int
 
     @classmethod
-    def of(cls, *runs: ArmRun) -> Figures:
+    def of(cls, *runs: ArmCounts) -> Figures:
         """Of several, such as seeds, the means."""
-        each = [cls._of(run) for run in runs]
-        before = _means([one.before for one in each])
-        return cls(before, {mode: _means([one.after[mode] for one in each]) for mode in MODES}, each[0].frames)
-
-    @classmethod
-    def _of(cls, run: ArmRun) -> Figures:
-        names, label = run.judged.names, run.judged.names.index(HEADLINE)
-        benign = [run.judged.targets(as_targets(r.targets_benign, CLASSES)) for r in run.results]
-        moved = [run.judged.targets(as_targets(r.targets_moved, CLASSES)) for r in run.results]
-        attacked = [as_detections(r.detections_attacked, names) for r in run.results]
-        photographs = [as_detections(r.detections_benign, names) for r in run.results]
-        return cls(
-            before=_figures(Outcome.of(benign, photographs, label)),
-            after={
-                "paper": _figures(Outcome.of(benign, attacked, label)),
-                "moved": _figures(Outcome.of(moved, attacked, label)),
-            },
-            frames=len(run.results),
-        )
+        before = _means([_figures(run.before) for run in runs])
+        after = {mode: _means([_figures(run.after[mode]) for run in runs]) for mode in MODES}
+        return cls(before, after, len(runs[0].frames))
 
     def of_ap50(self) -> Figures:
         """That alone: of a control nothing else is told."""
@@ -215,10 +212,9 @@ def _means(figures: Sequence[Sequence[Figure]]) -> list[Figure]:
     ]
 
 
-def _figures(outcome: Outcome) -> list[Figure]:
+def _figures(matches: Matches) -> list[Figure]:
     """In the order of FIGURES."""
-    candidates = outcome.candidates
-    tallies = [candidates.tally(candidates.coco(overlap), 0) for overlap in IOU_THRESHOLDS]
+    tallies = [matches.tally(place) for place in range(len(IOU_THRESHOLDS))]
     single = [
         Figure(key, (Averaged(tallies[int(np.abs(IOU_THRESHOLDS - overlap).argmin())], "coco"),))
         for key, overlap in _SINGLE_OVERLAPS.items()
@@ -227,19 +223,12 @@ def _figures(outcome: Outcome) -> list[Figure]:
     return [*single, mean, Figure("recall", (Recalled(tallies[0]),))]
 
 
-def relative_size(control: Sequence[FrameResult], attack: Sequence[FrameResult]) -> float | None:
+def relative_size(control: Sequence[FrameCounts], attack: Sequence[FrameCounts]) -> float | None:
     """How large a control's edits are: the mean over frames of the ratio of norms of theta, each coordinate in
     units of its bounds; None where no frame was changed by the attack.
     """
     ratios = []
     for one, other in zip(control, attack, strict=True):
-        size = size_of(other)
-        if size > 0:
-            ratios.append(size_of(one) / size)
+        if other.size > 0:
+            ratios.append(one.size / other.size)
     return float(np.mean(ratios)) if ratios else None
-
-
-def size_of(result: FrameResult) -> float:
-    """Norm of a frame's theta, each coordinate in units of its bounds."""
-    values = [c.value / (c.upper - c.lower) for c in result.theta if c.upper > c.lower]
-    return float(np.linalg.norm(values))

@@ -14,6 +14,7 @@ from detectors.types import CLASSES
 from drivesem.evaluation import failures
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import Difference, Interval, differences, intervals, rate, wilson
+from drivesem.questions.study.counts import ArmCounts, FrameCounts, SeenObject
 from drivesem.questions.study.running import ARMS, ArmRun
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import as_detections, as_targets
@@ -82,14 +83,18 @@ class Standing:
         }
 
 
-def costs_of(runs: Sequence[ArmRun], draws: int, seed: int) -> list[SearchCost]:
+_Seen = Mapping[str, Sequence[SeenObject]]
+"""By frame, as `seen_of` gives them."""
+
+
+def costs_of(runs: Sequence[ArmCounts], seen: _Seen, draws: int, seed: int) -> list[SearchCost]:
     """Of arms on the same frames, the first of which the others are compared with."""
-    first = _certain(runs[0].results)
-    objects = np.array([len(_objects(runs[0], result)) for result in runs[0].results], np.float64)
+    first = _certain(runs[0].frames)
+    objects = np.array([len(seen[frame.identifier]) for frame in runs[0].frames], np.float64)
     found = []
     for run in runs:
-        certain, seconds = _certain(run.results), np.array([result.seconds for result in run.results])
-        passes = np.array([result.passes or 0 for result in run.results], np.float64)
+        certain, seconds = _certain(run.frames), np.array([frame.seconds for frame in run.frames])
+        passes = np.array([frame.passes for frame in run.frames], np.float64)
         figures = [rate("passes", certain, passes / 100), rate("minute", certain, seconds / 60)]
         by_pass, by_minute = intervals(figures, len(certain), draws, np.random.default_rng(seed))
         pair = [rate("certain", certain, objects)], [rate("certain", first, objects)]
@@ -107,23 +112,31 @@ def depths_of(run: ArmRun, out: Path) -> dict[str, list[float]]:
     return {name: scene.objects.translation[:, 2].tolist() for name, scene in scenes}
 
 
-def standing_of(runs: Sequence[ArmRun], depths: Mapping[str, Sequence[float]]) -> list[Standing]:
-    """By size and by distance, of all arms that are no controls. depths: as of `depths_of`."""
+def seen_of(run: ArmRun, depths: Mapping[str, Sequence[float]]) -> dict[str, tuple[SeenObject, ...]]:
+    """The judged objects of each frame that the detector finds in the photograph. depths: as of `depths_of`."""
+    return {
+        result.identifier: tuple(
+            SeenObject(i, height, depths[result.identifier][i]) for i, height in _objects(run, result).items()
+        )
+        for result in run.results
+    }
+
+
+def standing_of(runs: Sequence[ArmCounts], seen: _Seen) -> list[Standing]:
+    """By size and by distance, of all arms that are no controls."""
     searching = [run for run in runs if run.arm.control is None]
-    first = searching[0]
     told: list[tuple[float, float, bool]] = []
-    for place, result in enumerate(first.results):
-        lost = {failure.index for run in searching for failure in certain_losses(run.results[place])}
-        depth = depths[result.identifier]
-        told += [(height, depth[i], i in lost) for i, height in _objects(first, result).items()]
+    for place, frame in enumerate(searching[0].frames):
+        lost = {failure.index for run in searching for failure in certain_losses(run.frames[place])}
+        told += [(one.height_px, one.depth_m, one.index in lost) for one in seen[frame.identifier]]
     by_height = _classes("height", "px", _HEIGHTS_PX, [(height, lost) for height, _, lost in told])
     by_depth = _classes("distance", "m", _DEPTHS_M, [(depth, lost) for _, depth, lost in told])
     return [_standing("all", [lost for _, _, lost in told]), *by_height, *by_depth]
 
 
-def _certain(results: Sequence[FrameResult]) -> Floats:
+def _certain(frames: Sequence[FrameCounts]) -> Floats:
     certain = at_least(Grade.CERTAIN)
-    return np.array([sum(map(certain, result.failures)) for result in results], np.float64)
+    return np.array([sum(map(certain, frame.failures)) for frame in frames], np.float64)
 
 
 def _objects(run: ArmRun, result: FrameResult) -> Mapping[int, float]:

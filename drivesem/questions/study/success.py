@@ -14,8 +14,7 @@ import numpy as np
 
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import Difference, Figure, Interval, differences, intervals, rate
-from drivesem.questions.study.running import ArmRun
-from drivesem.run.results import FrameResult
+from drivesem.questions.study.counts import ArmCounts, FrameCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,21 +40,21 @@ class Curve:
         ]
 
 
-def first_successes(results: Sequence[FrameResult]) -> Floats:
+def first_successes(frames: Sequence[FrameCounts]) -> Floats:
     """Queries (F,) to the first success of each frame; infinite where there was none."""
-    return np.array([r.queries if r.success_moved else np.inf for r in results], np.float64)
+    return np.array([f.queries if f.success_moved else np.inf for f in frames], np.float64)
 
 
-def curve_of(run: ArmRun, draws: int, seed: int) -> Curve:
+def curve_of(run: ArmCounts, draws: int, seed: int) -> Curve:
     """An arm's curve, with bootstrap intervals over frames."""
-    first, most = first_successes(run.results), most_queries(run)
+    first, most = first_successes(run.frames), most_queries(run)
     figures = [_share(first <= q) for q in range(1, most + 1)]
     shares = intervals(figures, len(first), draws, np.random.default_rng(seed))
-    mean = float(np.mean([r.queries for r in run.results])) if run.results else None
+    mean = float(np.mean([f.queries for f in run.frames])) if run.frames else None
     return Curve(run.arm.name, most, tuple(shares), mean)
 
 
-def most_queries(run: ArmRun) -> int:
+def most_queries(run: ArmCounts) -> int:
     """How many queries an arm may take."""
     config = run.arm.config
     if config.method == "fgsm":
@@ -63,11 +62,11 @@ def most_queries(run: ArmRun) -> int:
     return config.queries or config.steps
 
 
-def against(run: ArmRun, queries: int, other: ArmRun, draws: int, seed: int) -> Difference:
+def against(run: ArmCounts, queries: int, other: ArmCounts, draws: int, seed: int) -> Difference:
     """The share that `run` breaks within so many queries (second), less what `other` does with all of its own
     (first); paired over frames.
     """
-    mine, theirs = first_successes(run.results) <= queries, np.isfinite(first_successes(other.results))
+    mine, theirs = first_successes(run.frames) <= queries, np.isfinite(first_successes(other.frames))
     rng = np.random.default_rng(seed)
     (one,) = differences([_share(theirs)], [_share(mine)], len(mine), draws, rng)
     return one

@@ -74,6 +74,45 @@ def test_files(finished: Path) -> None:
     assert (settings["name"], settings["steps"]) == ("multi", 1)
 
 
+def test_tables_come_again_from_what_is_kept(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows, intervals and p values to the last bit; and other draws give other intervals."""
+    words = ["study", "multi", "--from", str(finished / "kept"), "--json"]
+    assert study(words, capsys) == json.loads((finished / "study.json").read_text())
+    assert study([*words, "--out", str(tmp_path / "again")], capsys)["bootstrap"] == 5
+    again = {path.name: path.read_bytes() for path in (tmp_path / "again").iterdir()}
+    assert set(again) == {"study.md", "study.csv", "study.json", "study.png", "grades.csv"}
+    assert all(data == (finished / name).read_bytes() for name, data in again.items())
+    (row,) = study([*words, "--bootstrap", "0"], capsys)["rows"]
+    assert (row["drop_moved_low"], row["p"]) == (None, None)
+    assert main(["study", "multi", "--kept", str(finished / "kept")]) == 0
+    assert "combo 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["labels"], "--kept: expected study single, multi, grades, searches, samples, steps, attribution, found"),
+        (["single"], "settings.name: expected single, found multi"),
+        (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
+    ],
+)
+def test_what_cannot_be_told_again(
+    words: list[str], message: str, finished: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused("study", *words, "--from", str(finished / "kept"))
+
+
+@pytest.mark.parametrize(
+    ("folder", "message"), [(".", "study.json: expected a readable"), ("none", "--kept: expected")]
+)
+def test_a_folder_that_keeps_nothing(
+    folder: str, message: str, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused("study", "multi", "--from", str(tmp_path / folder))
+
+
 def test_what_arms_have_in_common_takes_room_once(finished: Path) -> None:
     arms = sorted((finished / "arms").iterdir())
     frames = [arm / "frames" / "demo-000" for arm in arms]
@@ -92,6 +131,7 @@ def test_the_generator_draws_again_on_request(
     assert row["survive_share"] == drawn["survive"]
     assert row["survive_failures"] == drawn["rows"][0]["failures"]
     assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
+    assert study(["study", "multi", "--from", str(out / "kept"), "--json"], capsys)["rows"] == [row]
 
 
 def test_without_a_second_renderer_nothing_is_attacked(
@@ -181,6 +221,7 @@ def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture
         row["objects"] for row in found["standing"] if row["name"].startswith("distance")
     )
     assert (tmp_path / "a" / "standing.csv").is_file()
+    assert study(["study", "searches", "--from", str(tmp_path / "a" / "kept"), "--json"], capsys) == found
 
 
 @pytest.mark.slow
@@ -201,3 +242,4 @@ def test_attribution_sums_to_the_difference_and_goes_on(
     assert len(done) == len(data["arms"]) == 13
     assert study(words, capsys) == data
     assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert study(["study", "attribution", "--from", str(out / "kept"), "--json"], capsys) == data

@@ -10,6 +10,7 @@ import pytest
 from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE, JudgedClasses
 from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.counts import ArmCounts
 from drivesem.questions.study.running import ArmRun
 from drivesem.run.results import BoxRecord, Coordinate, FrameResult
 from drivesem.settings.commands import Attack
@@ -71,6 +72,12 @@ def frame() -> Callable[..., FrameResult]:
 @pytest.fixture
 def arm_run() -> Callable[[Arm, Sequence[FrameResult]], ArmRun]:
     return _run
+
+
+@pytest.fixture
+def counted() -> Callable[[Arm, Sequence[FrameResult]], ArmCounts]:
+    """The same as it is counted."""
+    return lambda arm, results: ArmCounts.of(_run(arm, results))
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from drivesem.questions.study.attribution import (
     told,
     write_waterfall,
 )
-from drivesem.questions.study.running import Ran
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.run.protocol import follows_paper
 from drivesem.settings.commands import Attack, Study
 from drivesem.settings.parsing import parse
@@ -63,14 +63,14 @@ def test_a_way_changes_one_factor_at_a_time_and_the_factors_start_as_ours() -> N
 
 
 @pytest.fixture
-def found(frame: Callable[..., Any], arm_run: Callable[..., Any]) -> Attribution:
+def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution:
     """Labels that are aimed at lose a car in two frames of six; what is not projected drives it away in all."""
     plan, runs = plan_of(limit=FRAMES), []
     for arm in plan.arms():
         lost = 2 if arm.config.objective_labels == "paper" else 0
         by = 40.0 if arm.config.project == "bounds" else 0.0
-        runs.append(arm_run(arm, [frame(f"{i}", moved_by=by, found=i >= lost) for i in range(FRAMES)]))
-    return attributed(Study(name="attribution"), plan, Ran(tuple(runs), 1, {"000009": "no camera"}), DRAWS)
+        runs.append(counted(arm, [frame(f"{i}", moved_by=by, found=i >= lost) for i in range(FRAMES)]))
+    return attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 1, {"000009": "no camera"}), DRAWS)
 
 
 def test_points_sum_to_the_difference_on_both_ways_and_in_the_mean(found: Attribution) -> None:
@@ -102,7 +102,7 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
 
 
 def test_a_detector_counts_with_what_its_fall_begins_from(
-    frame: Callable[..., Any], arm_run: Callable[..., Any]
+    frame: Callable[..., Any], counted: Callable[..., Any]
 ) -> None:
     """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
     plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
@@ -112,8 +112,8 @@ def test_a_detector_counts_with_what_its_fall_begins_from(
             one = results[0].detections_benign[:1]
             results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
             results[1] = replace(results[1], detections_attacked=one)
-        runs.append(arm_run(arm, results))
-    found = attributed(Study(name="attribution"), plan, Ran(tuple(runs), 0, {}), DRAWS)
+        runs.append(counted(arm, results))
+    found = attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 0, {}), DRAWS)
     assert found.shares[-1].name == "detector"
     # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
     assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))

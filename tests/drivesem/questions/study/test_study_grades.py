@@ -9,11 +9,11 @@ import cv2
 import pytest
 
 from drivesem.questions.study.arms import PLACEBO
+from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import ArmGrades, grades_of
 from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, notes, sheets
 from drivesem.questions.study.rows import rows_of
-from drivesem.questions.study.running import Ran
 from drivesem.run.results import Failure, FrameResult
 from drivesem.settings.commands import Study
 from drivesem.truth.grades import Agreement, Count, Grade, Kind
@@ -27,7 +27,7 @@ def failure(grade: Grade, kind: Kind = Kind.MISSED, second: Agreement | None = N
 
 
 @pytest.fixture
-def runs(frame, arm_run, arm) -> list:
+def runs(frame, counted, arm) -> list:
     """Four frames of two cars, failures of each grade in the first three; a control fails by threshold."""
     of = [
         (failure(Grade.THRESHOLD), failure(Grade.CERTAIN, second=ASKED)),
@@ -38,9 +38,9 @@ def runs(frame, arm_run, arm) -> list:
     frames = [replace(frame(str(i)), failures=failures, passes=30) for i, failures in enumerate(of)]
     control = [replace(frame(str(i)), failures=of[0][:1], passes=1) for i in range(4)]
     return [
-        arm_run(arm("combo 2"), frames),
-        arm_run(arm("combo 2 placebo", control=(PLACEBO, "combo 2")), control),
-        arm_run(arm("combo 2, halton", method="halton"), frames[:1] + control[1:]),
+        counted(arm("combo 2"), frames),
+        counted(arm("combo 2 placebo", control=(PLACEBO, "combo 2")), control),
+        counted(arm("combo 2, halton", method="halton"), frames[:1] + control[1:]),
     ]
 
 
@@ -66,26 +66,26 @@ def test_what_survives_is_a_share_of_what_was_asked(grades: ArmGrades) -> None:
     assert 0 <= low < 2 / 3 <= high == 1
 
 
-def test_ignored_objects_are_nothing_to_lose(frame, arm_run, arm) -> None:
+def test_ignored_objects_are_nothing_to_lose(frame, counted, arm) -> None:
     result: FrameResult = frame("0")
     first, second = result.targets_benign
     ignored = replace(result, targets_benign=(replace(first, ignore=True), second))
-    assert grades_of(arm_run(arm("a"), [ignored]), 0, 0).objects == 1
+    assert grades_of(counted(arm("a"), [ignored]), 0, 0).objects == 1
 
 
-def test_bounds_are_those_of_drawing_frames(frame, arm_run, arm) -> None:
+def test_bounds_are_those_of_drawing_frames(frame, counted, arm) -> None:
     """Equal frames leave nothing to chance; without draws there are no bounds."""
     alike = [replace(frame(str(i)), failures=(failure(Grade.CERTAIN),)) for i in range(5)]
-    one = grades_of(arm_run(arm("a"), alike), DRAWS, 0).rates[Grade.CERTAIN]
+    one = grades_of(counted(arm("a"), alike), DRAWS, 0).rates[Grade.CERTAIN]
     assert (one.value, one.low, one.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert grades_of(arm_run(arm("a"), alike), 0, 0).rates[Grade.CERTAIN].low is None
+    assert grades_of(counted(arm("a"), alike), 0, 0).rates[Grade.CERTAIN].low is None
 
 
 def test_told_to_people(runs: list, tmp_path: Path) -> None:
     found = Findings(
         Study(name="grades"),
         DRAWS,
-        Ran(tuple(runs), 0, {}),
+        StudyCounts(tuple(runs), 0, {}),
         rows_of(runs, DRAWS, 0),
         grades=[grades_of(run, DRAWS, 0) for run in runs],
     )

@@ -13,11 +13,11 @@ from rich.console import Console
 
 from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.counts import ArmCounts, StudyCounts
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, answer_of, notes, sheets, told
 from drivesem.questions.study.rows import rows_of
-from drivesem.questions.study.running import Ran
 from drivesem.questions.study.success import against, curve_of
 from drivesem.settings.commands import Study
 
@@ -25,33 +25,33 @@ DRAWS = 10
 
 
 @pytest.fixture
-def controlled(frame, arm_run, arm) -> Findings:
+def controlled(frame, counted, arm) -> Findings:
     """Two parameters; one frame of four is broken by the attack, none by its controls."""
     runs = []
     for name, reference in (("rotate", 0.982), ("mesh", 0.987)):
         lost = [frame(f"{i}", found=i > 0, success=i == 0) for i in range(4)]
-        runs.append(arm_run(arm(name, reference), lost))
+        runs.append(counted(arm(name, reference), lost))
         for kind in (RANDOM, PLACEBO):
-            runs.append(arm_run(arm(f"{name} {kind}", control=(kind, name)), [frame(f"{i}") for i in range(4)]))
-    ran = Ran(tuple(runs), without_vehicles=3, failed={"000009": "no camera"})
+            runs.append(counted(arm(f"{name} {kind}", control=(kind, name)), [frame(f"{i}") for i in range(4)]))
+    ran = StudyCounts(tuple(runs), without_vehicles=3, failed={"000009": "no camera"})
     return Findings(Study(name="single"), DRAWS, ran, rows_of(runs, DRAWS, 0))
 
 
 @pytest.fixture
-def sampled(frame, arm_run, arm) -> Findings:
+def sampled(frame, counted, arm) -> Findings:
     """An arm of 10 queries, one of 64, and one of a single query."""
     runs = [
-        arm_run(arm("si-fgsm"), [frame("0", queries=2, success=True), frame("1", queries=5, success=True)]),
-        arm_run(
+        counted(arm("si-fgsm"), [frame("0", queries=2, success=True), frame("1", queries=5, success=True)]),
+        counted(
             arm("halton", method="halton", queries=64),
             [frame("0", queries=30, success=True), frame("1", queries=64)],
         ),
-        arm_run(arm("fgsm", method="fgsm"), [frame("0", queries=1, success=True), frame("1", queries=1)]),
+        counted(arm("fgsm", method="fgsm"), [frame("0", queries=1, success=True), frame("1", queries=1)]),
     ]
     return Findings(
         Study(name="samples"),
         DRAWS,
-        Ran(tuple(runs), 0, {}),
+        StudyCounts(tuple(runs), 0, {}),
         rows_of(runs, DRAWS, 0),
         curves=[curve_of(run, DRAWS, 0) for run in runs],
         beside={run.arm.name: against(runs[0], 10, run, DRAWS, 0) for run in runs},
@@ -61,11 +61,9 @@ def sampled(frame, arm_run, arm) -> Findings:
 
 @pytest.fixture
 def labelled(frame, arm_run, arm) -> Findings:
-    runs = [arm_run(arm("translate"), [frame("0", moved_by=40.0), frame("1")])]
-    ran = Ran(tuple(runs), 0, {})
-    return Findings(
-        Study(name="labels"), 0, ran, rows_of(runs, 0, 0), label_sets=[label_sets(run) for run in runs]
-    )
+    run = arm_run(arm("translate"), [frame("0", moved_by=40.0), frame("1")])
+    counts = StudyCounts((ArmCounts.of(run),), 0, {})
+    return Findings(Study(name="labels"), 0, counts, rows_of(counts.arms, 0, 0), label_sets=[label_sets(run)])
 
 
 def cells(found: Findings, title: str, arm: str) -> dict[str, str]:
@@ -151,11 +149,11 @@ def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     assert found.rows[0].name in stream.getvalue()
 
 
-def test_nothing_to_attack(frame, arm_run, arm, tmp_path: Path) -> None:
+def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
     """No frame has a vehicle: the tables have dashes, and nothing fails."""
-    runs = [arm_run(arm("rotate", 0.982), []), arm_run(arm("rotate placebo", control=(PLACEBO, "rotate")), [])]
-    runs.append(arm_run(arm("rotate random", control=(RANDOM, "rotate")), []))
-    found = Findings(Study(name="single"), DRAWS, Ran(tuple(runs), 5, {}), rows_of(runs, DRAWS, 0))
+    runs = [counted(arm("rotate", 0.982), []), counted(arm("rotate placebo", control=(PLACEBO, "rotate")), [])]
+    runs.append(counted(arm("rotate random", control=(RANDOM, "rotate")), []))
+    found = Findings(Study(name="single"), DRAWS, StudyCounts(tuple(runs), 5, {}), rows_of(runs, DRAWS, 0))
     assert found.to_json()["feasible_fraction"] is None
     assert cells(found, "Car AP50", "rotate")["benign"] == "-"
     answer_of(told(found), tmp_path, {}, "drivesem study single", None).write()

@@ -7,6 +7,7 @@ import pytest
 
 from drivesem.evaluation.resampling import holm
 from drivesem.questions.study.arms import PLACEBO, RANDOM
+from drivesem.questions.study.counts import ArmCounts, FrameCounts
 from drivesem.questions.study.rows import relative_size, rows_of
 from drivesem.report.paper import PAPER_BENIGN
 from drivesem.settings.commands import Attack
@@ -17,7 +18,7 @@ FAR = 40.0
 
 
 @pytest.fixture
-def runs(frame, arm_run, arm):
+def runs(frame, counted, arm):
     """An attack that makes the detector lose a car in half of the frames; a random control that moves the car in
     all of them and is followed; a placebo that does nothing.
     """
@@ -26,9 +27,9 @@ def runs(frame, arm_run, arm):
     followed = [frame(n, moved_by=FAR) for n in names]
     nothing = [frame(n, yaw=0.1) for n in names]
     return [
-        arm_run(arm("rotate", 0.982), lost),
-        arm_run(arm("rotate random", control=(RANDOM, "rotate")), followed),
-        arm_run(arm("rotate placebo", control=(PLACEBO, "rotate")), nothing),
+        counted(arm("rotate", 0.982), lost),
+        counted(arm("rotate random", control=(RANDOM, "rotate")), followed),
+        counted(arm("rotate placebo", control=(PLACEBO, "rotate")), nothing),
     ]
 
 
@@ -48,8 +49,23 @@ def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
     assert flat["feasible_fraction"] == 1.0
 
 
+def test_figures_are_those_of_pycocotools(frame, arm_run, arm) -> None:
+    """As the run itself tells them, of detections that are true at some overlaps and false at others."""
+    run = arm_run(arm("a"), [frame(f"{i}", moved_by=4.0 * i, found=i != 3) for i in range(FRAMES)])
+    (row,) = rows_of([ArmCounts.of(run)], draws=0, seed=0)
+    sides = {
+        "benign": run.summary.benign,
+        "paper": run.summary.attacked_paper,
+        "moved": run.summary.attacked_moved,
+    }
+    for side, scores in sides.items():
+        for key in ("ap50", "ap70", "ap", "recall"):
+            expected = getattr(scores.headline, key)
+            assert getattr(getattr(row, side), key) == pytest.approx(expected, abs=1e-12), (side, key)
+    assert row.flat()["objects"] == run.summary.benign.headline.objects
+
+
 def test_drops_are_those_of_the_figures(runs) -> None:
-    """The bootstrap's figures and pycocotools' are the same numbers."""
     (row,) = rows_of(runs, draws=0, seed=0)
     flat = row.flat()
     for mode in ("paper", "moved"):
@@ -75,25 +91,25 @@ def test_the_controls_stand_beside(runs) -> None:
 
 
 def test_sizes_are_compared_frame_by_frame(frame) -> None:
-    attack = [frame("a", yaw=0.2), frame("b", yaw=0.1), frame("c", yaw=0.0)]
-    control = [frame("a", yaw=-0.2), frame("b", yaw=0.05), frame("c", yaw=0.3)]
+    attack = [FrameCounts.of(frame("a", yaw=yaw), ()) for yaw in (0.2, 0.1, 0.0)]
+    control = [FrameCounts.of(frame("a", yaw=yaw), ()) for yaw in (-0.2, 0.05, 0.3)]
     assert relative_size(control, attack) == pytest.approx(np.mean([1.0, 0.5]))
     assert relative_size([control[2]], [attack[2]]) is None
 
 
-def test_equal_arms_have_no_effect_and_no_spread(frame, arm_run, arm) -> None:
+def test_equal_arms_have_no_effect_and_no_spread(frame, counted, arm) -> None:
     results = [frame(f"{i}", found=i % 2 == 0) for i in range(4)]
-    runs = [arm_run(arm("one"), results), arm_run(arm("two", control=(PLACEBO, "one")), results)]
+    runs = [counted(arm("one"), results), counted(arm("two", control=(PLACEBO, "one")), results)]
     (row,) = rows_of(runs, draws=20, seed=3)
     effect = row.effects[PLACEBO]["moved"]
     assert (effect.difference, effect.low, effect.high, effect.p) == (0.0, 0.0, 0.0, 1.0)
     assert row.drops["moved"]["ap50"].value == pytest.approx(25 / 101)
 
 
-def test_seeds_of_a_control_count_as_their_mean(runs, frame, arm_run, arm) -> None:
+def test_seeds_of_a_control_count_as_their_mean(runs, frame, counted, arm) -> None:
     """Beside one that is followed in all frames, a second seed loses a car in all of them."""
     names = [f"{i:03d}" for i in range(FRAMES)]
-    lost = arm_run(
+    lost = counted(
         arm("rotate random 2", control=(RANDOM, "rotate"), seed=1),
         [frame(n, moved_by=5.0, found=False, success=True, yaw=0.1) for n in names],
     )
@@ -109,13 +125,13 @@ def test_seeds_of_a_control_count_as_their_mean(runs, frame, arm_run, arm) -> No
     assert both["random_size"] == pytest.approx((0.5 + 0.5) / 2)
 
 
-def test_the_effect_is_beside_the_control_with_as_many_chances(runs, arm_run, arm) -> None:
+def test_the_effect_is_beside_the_control_with_as_many_chances(runs) -> None:
     """Random where the best is kept, the placebo where the last is; p is Holm's over the rows."""
     kept_last = [
-        arm_run(replace(run.arm, name=f"last {run.arm.name}", of=run.arm.of and f"last {run.arm.of}"), run.results)
+        replace(run, arm=replace(run.arm, name=f"last {run.arm.name}", of=run.arm.of and f"last {run.arm.of}"))
         for run in runs
     ]
-    kept_last[0] = arm_run(replace(kept_last[0].arm, config=Attack(keep="last")), kept_last[0].results)
+    kept_last[0] = replace(kept_last[0], arm=replace(kept_last[0].arm, config=Attack(keep="last")))
     best, last = rows_of([*runs, *kept_last], draws=30, seed=0)
     assert (best.matching, last.matching) == (RANDOM, PLACEBO)
     ps = [best.effects[RANDOM]["moved"].p, last.effects[PLACEBO]["moved"].p]

@@ -8,11 +8,12 @@ from dataclasses import replace
 import pytest
 
 from drivesem.questions.study.arms import PLACEBO
+from drivesem.questions.study.counts import ArmCounts, StudyCounts
 from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.report import Findings, notes, sheets, told
 from drivesem.questions.study.rows import rows_of
-from drivesem.questions.study.running import ArmRun, Ran
-from drivesem.questions.study.searches import Standing, costs_of, standing_of
+from drivesem.questions.study.running import ArmRun
+from drivesem.questions.study.searches import Standing, costs_of, seen_of, standing_of
 from drivesem.run.results import Failure
 from drivesem.settings.commands import Study
 from drivesem.truth.grades import Count, Grade, Kind
@@ -40,8 +41,13 @@ def runs(frame, arm_run, arm) -> list[ArmRun]:
     ]
 
 
-def test_certain_failures_for_passes_and_minutes(runs: list[ArmRun]) -> None:
-    climb, halton, _ = costs_of(runs, DRAWS, 0)
+@pytest.fixture
+def counts(runs: list[ArmRun]) -> StudyCounts:
+    return StudyCounts(tuple(map(ArmCounts.of, runs)), 0, {}, seen_of(runs[0], DEPTHS))
+
+
+def test_certain_failures_for_passes_and_minutes(counts: StudyCounts) -> None:
+    climb, halton, _ = costs_of(counts.arms, counts.seen, DRAWS, 0)
     assert climb.per_100_passes.value == pytest.approx(3 / 2)
     assert climb.per_minute.value == pytest.approx(3 / 2)
     assert halton.per_100_passes.value == pytest.approx(1.0)
@@ -50,8 +56,8 @@ def test_certain_failures_for_passes_and_minutes(runs: list[ArmRun]) -> None:
     assert climb.per_minute.low < 1.5
 
 
-def test_the_first_arm_is_what_others_are_compared_with(runs: list[ArmRun]) -> None:
-    climb, halton, _ = costs_of(runs, DRAWS, 0)
+def test_the_first_arm_is_what_others_are_compared_with(counts: StudyCounts) -> None:
+    climb, halton, _ = costs_of(counts.arms, counts.seen, DRAWS, 0)
     assert climb.ahead is None
     assert halton.ahead is not None
     assert halton.ahead.difference == pytest.approx((3 - 1) / 8)
@@ -59,8 +65,8 @@ def test_the_first_arm_is_what_others_are_compared_with(runs: list[ArmRun]) -> N
     assert halton.ahead.low >= 0
 
 
-def test_what_stands_by_size_and_distance(runs: list[ArmRun]) -> None:
-    classes = {one.name: one for one in standing_of(runs, DEPTHS)}
+def test_what_stands_by_size_and_distance(counts: StudyCounts) -> None:
+    classes = {one.name: one for one in standing_of(counts.arms, counts.seen)}
     assert (classes["all"].objects, classes["all"].lost) == (8, 3)  # the placebo's is not counted
     assert (classes["distance below 15 m"].objects, classes["distance below 15 m"].lost) == (4, 3)
     assert (classes["distance from 30 m"].objects, classes["distance from 30 m"].lost) == (4, 0)
@@ -70,7 +76,8 @@ def test_what_stands_by_size_and_distance(runs: list[ArmRun]) -> None:
 
 def test_cars_that_the_detector_does_not_find_cannot_fall(runs: list[ArmRun]) -> None:
     blind = [replace(result, detections_benign=()) for result in runs[0].results]
-    assert standing_of([replace(runs[0], results=tuple(blind))], DEPTHS)[0].objects == 0
+    run = replace(runs[0], results=tuple(blind))
+    assert standing_of([ArmCounts.of(run)], seen_of(run, DEPTHS))[0].objects == 0
 
 
 def test_share_with_wilson() -> None:
@@ -80,15 +87,15 @@ def test_share_with_wilson() -> None:
     assert Standing("none", 0, 0).standing.value is None
 
 
-def test_told_to_people(runs: list[ArmRun]) -> None:
+def test_told_to_people(counts: StudyCounts) -> None:
     found = Findings(
         Study(name="searches"),
         DRAWS,
-        Ran(tuple(runs), 0, {}),
-        rows_of(runs, DRAWS, 0),
-        grades=[grades_of(run, DRAWS, 0) for run in runs],
-        costs=costs_of(runs, DRAWS, 0),
-        standing=standing_of(runs, DEPTHS),
+        counts,
+        rows_of(counts.arms, DRAWS, 0),
+        grades=[grades_of(one, DRAWS, 0) for one in counts.arms],
+        costs=costs_of(counts.arms, counts.seen, DRAWS, 0),
+        standing=standing_of(counts.arms, counts.seen),
     )
     by_title = {sheet.title: sheet for sheet in sheets(found, whole=False)}
     cost = by_title["What certain failures cost"]

@@ -7,7 +7,7 @@ from drivesem.questions.study.success import against, curve_of, first_successes,
 
 
 @pytest.fixture
-def runs(frame, arm_run, arm):
+def runs(frame, counted, arm):
     """One arm that breaks frames after 1, 3, 3 queries and one never; one that needs 8 in two of them."""
     quick = [(1, True), (3, True), (3, True), (10, False)]
     slow = [(8, True), (8, True), (64, False), (64, False)]
@@ -16,8 +16,8 @@ def runs(frame, arm_run, arm):
         for name, pairs in (("quick", quick), ("slow", slow))
     }
     return (
-        arm_run(arm("quick", early_stop=True), made["quick"]),
-        arm_run(arm("slow", method="halton", queries=64, early_stop=True), made["slow"]),
+        counted(arm("quick", early_stop=True), made["quick"]),
+        counted(arm("slow", method="halton", queries=64, early_stop=True), made["slow"]),
     )
 
 
@@ -41,7 +41,7 @@ def test_the_curve_is_the_distribution_of_first_successes(runs) -> None:
 
 
 def test_queries_of_frames_that_were_never_broken_count_as_none(runs) -> None:
-    assert first_successes(runs[0].results).tolist() == [1, 3, 3, np.inf]
+    assert first_successes(runs[0].frames).tolist() == [1, 3, 3, np.inf]
 
 
 def test_one_arm_against_the_end_of_another(runs) -> None:
@@ -51,9 +51,9 @@ def test_one_arm_against_the_end_of_another(runs) -> None:
     assert against(runs[0], 3, runs[1], 0, 0).difference == pytest.approx(0.25)
 
 
-def test_how_many_queries_an_arm_may_take(frame, arm_run, arm) -> None:
+def test_how_many_queries_an_arm_may_take(frame, counted, arm) -> None:
     asked = {"si-fgsm": 7, "fgsm": 1, "halton": 32}
     for method, most in asked.items():
         queries = 32 if method == "halton" else None
-        run = arm_run(arm(method, method=method, steps=7, queries=queries), [frame("0")])
+        run = counted(arm(method, method=method, steps=7, queries=queries), [frame("0")])
         assert most_queries(run) == most
