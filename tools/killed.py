@@ -18,12 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
+from drivesem.report.progress import progress_bar
+from drivesem.report.terminal import Console
 from scene_ir import files
 from tools.same import Hasher, differences, environment
 from tools.small_frames import small_frames
@@ -72,9 +73,11 @@ def run_unbroken(words: Sequence[str], folder: Path) -> None:
     _check(done.returncode, folder)
 
 
-def run_killed(words: Sequence[str], folder: Path, delays: Sequence[float], trial: Trial) -> int:
+def run_killed(
+    words: Sequence[str], folder: Path, delays: Sequence[float], trial: Trial, killed: Callable[[], object]
+) -> int:
     """The same, killed after so many seconds, and given again, as often as there are delays. How many of them
-    passed until it was done. RuntimeError as `run_unbroken`.
+    passed until it was done. killed: called at each. RuntimeError as `run_unbroken`.
     """
     for used, delay in enumerate(delays):
         with (folder / "said.txt").open("w") as said:
@@ -87,6 +90,7 @@ def run_killed(words: Sequence[str], folder: Path, delays: Sequence[float], tria
                 process.wait()
                 trial.kills += 1
                 trial.begun += (folder / RUN).exists()
+                killed()
     run_unbroken(words, folder)
     return len(delays)
 
@@ -108,7 +112,15 @@ def hashes(folder: Path, trial: Trial) -> dict[str, str]:
     return Hasher({folder.parent: "WORK"}).rows(RUN, folder / RUN)
 
 
-def try_out(trial: Trial, words: Sequence[str], work: Path, kills: int, spread: float, seed: int) -> None:
+def try_out(
+    trial: Trial,
+    words: Sequence[str],
+    work: Path,
+    kills: int,
+    spread: float,
+    seed: int,
+    killed: Callable[[], object] = lambda: None,
+) -> None:
     """Kill the command so often, at moments that are drawn from the first part, `spread` of the whole, of what it
     takes unbroken: a run that goes on is done with what lies behind it.
     """
@@ -124,7 +136,7 @@ def try_out(trial: Trial, words: Sequence[str], work: Path, kills: int, spread: 
         folder = work / trial.name / f"run-{trial.runs:03d}"
         folder.mkdir()
         delays = [generator.uniform(0, spread * trial.unbroken_s) for _ in range(kills - trial.kills)]
-        run_killed(words, folder, delays, trial)
+        run_killed(words, folder, delays, trial, killed)
         trial.runs += 1
         found = differences(expected, hashes(folder, trial))
         trial.differing += [f"{folder.name}: {line}" for line in found]
@@ -156,10 +168,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             trials.append(trial)
             shutil.rmtree(work / name, ignore_errors=True)
             words = [sys.executable, "-m", "drivesem.cli", *command.split()]
-            try:
-                try_out(trial, words, work, int(kills), given.spread, given.seed)
-            except RuntimeError as error:
-                trial.differing.append(str(error))
+            with progress_bar(console, stays=False) as progress:
+                task = progress.add_task(f"kills of {name}", total=int(kills))
+                try:
+                    try_out(
+                        trial, words, work, int(kills), given.spread, given.seed, partial(progress.advance, task)
+                    )
+                except RuntimeError as error:
+                    trial.differing.append(str(error))
             if given.out is not None:
                 files.write_json(given.out, [asdict(one) for one in trials])
             console.print(
