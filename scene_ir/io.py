@@ -165,11 +165,11 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
         )
     )
     known = {
-        name: size for name, size in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
+        name: width for name, width in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
     }
     environment = environment_node.build(
         lambda: Environment(
-            **{name: environment_node[name].tensor(size) for name, size in known.items()},
+            **{name: environment_node[name].tensor(width) for name, width in known.items()},
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )

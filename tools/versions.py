@@ -118,8 +118,9 @@ def run_words(words: Sequence[str], folder: Path) -> Ended:
     except (OSError, subprocess.TimeoutExpired) as error:
         return Ended(str(error))
     lines = [line for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
-    failed = "" if ended.returncode == 0 else (lines[-1] if lines else f"exit code {ended.returncode}")
-    return Ended(failed, ended.stdout)
+    named = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]  # pytest's last line counts only
+    failed = "; ".join(named) or (lines[-1] if lines else f"exit code {ended.returncode}")
+    return Ended(failed if ended.returncode else "", ended.stdout)
 
 
 def tried(python: str, versions: str, wheel: str, work: Path, args: argparse.Namespace, run: Run) -> Outcome:
