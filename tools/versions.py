@@ -49,9 +49,9 @@ HIDDEN = (
 _MINUTES = 60
 """A step that takes longer is stopped."""
 _VERSIONS = f"""
-import json
+import json, platform
 from importlib.metadata import version
-print(json.dumps({{name: version(name) for name in {PACKAGES!r}}}))
+print(json.dumps({{"Python": platform.python_version(), **{{name: version(name) for name in {PACKAGES!r}}}}}))
 """
 
 
@@ -70,7 +70,7 @@ Run = Callable[[Sequence[str], Path], Ended]
 @dataclass(frozen=True)
 class Outcome:
     """What came of one Python and one set of versions. failed: the step that failed, and why; empty where none.
-    found: versions of `PACKAGES`; parts: what `drivesem doctor` says of each part; figures: of the attack.
+    found: versions of Python and `PACKAGES`; parts: what `drivesem doctor` says of each; figures: the attack's.
     """
 
     python: str
@@ -161,14 +161,20 @@ def tried(python: str, versions: str, wheel: str, work: Path, args: argparse.Nam
     if args.bare and not failed and parts.get("EGL") == "works":
         failed = "doctor: EGL is hidden, and works"
     figures = {key: said["attack"][key] for key in ("frames", "grades") if key in said.get("attack", {})}
-    return Outcome(python, versions, failed, said.get("versions", {}), parts, figures)
+    named = f"{versions}, bare" if args.bare else versions
+    return Outcome(python, named, failed, said.get("versions", {}), parts, figures)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """The outcomes in Markdown."""
     heads = ("Python", "versions", *PACKAGES, "outcome")
     rows = [
-        (Path(o.python).name, o.versions, *(o.found.get(name, "") for name in PACKAGES), o.failed or "works")
+        (
+            o.found.get("Python", Path(o.python).name),
+            o.versions,
+            *(o.found.get(name, "") for name in PACKAGES),
+            o.failed or "works",
+        )
         for o in outcomes
     ]
     return "".join(f"| {' | '.join(row)} |\n" for row in (heads, ("---",) * len(heads), *rows))

@@ -30,7 +30,7 @@ class Recorder:
         if "sys.version_info" in line:
             return Ended(said="3.13\n")
         if "importlib.metadata" in line:
-            return Ended(said=json.dumps({"torch": "9.1"}))
+            return Ended(said=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
         if "doctor" in line:
             return Ended(said=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
         return Ended(
@@ -66,11 +66,11 @@ def test_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [(row["python"], row["versions"], row["failed"]) for row in told][:2] == [
         ("python8", "lowest", ""), ("python8", "highest", ""),
     ]  # fmt: skip
-    assert told[0]["found"] == {"torch": "9.1"}
+    assert told[0]["found"] == {"Python": "9.0.1", "torch": "9.1"}
     assert told[0]["figures"] == {"frames": 10, "grades": {"certain": 3}}
     out = capsys.readouterr().out
     assert "python9, highest: works\n    {'frames': 10, 'grades': {'certain': 3}}; without EGL\n" in out
-    assert "| python9 | highest | 9.1 |" in out
+    assert "| 9.0.1 | highest | 9.1 |" in out
 
 
 def test_pinned_and_bare(capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,4 +114,6 @@ def test_resolving_installs_nothing() -> None:
 def test_words_are_run(tmp_path: Path) -> None:
     assert run_words(["python3", "-c", "print(7)"], tmp_path) == Ended("", "7\n")
     assert run_words(["python3", "-c", "raise ValueError('so')"], tmp_path).failed == "ValueError: so"
+    tests = "print('FAILED a.py::b - so'); print('1 failed in 3 s'); raise SystemExit(1)"
+    assert run_words(["python3", "-c", tests], tmp_path).failed == "FAILED a.py::b - so"
     assert "nowhere" in run_words(["nowhere"], tmp_path).failed
