@@ -101,7 +101,7 @@ PARTS = (
     Part(
         "open3d, libusb",
         "the second check of feasibility by rays; without, by outlines",
-        "apt install libusb-1.0-0",
+        "apt install libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0",
         _version("open3d"),
     ),
     Part(

@@ -35,6 +35,7 @@ from scene_ir.types import (
     Crop,
     Environment,
     Front,
+    Labels,
     Mesh,
     Objects,
     SceneIR,
@@ -63,6 +64,14 @@ _OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
     "box2d": (4,),
     "truncation": (),
     "occlusion": (),
+}
+_LABEL_FIELDS: dict[str, tuple[int, ...]] = {
+    "boxes_xyxy": (4,),
+    "truncation": (),
+    "occlusion": (),
+    "translation": (3,),
+    "yaw": (),
+    "size_lhw": (3,),
 }
 _ENVIRONMENT_FIELDS = {"weather": WEATHER_DIM, "foliage": FOLIAGE_DIM, "light": LIGHT_DIM, "sun": 3, "ground": 4}
 _SOURCE_FIELDS: dict[str, tuple[int, ...]] = {
@@ -112,6 +121,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.front)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
             "ignore": _numbers(scene.ignore),
+            "others": None if scene.others is None else _labels_record(scene.others),
             "before": scene.before is not None,
         }
         files.write_json(temporary / "scene.json", record)
@@ -155,11 +165,11 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
         )
     )
     known = {
-        name: size for name, size in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
+        name: width for name, width in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
     }
     environment = environment_node.build(
         lambda: Environment(
-            **{name: environment_node[name].tensor(size) for name, size in known.items()},
+            **{name: environment_node[name].tensor(width) for name, width in known.items()},
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )
@@ -183,6 +193,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             provenance=provenance,
             front=front,
             before=before,
+            others=_others(root),
         )
     )
 
@@ -207,6 +218,29 @@ def count_objects(folder: Path) -> int:
     """How many objects the scene in `folder` has, from its record alone. FormatError naming file and key."""
     root = _record(Path(folder))
     return root["objects"]["translation"].rows()
+
+
+def load_others(folder: Path) -> Labels | None:
+    """`SceneIR.others` of the scene in `folder`, from its record alone. FormatError naming file and key."""
+    return _others(_record(Path(folder)))
+
+
+def _others(root: _Node) -> Labels | None:
+    if "others" not in root.mapping() or root["others"].value is None:  # earlier scenes have no such key
+        return None
+    node = root["others"]
+    kinds = tuple(kind.text() for kind in node["kind"].items())
+    known = {
+        name: node[name].tensor(len(kinds), *shape, integer=name in _INTEGERS)
+        for name, shape in _LABEL_FIELDS.items()
+    }
+    regions = node["ignore_xyxy"]
+    return node.build(lambda: Labels(kinds, **known, ignore_xyxy=regions.tensor(regions.rows(), 4)))
+
+
+def _labels_record(labels: Labels) -> dict[str, Any]:
+    values = {name: _numbers(getattr(labels, name)) for name in (*_LABEL_FIELDS, "ignore_xyxy")}
+    return {"kind": list(labels.kind), **values}
 
 
 def _record(folder: Path) -> _Node:

@@ -5,7 +5,7 @@ Axes, units, pixel centres and colour space are fixed in `conventions.md`, once 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import IntEnum
 from typing import Any, TypeVar
@@ -289,6 +289,8 @@ class SceneIR:
     """One frame, taken apart. photograph, background: (3, H, W) RGB in [0, 1], the background without the cars and
     their shadows, and equal to the photograph elsewhere; depth: (H, W) m of the background, inf in the sky.
     ignore: (K, 4) px, xyxy, regions no detection is judged in (DontCare). provenance: where it came from.
+    others: what `ignore` is where labels said so: their regions, then what they tell of all that is no object here
+    (people, trams), which stays in the picture as it is.
     front: what may stand in front of vehicles: drawn over those behind it, and part of the background too.
     before: the scene of which this is what became when a vehicle was exchanged, added or taken away; None where
     none was. It has the same objects, row by row; one that is not there stands behind the camera (`in_view`).
@@ -305,6 +307,7 @@ class SceneIR:
     provenance: Mapping[str, str] = field(default_factory=dict)
     front: tuple[Front, ...] = ()
     before: SceneIR | None = None
+    others: Labels | None = None
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width
@@ -313,6 +316,8 @@ class SceneIR:
         check_shape("scene.depth", self.depth, h, w)
         check_shape("scene.environment.sky", self.environment.sky, h, w)
         check_shape("scene.ignore", self.ignore, None, 4)
+        if self.others is not None:
+            check_shape("scene.ignore", self.ignore, len(self.others.ignore_xyxy) + len(self.others.kind), 4)
         check_indices("objects.mesh_index", self.objects.mesh_index, len(self.meshes))
         for i, source in enumerate(self.objects.source):
             for name in ("foreground", "shadow", "region"):
@@ -406,6 +411,12 @@ class Labels:
         check_shape("labels.yaw", self.yaw, m)
         check_shape("labels.size_lhw", self.size_lhw, m, 3)
         check_shape("labels.ignore_xyxy", self.ignore_xyxy, None, 4)
+
+    def rows(self, kept: Sequence[int]) -> Labels:
+        """Some of the objects, and all regions."""
+        columns = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
+        chosen = {name: getattr(self, name)[list(kept)] for name in columns}
+        return replace(self, kind=tuple(self.kind[row] for row in kept), **chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,101 +2,194 @@
 
     python -m tools.versions                                           # this Python, lowest and highest versions
     python -m tools.versions --python python3.11,python3.13 --tests    # also the quick tests
+    python -m tools.versions --versions pinned,highest --bare          # where there is no compiler, EGL and libusb
     python -m tools.versions --resolve                                 # only: do the versions go together?
 
-For each Python and each of "lowest" (each dependency of pyproject.toml at its lower bound) and "highest" (whatever
-pip finds), a wheel of the working tree is installed into a fresh virtual environment. From an empty folder it is
-asked for `drivesem doctor`, and for an attack on one generated street. Exit code 1 where anything fails.
+For each Python and each of "lowest" (each dependency of pyproject.toml at its lower bound), "pinned" (those of
+constraints.txt) and "highest" (whatever pip finds), a wheel of the working tree is installed into a fresh virtual
+environment. From an empty folder it is asked for `drivesem doctor`, and for the README's attack. The last lines
+are a table. Exit code 1 where anything fails. pip's own settings count, those of the machine too.
+
+--bare needs Linux and `unshare`: each command sees a /usr without these files, in a mount namespace of its own.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
-import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
 
 from scene_ir import files
 
 ROOT = Path(__file__).resolve().parents[1]
-ATTACK = "attack --limit 1 --steps 1 --combo 1 --nuisances off --workers 1 --out run"
-SETS = ("lowest", "highest")
+ATTACK = "attack --combo 2 --workers 1 --json --out run"
+QUICK = "--limit 1 --steps 1 --nuisances off"
+SETS = ("lowest", "pinned", "highest")
+PACKAGES = (
+    *("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia", "warp-lang", "open3d"),
+    *("trimesh", "matplotlib", "pillow", "tyro"),
+)
+"""Those whose versions are told."""
+HIDDEN = (
+    *("bin/*gcc*", "bin/*g++*", "bin/cc", "bin/c++", "bin/*clang*", "bin/ld*", "bin/*-linux-gnu-ld*"),
+    *(f"{lib}/{name}*" for lib in ("lib", "lib/*", "lib64") for name in ("libEGL", "libOSMesa", "libusb")),
+)
+"""What --bare hides, below /usr."""
 _MINUTES = 60
 """A step that takes longer is stopped."""
-Run = Callable[[Sequence[str], Path], str]
-"""Runs words in a folder; why they failed, in a line, or nothing."""
+_VERSIONS = f"""
+import json, platform
+from importlib.metadata import version
+print(json.dumps({{"Python": platform.python_version(), **{{name: version(name) for name in {PACKAGES!r}}}}}))
+"""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A step: why it failed, in a line, or nothing; what it said."""
+
+    failed: str = ""
+    said: str = ""
+
+
+Run = Callable[[Sequence[str], Path], Ended]
+"""Runs words in a folder."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one Python and one set of versions. failed: the step that failed, and why; empty where none."""
+    """What came of one Python and one set of versions. failed: the step that failed, and why; empty where none.
+    found: versions of Python and `PACKAGES`; parts: what `drivesem doctor` says of each; figures: the attack's.
+    """
 
     python: str
     versions: str
     failed: str
+    found: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, str] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
 
-def lowest(pyproject: Path) -> list[str]:
-    """Each dependency at its lower bound, `name==version`. ValueError for one without."""
+def lowest(pyproject: Path, python: str) -> list[str]:
+    """Each dependency at its lower bound, `name==version`, for a Python such as 3.11. ValueError where there is
+    none.
+    """
     wanted = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]["dependencies"]
     pins: list[str] = []
-    for text in wanted:
-        match = re.match(r"([A-Za-z0-9_.-]+)\s*>=\s*([0-9][0-9a-z.]*)", text)
-        if match is None:
-            raise ValueError(f"dependency {text!r}: expected a lower bound, name>=version")
-        pins.append(f"{match[1]}=={match[2]}")
+    for told in map(Requirement, wanted):
+        if told.marker is not None and not told.marker.evaluate({"python_version": python}):
+            continue
+        bounds = [one.version for one in told.specifier if one.operator == ">="]
+        if not bounds:
+            raise ValueError(f"dependency {str(told)!r}: expected a lower bound, name>=version")
+        pins.append(f"{told.name}=={bounds[0]}")
     return pins
 
 
-def run_words(words: Sequence[str], folder: Path) -> str:
+def hiding(work: Path, usr: Path = Path("/usr")) -> list[str]:
+    """Words before a command that hide `HIDDEN` from it. work: a folder for the layer of /usr that lacks it."""
+    upper, spare = work / "upper", work / "spare"
+    spare.mkdir(parents=True)
+    for path in sorted({path for pattern in HIDDEN for path in usr.glob(pattern)}):
+        mark = upper / path.relative_to(usr)
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        os.mknod(mark, 0o020000)  # a character device 0, 0: not there, to overlayfs
+    upper.mkdir(exist_ok=True)
+    layers = f"lowerdir={usr},upperdir={upper},workdir={spare}"
+    return ["unshare", "-rm", "sh", "-c", f'mount -t overlay overlay -o {layers} {usr} && exec "$@"', "sh"]
+
+
+def run_words(words: Sequence[str], folder: Path) -> Ended:
     """See `Run`."""
     own = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     try:
         ended = subprocess.run(words, cwd=folder, env=own, capture_output=True, text=True, timeout=60 * _MINUTES)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return str(error)
+        return Ended(str(error))
     lines = [line for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
-    return "" if ended.returncode == 0 else (lines[-1] if lines else f"exit code {ended.returncode}")
+    named = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]  # pytest's last line counts only
+    failed = "; ".join(named) or (lines[-1] if lines else f"exit code {ended.returncode}")
+    return Ended(failed if ended.returncode else "", ended.stdout)
 
 
 def tried(python: str, versions: str, wheel: str, work: Path, args: argparse.Namespace, run: Run) -> Outcome:
     """One Python and one set of versions. wheel: to install, or the tree."""
     environment, empty = work / "environment", work / "empty"
     empty.mkdir(parents=True)
-    own = str(environment / "bin" / "python")
-    install = [own, "-m", "pip", "install", "-q"]
+    before = hiding(work) if args.bare else []
+    own = [*before, str(environment / "bin" / "python")]
+    install = [*own, "-m", "pip", "install", "-q"]
     if versions == "lowest":
-        files.write_text(work / "lowest.txt", "".join(f"{pin}\n" for pin in lowest(ROOT / "pyproject.toml")))
+        told = run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], work).said.strip()
+        files.write_text(work / "lowest.txt", "\n".join(lowest(ROOT / "pyproject.toml", told or "3.11")) + "\n")
         install += ["-c", str(work / "lowest.txt")]
+    if versions == "pinned":
+        install += ["-c", str(ROOT / "constraints.txt")]
     install += ["--dry-run"] if args.resolve else []
     steps = {
-        "venv": [python, "-m", "venv", str(environment)],
+        "venv": [*before, python, "-m", "venv", str(environment)],
         "install": [*install, f"{wheel}[test]" if args.tests else wheel],
     }
     if not args.resolve:
-        steps["doctor"] = [own, "-m", "drivesem.cli", "doctor"]
-        steps["attack"] = [own, "-m", "drivesem.cli", *ATTACK.split()]
+        steps["versions"] = [*own, "-c", _VERSIONS]
+        steps["doctor"] = [*own, "-m", "drivesem.cli", "doctor", "--json"]
+        steps["attack"] = [*own, "-m", "drivesem.cli", *ATTACK.split(), *(QUICK.split() if args.quick else [])]
     if args.tests and not args.resolve:
-        steps["tests"] = [own, "-m", "pytest", "-q", "-m", "quick", "-p", "no:cacheprovider", str(ROOT / "tests")]
+        steps["tests"] = [*own, "-m", "pytest", "-q", "-m", "quick", "-p", "no:cacheprovider", str(ROOT / "tests")]
+    said: dict[str, Any] = {}
+    failed = ""
     for name, words in steps.items():
-        reason = run(words, ROOT if name == "tests" else empty)
-        if reason:
-            return Outcome(python, versions, f"{name}: {reason}")
-    return Outcome(python, versions, "")
+        ended = run(words, ROOT if name == "tests" else empty)
+        if ended.failed:
+            failed = f"{name}: {ended.failed}"
+            break
+        if name in ("versions", "doctor", "attack") and ended.said:
+            said[name] = json.loads(ended.said)
+    shutil.rmtree(environment, ignore_errors=True)  # gigabytes
+    parts = {part["name"]: part["status"] for part in said.get("doctor", {}).get("parts", ())}
+    if args.bare and not failed and parts.get("EGL") == "works":
+        failed = "doctor: EGL is hidden, and works"
+    figures = {key: said["attack"][key] for key in ("frames", "grades") if key in said.get("attack", {})}
+    named = f"{versions}, bare" if args.bare else versions
+    return Outcome(python, named, failed, said.get("versions", {}), parts, figures)
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """The outcomes in Markdown."""
+    heads = ("Python", "versions", *PACKAGES, "outcome")
+    rows = [
+        (
+            o.found.get("Python", Path(o.python).name),
+            o.versions,
+            *(o.found.get(name, "") for name in PACKAGES),
+            o.failed or "works",
+        )
+        for o in outcomes
+    ]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (heads, ("---",) * len(heads), *rows))
 
 
 def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
     """Entry point; exit code 0, or 1 where anything fails."""
     parser = argparse.ArgumentParser(prog="python -m tools.versions", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--python", default=sys.executable, help="interpreters, with commas")
-    parser.add_argument("--versions", default=",".join(SETS), help="lowest, highest, or both with a comma")
+    parser.add_argument("--versions", default="lowest,highest", help=f"some of {', '.join(SETS)}, with commas")
     parser.add_argument("--tests", action="store_true", help="also run the quick tests of the tree")
+    parser.add_argument(
+        "--quick", action="store_true", help="one frame and one step instead of the README's attack"
+    )
+    parser.add_argument("--bare", action="store_true", help="hide compilers, EGL, OSMesa and libusb")
     parser.add_argument("--resolve", action="store_true", help="only ask pip whether the versions go together")
     parser.add_argument("--out", help="JSON file for the outcomes")
     args = parser.parse_args(argv)
@@ -105,17 +198,20 @@ def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
     outcomes: list[Outcome] = []
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        reason = run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work), str(ROOT)], work)
-        if reason:
-            sys.stderr.write(f"the wheel cannot be made: {reason}\n")
+        made = run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work), str(ROOT)], work)
+        if made.failed:
+            sys.stderr.write(f"the wheel cannot be made: {made.failed}\n")
             return 1
         wheel = next((str(path) for path in work.glob("*.whl")), str(ROOT))
         for python in args.python.split(","):
             for versions in args.versions.split(","):
-                place = work / f"{Path(python).name}-{versions}"
+                place = work / f"{Path(python).name}-{versions}-{len(outcomes)}"
                 outcome = tried(python, versions, wheel, place, args, run)
                 outcomes.append(outcome)
+                lacking = ", ".join(name for name, status in outcome.parts.items() if status != "works")
                 sys.stdout.write(f"{python}, {versions}: {outcome.failed or 'works'}\n")
+                sys.stdout.write(f"    {dict(outcome.figures)}; without {lacking}\n" if lacking else "")
+    sys.stdout.write(f"\n{table(outcomes)}")
     if args.out:
         files.write_json(Path(args.out), [asdict(outcome) for outcome in outcomes])
     return 1 if any(outcome.failed for outcome in outcomes) else 0

@@ -389,4 +389,6 @@ def _ground_axes_of(scene: SceneIR) -> Tensor:
 
 def _within(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
     """start + change within [low, high], or up to `start` where that lies outside: 0 changes nothing."""
-    return torch.clamp(start + change, min=start.clamp(max=low), max=start.clamp(min=high))
+    value, lowest, highest = start + change, start.clamp(max=low), start.clamp(min=high)
+    # On a bound, where most codes begin, torch.clamp's gradient is 1, 0.5 or 0, as torch's version has it.
+    return torch.where((value >= lowest) & (value <= highest), value, torch.clamp(value.detach(), lowest, highest))

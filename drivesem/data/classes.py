@@ -44,9 +44,7 @@ class ClassMap:
         rows = [i for i, kind in enumerate(labels.kind) if kind in self.classes or kind in self.ignored]
         if len(rows) == len(labels.kind):
             return labels
-        columns = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
-        chosen = {name: getattr(labels, name)[rows] for name in columns}
-        return replace(labels, kind=tuple(labels.kind[i] for i in rows), **chosen)
+        return labels.rows(rows)
 
     def targets(self, labels: Labels) -> Targets:
         """What a detector is trained on and judged by.

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivesem.data.frames import images_in, size_of_image
 from drivesem.data.kitti import read_calib
-from drivesem.data.kitti_labels import label_folder
+from drivesem.data.kitti_labels import TYPES, label_folder
 from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
 from drivesem.data.registry import images_beside, write_table
 from drivesem.run.labels import layout_of, read
@@ -54,6 +54,8 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
         raise FormatError(f"{source}: truncation", "[0, 1], or -1 where it is not known", f"{odd[0]:g}")
     if how.mapping:
         table = renamed(table, how.mapping)
+    if layout == "run":
+        table = _as_far_as_held(table, how)
     found = images_in([how.images], table.frames) if how.images is not None else {}
     if how.images is None and (how.copy_images or (not table.sizes_wh.all() and how.size_wh is None)):
         beside = pictures if layout == "run" else partial(images_beside, layout=layout)
@@ -87,6 +89,19 @@ def renamed(table: LabelTable, mapping: Mapping[str, str | None]) -> LabelTable:
     kind = places[table.kind]
     table = replace(table, kinds=tuple(kinds), kind=kind, kind_ids=None)
     return table.rows(kind != left_out)
+
+
+def _as_far_as_held(table: LabelTable, how: Conversion) -> LabelTable:
+    """What a run leaves as it is, as regions where the layout has no place for it: types that KITTI does not have,
+    and in Virtual KITTI also what has no 3D box.
+    """
+    if how.to_format not in ("kitti", "vkitti1", "vkitti2"):
+        return table
+    held = {name.lower() for name in (*TYPES, *(name or "" for name in how.mapping.values()))}
+    region = np.array([*(name.lower() not in held for name in table.kinds), True], np.bool_)[table.kind]
+    if how.to_format != "kitti":
+        region |= ~np.isfinite(table.pose).all(axis=1)
+    return replace(table, kind=np.where(region, REGION, table.kind), ignore=table.ignore | region)
 
 
 def _calibrations(source: Path, table: LabelTable) -> dict[int, dict[str, Any]]:

@@ -1,11 +1,14 @@
 """A counterexample as a notebook holds it: one scene attacked in memory, by the way that `drivesem attack` goes.
 
+```pycon
 >>> import drivesem as ds
 >>> found = ds.attack(ds.demo_scene(0), "squeezedet", params="translate,rotate", steps=2)
 >>> found.picture.shape, found.feasible
 ((376, 1241, 3), True)
 >>> sorted(found.theta)[0]
 'objects[0].translate.across'
+
+```
 """
 
 from __future__ import annotations

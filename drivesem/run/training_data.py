@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from drivesem.data.frames import size_of_image
 from drivesem.data.kitti_labels import table_of
-from drivesem.data.label_table import LabelTable, camera_entry
+from drivesem.data.label_table import REGION, LabelTable, camera_entry, shortest
 from drivesem.run.labels import RESULT
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.truth.grades import Grade
 from scene_ir.errors import FormatError
-from scene_ir.io import load_camera
+from scene_ir.io import load_camera, load_others
 
 PICTURE, LABELS = "counterexample.png", "labels_moved.txt"
 """What of a frame is trained on."""
@@ -32,14 +33,16 @@ def pictures(run: Path, frames: Sequence[str]) -> dict[str, Path]:
 
 def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
     """A run's counterexamples as training data: moved labels with 3D boxes, cameras, sizes and names of the
-    pictures. "failure" is the grade of an object that the detector lost, in an extra column. frames: some of them,
-    by default all. FormatError naming a file that is not as it should be.
+    pictures. People and whatever else the scenes leave as it is keep their labels. "failure" is the grade of an
+    object that the detector lost, in an extra column. frames: some of them, by default all. FormatError naming a
+    file that is not as it should be.
     """
     names = sorted(p.parent.name for p in (run / "frames").glob(f"*/{RESULT}")) if frames is None else list(frames)
     if not names:
         raise FormatError(str(run / "frames"), f"frames with {RESULT}", "none")
     folders = [run / "frames" / name for name in names]
     table = table_of({name: str(folder / LABELS) for name, folder in zip(names, folders, strict=True)})
+    table = _with_others(table, folders)
     results = [load_frame(folder / RESULT) for folder in folders]
     sizes = [size_of_image(folder / PICTURE) for folder in folders]
     failure: list[str | None] = [None] * len(table)
@@ -56,6 +59,31 @@ def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
         image_files={i: f"{name}/{PICTURE}" for i, name in enumerate(names)},
         told={i: told_of(run, result) for i, result in enumerate(results)},
     )
+
+
+def _with_others(table: LabelTable, folders: Sequence[Path]) -> LabelTable:
+    """The table with the labels of what scenes leave as it is. Label files of a run tell of it as regions, the
+    last of each frame. FormatError where there are fewer.
+    """
+    found = [load_others(folder / "scene") for folder in folders]
+    kinds = sorted({*table.kinds, *(kind for others in found if others is not None for kind in others.kind)})
+    names = ("ignore", "truncation", "occlusion", "pose")
+    columns = {name: getattr(table, name).copy() for name in names}
+    kind = np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind]
+    for folder, others, rows in zip(folders, found, table.by_frame(), strict=True):
+        if others is None:
+            continue
+        count = len(others.kind)
+        own = slice(rows.stop - count, rows.stop)
+        if count > len(rows) or (table.kind[own] != REGION).any():
+            raise FormatError(str(folder / LABELS), f"at its end {count} DontCare, as the scene has", "others")
+        kind[own] = [kinds.index(name) for name in others.kind]
+        columns["ignore"][own] = False
+        columns["truncation"][own] = np.nan_to_num(shortest(others.truncation), nan=-1)
+        columns["occlusion"][own] = others.occlusion.numpy()
+        pose = torch.cat([others.size_lhw, others.translation, others.yaw[:, None]], dim=1)
+        columns["pose"][own] = np.reshape(shortest(pose), (count, 7))
+    return replace(table, kinds=tuple(kinds), kind=kind, **columns)
 
 
 def told_of(run: Path, result: FrameResult) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Scenes as a notebook holds them: a photograph taken apart, changed, rendered; nothing touches the disk unasked.
 
+```pycon
 >>> import drivesem as ds
 >>> scene = ds.demo_scene(0)
 >>> foggy = scene.edit("objects[1].translate=0.5m,0m", weather="fog", remove=[3])
@@ -7,6 +8,8 @@
 True
 >>> foggy.render().shape, foggy.render().dtype
 ((376, 1241, 3), dtype('uint8'))
+
+```
 """
 
 from __future__ import annotations

@@ -271,6 +271,9 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         provenance[f"objects[{index}].mesh"] = cut.placement.mesh.name
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
     picture = torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1)))
+    # People, trams, vehicles that could not be taken apart: they stay as they are, and no detection counts there.
+    taken = {cut.row for cut in cuts}
+    kept = labels.rows([row for row in range(len(labels.kind)) if row not in taken])
     scene = SceneIR(
         camera,
         meshes,
@@ -279,9 +282,10 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         frame.photograph.float(),
         picture,
         depth,
-        _not_judged(labels, [cut.row for cut in cuts]),
+        torch.cat([kept.ignore_xyxy, kept.boxes_xyxy]),
         provenance,
         tuple(front.layer(a, thing.depth_m) for a, thing in zip(opacities, things, strict=True) if a.any()),
+        others=kept,
     )
     if not cuts:
         return scene
@@ -294,15 +298,6 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         margins,
     )
     return paint.with_regions(solved, settings.backend)
-
-
-def _not_judged(labels: Labels, rows: Sequence[int]) -> torch.Tensor:
-    """Boxes (K, 4) px in which no detection counts: regions, and what was labelled but is none of the vehicles
-    `rows`: people, trams, vehicles that could not be taken apart. They stay in the picture as they are.
-    """
-    others = torch.ones(len(labels.kind), dtype=torch.bool)
-    others[list(rows)] = False
-    return torch.cat([labels.ignore_xyxy, labels.boxes_xyxy[others]])
 
 
 def _bytes(image: Array) -> NDArray[np.uint8]:

@@ -119,8 +119,9 @@ def test_options_are_the_commands() -> None:
 
 def test_examples_in_docstrings() -> None:
     for name in ("drivesem.scenes.scene", "drivesem.run.counterexample"):
-        result = doctest.testmod(importlib.import_module(name), raise_on_error=True)
-        assert result.attempted > 0
+        module = importlib.import_module(name)
+        assert doctest.testmod(module, raise_on_error=True).attempted > 0
+        assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations
 
 
 def test_a_scene_shows_and_tells_itself(scene: ds.Scene, tmp_path: Path) -> None:

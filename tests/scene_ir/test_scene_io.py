@@ -13,7 +13,7 @@ import torch
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene
-from scene_ir.types import Camera, Crop, Environment, Mesh, Objects, SceneIR, Source
+from scene_ir.types import Camera, Crop, Environment, Labels, Mesh, Objects, SceneIR, Source
 
 H, W = 12, 20
 
@@ -75,7 +75,11 @@ def rich_scene(seed: int = 0, count: int = 2, **changes: Any) -> SceneIR:
         depth=depth,
         ignore=rand(1, 4) * 9,
         provenance={"dataset": "kitti", "Straße": "läßt"},
-    )
+        others=Labels(
+            ("Cyclist",), rand(1, 4), torch.tensor([torch.nan]), torch.tensor([3]), rand(1, 3), rand(1),
+            rand(1, 3), torch.zeros(0, 4),
+        ),
+    )  # fmt: skip
     return dataclasses.replace(scene, **changes)
 
 
@@ -108,7 +112,9 @@ def float64_camera() -> Camera:
         pytest.param(rich_scene(), id="rich"),
         pytest.param(rich_scene(count=0), id="no-objects"),
         pytest.param(rich_scene(camera=float64_camera()), id="float64-no-projection"),
-        pytest.param(rich_scene(ignore=torch.zeros(0, 4), meshes=rich_scene().meshes[::-1]), id="no-ignore"),
+        pytest.param(
+            rich_scene(ignore=torch.zeros(0, 4), others=None, meshes=rich_scene().meshes[::-1]), id="no-ignore"
+        ),
         pytest.param(
             rich_scene().with_objects(box2d=torch.tensor([[torch.nan] * 4, [-torch.inf, 0, 1, 2]])), id="nan"
         ),
@@ -273,6 +279,8 @@ BAD = [
     ("category", edit("objects", "category", value=[0, 1.5]), r"objects: category: expected integers"),
     ("index", edit("objects", "mesh_index", value=[0, 7]), r"mesh_index: expected indices in \[0, 2\), found"),
     ("dtype", edit("ignore", value={"dtype": "object", "values": []}), r"ignore: dtype: expected one of"),
+    ("others", edit("others", "kind", value=[1]), r"others: kind\[0\]: expected text, found int"),
+    ("others-rows", edit("others", "kind", value=[]), r"others: boxes_xyxy: expected shape \(0, 4\), found"),
     ("weather", edit("environment", "weather", value=[0] * 3), r"environment: weather: expected shape \(4,\)"),
     ("sources", edit("sources", 1), r"objects\.source: expected 2 entries or none, found 1"),
     ("source", edit("sources", 0, "ffd"), r"sources\[0\]: ffd: expected a value"),

@@ -3,38 +3,54 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from tools.versions import ROOT, lowest, main, run_words
+from tools.versions import PACKAGES, ROOT, Ended, hiding, lowest, main, run_words
 
 
 class Recorder:
     """Takes no step but notes it; fails those whose words hold `failing`."""
 
-    def __init__(self, failing: str = "") -> None:
+    def __init__(self, failing: str = "", egl: str = "missing") -> None:
         self.steps: list[str] = []
         self.pins = ""
-        self.failing = failing
+        self.failing, self.egl = failing, egl
 
-    def __call__(self, words: Sequence[str], folder: Path) -> str:
+    def __call__(self, words: Sequence[str], folder: Path) -> Ended:
         line = " ".join(words)
         self.steps.append(line)
-        if "-c" in words and "install" in words:
+        if "-c" in words and "lowest.txt" in line:
             self.pins = Path(words[words.index("-c") + 1]).read_text()
-        return "no such version" if self.failing and self.failing in line else ""
+        if self.failing and self.failing in line:
+            return Ended("no such version")
+        if "sys.version_info" in line:
+            return Ended(said="3.13\n")
+        if "importlib.metadata" in line:
+            return Ended(said=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
+        if "doctor" in line:
+            return Ended(said=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
+        return Ended(
+            said=json.dumps({"frames": 10, "grades": {"certain": 3}, "more": 0}) if "attack" in line else ""
+        )
 
 
 def test_lower_bounds_are_pinned(tmp_path: Path) -> None:
     path = tmp_path / "pyproject.toml"
-    path.write_text('[project]\ndependencies = ["torch>=2.6", "warp-lang >= 1.19, <2"]\n')
-    assert lowest(path) == ["torch==2.6", "warp-lang==1.19"]
+    newer = """"numpy>=2.0; python_version < '3.13'", "numpy>=2.1; python_version >= '3.13'\""""
+    path.write_text(f'[project]\ndependencies = ["torch>=2.6", "warp-lang >= 1.19, <2", {newer}]\n')
+    assert lowest(path, "3.11") == ["torch==2.6", "warp-lang==1.19", "numpy==2.0"]
+    assert lowest(path, "3.13")[2] == "numpy==2.1"
     path.write_text('[project]\ndependencies = ["torch"]\n')
     with pytest.raises(ValueError, match="dependency 'torch': expected a lower bound"):
-        lowest(path)
-    assert any(pin.startswith("numpy==") for pin in lowest(ROOT / "pyproject.toml"))
+        lowest(path, "3.11")
+    for python in ("3.11", "3.12", "3.13"):
+        names = [pin.partition("==")[0] for pin in lowest(ROOT / "pyproject.toml", python)]
+        assert len(names) == len(set(names))
+        assert set(PACKAGES) <= set(names)
 
 
 def test_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,7 +66,33 @@ def test_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [(row["python"], row["versions"], row["failed"]) for row in told][:2] == [
         ("python8", "lowest", ""), ("python8", "highest", ""),
     ]  # fmt: skip
-    assert "python9, highest: works" in capsys.readouterr().out
+    assert told[0]["found"] == {"Python": "9.0.1", "torch": "9.1"}
+    assert told[0]["figures"] == {"frames": 10, "grades": {"certain": 3}}
+    out = capsys.readouterr().out
+    assert "python9, highest: works\n    {'frames': 10, 'grades': {'certain': 3}}; without EGL\n" in out
+    assert "| 9.0.1 | highest | 9.1 |" in out
+
+
+def test_pinned_and_bare(capsys: pytest.CaptureFixture[str]) -> None:
+    run = Recorder()
+    assert main(["--python", "python9", "--versions", "pinned", "--bare", "--quick"], run) == 0
+    within = [line for line in run.steps if line.startswith("unshare -rm")]
+    assert [
+        any(word in line for line in within) for word in ("-m venv", "constraints.txt", "doctor", "--limit 1")
+    ] == [True] * 4
+    assert main(["--python", "python9", "--versions", "pinned", "--bare"], Recorder(egl="works")) == 1
+    assert "doctor: EGL is hidden, and works" in capsys.readouterr().out
+
+
+def test_what_is_hidden_is_not_there(tmp_path: Path) -> None:
+    tried = subprocess.run(["unshare", "-rm", "true"], capture_output=True)
+    if tried.returncode:
+        pytest.skip("no mount namespace can be made here")
+    hidden = run_words(
+        [*hiding(tmp_path), "sh", "-c", "ls /usr/bin/env /usr/bin/*gcc* /usr/lib/*/libEGL*"], tmp_path
+    )
+    assert hidden.said == "/usr/bin/env\n"
+    assert "cannot access" in hidden.failed
 
 
 def test_a_failure_ends_one_set_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -70,6 +112,8 @@ def test_resolving_installs_nothing() -> None:
 
 
 def test_words_are_run(tmp_path: Path) -> None:
-    assert run_words(["python3", "-c", "pass"], tmp_path) == ""
-    assert run_words(["python3", "-c", "raise ValueError('so')"], tmp_path) == "ValueError: so"
-    assert "nowhere" in run_words(["nowhere"], tmp_path)
+    assert run_words(["python3", "-c", "print(7)"], tmp_path) == Ended("", "7\n")
+    assert run_words(["python3", "-c", "raise ValueError('so')"], tmp_path).failed == "ValueError: so"
+    tests = "print('FAILED a.py::b - so'); print('1 failed in 3 s'); raise SystemExit(1)"
+    assert run_words(["python3", "-c", tests], tmp_path).failed == "FAILED a.py::b - so"
+    assert "nowhere" in run_words(["nowhere"], tmp_path).failed

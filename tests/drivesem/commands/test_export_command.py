@@ -8,6 +8,7 @@ import importlib
 import io
 import json
 import math
+import shutil
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +22,12 @@ import trimesh
 from pycocotools.coco import COCO
 
 from drivesem.cli import main
+from drivesem.data.kitti import read_labels, write_labels
 from drivesem.data.vkitti2 import Vkitti2Dataset
 from drivesem.data.yolo import YoloDataset
 from drivesem.run.results import Failure, FrameResult, dump_frame, load_frame
 from scene_ir import files
-from scene_ir.io import load_scene
+from scene_ir.io import load_scene, save_scene
 
 GRADE = "certain"
 
@@ -154,6 +156,140 @@ def test_yolo_and_virtual_kitti_by_their_readers(layout: str, kind: Any, run: Pa
     assert float((frame.labels.boxes_xyxy - boxes).abs().max()) < (0.01 if layout == "yolo" else 1.01)
     shown = picture(run / "frames/demo-000/counterexample.png")[..., ::-1]
     assert np.array_equal((frame.photograph * 255).round().byte().permute(1, 2, 0).numpy(), shown)
+
+
+PEOPLE = (
+    "Pedestrian 0.00 1 -0.35 885.00 167.00 910.00 251.00 1.75 0.60 0.80 6.00 1.65 15.00 0.03",
+    "Cyclist 0.00 3 -10 100.50 170.25 130.75 210.00 -1 -1 -1 -1000 -1000 -1000 -10",
+    "Tram 0.20 2 -10 1100.00 120.00 1200.00 200.00 -1 -1 -1 -1000 -1000 -1000 -10",
+)
+REGION = "DontCare -1 -1 -10 300.00 160.00 330.00 175.00 -1 -1 -1 -1000 -1000 -1000 -10"
+
+
+@pytest.fixture(scope="module")
+def crowded(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a frame with people, a tram and a region without labels: its files as `attack` writes them."""
+    out = tmp_path_factory.mktemp("crowded") / "b"
+    shutil.copytree(run, out)
+    frame = out / "frames" / "demo-000"
+    files.write_text(out / "people.txt", "".join(f"{line}\n" for line in (REGION, *PEOPLE)))
+    others, scene = read_labels(out / "people.txt"), load_scene(frame / "scene")
+    ignore = torch.cat([others.ignore_xyxy, others.boxes_xyxy])
+    save_scene(replace(scene, ignore=ignore, others=others), frame / "scene")
+    moved = replace(read_labels(frame / "labels_moved.txt"), ignore_xyxy=ignore)
+    write_labels(frame / "labels_moved.txt", moved)
+    return out
+
+
+def people_of(lines: list[str]) -> list[list[str | float]]:
+    """Label lines of all but vehicles, as types and numbers."""
+    rows = [line.split() for line in lines if not line.startswith(("Car", "Van", "Truck"))]
+    return [[kind, *map(float, numbers)] for kind, *numbers in rows]
+
+
+def check_people(run: Path, out: Path, *words: str) -> None:
+    """KITTI's labels of an exported run have those that it was made from."""
+    export(run, "kitti", out, *words)
+    found = people_of((out / "training/label_2/demo-000.txt").read_text().splitlines())
+    expected = people_of([REGION, *PEOPLE])
+    assert [row[0] for row in found] == [row[0] for row in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert one[1:] == pytest.approx(other[1:], abs=0.01)  # alpha follows from the place
+
+
+def test_kitti_has_people_as_they_were_labelled(crowded: Path, tmp_path: Path) -> None:
+    check_people(crowded, tmp_path / "K")
+
+
+@pytest.mark.slow
+def test_an_attack_on_a_frame_with_people(run: Path, tmp_path: Path) -> None:
+    labels = export(run, "kitti", tmp_path / "K") / "training" / "label_2" / "demo-000.txt"
+    labels.write_text(labels.read_text() + "".join(f"{line}\n" for line in (*PEOPLE, REGION)))
+    words = ["attack", "--dataset", "kitti", "--root", str(tmp_path / "K"), "--no-fit", "--params", "color"]
+    words += ["--steps", "1", "--nuisances", "off", "--no-confirm", "--workers", "1"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    check_people(tmp_path / "run", tmp_path / "again", "--grade", "all")
+
+
+def test_coco_has_people_as_objects_and_regions_as_crowds(crowded: Path, tmp_path: Path) -> None:
+    out = export(crowded, "coco", tmp_path / "C")
+    with contextlib.redirect_stdout(io.StringIO()):
+        told = COCO(str(out / "annotations" / "instances_all.json"))
+    names = {row["id"]: row["name"] for row in told.loadCats(told.getCatIds())}
+    rows = told.loadAnns(told.getAnnIds(iscrowd=0))
+    for kind, *numbers in people_of(list(PEOPLE)):
+        (row,) = (row for row in rows if names[row["category_id"]] == kind)
+        left, top, right, bottom = numbers[3:7]
+        assert row["bbox"] == pytest.approx([left + 0.5, top + 0.5, right - left, bottom - top])
+        assert ("pose" in row) == (kind == "Pedestrian")
+    crowds = told.loadAnns(told.getAnnIds(iscrowd=1))
+    assert sorted(row["category_id"] for row in crowds) == sorted(names)  # of every class
+    assert {tuple(row["bbox"]) for row in crowds} == {(300.5, 160.5, 30.0, 15.0)}
+
+
+@pytest.mark.parametrize("layout", ["yolo", "vkitti2"])
+def test_people_by_the_readers_of_yolo_and_virtual_kitti(layout: str, crowded: Path, tmp_path: Path) -> None:
+    out = export(crowded, layout, tmp_path / "out")
+    dataset = YoloDataset(out) if layout == "yolo" else Vkitti2Dataset(out)
+    labels = dataset.frame(dataset.identifiers[0]).labels
+    assert labels is not None
+    found = dict(zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True))
+    for kind, *numbers in people_of(list(PEOPLE)):
+        if layout == "yolo" or kind == "Pedestrian":
+            assert found[str(kind)] == pytest.approx(numbers[3:7], abs=0.01)
+        else:  # Virtual KITTI holds nothing without a 3D box
+            assert kind not in found
+
+
+def test_fiftyone_has_people(crowded: Path, tmp_path: Path) -> None:
+    content = json.loads((export(crowded, "fiftyone", tmp_path / "F") / "labels.json").read_text())
+    kinds = [content["classes"][row["label"]] for row in content["labels"]["demo-000"]]
+    assert [kind for kind in kinds if kind not in ("Car", "Truck")] == ["Pedestrian", "Cyclist", "Tram"]
+
+
+def kitti_lines(run: Path, out: Path, *words: str) -> list[str]:
+    """What an exported label file has beside vehicles."""
+    lines = (export(run, "kitti", out, *words) / "training/label_2/demo-000.txt").read_text()
+    return [str(row[0]) for row in people_of(lines.splitlines())]
+
+
+@pytest.fixture
+def with_bus(crowded: Path, tmp_path: Path) -> Path:
+    """The run with a class that KITTI does not have in the place of the tram."""
+    again = tmp_path / "run"
+    shutil.copytree(crowded, again)
+    record = again / "frames/demo-000/scene/scene.json"
+    content = files.read_json(record)
+    content["others"]["kind"][2] = "bus"
+    files.write_json(record, content)
+    return again
+
+
+def test_what_kitti_has_no_type_for_is_a_region(
+    with_bus: Path, tmp_path: Path, refused: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert kitti_lines(with_bus, tmp_path / "a") == ["DontCare", "Pedestrian", "Cyclist", "DontCare"]
+    mapped = kitti_lines(with_bus, tmp_path / "b", "--map", "bus=Tram")
+    assert mapped == ["DontCare", "Pedestrian", "Cyclist", "Tram"]
+    words = [str(with_bus), "--to", "kitti", "--out", str(tmp_path / "c"), "--map", "bus=lorry"]
+    capsys.readouterr()
+    assert "class 'lorry': expected one of Car" in refused("export", *words)
+
+
+def test_scenes_and_label_files_that_do_not_tell_of_people(
+    with_bus: Path, tmp_path: Path, refused: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = with_bus / "frames/demo-000/scene/scene.json"
+    content = files.read_json(record)
+    files.write_json(record, {key: value for key, value in content.items() if key != "others"})
+    assert kitti_lines(with_bus, tmp_path / "a") == ["DontCare"] * 4  # as before scenes told of them
+    files.write_json(record, content)
+    labels = with_bus / "frames/demo-000/labels_moved.txt"
+    lines = labels.read_text().splitlines()
+    labels.write_text("".join(f"{line}\n" for line in lines if not line.startswith("DontCare")))
+    words = [str(with_bus), "--to", "kitti", "--out", str(tmp_path / "b")]
+    capsys.readouterr()
+    assert "labels_moved.txt: expected at its end 3 DontCare, as the scene has" in refused("export", *words)
 
 
 def test_provenance_says_where_a_picture_is_from(run: Path, tmp_path: Path) -> None:

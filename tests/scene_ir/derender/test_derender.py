@@ -168,6 +168,9 @@ def test_what_is_labelled_and_no_vehicle_is_a_region_beside_those_of_the_labels(
     scene = derender(replace(street.frame, labels=both), DerenderSettings(fit=False))
     assert len(scene.objects) == 1
     assert torch.equal(scene.ignore, torch.cat([region, walker]))
+    assert scene.others is not None
+    assert (scene.others.kind, scene.others.ignore_xyxy.tolist()) == (("Pedestrian",), region.tolist())
+    assert torch.equal(scene.others.translation, one.translation)
 
 
 def test_vans_are_cars_and_trucks_are_trucks(street):
