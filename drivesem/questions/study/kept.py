@@ -48,6 +48,7 @@ _MOST_BYTES = 1 << 28
 """Of a file, unpacked: some million detections."""
 _LEAST, _MOST = 1e-30, 1 << 31
 """No measure but 0 is below the one, and none reaches the other: ratios are finite."""
+_MEASURE = f"0, or from {_LEAST:g} to below {_MOST}"
 _MOST_DRAWS = 100_000
 """Of frames; and of an arm's steps and queries."""
 _OF_AN_ARM = ("detector", "method", "keep", "steps", "queries")
@@ -310,7 +311,7 @@ def _frames(path: Path, head: _Head) -> dict[_Key, FrameRow]:
         _require((row.arm, row.frame) not in found, where, "each frame once an arm", row.frame)
         for name in ("queries", "passes", "seconds", "size", "judged", "cars", "cars_moved"):
             value = getattr(row, name)
-            _require(value == 0 or _LEAST <= value < _MOST, f"{where}: {name}", "at least 0", value)
+            _require(value == 0 or _LEAST <= value < _MOST, f"{where}: {name}", _MEASURE, value)
         found[row.arm, row.frame] = row
     for key in wanted - found.keys():
         raise FormatError(str(path), f"a row of arm {key[0]}, frame {key[1]}", "none")
