@@ -432,7 +432,7 @@ def test_a_detectors_frames_are_shared_and_one_that_cannot_be_used_is_listed(
 
 
 def test_a_detectors_mistakes_are_drawn_worst_first(run: Run, tmp_path: Path, kitti_with_images: Path):
-    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
+    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0, "--workers", 1)
     code, data, _ = run(*words, "--out", tmp_path / "out", "--pictures", 1)
     assert code == 0
     assert data["intervals"] == []
@@ -444,7 +444,7 @@ def test_a_detectors_mistakes_are_drawn_worst_first(run: Run, tmp_path: Path, ki
 
 
 def test_truncation_decides_what_is_judged(run: Run, kitti_with_images: Path):
-    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0)
+    words = ("--detector", "squeezedet", "--root", kitti_with_images, "--bootstrap", 0, "--workers", 1)
     assert [run(*words, "--max-truncation", share)[1]["objects"] for share in (0.3, 0.5, 1.0)] == [1, 2, 3]
 
 
@@ -452,12 +452,16 @@ def test_a_detector_on_a_data_set(run: Run, tmp_path: Path, capsys: pytest.Captu
     root = tmp_path / "kitti"
     assert main(["synth", "--frames", "2", "--out", str(root), "--workers", "1"]) == 0
     capsys.readouterr()
-    code, data, _ = run("--detector", "squeezedet", "--root", root, "--out", tmp_path / "out", "--limit", 2)
+    code, data, _ = run(
+        "--detector", "squeezedet", "--root", root, "--out", tmp_path / "out", "--limit", 2, "--workers", 1
+    )
     assert code == 0
     assert (data["frames"], data["headline"], data["min_height"], data["max_occlusion"]) == (2, "Car", 25.0, 1)
     assert data["ap50"] == data["per_class"]["Car"]["ap50"]
     assert sorted(p.name for p in (tmp_path / "out/detections").iterdir()) == ["000000.txt", "000001.txt"]
-    more = run("--detector", "squeezedet", "--root", root, "--min-height", 0, "--max-occlusion", 3)[1]
+    more = run(
+        "--detector", "squeezedet", "--root", root, "--min-height", 0, "--max-occlusion", 3, "--workers", 1
+    )[1]
     assert more["objects"] >= data["objects"]
     names = [one["name"] for one in data["intervals"]]
     assert names == ["AP50", "recall"]
