@@ -93,7 +93,7 @@ def _shared(start: Start, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Ca
     left = list(jobs)
     while left:
         lost: list[J] = []
-        for job, outcome in _pooled(start, left, count, lost):
+        for job, outcome in _pooled(start, tuple(left), count, lost):
             left.remove(job)
             yield job, outcome
         # A process is gone, for want of memory say, and nobody knows at which of these: each has one try alone.

@@ -61,6 +61,11 @@ def test_processes_make_their_own_and_hand_errors_back() -> None:
         assert value[1] != os.getpid()
 
 
+def test_processes_begin_once_for_all_jobs() -> None:
+    found = in_order([job for job in range(20) if job != 3], Sharing(workers=2))
+    assert len({value[1] for value in found.values() if isinstance(value, tuple)}) == 2, "a start takes seconds"
+
+
 @pytest.mark.parametrize("kind", [ShapeError, RangeError, FormatError, UsageError])
 def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> None:
     error = kind("file:3", "a number", [1, 2])
