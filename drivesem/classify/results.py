@@ -171,19 +171,8 @@ class ClassifiedRun:
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
-        return {
-            "schema": SCHEMA,
-            "out": self.out,
-            "objects": self.objects,
-            "network": self.network,
-            "method": self.method,
-            "params": list(self.params),
-            "pictures": self.pictures,
-            "accuracy": {"benign": self.benign, "attacked": self.attacked},
+        accuracy = {"benign": self.benign, "attacked": self.attacked}
+        return {"schema": SCHEMA, **asdict(self), "pictures": self.pictures} | {
+            "accuracy": accuracy,
             "grades": self.grades,
-            "classes": [asdict(one) for one in self.classes],
-            "frames_failed": self.frames_failed,
-            "queries": self.queries,
-            "passes": self.passes,
-            "seconds": self.seconds,
         }

@@ -18,13 +18,13 @@ from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
+from drivesem.classify.paper import NETWORKS
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
 from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
 from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
-from drivesem.classify.study.paper import NETWORKS
 from drivesem.classify.study.retraining import RETRAINED, half, retrained
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.realism.asking import AVAILABLE, chosen

@@ -12,7 +12,7 @@ from rich.progress import track
 from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.study.paper import theirs
+from drivesem.classify.paper import theirs
 from drivesem.questions.realism.frechet import Gaussian, frechet
 from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures, psnr_db
 from drivesem.questions.worth.measures import Floats

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.objects.types import CLASSES, SPLITS
+from drivesem.classify.paper import NETWORKS, REMARKS, figures
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, NAMES, STRATEGIES, preset
 from drivesem.classify.study.figures import Answers, verdict
 from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE, Lab
 from drivesem.classify.study.looking import Eyes
-from drivesem.classify.study.paper import NETWORKS, REMARKS, figures
 from drivesem.classify.study.retraining import chances, right
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism.measures import METRICS, missing
