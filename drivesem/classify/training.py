@@ -16,6 +16,7 @@ from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
+from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import claim, folder_of
@@ -59,13 +60,15 @@ def train_run(config: Classify) -> dict[str, Any]:
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
+    counts = {name: len(split.labels) for name, split in splits.items()}
     data = {
         "out": str(out),
         "weights": str(path),
         "network": config.network,
         "layers": config.layers,
-        "pictures": {name: len(split.labels) for name, split in splits.items()},
+        "pictures": counts,
         "accuracy": accuracy,
+        "intervals": {name: wilson(round(accuracy[name] * count), count) for name, count in counts.items()},
         "epochs": curve,
         "frames_failed": failed,
         "seconds": round(time.perf_counter() - start, 3),
