@@ -2,12 +2,12 @@
 
     python -m tools.object_gradients [bus/0080:left ...] [--params vertex pose lighting] [--times 4]
 
-Along random directions, in which all coordinates move by a step in the root mean square (vertices: each by itself),
-derivatives by the gradient stand beside central differences: through the picture, times smooth noise, and through
-the shipped classifier's score of the true class. Printed are cosines over directions: with differences of the same,
-and with those of the picture drawn so many times as finely and averaged down, in which faces thinner than a pixel do
-not come and go; the score is linear in these, with its gradient at the picture. By default of one held-out object of
-each class, in a view that is not straight ahead.
+Along random directions, in which all coordinates move by a step in the root mean square (vertices: each by
+itself), derivatives by the gradient stand beside central differences: through the picture, times smooth noise,
+and through the shipped classifier's score of the true class. Printed are cosines over directions: with
+differences of the same, and with those of the picture drawn so many times as finely and averaged down, in which
+faces thinner than a pixel do not come and go; the score is linear in these, with its gradient at the picture. By
+default of one held-out object of each class, in a view that is not straight ahead.
 """
 
 from __future__ import annotations

@@ -27,6 +27,9 @@ from drivesem.classify.scenes import VIEWS, ObjectScene, camera, generated_backg
 from scene_ir import files
 from scene_ir.io import to_uint8
 
+_QUALITY = 80
+"""Of a JPEG."""
+
 
 @torch.no_grad()
 def row(objects: ObjectSet, names: list[str], views: list[str], size: int) -> np.ndarray:
@@ -89,7 +92,8 @@ def main() -> None:
         rows += [row(objects, chosen, told.views, told.size)] if chosen else []
     wide = max(one.shape[1] for one in rows)
     padded = [np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0))) for one in rows]
-    encoded = cv2.imencode(told.out.suffix, np.vstack(padded)[..., ::-1])[1]
+    sheet = np.vstack(padded)[..., ::-1]
+    encoded = cv2.imencode(told.out.suffix, sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
     files.write_bytes(told.out, encoded.tobytes())
 
 
