@@ -66,7 +66,7 @@ def cosines(
     """
     space = ObjectSpace(scene.vertices, (Moved(parameter),), Amounts(0.002, 0.15, 0.2))
     directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
-    picture, finer = (pictured(scene, space, times) for times in (1, told.times))
+    picture, finer = (pictured(scene, space, times) for times in (told.drawn, told.times))
     noise = torch.randn(1, 3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(0))
     seen = picture(space.theta0).requires_grad_(True)
     (felt,) = torch.autograd.grad(score(network, seen, scene), seen)
@@ -99,7 +99,8 @@ def main() -> None:
     parser.add_argument("--params", nargs="+", choices=list(STEPS), default=list(STEPS))
     parser.add_argument("--step", type=float, help="instead of each parameter's own")
     parser.add_argument("--directions", type=int, default=10)
-    parser.add_argument("--times", type=int, default=4)
+    parser.add_argument("--times", type=int, default=4, help="how much finer the picture is drawn for differences")
+    parser.add_argument("--drawn", type=int, default=1, help="and for gradients")
     told = parser.parse_args()
     objects = open_objects(told.objects)
     network = load_classifier("squeezenet", objects.classes)

@@ -35,7 +35,7 @@ class LeastChange:
     """One failure. source: digest of the run's result. share: of the change's size that is enough; angles, found:
     rad by axis, of the least change and of the whole one; vertex, light: the largest of each in the least change;
     dropped: what was left out; predicted: the class that it is called then; sign_changes: how often failing
-    begins or ends on the way to the whole change. `seconds` alone may differ between two calls.
+    begins or ends on the way to the whole change.
     """
 
     identifier: str
