@@ -82,7 +82,7 @@ class FailureWorker(ABC, Generic[K]):
 
     question: ClassVar[str]
     file: ClassVar[str]
-    kind: type[K]
+    kind: ClassVar[type[Any]]
     grades: ClassVar[Collection[str]] = tuple(Grade)
     needs_some: ClassVar[bool] = True
     free: ClassVar[tuple[str, ...]] = ()

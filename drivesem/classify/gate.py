@@ -73,7 +73,6 @@ def gate_run(config: Classify) -> tuple[bool, Answer]:
     rows = rows_of(pairs, config.tolerance, DRAWS, config.seed)
     passed = not any(row.grew for row in rows)
     facts = {"run": str(asked.run.folder), "before": asked.run.config.network, "after": config.network}
-    facts["tolerance"] = config.tolerance
-    answer = answer_of(asked.out, passed, rows, facts, asked.failed, _WORDS)
+    answer = answer_of(asked.out, passed, rows, facts | {"tolerance": config.tolerance}, asked.failed, _WORDS)
     answer.write()
     return passed, answer
