@@ -95,7 +95,7 @@ def unseal(run: Path) -> None:
     """Make a run's manifest as earlier versions wrote it."""
 
     def earlier(data: dict[str, Any]) -> None:
-        del data["settings"], data["metrics"]
+        del data["settings"], data["metrics"], data["fields"]
         kept = {"benign.png", "rerender.png", "counterexample.png", "theta.json", "labels_paper.txt"}
         for name, hashes in data["frames"].items():
             data["frames"][name] = {part: hashes[part] for part in hashes.keys() & {*kept, "labels_moved.txt"}}
@@ -395,8 +395,8 @@ def nested(*keys: Any, value: Any) -> Callable[[Any], None]:
         (nested("t_star", value=0.6), "metrics.json: t_star"),
         (nested("passes", value=1), "metrics.json: passes"),
         (nested("phantoms_by_class", "Car", value=5), "metrics.json: phantoms_by_class.Car"),
-        (nested("frames_without_vehicles", value=9), "metrics.json"),
-        (nested("frames_failed", value={"demo-007": "why"}), "metrics.json"),
+        (nested("frames_without_vehicles", value=9), "metrics.json: frames_without_vehicles"),
+        (nested("frames_failed", value={"demo-007": "why"}), "metrics.json: frames_failed"),
     ],
 )
 def test_each_figure_of_the_run(
@@ -409,16 +409,21 @@ def test_each_figure_of_the_run(
 @pytest.mark.parametrize(
     ("edit", "field"),
     [
-        (nested("loss_trace", value=[9.0]), "result.json"),
+        (nested("loss_trace", value=[9.0]), "result.json: loss_trace"),
         (nested("queries", value=1), "metrics.json: queries"),
-        (nested("active_constraints", value=["objects[0]: road"]), "result.json"),
+        (nested("queries", value=1), "result.json: queries"),
+        (nested("active_constraints", value=["objects[0]: road"]), "result.json: active_constraints"),
+        (nested("violated_at_start", value=["objects[0]: road"]), "result.json: violated_at_start"),
+        (nested("became_ignored", value=[0]), "result.json: became_ignored"),
+        (nested("checked_by", value="open3d"), "result.json: checked_by"),
+        (nested("change", value="a car is gone"), "result.json: change"),
         (nested("identity_psnr_db", value=31.0), "identity_psnr_db"),
         (nested("failures", 0, "index", value=1), "failures[0].index"),
         (
             nested("failures", 0, "peer", value={"by": "yolov3-slim", "before": 8, "after": 8, "draws": 8}),
-            "result.json",
+            "result.json: failures",
         ),
-        (nested("grade_notes", value=["no peer"]), "result.json"),
+        (nested("grade_notes", value=["no peer"]), "result.json: grade_notes"),
     ],
 )
 def test_each_figure_of_a_frame(
@@ -426,6 +431,13 @@ def test_each_figure_of_a_frame(
 ) -> None:
     change(run / FRAME / "result.json", edit)
     assert {field, "result.json"} <= set(told(verify(run)))
+
+
+def test_runs_from_before_values_had_hashes_of_their_own(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    change(run / "manifest.json", lambda data: data.pop("fields"))
+    verify(run, code=0)
+    change(run / FRAME / "result.json", nested("loss_trace", value=[9.0]))
+    assert set(told(verify(run))) == {"result.json"}
 
 
 def test_settings_overlays_and_files_that_were_added_or_taken_away(
