@@ -28,6 +28,8 @@ def raised(error: Exception) -> str:
     """What a user's code raised, and where: `ValueError: why (mine.py:12, in forward)`. The place is the innermost
     outside of installed libraries and of this package.
     """
+    if isinstance(error, SyntaxError) and error.filename:  # no line of it was run
+        return f"{type(error).__name__}: {error.msg} ({Path(error.filename).name}:{error.lineno})"
     place = (outside(error) or traceback.extract_tb(error.__traceback__))[-1]
     said = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {said} ({Path(place.filename).name}:{place.lineno}, in {place.name})"

@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from detectors.adapters.module import RAISES_NOTHING
 from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
@@ -42,7 +43,7 @@ def run(config: Check) -> int:
     else:
         _print(report, config, Console())
     if report.raised:
-        raise UsageError("--detector", "methods that raise nothing", report.raised[0].said)
+        raise UsageError("--detector", RAISES_NOTHING, report.raised[0].said)
     return 1 if report.failed else 0
 
 

@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def table(found: Sequence[tuple[Case, Done, list[str]]]) -> Table:
-    """By families: how many, and the most that one took."""
+    """By families: how many, and the most that one took of those that are to refuse something."""
     columns = ("family", "cases", "clean", "most s", "of", "most MB", "of ")
     shown = Table()
     for column in columns:
@@ -77,12 +77,13 @@ def table(found: Sequence[tuple[Case, Done, list[str]]]) -> Table:
         ours = [one for one in found if one[0].family == family]
         if not ours:
             continue
-        timed = [one for one in ours if not one[0].unlimited]
-        slowest = max(timed, key=lambda one: one[1].seconds, default=None)
-        largest = max(ours, key=lambda one: one[1].mb)
+        limited = [one for one in ours if not one[0].unlimited]
+        slowest = max(limited, key=lambda one: one[1].seconds, default=None)
+        largest = max(limited, key=lambda one: one[1].mb, default=None)
         clean = sum(not wrong for _, _, wrong in ours)
         seconds = (f"{slowest[1].seconds:.1f}", slowest[0].name) if slowest else ("", "")
-        shown.add_row(family, str(len(ours)), str(clean), *seconds, f"{largest[1].mb:.0f}", largest[0].name)
+        memory = (f"{largest[1].mb:.0f}", largest[0].name) if largest else ("", "")
+        shown.add_row(family, str(len(ours)), str(clean), *seconds, *memory)
     ended = [done.ended_s for case, done, _ in found if case.signals is not None]
     if ended:
         shown.caption = f"after a signal, at most {max(ended):.1f} s until all processes were gone"

@@ -66,7 +66,7 @@ def _trust() -> Iterator[Case]:
             "active_constraints",
         ),
         "identity PSNR": (edited(RESULT, "identity_psnr_db", value=31.0), "identity_psnr_db"),
-        "a failure's index": (edited(RESULT, "failures", 0, "index", value=1), "failures[0].index"),
+        "a failure's index": (edited(RESULT, "failures", 0, "index", value=None), "result.json: failures"),
         "a failure that is a phantom": (edited(RESULT, "failures", 0, "kind", value="phantom"), "phantoms"),
         "a failure's grade": (edited(RESULT, "failures", 0, "grade", value="certain"), "failures[0].grade"),
         "a peer's opinion": (
@@ -217,7 +217,7 @@ READERS: Mapping[str, tuple[Make, str, str]] = {
     "manifest.json of synth": (
         inputs.layout("kitti"),
         "kitti/manifest.json",
-        "drivesem drive --dataset kitti --root kitti --out out",
+        "drivesem drive kitti --out out",
     ),
     "a preset": (inputs.nothing, "preset.yaml", "drivesem attack --config preset.yaml"),
     "a budget": (inputs.nothing, "budget.yaml", "drivesem attack --budget budget.yaml --out out"),
@@ -264,7 +264,9 @@ def _tracebacks() -> Iterator[Case]:
     yield Case("photograph of 1x1: KITTI", "tracebacks", make, DERENDER, ("1x1 px",))
     for value in (10**9, -(10**9), 1e300):
         make = both(scene, edited("scene/scene.json", "sources", 0, "foreground", "x0", value=value))
-        yield Case(f"crop x0 = {value:g}", "tracebacks", make, "drivesem render scene", ("scene.json", "x0"))
+        yield Case(
+            f"crop x0 = {value:g}", "tracebacks", make, "drivesem render scene", ("scene.json", "foreground")
+        )
     for table, key, value, said in (
         ("images", "id", [1], "images[0].id"),
         ("categories", "id", [1], "categories[0].id"),
@@ -307,8 +309,8 @@ def _tracebacks() -> Iterator[Case]:
     for command in ("convert kitti --to coco --out out", DERENDER.removeprefix("drivesem ")):
         for what, lines, said in (
             ("height -1.5", {8: "-1.5"}, "height"),
-            ("truncation -5", {1: "-5"}, "truncation"),
-            ("truncation 1.5", {1: "1.5"}, "truncation"),
+            ("truncation -5", {1: "-5"}, "truncat"),
+            ("truncation 1.5", {1: "1.5"}, "truncat"),
         ):
             name = f"{what}: {command.partition(' ')[0]}"
             yield Case(name, "tracebacks", kitti(lines=lines), f"drivesem {command}", ("n00000", said))
@@ -346,7 +348,7 @@ def _signals() -> Iterator[Case]:
                 unlimited=True,
             )
     make = both(kitti(), text("script.py", inputs.SCRIPT))
-    yield Case("two workers, no main guard", "signals", make, "script.py", code=0, unlimited=True)
+    yield Case("two workers, no main guard", "signals", make, "python script.py", code=0, unlimited=True)
 
 
 def _own() -> Iterator[Case]:
@@ -363,12 +365,26 @@ def _own() -> Iterator[Case]:
     make = detector(beside="import nowhere")
     yield Case("raises when imported: check", "own detectors", make, CHECK_MINE, ("nowhere",))
     make = detector(beside="def broken(:")
-    yield Case("no Python: check", "own detectors", make, CHECK_MINE, ("SyntaxError",))
-    words = f"{ATTACK} --detector module:mine.py:Mine"
-    for name, method in {"forward": "def forward(self, images):", "decode": "def decode(self, raw):"}.items():
+    yield Case("no Python: check", "own detectors", make, CHECK_MINE, ("SyntaxError", "(mine.py:2)"))
+    mine, looks = "--detector module:mine.py:Mine", "drivesem eval --dataset kitti --root kitti --workers 1"
+    words = f"{ATTACK} {mine}"
+    for name, method, command in (
+        ("forward: attack", "def forward(self, images):", words),
+        ("decode: attack", "def decode(self, raw):", words),
+        ("loss: attack", "def loss(self, raw, targets):", words),
+        (
+            "decode: eval",
+            "def decode(self, raw):",
+            f"drivesem eval {mine} --dataset kitti --root kitti --workers 1",
+        ),
+        ("decode: drive", "def decode(self, raw):", f"drivesem drive {mine} --limit 4 --out out"),
+    ):
         make = both(kitti(), detector(method, 'raise KeyError("wheels")'))
-        yield Case(
-            f"raises in {name}: attack", "own detectors", make, words, ("KeyError", f"mine.py:7, in {name}")
-        )
+        says = ("--detector", "KeyError", f"mine.py:7, in {name.partition(':')[0]}")
+        yield Case(f"raises in {name}", "own detectors", make, command, says)
+    make = both(kitti(), detector("def decode(self, raw):", 'raise KeyError("wheels")'))
+    two = words.replace("--workers 1", "--workers 2")
+    says = ("--detector", "mine.py:7, in decode")
+    yield Case("raises in decode: attack, two workers", "own detectors", make, two, says, unlimited=True)
     make = both(kitti(), text("mine.py", inputs.BLIND))
     yield Case("finds no car: attack", "own detectors", make, words, ("--detector", "finds something"))

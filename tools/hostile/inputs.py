@@ -52,9 +52,10 @@ class Ground:
         words = f"attack --dataset kitti --root {self.kitti} --no-fit --params weather,translate,rotate"
         words += " --method random --queries 8 --limit 1 --workers 1 --out"
         out = self._folder / "run"
-        done = subprocess.run([sys.executable, "-m", "drivesem.cli", *words.split(), str(out)], check=False)
+        whole = [sys.executable, "-m", "drivesem.cli", *words.split(), str(out)]
+        done = subprocess.run(whole, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise RuntimeError(f"the run that is to be spoiled: exit code {done.returncode}")
+            raise RuntimeError(f"the run that is to be spoiled: exit code {done.returncode}: {done.stderr[-500:]}")
         return out
 
 
@@ -265,9 +266,9 @@ def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | No
 
 
 def equal_detections(ground: Ground, place: Path) -> None:
-    """80,000 times the same, as `found`."""
-    label = (ground.kitti / "training" / "label_2" / "n00000.txt").read_text().strip()
-    files.write_text(place / "found" / "n00000.txt", f"{label} 0.5\n" * 80_000)
+    """80,000 times the same in a frame, as `found`."""
+    for path in (ground.kitti / "training" / "label_2").iterdir():
+        files.write_text(place / "found" / path.name, f"{path.read_text().strip()} 0.5\n" * 80_000)
 
 
 def coco(table: str, key: str, value: Any) -> Make:

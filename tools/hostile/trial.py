@@ -69,7 +69,7 @@ class Signals:
 class Case:
     """make: writes what the command is given into an empty folder, in which it is then typed; words: the command;
     code: the exit code that is right; says: what its one line must name; signals: what is sent to it. unlimited:
-    it really works, so that its processor time is not looked at.
+    it really works, so that it may take its time and its memory.
     """
 
     name: str
@@ -128,7 +128,7 @@ def judge(case: Case, done: Done) -> list[str]:
     wrong += _wrong_lines(case, done)
     if not case.unlimited and done.seconds > SECONDS:
         wrong.append(f"{done.seconds:.1f} s of the processor, more than {SECONDS:g}")
-    if done.mb > MEMORY_MB:
+    if not case.unlimited and done.mb > MEMORY_MB:
         wrong.append(f"{done.mb:.0f} MB, more than {MEMORY_MB}")
     if done.mark:
         wrong.append("foreign code was run")
@@ -159,7 +159,7 @@ def _wrong_lines(case: Case, done: Done) -> list[str]:
 
 
 def words_of(case: Case) -> list[str]:
-    """The process that is started: `drivesem` is this checkout's, by the Python that runs this."""
+    """The process that is started: `drivesem` is this checkout's, and `python` the one that runs this."""
     first, *rest = shlex.split(case.words)
     return [sys.executable, *(("-m", "drivesem.cli") if first == "drivesem" else ()), *rest]
 

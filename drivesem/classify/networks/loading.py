@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import detectors.registry
+from detectors.reading import unreadable
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
@@ -147,9 +148,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     except OSError as error:
         raise FormatError(str(path), "a file that can be read", error.strerror) from error
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise FormatError(
-            str(path), "tensors by name, as torch.save writes them", str(error).splitlines()[0]
-        ) from error
+        raise FormatError(str(path), "tensors by name, as torch.save writes them", unreadable(error)) from error
     if not isinstance(loaded, dict) or not all(isinstance(tensor, Tensor) for tensor in loaded.values()):
         raise FormatError(str(path), "tensors by name (a state_dict)", type(loaded).__name__)
     return {str(name): tensor for name, tensor in loaded.items() if tensor.is_floating_point()}

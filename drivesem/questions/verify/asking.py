@@ -26,7 +26,7 @@ from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-_WHOLE_RUN = "(run)"
+WHOLE_RUN = "(run)"
 """Stands for a frame's name where a difference is the run's."""
 _NOT_COMPUTED = ("schema", "out", "seconds", "frames_without_vehicles", "frames_failed")
 """Of metrics.json: what does not follow from the frames. The last two are in its hash."""
@@ -153,7 +153,7 @@ def _data(
 ) -> dict[str, Any]:
     """JSON's form."""
     differences: list[tuple[str, Disagreement]] = [(c.identifier, d) for c in checked for d in c.differences]
-    differences += [(_WHOLE_RUN, d) for d in totals.differences]
+    differences += [(WHOLE_RUN, d) for d in totals.differences]
     rows = []
     for check, holds in CHECKS.items():
         ours = [(name, d) for name, d in differences if d.check == check]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -257,6 +258,22 @@ def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> Non
     share = f"up to 128 levels off, in {100 * 1600 / (image.shape[0] * image.shape[1]):.3g} % of the pixels"
     found = {d["field"]: d["found"] for d in data["differences"] if d["check"] == "pictures"}
     assert found == dict.fromkeys(pictures, share)
+
+
+def test_what_is_wrong_in_many_ways_hides_nothing_else(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A picture with other detections makes differences by the dozen."""
+    result = run / FRAME / "result.json"
+    change(result, lambda data: data["detections_benign"].extend(data["detections_benign"] * 40))
+    settings = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99"))
+    capsys.readouterr()
+    assert main(["verify", "--run", str(run), "--workers", "1"]) == 1
+    said = capsys.readouterr().out
+    lines = [line for line in said.splitlines() if ": expected " in line]
+    assert lines[0].startswith("(run): ")
+    assert "(run): settings: config.yaml: steps: expected 99, found 10" in lines
+    assert len([line for line in lines if ": detections: " in line]) == 5
+    assert re.search(r"^and \d+ more$", said, re.MULTILINE)
 
 
 def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
