@@ -62,8 +62,8 @@ def do(job: Any) -> Any:
 
 def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
     """A job's result. SceneError where the device has no room for it, UsageError for what a user's own detector
-    raised. keep_going: this, and an error for which no input is to blame, becomes UnforeseenError, which says where
-    it arose.
+    raised. keep_going: this, and an error for which no input is to blame, becomes UnforeseenError, which says
+    where it arose.
     """
     try:
         result = work(job)

@@ -372,11 +372,7 @@ def _own() -> Iterator[Case]:
         ("forward: attack", "def forward(self, images):", words),
         ("decode: attack", "def decode(self, raw):", words),
         ("loss: attack", "def loss(self, raw, targets):", words),
-        (
-            "decode: eval",
-            "def decode(self, raw):",
-            f"drivesem eval {mine} --dataset kitti --root kitti --workers 1",
-        ),
+        ("decode: eval", "def decode(self, raw):", f"{looks} {mine}"),
         ("decode: drive", "def decode(self, raw):", f"drivesem drive {mine} --limit 4 --out out"),
     ):
         make = both(kitti(), detector(method, 'raise KeyError("wheels")'))
