@@ -26,7 +26,7 @@ def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
     """Make `folder`, KITTI's layout: a car a frame, cut from so many generated streets."""
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
         words = ["synth", "--frames", str(streets), "--seed", "11", "--workers", "2", "--out", temporary]
-        subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True)
+        subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True, stdout=subprocess.DEVNULL)
         source = Path(temporary) / "training"
         cars = {path.stem: objects_of(path) for path in sorted((source / "label_2").glob("*.txt"))}
         shown = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]

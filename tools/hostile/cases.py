@@ -377,7 +377,8 @@ def _own() -> Iterator[Case]:
     ):
         make = both(kitti(), detector(method, 'raise KeyError("wheels")'))
         says = ("--detector", "KeyError", f"mine.py:7, in {name.partition(':')[0]}")
-        yield Case(f"raises in {name}", "own detectors", make, command, says)
+        works = "drive" in name  # a clip is taken apart before anybody looks at it
+        yield Case(f"raises in {name}", "own detectors", make, command, says, unlimited=works)
     make = both(kitti(), detector("def decode(self, raw):", 'raise KeyError("wheels")'))
     two = words.replace("--workers 1", "--workers 2")
     says = ("--detector", "mine.py:7, in decode")
