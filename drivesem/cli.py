@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 nobody reads
     on, 143 ended by SIGTERM.
     """
-    with _interrupted_once():
+    with _interrupted_once(last=argv is None):
         return _main(argv)
 
 
@@ -72,9 +72,10 @@ class _EndedError(KeyboardInterrupt):
 
 
 @contextmanager
-def _interrupted_once() -> Iterator[None]:
+def _interrupted_once(last: bool) -> Iterator[None]:
     """Let SIGTERM, which systems that share machines send before they kill, end a command as Ctrl-C does. While a
-    command ends, neither counts again, so that it can clean up, also after this: until the process is gone.
+    command ends, neither counts again for some seconds, so that it can clean up. last: the process does nothing
+    else, and they do not count again at all once the command is done.
     """
     if threading.current_thread() is not threading.main_thread():  # a signal's handler can't be set elsewhere
         yield
@@ -93,9 +94,8 @@ def _interrupted_once() -> Iterator[None]:
     try:
         yield
     finally:
-        if interrupted_s == -math.inf:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_IGN if last and interrupted_s > -math.inf else handler)
 
 
 def _tell_of_code(config: Command) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 
@@ -42,7 +43,8 @@ def test_what_comes_again_while_a_command_ends_changes_nothing(
         return 0
 
     monkeypatch.setattr(cli, "_run", work)
-    assert cli.main(["doctor"]) == code
+    monkeypatch.setattr(sys, "argv", ["drivesem", "doctor"])
+    assert cli.main() == code
     send(again)  # as Python ends
     assert cleaned == [True]
 
@@ -60,6 +62,7 @@ def test_after_some_seconds_it_counts_again(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(cli, "_run", work)
     assert cli.main(["doctor"]) == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler, "Python goes on"
 
 
 def test_a_command_that_is_not_interrupted_leaves_handlers_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
