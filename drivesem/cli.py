@@ -110,7 +110,9 @@ def _tell_of_code(config: Command) -> None:
 def _of_detector(error: Exception) -> UsageError | None:
     """An error that a detector of the user's own raised, as one of the setting that names it."""
     module = sys.modules.get("detectors.adapters.module")  # nothing heavy is imported to find out
-    told = None if module is None or _is_bad_input(error) else module.blamed(error)
+    if module is None or _is_bad_input(error):
+        return None
+    told = module.blamed(error)
     return None if told is None else UsageError("--detector", module.RAISES_NOTHING, told)
 
 
