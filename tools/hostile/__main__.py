@@ -21,6 +21,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -97,7 +98,7 @@ def failure(case: Case, done: Done, wrong: Sequence[str]) -> str:
     return "\n".join([*lines, *(f"  | {line}" for line in said[-_TOLD_LINES:])])
 
 
-def row(case: Case, done: Done, wrong: Sequence[str]) -> dict[str, object]:
+def row(case: Case, done: Done, wrong: Sequence[str]) -> dict[str, Any]:
     """One case, for JSON."""
     facts = {key: value for key, value in asdict(done).items() if key not in ("out", "err")}
     names = {"name": case.name, "family": case.family, "command": case.words}
