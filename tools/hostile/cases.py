@@ -317,7 +317,7 @@ def _tracebacks() -> Iterator[Case]:
 
 
 def _signals() -> Iterator[Case]:
-    attack = "drivesem attack --combo 2 --workers 2 --out out"
+    attack = "drivesem attack --combo 2 --no-fit --steps 2 --no-grade --workers 2 --out out"
     begun, first = "out/config.yaml", "out/frames/demo-*"
     moments = [
         ("", 0.5),
