@@ -177,19 +177,20 @@ def run(case: Case, folder: Path, ground: Ground) -> Done:
         if not _soon(started.exists):
             raise RuntimeError(f"{case.name}: the command did not start")
         session = int(started.read_text())
-        sent = _send(case.signals, session, place) if case.signals is not None else 0.0
+        used, sent, ended, left = {}, 0.0, 0.0, []
         try:
+            sent = _send(case.signals, session, place) if case.signals is not None else 0.0
             launcher.wait(_STUCK_SECONDS)
+            used = json.loads(answer.read_text())
+            # What was interrupted may take so long; what ended by itself has nothing to wait for.
+            _soon(lambda: not _members(session), max(sent + END_SECONDS - time.monotonic(), 0) if sent else 1.0)
         except subprocess.TimeoutExpired:
             pass
-        finally:
-            used = json.loads(answer.read_text()) if launcher.poll() is not None else {}
-        # What was interrupted may take as long as it may take; what ended by itself has nothing to wait for.
-        _soon(lambda: not _members(session), max(sent + END_SECONDS - time.monotonic(), 0) if sent else 1.0)
-        ended, left = time.monotonic(), _members(session)
-        for pid in left:
-            _signal(os.kill, pid, signal.SIGKILL)
-        launcher.wait()
+        finally:  # also where this one is interrupted
+            ended, left = time.monotonic(), _members(session)
+            for pid in left:
+                _signal(os.kill, pid, signal.SIGKILL)
+            launcher.wait()
     said = [(folder / name).read_text(errors="replace") for name in ("out.txt", "err.txt")]
     return Done(
         code=used.get("code"),
