@@ -320,8 +320,8 @@ def _signals() -> Iterator[Case]:
     attack = "drivesem attack --combo 2 --no-fit --steps 2 --no-grade --workers 2 --out out"
     begun, first = "out/config.yaml", "out/frames/demo-*"
     moments = [
-        ("", 0.5),
-        ("", 1.5),
+        ("", 2.0),
+        ("", 3.0),
         (begun, 0.0),
         (begun, 1.0),
         (begun, 3.0),
