@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from drivesem.attack.methods.base import Attack
 from drivesem.classify.grading import PictureGrader
@@ -33,7 +32,7 @@ from drivesem.run.records import dump_record, load_record
 from drivesem.settings.commands import Classify
 from drivesem.settings.errors import UsageError
 from drivesem.truth.certificate import Rule
-from drivesem.truth.grades import Count, Grade
+from drivesem.truth.grades import Grade
 from drivesem.truth.nuisances import Nuisances
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -108,81 +107,44 @@ class Attacker:
         )
 
     def attack(self, shown: Shown, out: Path) -> None:
-        """One picture, to its folder. Raises SceneError."""
+        """One picture, to its folder; one that is misclassified as it is stays as it is. Raises SceneError."""
         start = time.perf_counter()
         scene, space = self.scene(shown)
         try:
-            found = attack_picture(scene, space, self)
+            objective = ClassifierObjective(scene, space, self.network, aimed_by(self.config))
+            wrong = not objective.benign.right
+            search = None if wrong else self.method(objective.problem(), space.theta0, self.config.seed)
         except (RangeError, ShapeError) as error:
             raise type(error)(f"{shown.identifier}: {error.field}", error.expected, error.actual) from error
+        theta = space.theta0 if search is None else search.theta
+        before, after = objective.picture(space.theta0), objective.picture(theta)
+        attacked, passes = objective.see(theta), objective.passes
+        failed, count = search is not None and not attacked.right, None
+        if failed and self.config.grade:
+            count = self.grader.count(scene.identifier, objective.look, before, after)
+        certain = count is not None and self.grader.rule.holds(count)
         classes = self.network.classes
         record = ClassifiedFrame(
             identifier=shown.identifier,
             object=shown.name,
             label=classes[scene.model.label],
             view=shown.view,
-            benign=verdict(found.benign, classes),
-            attacked=verdict(found.attacked, classes),
-            grade=found.grade,
-            count=found.count,
-            sizes=space.sizes(found.theta),
-            moved=space.few(found.theta),
-            loss_trace=found.loss_trace,
-            queries=found.queries,
-            passes=found.passes,
+            benign=verdict(objective.benign, classes),
+            attacked=verdict(attacked, classes),
+            grade=str(Grade.CERTAIN if certain else Grade.THRESHOLD) if failed else None,
+            count=count,
+            sizes=space.sizes(theta),
+            moved=space.few(theta),
+            loss_trace=() if search is None else search.loss_trace,
+            queries=0 if search is None else search.queries,
+            passes=passes,
             seconds=round(time.perf_counter() - start, 3),
         )
         with files.whole_folder(out / FRAMES / shown.identifier) as part:
-            files.write_png(part / "benign.png", to_uint8(found.before))
-            files.write_png(part / "counterexample.png", to_uint8(found.after))
-            files.write_npz(part / "theta.npz", {"theta": found.theta.numpy().astype(np.float32)})
+            files.write_png(part / "benign.png", to_uint8(before))
+            files.write_png(part / "counterexample.png", to_uint8(after))
+            files.write_npz(part / "theta.npz", {"theta": theta.numpy().astype(np.float32)})
             files.write_text(part / RESULT, dump_record(record, SCHEMA))
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What an attack on one picture came to. before, after: pictures (3, H, W) as they are written."""
-
-    theta: Tensor
-    before: Tensor
-    after: Tensor
-    benign: Seen
-    attacked: Seen
-    queries: int
-    passes: int
-    loss_trace: tuple[float, ...] = ()
-    grade: str | None = None
-    count: Count | None = None
-
-
-def attack_picture(scene: ObjectScene, space: ObjectSpace, attacker: Attacker) -> Found:
-    """Attack one picture in memory. One that is misclassified as it is stays as it is."""
-    config = attacker.config
-    objective = ClassifierObjective(scene, space, attacker.network, aimed_by(config))
-    before, benign = objective.picture(space.theta0), objective.benign
-    if not benign.right:
-        return Found(space.theta0, before, before, benign, benign, 0, objective.passes)
-    search = attacker.method(objective.problem(), space.theta0, config.seed)
-    after, attacked = objective.picture(search.theta), objective.see(search.theta)
-    passes = objective.passes
-    grade, count = None, None
-    if not attacked.right and config.grade:
-        count = attacker.grader.count(scene.identifier, objective.look, before, after)
-        grade = str(Grade.CERTAIN if attacker.grader.rule.holds(count) else Grade.THRESHOLD)
-    elif not attacked.right:
-        grade = str(Grade.THRESHOLD)
-    return Found(
-        theta=search.theta,
-        before=before,
-        after=after,
-        benign=benign,
-        attacked=attacked,
-        queries=search.queries,
-        passes=passes,
-        loss_trace=search.loss_trace,
-        grade=grade,
-        count=count,
-    )
 
 
 def verdict(seen: Seen, classes: tuple[str, ...]) -> Verdict:

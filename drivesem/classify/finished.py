@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,13 +15,12 @@ from torch import Tensor
 from drivesem.classify.attack import Attacker
 from drivesem.classify.objective import ClassifierObjective
 from drivesem.classify.pictures import Shown
-from drivesem.classify.protocol import aimed_by, params_of
+from drivesem.classify.protocol import aimed_by
 from drivesem.classify.results import SCHEMA, ClassifiedFrame
 from drivesem.run.ask import Bar, Kept, KeptFrames
-from drivesem.run.finished import Run
-from drivesem.run.folder import CONFIG, FRAMES
+from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, claim
 from drivesem.run.frame import RESULT
-from drivesem.run.records import from_json, load_record
+from drivesem.run.records import dump_record, from_json, load_record
 from drivesem.settings.commands import Classify
 from drivesem.settings.errors import UsageError
 from drivesem.truth.grades import Grade
@@ -71,23 +72,62 @@ class ClassifyRun:
             raise FormatError(f"{path}: theta", f"shape {tuple(space.theta0.shape)}", tuple(theta.shape))
         return ClassifierObjective(scene, space, attacker.network, aimed_by(self.config)), theta
 
-    def ask(
-        self,
-        asked: Classify,
-        out: Path,
-        kept: tuple[str, Callable[[Path], K]],
-        build: Callable[[], Callable[[str], object]],
-        bar: Bar,
-        grades: Collection[str] = tuple(Grade),
-    ) -> tuple[list[K], dict[str, str]]:
-        """Answers about the run's failures, kept in `out`. kept: their file, and what reads it."""
-        config = self.config
-        params = ",".join(str(one) for one in params_of(config))
-        run = Run(self.folder.name, self.folder, config.network, config.method, params, ())
-        return KeptFrames(run, out, *kept).ask(self.failures(asked.limit, grades), build(), build, asked, bar)
 
-    def facts(self, out: Path, failed: dict[str, str]) -> dict[str, Any]:
-        """What stands first in a question's JSON."""
-        config = self.config
-        told = {"out": str(out), "run": str(self.folder), "network": config.network, "method": config.method}
-        return told | {"frames_failed": failed}
+class FailureWorker(ABC, Generic[K]):
+    """Answers a question about a run's failures, each in a folder of its own; built once for a process. question:
+    its name, that of its folder in the run's and of its files; file, kind: of what is kept of a failure; grades:
+    which failures it is about; needs_some: whether a run may have none; free: further settings that change no
+    answer.
+    """
+
+    question: ClassVar[str]
+    file: ClassVar[str]
+    kind: ClassVar[type[Any]]
+    grades: ClassVar[Collection[str]] = tuple(Grade)
+    needs_some: ClassVar[bool] = True
+    free: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
+        self.config, self.run, self.out, self.attacker = config, run, out, Attacker.of(run.config)
+
+    @abstractmethod
+    def answer(self, name: str, source: str, folder: Path) -> K:
+        """What is kept of a failure. source: digest of the run's result; folder: for pictures."""
+
+    def __call__(self, name: str) -> None:
+        """One failure, from the run's folder to its own."""
+        source = files.digest(self.run.folder / FRAMES / name / RESULT)
+        with files.whole_folder(self.out / FRAMES / name) as part:
+            files.write_text(part / self.file, dump_record(self.answer(name, source, part), SCHEMA))
+
+
+@dataclass(frozen=True, slots=True)
+class Asked(Generic[K]):
+    """What a question came to. answers: by failure, in the run's order; failed: why others have none."""
+
+    run: ClassifyRun
+    out: Path
+    answers: list[K]
+    failed: dict[str, str]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What stands first in the JSON."""
+        config = self.run.config
+        told = {"out": str(self.out), "run": str(self.run.folder), "network": config.network}
+        return told | {"method": config.method, "frames_failed": self.failed}
+
+
+def ask_of_failures(config: Classify, worker: type[FailureWorker[K]], title: str) -> Asked[K]:
+    """Ask about a run's failures, or go on with it. title: of the bar. Raises UsageError or SceneError."""
+    run = ClassifyRun.of(config)
+    names = run.failures(config.limit, worker.grades)
+    if worker.needs_some and not names:
+        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
+    out = Path(config.out) if config.out else run.folder / worker.question
+    build = partial(worker, config, run, out)
+    work = build()
+    written = (*(f"{worker.question}.{kind}" for kind in ("json", "md", "csv", "xml")), FRAMES)
+    claim(out, config, written, (*PRESENTATION, "folder", *worker.free))
+    kept = KeptFrames(run.folder, out, worker.file, partial(load_record, kind=worker.kind, schema=SCHEMA))
+    return Asked(run, out, *kept.ask(names, work, build, config, Bar(title, remaining=True)))

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +19,16 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.attack import Attacker
-from drivesem.classify.finished import ClassifyRun
+from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
 from drivesem.classify.objective import ClassifierObjective, as_written
 from drivesem.classify.scenes import SEEN_PX, VIEWS
 from drivesem.classify.space import Change
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from drivesem.run.ask import Bar
-from drivesem.run.folder import FRAMES, PRESENTATION, claim
-from drivesem.run.frame import RESULT
-from drivesem.run.records import dump_record, load_record
 from drivesem.settings.commands import Classify
-from drivesem.settings.errors import UsageError
 from drivesem.truth.rules import Floats, Where, fit
-from scene_ir import files
 
-_SCHEMA = 1
-_HOLE = "hole.json"
-_WRITTEN = ("holes.json", "holes.md", "holes.csv", FRAMES)
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
 _NOTES = (
     "Where: pitch, yaw and roll of the object in degrees, the view's own turn included (top: pitch 20; left and "
@@ -83,14 +73,13 @@ class PoseHole:
         return f"The {self.label} of {self.identifier} is {called}, in {share} of poses with {place}"
 
 
-class HoleWorker:
-    """What one process needs: built once, used for many failures."""
+class HoleWorker(FailureWorker[PoseHole]):
+    """Turns an object around the pose in which it failed."""
 
-    def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
-        self.config, self.run, self.out, self.attacker = config, run, out, Attacker.of(run.config)
+    question, file, kind = "holes", "hole.json", PoseHole
 
-    def __call__(self, name: str) -> None:
-        """One failure, from the run's folder to its own."""
+    def answer(self, name: str, source: str, folder: Path) -> PoseHole:
+        """See `FailureWorker`."""
         config = self.config
         objective, theta = self.run.rebuilt(self.attacker, name)
         change = objective.space.change(theta)
@@ -108,9 +97,9 @@ class HoleWorker:
         inside = [objective.look(poses.picture(one, number)).predicted for number, one in numbered]
         wrong = [one for one in inside if one != objective.scene.model.label]
         frame, classes = self.run.frames[name], self.attacker.network.classes
-        result = PoseHole(
+        return PoseHole(
             identifier=name,
-            source=files.digest(self.run.folder / FRAMES / name / RESULT),
+            source=source,
             label=frame.label,
             predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else frame.attacked.predicted,
             where=_as_seen(rule.where, frame.view),
@@ -122,8 +111,6 @@ class HoleWorker:
             count_all=len(fails),
             passes=objective.passes,
         )
-        with files.whole_folder(self.out / FRAMES / name) as part:
-            files.write_text(part / _HOLE, dump_record(result, _SCHEMA))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,22 +149,14 @@ def _as_seen(where: Where, view: str) -> dict[str, tuple[float, float]]:
 
 def holes_run(config: Classify) -> Answer:
     """Look around a run's failures, or go on with it. Raises UsageError or SceneError."""
-    run = ClassifyRun.of(config)
-    if not run.failures(config.limit):
-        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
-    out = Path(config.out) if config.out else run.folder / "holes"
-    build = partial(HoleWorker, config, run, out)
-    build()
-    claim(out, config, _WRITTEN, (*PRESENTATION, "folder"))
-    read = partial(load_record, kind=PoseHole, schema=_SCHEMA)
-    found, failed = run.ask(config, out, (_HOLE, read), build, Bar("looking around failures", remaining=True))
-    answer = _answer(out, found, run.facts(out, failed), failed)
+    asked = ask_of_failures(config, HoleWorker, "looking around failures")
+    answer = _answer(asked)
     answer.write()
     return answer
 
 
-def _answer(out: Path, found: Sequence[PoseHole], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
-    ordered = sorted(found, key=lambda hole: (-hole.interval[0], hole.identifier))
+def _answer(asked: Asked[PoseHole]) -> Answer:
+    ordered = sorted(asked.answers, key=lambda hole: (-hole.interval[0], hole.identifier))
     rows = [
         asdict(hole)
         | {"probability": hole.fails / hole.count, "interval": list(hole.interval), "sentence": hole.sentence()}
@@ -191,16 +170,16 @@ def _answer(out: Path, found: Sequence[PoseHole], facts: Mapping[str, Any], fail
         )
         for hole in ordered
     )
-    title = f"Holes of {facts['network']}, by pose"
+    title = f"Holes of {asked.run.config.network}, by pose"
     return Answer(
-        out=out,
+        out=asked.out,
         name="holes",
         heading="Holes by pose",
-        data={**facts, "holes": rows},
+        data={**asked.facts, "holes": rows},
         tables={"holes": [_flat(row) for row in rows]} if rows else {},
         sheets=[Sheet(title, ("where", "elsewhere, %", "of all near, %"), lines)],
         notes=_NOTES,
-        failed={f"picture {name}": reason for name, reason in failed.items()},
+        failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )
 
 

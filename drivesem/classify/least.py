@@ -3,35 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from drivesem.classify.attack import Attacker
-from drivesem.classify.finished import ClassifyRun
+from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
 from drivesem.classify.space import Moved, ObjectSpace
 from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from drivesem.run.ask import Bar
-from drivesem.run.folder import FRAMES, PRESENTATION, claim
-from drivesem.run.frame import RESULT
-from drivesem.run.records import dump_record, load_record
 from drivesem.settings.commands import Classify
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import RangeError
 from scene_ir.io import to_uint8
 
-_SCHEMA = 1
-_LEAST = "least.json"
-_WRITTEN = ("explain.json", "explain.md", "explain.csv", FRAMES)
 _POINTS = 16
 """Of the grid of scales, as for detectors."""
 _AXES = ("pose.pitch", "pose.yaw", "pose.roll")
@@ -47,7 +35,7 @@ class LeastChange:
     """One failure. source: digest of the run's result. share: of the change's size that is enough; angles, found:
     rad by axis, of the least change and of the whole one; vertex, light: the largest of each in the least change;
     dropped: what was left out; predicted: the class that it is called then; sign_changes: how often failing
-    begins or ends on the way to the whole change. `seconds` alone may differ between two calls.
+    begins or ends on the way to the whole change.
     """
 
     identifier: str
@@ -80,14 +68,13 @@ class LeastChange:
         )
 
 
-class LeastWorker:
-    """What one process needs: built once, used for many failures."""
+class LeastWorker(FailureWorker[LeastChange]):
+    """Takes the change of a failure back."""
 
-    def __init__(self, run: ClassifyRun, out: Path) -> None:
-        self.run, self.out, self.attacker = run, out, Attacker.of(run.config)
+    question, file, kind = "explain", "least.json", LeastChange
 
-    def __call__(self, name: str) -> None:
-        """One failure, from the run's folder to its own."""
+    def answer(self, name: str, source: str, folder: Path) -> LeastChange:
+        """See `FailureWorker`."""
         objective, theta = self.run.rebuilt(self.attacker, name)
         space, problem = objective.space, objective.problem()
         search = LeastSearch(
@@ -100,9 +87,10 @@ class LeastWorker:
             found = minimal(theta, blocks(space), search)
         except RangeError as error:  # judged otherwise on this machine
             raise RangeError(f"{name}: {error.field}", error.expected, error.actual) from error
-        result = LeastChange(
+        files.write_png(folder / "least.png", to_uint8(objective.picture(found.theta)))
+        return LeastChange(
             identifier=name,
-            source=files.digest(self.run.folder / FRAMES / name / RESULT),
+            source=source,
             label=self.run.frames[name].label,
             predicted=self.attacker.network.classes[objective.see(found.theta).predicted],
             share=round(search.size(found.theta) / search.size(theta), 6),
@@ -114,9 +102,6 @@ class LeastWorker:
             sign_changes=found.sign_changes,
             passes=objective.passes,
         )
-        with files.whole_folder(self.out / FRAMES / name) as part:
-            files.write_png(part / "least.png", to_uint8(objective.picture(found.theta)))
-            files.write_text(part / _LEAST, dump_record(result, _SCHEMA))
 
 
 def blocks(space: ObjectSpace) -> list[ThetaBlock]:
@@ -142,23 +127,16 @@ def _angles(space: ObjectSpace, theta: Tensor) -> dict[str, float]:
 
 def explain_run(config: Classify) -> Answer:
     """Find the least change of a run's failures, or go on with it. Raises UsageError or SceneError."""
-    run = ClassifyRun.of(config)
-    if not run.failures(config.limit):
-        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
-    out = Path(config.out) if config.out else run.folder / "explain"
-    build = partial(LeastWorker, run, out)
-    build()
-    claim(out, config, _WRITTEN, (*PRESENTATION, "folder"))
-    read = partial(load_record, kind=LeastChange, schema=_SCHEMA)
-    found, failed = run.ask(config, out, (_LEAST, read), build, Bar("shortening changes"))
-    answer = _answer(out, found, run.facts(out, failed), failed)
+    asked = ask_of_failures(config, LeastWorker, "shortening changes")
+    answer = _answer(asked)
     answer.write()
     return answer
 
 
-def _answer(out: Path, found: Sequence[LeastChange], facts: dict[str, Any], failed: dict[str, str]) -> Answer:
+def _answer(asked: Asked[LeastChange]) -> Answer:
+    found = asked.answers
     columns = ("picture", "called", "enough, %", "pitch, rad", "yaw, rad", "roll, rad", "vertices", "left out")
-    title = f"How little is enough: {len(found)} failures of {facts['network']}"
+    title = f"How little is enough: {len(found)} failures of {asked.run.config.network}"
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [
@@ -169,13 +147,13 @@ def _answer(out: Path, found: Sequence[LeastChange], facts: dict[str, Any], fail
         for one in found
     ]
     return Answer(
-        out=out,
+        out=asked.out,
         name="explain",
         heading="How little is enough",
-        data={**facts, "share_median": round(middle, 4) if found else None, "least": rows},
+        data={**asked.facts, "share_median": round(middle, 4) if found else None, "least": rows},
         tables={"explain": flat} if found else {},
         sheets=[Sheet(title, columns, tuple(one.row() for one in found), {"unbroken": columns[:2]})],
         notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
         words=("picture", "called", "left out"),
-        failed={f"picture {name}": reason for name, reason in failed.items()},
+        failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )

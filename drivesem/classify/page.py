@@ -47,12 +47,13 @@ def share(part: int, whole: int) -> float | None:
 
 
 def _card(frame: ClassifiedFrame, folder: Path) -> _Card:
-    sizes = ", ".join(f"{name} {size:.3g}" for name, size in frame.sizes.items() if name == "vertex")
-    moved = ", ".join(f"{name.rpartition('.')[2]} {value}" for name, value in frame.moved.items())
-    told = "; ".join(words for words in (moved, sizes) if words)
+    told = [f"{name.rpartition('.')[2]} {value}" for name, value in frame.moved.items()]
+    told += (
+        [f"vertices by up to {100 * frame.sizes['vertex']:.1f} % of the size"] if "vertex" in frame.sizes else []
+    )
     shots = [("before", "benign.png"), ("after", "counterexample.png")]
     shots += [(frame.second.agreement.by, SECOND_PICTURE)] if frame.second is not None else []
-    return _Card(frame, tuple((name, _embedded(folder / file)) for name, file in shots), told)
+    return _Card(frame, tuple((name, _embedded(folder / file)) for name, file in shots), ", ".join(told))
 
 
 def _embedded(path: Path) -> str:

@@ -144,46 +144,40 @@ class ClassifiedRun:
         )
 
     @property
+    def whole(self) -> ClassTally:
+        """All classes as one."""
+        counts = ("pictures", "benign", "attacked", "certain", "confirmed")
+        return ClassTally("all", *(sum(getattr(one, name) for one in self.classes) for name in counts))
+
+    @property
     def pictures(self) -> int:
-        return sum(one.pictures for one in self.classes)
+        return self.whole.pictures
 
     @property
     def benign(self) -> float | None:
         """Accuracy before the change; None without pictures."""
-        return self._share("benign")
+        return round(self.whole.benign / self.pictures, 4) if self.pictures else None
 
     @property
     def attacked(self) -> float | None:
         """Accuracy after it."""
-        return self._share("attacked")
+        return round(self.whole.attacked / self.pictures, 4) if self.pictures else None
 
     @property
     def grades(self) -> dict[str, int]:
         """How many failures are at least so sure."""
-        failures = sum(one.benign - one.attacked for one in self.classes)
-        certain = sum(one.certain for one in self.classes)
-        confirmed = sum(one.confirmed for one in self.classes)
-        return {str(Grade.THRESHOLD): failures, str(Grade.CERTAIN): certain, str(Grade.CONFIRMED): confirmed}
-
-    def _share(self, which: str) -> float | None:
-        total = sum(getattr(one, which) for one in self.classes)
-        return round(total / self.pictures, 4) if self.pictures else None
+        whole = self.whole
+        failures = whole.benign - whole.attacked
+        return {
+            str(Grade.THRESHOLD): failures,
+            str(Grade.CERTAIN): whole.certain,
+            str(Grade.CONFIRMED): whole.confirmed,
+        }
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
-        return {
-            "schema": SCHEMA,
-            "out": self.out,
-            "objects": self.objects,
-            "network": self.network,
-            "method": self.method,
-            "params": list(self.params),
-            "pictures": self.pictures,
-            "accuracy": {"benign": self.benign, "attacked": self.attacked},
+        accuracy = {"benign": self.benign, "attacked": self.attacked}
+        return {"schema": SCHEMA, **asdict(self), "pictures": self.pictures} | {
+            "accuracy": accuracy,
             "grades": self.grades,
-            "classes": [asdict(one) for one in self.classes],
-            "frames_failed": self.frames_failed,
-            "queries": self.queries,
-            "passes": self.passes,
-            "seconds": self.seconds,
         }

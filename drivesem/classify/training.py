@@ -16,7 +16,8 @@ from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
-from drivesem.report.progress import progress_bar
+from drivesem.evaluation.resampling import wilson
+from drivesem.report.progress import progress_bar, training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import claim, folder_of
 from drivesem.settings.commands import Classify
@@ -26,7 +27,8 @@ PICTURES = "pictures"
 """Folder in --out where pictures are drawn, unless --data has them."""
 RECORD = "training.json"
 _RATES = {"last": 3e-3, "all": 1e-4}
-_EMBEDDED_AT_A_TIME = 32
+_EMBEDDED_AT_A_TIME = 4
+"""More is no faster on a CPU, and VGG-16's maps are so large that the system clears them anew each time."""
 _TINY = 1e-12
 
 
@@ -59,13 +61,15 @@ def train_run(config: Classify) -> dict[str, Any]:
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
+    counts = {name: len(split.labels) for name, split in splits.items()}
     data = {
         "out": str(out),
         "weights": str(path),
         "network": config.network,
         "layers": config.layers,
-        "pictures": {name: len(split.labels) for name, split in splits.items()},
+        "pictures": counts,
         "accuracy": accuracy,
+        "intervals": {name: wilson(round(accuracy[name] * count), count) for name, count in counts.items()},
         "epochs": curve,
         "frames_failed": failed,
         "seconds": round(time.perf_counter() - start, 3),
@@ -78,7 +82,10 @@ def _fit_last(
     network: Classifier, splits: dict[str, Pictures], config: Classify, generator: torch.Generator
 ) -> tuple[list[dict[str, float]], dict[str, float]]:
     network.eval()
-    known = {name: embedded(network, split, config.device) for name, split in splits.items()}
+    known = {
+        name: embedded(network, split.images, config.device, f"looking at {name}")
+        for name, split in splits.items()
+    }
     labels = {name: split.labels.to(config.device) for name, split in splits.items()}
     return fit_last(network, known, labels, config, generator)
 
@@ -130,7 +137,7 @@ def _fit_all(
     @torch.no_grad()
     def accuracy(name: str) -> float:
         network.eval()
-        features = embedded(network, splits[name], config.device)
+        features = embedded(network, splits[name].images, config.device, f"looking at {name}")
         said = network.last(features).argmax(1)
         return round(float((said == splits[name].labels.to(said)).float().mean()), 4)
 
@@ -170,7 +177,8 @@ def _fit(
 
 
 @torch.no_grad()
-def embedded(network: Classifier, pictures: Pictures, device: str) -> Tensor:
-    """Features (N, K) of pictures, computed once."""
-    rows = torch.arange(len(pictures.labels)).split(_EMBEDDED_AT_A_TIME)
-    return torch.cat([network.embed(pictures.batch(part, device)[0]) for part in rows])
+def embedded(network: Classifier, images: Tensor, device: str, title: str) -> Tensor:
+    """Features (N, K) of pictures (N, 3, H, W) uint8, computed once. title: of the bar."""
+    with training_bar(Console(stderr=True)) as progress:
+        parts = progress.track(images.split(_EMBEDDED_AT_A_TIME), description=title)
+        return torch.cat([network.embed(part.to(device).float() / 255) for part in parts])

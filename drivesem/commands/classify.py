@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from drivesem.classify.attack import attack_run
 from drivesem.classify.confirm import confirm_run
@@ -12,12 +13,12 @@ from drivesem.classify.holes import holes_run
 from drivesem.classify.least import explain_run
 from drivesem.classify.page import share
 from drivesem.classify.pictures import write_pictures
-from drivesem.classify.results import ClassifiedRun
+from drivesem.classify.results import ClassifiedRun, ClassTally
 from drivesem.classify.training import train_run
 from drivesem.report.answer import print_json
 from drivesem.report.tables import Sheet, percent
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say
+from drivesem.run.ask import say, say_end
 from drivesem.run.folder import claim, folder_of
 from drivesem.run.page import PAGE
 from drivesem.settings.commands import Classify
@@ -46,11 +47,8 @@ def _data(config: Classify, console: Console) -> None:
     out = folder_of(config.out, Path("runs") / "classify-pictures")
     claim(out, config, ("train", "val", "test"))
     counts, failed = write_pictures(config, out)
-    _say_failed(failed, console)
-    told = ", ".join(f"{count} {split}" for split, count in counts.items())
-    console.print(f"pictures in {out}: {told}", soft_wrap=True, markup=False)
-    if config.json:
-        print_json({"out": str(out), "pictures": counts, "frames_failed": failed})
+    console.print(f"pictures: {', '.join(f'{count} {split}' for split, count in counts.items())}")
+    _end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed})
 
 
 def _train(config: Classify, console: Console) -> None:
@@ -58,11 +56,12 @@ def _train(config: Classify, console: Console) -> None:
     rows = tuple((str(e["epoch"]), f"{e['loss']:.4f}", percent(e["val"])) for e in data["epochs"])
     sheet = Sheet(f"{config.network}: {config.layers} layers", ("epoch", "loss", "accuracy on val, %"), rows)
     console.print(sheet.table(()))
-    accuracy = ", ".join(f"{name} {percent(value)} %" for name, value in data["accuracy"].items())
-    _say_failed(data["frames_failed"], console)
-    console.print(f"accuracy: {accuracy}; weights: {data['weights']}", soft_wrap=True, markup=False)
-    if config.json:
-        print_json(data)
+    for split, value in data["accuracy"].items():
+        low, high = (percent(end) for end in data["intervals"][split])
+        console.print(
+            f"accuracy on {split}: {percent(value)} % [{low}, {high}] of {data['pictures'][split]}", markup=False
+        )
+    _end(config, console, Path(data["weights"]), data)
 
 
 def _attack(config: Classify, console: Console) -> None:
@@ -74,58 +73,46 @@ def _attack(config: Classify, console: Console) -> None:
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} for certain",
         soft_wrap=True,
     )
-    _say_failed(found.frames_failed, console)
-    console.print(f"report: {Path(found.out) / PAGE}", soft_wrap=True, markup=False)
-    if config.json:
-        print_json(found.to_json())
+    _end(config, console, Path(found.out) / PAGE, found.to_json())
 
 
 def _confirm(config: Classify, console: Console) -> None:
     found, facts = confirm_run(config)
     console.print(_table(found).table(("class",)))
-    console.print(
+    lines = [
         f"{facts['renderer']} agrees on {facts['agree']} of {facts['failures']} failures; "
-        f"{found.grades['certain']} are certain, {found.grades['confirmed']} confirmed",
-        soft_wrap=True,
-    )
+        f"{found.grades['certain']} are certain, {found.grades['confirmed']} confirmed"
+    ]
     if facts["iou"]:
-        console.print(
+        lines.append(
             f"silhouettes of both renderers: IoU {facts['iou']['mean']:.4f} in the mean, "
             f"{facts['iou']['least']:.4f} at least; "
             f"colours: {facts['colour']['mean']:.1f} in the mean, {facts['colour']['most']:.1f} at most "
-            "(CIE 1976, mean of an object)",
-            soft_wrap=True,
+            "(CIE 1976, mean of an object)"
         )
-    _say_failed(facts["frames_failed"], console)
-    console.print(f"report: {Path(found.out) / PAGE}", soft_wrap=True, markup=False)
+    console.print("\n".join(lines), soft_wrap=True)
+    _end(config, console, Path(found.out) / PAGE, {**found.to_json(), "second": facts}, facts["frames_failed"])
+
+
+def _end(
+    config: Classify,
+    console: Console,
+    written: Path,
+    data: Mapping[str, Any],
+    failed: Mapping[str, str] | None = None,
+) -> None:
+    say_end(written, console, data["frames_failed"] if failed is None else failed)
     if config.json:
-        print_json({**found.to_json(), "second": facts})
+        print_json(data)
 
 
 def _table(run: ClassifiedRun) -> Sheet:
-    rows = [
-        (
-            *(one.name, str(one.pictures), *_shares(one.benign, one.attacked, one.pictures)),
-            *(str(one.certain), str(one.confirmed)),
-        )
-        for one in run.classes
-        if one.pictures
-    ]
-    rows.append(("all", str(run.pictures), percent(run.benign), percent(run.attacked), *_sure(run)))
+    def row(name: str, tally: ClassTally) -> tuple[str, ...]:
+        shares = (percent(share(count, tally.pictures)) for count in (tally.benign, tally.attacked))
+        return name, str(tally.pictures), *shares, str(tally.certain), str(tally.confirmed)
+
+    rows = [*(row(one.name, one) for one in run.classes if one.pictures), row("all", run.whole)]
     title = f"{run.network} on {run.objects} objects: {run.method}, {' + '.join(run.params)}"
     columns = ("class", "pictures", "accuracy, %", "attacked, %", "certain", "confirmed")
     shown = len(columns) if run.grades["confirmed"] else len(columns) - 1
     return Sheet(title, columns[:shown], tuple(row[:shown] for row in rows))
-
-
-def _sure(run: ClassifiedRun) -> tuple[str, str]:
-    return str(run.grades["certain"]), str(run.grades["confirmed"])
-
-
-def _shares(benign: int, attacked: int, pictures: int) -> tuple[str, str]:
-    return percent(share(benign, pictures)), percent(share(attacked, pictures))
-
-
-def _say_failed(failed: Mapping[str, str], console: Console) -> None:
-    for name, reason in failed.items():
-        console.print(f"{name} could not be used: {reason}", soft_wrap=True, markup=False)

@@ -12,7 +12,6 @@ from typing import Generic, Protocol, TypeVar
 from drivesem.report.answer import Answer, print_json
 from drivesem.report.progress import progress_bar
 from drivesem.report.terminal import Console
-from drivesem.run.finished import Run
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.workers import outcomes
@@ -84,10 +83,10 @@ def ask(
 @dataclass(frozen=True, slots=True)
 class KeptFrames(Generic[K]):
     """Answers about frames of a run, each kept in a folder of its own below `out`, and asked for again where the
-    run's frame has become another. file: in that folder, which marks it as done; read: reads it.
+    run's frame has become another. run: its folder; file: in that folder, which marks it as done; read: reads it.
     """
 
-    run: Run
+    run: Path
     out: Path
     file: str
     read: Callable[[Path], K]
@@ -109,7 +108,7 @@ class KeptFrames(Generic[K]):
         return self.out / FRAMES / name / self.file
 
     def _is_done(self, name: str) -> bool:
-        path, source = self._path(name), self.run.folder / FRAMES / name / RESULT
+        path, source = self._path(name), self.run / FRAMES / name / RESULT
         return path.is_file() and self.read(path).source == files.digest(source)
 
 

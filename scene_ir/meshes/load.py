@@ -367,17 +367,28 @@ def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
             tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0
     if image is None or uv is None or len(uv) != count:
         return _plain(count) if tint is None else np.tile(tint, (count, 1))
-    width, height = image.size
-    if width * height > _MOST_TEXELS:
-        raise FormatError(f"{file}: texture", f"at most {_MOST_TEXELS:,} px", f"{width}x{height}")
+    return texels(image, uv[:, :2], file) * (1.0 if tint is None else tint)
+
+
+def texels(image: Any, uv: NDArray[np.float64], file: Path, most_px: int | None = None) -> NDArray[np.float64]:
+    """sRGB (..., 3) in [0, 1] of a texture at coordinates (..., 2), v upwards. most_px: a larger one is averaged
+    down to so many first. Raises FormatError naming the file of the mesh.
+    """
+    if image.width * image.height > _MOST_TEXELS:
+        found = f"{image.width}x{image.height}"
+        raise FormatError(f"{file}: texture", f"at most {_MOST_TEXELS:,} px", found)
     try:
-        pixels = np.asarray(image.convert("RGB"))
+        image = image.convert("RGB")
     except (OSError, ValueError, SyntaxError) as error:  # Pillow reads pixels only now
-        raise FormatError(f"{file}: texture", "an image", str(error)) from error
-    places = np.mod(np.nan_to_num(uv[:, :2]), 1.0)
-    columns = np.floor(places[:, 0] * width).astype(int).clip(0, width - 1)
-    rows = np.floor(np.mod(1.0 - places[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
-    return pixels[rows, columns] / 255.0 * (1.0 if tint is None else tint)
+        raise FormatError(f"{file}: texture", "an image", str(error).splitlines()[0]) from error
+    if most_px is not None:
+        image.thumbnail((most_px, most_px))
+    pixels = np.asarray(image)
+    height, width = pixels.shape[:2]
+    places = np.mod(np.nan_to_num(uv, posinf=0.0, neginf=0.0), 1.0)
+    columns = np.floor(places[..., 0] * width).astype(int).clip(0, width - 1)
+    rows = np.floor(np.mod(1.0 - places[..., 1], 1.0) * height).astype(int).clip(0, height - 1)
+    return pixels[rows, columns] / 255.0
 
 
 def _plain(count: int) -> NDArray[np.float64]:

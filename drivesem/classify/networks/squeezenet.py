@@ -10,22 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors.squeezedet import BGR_MEAN, Fire
+from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
 from drivesem.classify.networks.base import Classifier
 
-_FIRES = {
-    "fire2": (64, 16, 64),
-    "fire3": (128, 16, 64),
-    "fire4": (128, 32, 128),
-    "fire5": (256, 32, 128),
-    "fire6": (256, 48, 192),
-    "fire7": (384, 48, 192),
-    "fire8": (384, 64, 256),
-    "fire9": (512, 64, 256),
-}
-"""Channels in, of the squeeze, and of each expansion."""
-_POOLED = ("fire3", "fire5")
-"""A 3x3/2 pooling follows these, and the first convolution."""
+_FIRES = dict(list(SqueezeDet.layout.fires.items())[:8])
+"""Up to fire9: what SqueezeDet has after that is its own."""
 
 
 class SqueezeNet(Classifier):
@@ -38,14 +27,18 @@ class SqueezeNet(Classifier):
     def __init__(self, classes: Sequence[str]) -> None:
         mean = [value / 255 for value in reversed(BGR_MEAN)]
         super().__init__(classes, mean, [1 / 255] * 3)
-        self.conv1 = nn.Conv2d(3, 64, 3, 2)
-        self.fires = nn.ModuleDict({name: Fire(*channels) for name, channels in _FIRES.items()})
-        self.classifier = nn.Linear(2 * 512, len(self.classes))
+        channels = SqueezeDet.layout.channels
+        self.conv1 = nn.Conv2d(3, channels, SqueezeDet.layout.kernel, 2)
+        self.fires = nn.ModuleDict()
+        for name, (squeeze, expand) in _FIRES.items():
+            self.fires[name] = Fire(channels, squeeze, expand)
+            channels = 2 * expand
+        self.classifier = nn.Linear(2 * channels, len(self.classes))
 
     def encode(self, prepared: Tensor) -> Tensor:
         x = F.max_pool2d(F.relu(self.conv1(prepared.flip(1))), 3, 2, ceil_mode=True)  # its weights read BGR
         for name, fire in self.fires.items():
             x = fire(x)
-            if name in _POOLED:
+            if name in SqueezeDet.layout.pooled:
                 x = F.max_pool2d(x, 3, 2, ceil_mode=True)
         return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)

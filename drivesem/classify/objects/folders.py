@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from drivesem.classify.objects.meshes import read_object
 from drivesem.classify.objects.types import CLASSES, SPLITS, ObjectModel, Split
+from drivesem.classify.paper import figures
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
@@ -30,21 +31,6 @@ _SYNSETS = {
     "04530566": "boat",
 }
 """ShapeNetCore's folders of the paper's classes: WordNet's numbers."""
-PAPER_SIZES: Mapping[str, tuple[int, int, int]] = {
-    "airplane": (2713, 388, 775),
-    "bench": (1624, 232, 464),
-    "trashcan": (417, 60, 119),
-    "bus": (445, 64, 127),
-    "car": (5421, 774, 1549),
-    "helmet": (210, 30, 60),
-    "mailbox": (53, 8, 15),
-    "motorcycle": (258, 37, 73),
-    "skateboard": (171, 24, 49),
-    "tower": (87, 12, 25),
-    "train": (344, 49, 99),
-    "boat": (1100, 157, 315),
-}
-"""Objects of each class for training, validation and test in the paper: 12,843, 1,835 and 3,670."""
 _SHARES = (0.7, 0.1)
 """Of training and validation where a class has fewer objects than in the paper: the paper's own shares."""
 _MODELS = ("models/model_normalized.obj", "model.obj")
@@ -145,10 +131,11 @@ class FolderObjects:
     def _drawn(self) -> dict[Split, tuple[str, ...]]:
         """Splits drawn by seed."""
         splits: dict[Split, list[str]] = {split: [] for split in SPLITS}
+        sizes = figures()["sizes"] if self._synsets else {}
         for kind in self.classes:
             own = sorted(name for name in self._paths if name.partition("/")[0] == kind)
             order = np.random.default_rng([self._seed, crc32(kind.encode())]).permutation(len(own))
-            train, val, test = PAPER_SIZES.get(kind, (len(own), 0, 1)) if self._synsets else (len(own), 0, 1)
+            test, train, val = sizes.get(kind, (1, len(own), 0))
             if train + val + test > len(own):
                 train, val = (round(share * len(own)) for share in _SHARES)
                 test = len(own) - train - val

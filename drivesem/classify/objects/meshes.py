@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from drivesem.classify.objects.types import ObjectModel, used
 from scene_ir.errors import FormatError
-from scene_ir.meshes.load import read_scene
+from scene_ir.meshes.load import read_scene, texels
 from scene_ir.meshes.lod import simplify
 from scene_ir.types import Mesh, Part
 
@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 
 _MOST_BYTES = 1 << 28
 """Of a mesh file, its materials and each texture: ten times the largest of usual objects."""
-_MOST_PIXELS = 1 << 26
 _TEXTURE_PX = 512
 """Larger textures are averaged down to so many before faces look at them."""
 _PLACES = np.array([[4, 4, 4], [10, 1, 1], [1, 10, 1], [1, 1, 10], [5, 5, 2], [5, 2, 5], [2, 5, 5]]) / 12
@@ -111,7 +110,9 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         specular = float(_share(said.get("ks"), specular).mean())
         shininess = _number(said.get("ns"), shininess, _MOST_SHININESS)
     if image is not None and uv is not None and len(uv) == len(part.vertices):
-        rgb = rgb * _texels(image, np.asarray(uv, float)[part.faces][..., :2], path)
+        corners = np.nan_to_num(np.asarray(uv, float)[part.faces][..., :2], posinf=0.0, neginf=0.0)
+        seen = texels(image, np.einsum("pc,fcd->fpd", _PLACES, corners), path, _TEXTURE_PX)
+        rgb = rgb * _linear(seen).mean(axis=1)
     return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])
 
 
@@ -125,23 +126,6 @@ def _share(value: Any, other: float) -> Array:
     if not isinstance(value, list) or len(value) != 3 or not np.isfinite(value).all():
         return np.full(3, other)
     return np.array(value, float).clip(0, 1)
-
-
-def _texels(image: Any, uv: Array, path: Path) -> Array:
-    """Mean linear RGB (F, 3) of a texture at some places of faces with coordinates (F, 3, 2)."""
-    if image.width * image.height > _MOST_PIXELS:
-        raise FormatError(f"{path}: texture", f"at most {_MOST_PIXELS:,} px", f"{image.width}x{image.height}")
-    try:
-        small = image.convert("RGB")
-        small.thumbnail((_TEXTURE_PX, _TEXTURE_PX))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise FormatError(f"{path}: texture", "an image", str(error).splitlines()[0]) from error
-    pixels = _linear(np.asarray(small, float) / 255.0)
-    height, width = pixels.shape[:2]
-    places = np.einsum("pc,fcd->fpd", _PLACES, np.nan_to_num(uv, posinf=0.0, neginf=0.0))
-    columns = np.floor(np.mod(places[..., 0], 1.0) * width).astype(int).clip(0, width - 1)
-    rows = np.floor(np.mod(1.0 - places[..., 1], 1.0) * height).astype(int).clip(0, height - 1)
-    return pixels[rows, columns].mean(axis=1)
 
 
 def _linear(srgb: Array) -> Array:

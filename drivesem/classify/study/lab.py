@@ -18,14 +18,15 @@ from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
+from drivesem.classify.paper import NETWORKS
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
 from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
 from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
-from drivesem.classify.study.paper import NETWORKS
-from drivesem.classify.study.retraining import RETRAINED, half, retrained
+from drivesem.classify.study.retraining import RETRAINED, half, retrained, right
+from drivesem.classify.training import embedded
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.realism.asking import AVAILABLE, chosen
 from drivesem.questions.realism.measures import load
@@ -242,10 +243,11 @@ class Lab:
 
         def compute() -> Mapping[str, np.ndarray]:
             before = [files.read_image(path) for path in paths]
-            images, labels = np.stack(before).transpose(0, 3, 1, 2), np.array(self.labels(self.done))
+            images, labels = np.stack(before).transpose(0, 3, 1, 2), self.labels(self.done)
             found: dict[str, np.ndarray] = {}
-            for name, after in pixels.attacked(eyes.network, images / np.float32(255), labels).items():
-                found[name] = np.array(pixels.right(eyes.network, after, labels))
+            for name, after in pixels.attacked(eyes.network, images / np.float32(255), np.array(labels)).items():
+                features = embedded(eyes.network, torch.from_numpy(after), self.study.device, name)
+                found[name] = np.array(right(eyes.network, features, labels))
                 pairs = zip(before, after.transpose(0, 2, 3, 1), strict=True)
                 found[f"{name} apart"] = np.array([self.measures["perceptual"](a, b) for a, b in pairs])
             return found

@@ -8,21 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.study.paper import theirs
+from drivesem.classify.paper import theirs
+from drivesem.classify.training import embedded
 from drivesem.questions.realism.frechet import Gaussian, frechet
 from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures, psnr_db
 from drivesem.questions.worth.measures import Floats
+from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.looking import weights_digest
 from scene_ir import files
 
 LOOKED = "looked"
 """Folder of what is kept."""
-_AT_A_TIME = 32
 
 
 def kept(path: Path, about: str, compute: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
@@ -34,11 +34,6 @@ def kept(path: Path, about: str, compute: Callable[[], Mapping[str, np.ndarray]]
     found = {**compute(), "about": np.array(about)}
     files.write_npz(path, found)
     return found
-
-
-def _progress(title: str, items: Sequence[int]) -> Sequence[int]:
-    console = Console(stderr=True)
-    return track(items, title, console=console, transient=True, disable=not console.is_terminal)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -58,22 +53,18 @@ class Eyes:
 
     def features(self, name: str, paths: Sequence[Path]) -> Tensor:
         """Features (N, K) of pictures, which are known by a name of their own."""
-        about = self.about(paths)
-        found = kept(self.folder / LOOKED / f"{self.name}-{name}.npz", about, lambda: self._look(name, paths))
+
+        def look() -> Mapping[str, np.ndarray]:
+            images = torch.from_numpy(np.stack([files.read_image(path) for path in paths])).permute(0, 3, 1, 2)
+            title = f"{self.name} looks at {name}"
+            return {"features": embedded(self.network, images, self.device, title).cpu().numpy()}
+
+        found = kept(self.folder / LOOKED / f"{self.name}-{name}.npz", self.about(paths), look)
         return torch.from_numpy(found["features"]).to(self.device)
 
     def about(self, paths: Sequence[Path]) -> str:
         """What tells this network before these pictures from all others."""
         return "\n".join((weights_digest(self.network), *(f"{path.parent.name}/{path.name}" for path in paths)))
-
-    @torch.no_grad()
-    def _look(self, name: str, paths: Sequence[Path]) -> Mapping[str, np.ndarray]:
-        found = []
-        for start in _progress(f"{self.name} looks at {name}", range(0, len(paths), _AT_A_TIME)):
-            stack = np.stack([files.read_image(path) for path in paths[start : start + _AT_A_TIME]])
-            images = torch.from_numpy(stack).permute(0, 3, 1, 2).to(self.device).float() / 255
-            found.append(self.network.embed(images).cpu().numpy())
-        return {"features": np.concatenate(found)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +94,15 @@ def apart(
 
     def compute() -> Mapping[str, np.ndarray]:
         columns: dict[str, list[np.ndarray | float]] = {}
-        for i in _progress(f"distances of {path.stem}", range(len(pairs))):
-            before, after = (files.read_image(side) for side in pairs[i])
-            for name, measure in measures.items():
-                if METRICS[name].pairwise:
-                    columns.setdefault(name, []).append(measure(before, after))  # type: ignore[call-arg]
-                else:
-                    columns.setdefault(f"{name} before", []).append(measure(before))  # type: ignore[call-arg]
-                    columns.setdefault(f"{name} after", []).append(measure(after))  # type: ignore[call-arg]
+        with training_bar(Console(stderr=True)) as progress:
+            for pair in progress.track(pairs, description=f"distances of {path.stem}"):
+                before, after = map(files.read_image, pair)
+                for name, measure in measures.items():
+                    if METRICS[name].pairwise:
+                        columns.setdefault(name, []).append(measure(before, after))  # type: ignore[call-arg]
+                    else:
+                        columns.setdefault(f"{name} before", []).append(measure(before))  # type: ignore[call-arg]
+                        columns.setdefault(f"{name} after", []).append(measure(after))  # type: ignore[call-arg]
         return {name: np.asarray(column, np.float64) for name, column in columns.items()}
 
     about = "\n".join((", ".join(measures), *(str(after.parent.name) for _, after in pairs)))

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from torch import nn
 
 from drivesem.classify.networks.base import Classifier
@@ -54,15 +53,4 @@ def attacked(network: Classifier, images: np.ndarray, labels: np.ndarray) -> Map
     for name in ATTACKS:
         changed = made[name]().generate(x=images.astype(np.float32), y=truth)
         found[name] = (np.clip(changed, 0, 1) * 255).round().astype(np.uint8)
-    return found
-
-
-@torch.no_grad()
-def right(network: Classifier, images: np.ndarray, labels: np.ndarray) -> list[bool]:
-    """Which pictures (N, 3, H, W) uint8 a network classifies rightly."""
-    found: list[bool] = []
-    device = next(network.parameters()).device
-    for start in range(0, len(images), _AT_A_TIME):
-        part = torch.from_numpy(images[start : start + _AT_A_TIME]).to(device).float() / 255
-        found += (network(part).argmax(1).cpu().numpy() == labels[start : start + _AT_A_TIME]).tolist()
     return found

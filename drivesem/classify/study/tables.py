@@ -12,12 +12,12 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.objects.types import CLASSES, SPLITS
+from drivesem.classify.paper import NETWORKS, REMARKS, figures
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, NAMES, STRATEGIES, preset
 from drivesem.classify.study.figures import Answers, verdict
 from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE, Lab
 from drivesem.classify.study.looking import Eyes
-from drivesem.classify.study.paper import NETWORKS, REMARKS, figures
 from drivesem.classify.study.retraining import chances, right
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism.measures import METRICS, missing
@@ -39,6 +39,8 @@ TESTS = (BENIGN, *GRADIENT)
 """Columns of what retrained networks are judged on."""
 ORDERS = "orders"
 _BOTH = "pose,vertex"
+_COMPARED = ("vertex", "pose", _BOTH)
+"""What the paper's table of parameters has."""
 _HEADS = {
     "trained_on": "trained on",
     "params": "parameters",
@@ -120,10 +122,6 @@ def tables_of(lab: Lab) -> list[Table]:
     return found
 
 
-def _by_class(lab: Lab, answers: Answers) -> Row:
-    return dict(zip(lab.classes, (_rounded(x) for x in answers.by_class(len(lab.classes))), strict=True))
-
-
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 5)
 
@@ -136,8 +134,26 @@ def _overall(lab: Lab, answers: Answers) -> Row:
     return found
 
 
-def _paper_by_class(values: Sequence[float]) -> Row:
-    return {**dict(zip(CLASSES, values, strict=False)), "overall": values[len(CLASSES)]}
+def _with_classes(lab: Lab, answers: Answers) -> Row:
+    own = zip(lab.classes, answers.by_class(len(lab.classes)), strict=True)
+    return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
+
+
+def _paper(table: str, *names: str) -> Iterator[tuple[Row, Any]]:
+    """The figures of one of the paper's tables, or lists of them, and of what: a network, and what `names` are."""
+
+    def walk(node: Any, keys: tuple[str, ...]) -> Iterator[tuple[Row, Any]]:
+        if isinstance(node, dict):
+            for key, below in node.items():
+                yield from walk(below, (*keys, key))
+        else:
+            yield {"network": NETWORKS[keys[0]], **dict(zip(names, keys[1:], strict=True))}, node
+
+    return walk(figures()[table], ())
+
+
+def _by_class(values: Sequence[float]) -> Row:
+    return dict(zip((*CLASSES, "overall"), values, strict=False))
 
 
 def _attacked(lab: Lab, eyes: Eyes, strategy: str) -> Answers:
@@ -150,17 +166,9 @@ def _attacked(lab: Lab, eyes: Eyes, strategy: str) -> Answers:
 def _degradation(lab: Lab) -> Table:
     rows = []
     for eyes, strategy in product(lab.eyes, (BENIGN, *STRATEGIES)):
-        answers = _attacked(lab, eyes, strategy)
-        row = {"network": eyes.name, "strategy": strategy, **_overall(lab, answers), **_by_class(lab, answers)}
+        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, _attacked(lab, eyes, strategy))}
         rows.append(row | {"certain": None if strategy == BENIGN else lab.certain(eyes, strategy)})
-    reference = [
-        {
-            "network": NETWORKS[network],
-            "strategy": strategy,
-            **_paper_by_class(figures()["degradation"][network][strategy]),
-        }
-        for network, strategy in product(NETWORKS, (BENIGN, *STRATEGIES))
-    ]
+    reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
     columns = ("network", "strategy", *lab.classes, "overall", "at_paper_sizes", "certain")
     return Table("degradation", "Accuracy by class and strategy, %", columns, rows, reference)
 
@@ -170,26 +178,15 @@ def _moved(lab: Lab, eyes: Eyes, strategy: str, params: str) -> Answers:
 
 
 def _parameters(lab: Lab) -> Table:
+    moved = (*SINGLE[:3], _BOTH, SINGLE[3])
     rows = [
-        {
-            "network": eyes.name,
-            "strategy": strategy,
-            "params": params.replace(",", " + "),
-            **_overall(lab, _moved(lab, eyes, strategy, params)),
-        }
-        for eyes, strategy, params in product(lab.deep, GRADIENT, (*SINGLE[:3], _BOTH, SINGLE[3]))
+        {"network": eyes.name, "strategy": one, "params": what, **_overall(lab, _moved(lab, eyes, one, what))}
+        for eyes, one, what in product(lab.deep, GRADIENT, moved)
     ]
     reference = [
-        {
-            "network": NETWORKS["vgg16"],
-            "strategy": strategy,
-            "params": params.replace(",", " + "),
-            "overall": value,
-        }
-        for strategy in GRADIENT
-        for params, value in zip(
-            ("vertex", "pose", _BOTH), figures()["parameters"]["vgg16"][strategy], strict=True
-        )
+        row | {"params": params, "overall": value}
+        for row, values in _paper("parameters", "strategy")
+        for params, value in zip(_COMPARED, values, strict=True)
     ]
     note = "The paper says that light does not matter, without figures."
     columns = ("network", "strategy", "params", "overall", "at_paper_sizes")
@@ -210,6 +207,10 @@ def _hyperparameters(lab: Lab) -> Table:
     return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference)
 
 
+_Tried = Callable[[Lab, Eyes, str], Mapping[str, Answers]]
+"""A network that was trained so, on each of TESTS."""
+
+
 def _on_tests(lab: Lab, network: str, train: str, found: Mapping[str, Answers]) -> Row:
     row: Row = {"network": network, "trained_on": train}
     for test, answers in found.items():
@@ -218,11 +219,7 @@ def _on_tests(lab: Lab, network: str, train: str, found: Mapping[str, Answers]) 
 
 
 def _paper_on_tests(table: str) -> list[Row]:
-    return [
-        {"network": NETWORKS[network], "trained_on": train, **dict(zip(TESTS, values, strict=True))}
-        for network, rows in figures()[table].items()
-        for train, values in rows.items()
-    ]
+    return [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
 
 
 def _known(lab: Lab, eyes: Eyes, trained: str) -> dict[str, Answers]:
@@ -239,25 +236,22 @@ def _fresh(lab: Lab, eyes: Eyes, trained: str) -> dict[str, Answers]:
     return found | {test: lab.answers(kind, eyes, test, few) for test in GRADIENT}
 
 
-def _retraining(lab: Lab) -> Table:
+def _learners(lab: Lab, table: str, title: str, trained: Sequence[str], tried: _Tried) -> Table:
     rows = [
-        _on_tests(lab, eyes.name, trained, _known(lab, eyes, trained))
-        for eyes, trained in product(lab.deep, (BENIGN, ONWARD, *GRADIENT))
+        _on_tests(lab, eyes.name, one, tried(lab, eyes, one))
+        for eyes, one in product(lab.deep, (BENIGN, *trained))
     ]
+    return Table(table, title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests(table))
+
+
+def _retraining(lab: Lab) -> Table:
     title = "Retrained networks on pictures made against the benign one, %"
-    return Table(
-        "retraining", title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests("retraining")
-    )
+    return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), _known)
 
 
 def _robustness(lab: Lab) -> Table:
-    rows = [
-        _on_tests(lab, eyes.name, trained, _fresh(lab, eyes, trained))
-        for eyes, trained in product(lab.deep, (BENIGN, *GRADIENT))
-    ]
-    title = "Retrained networks on pictures made against themselves, %"
-    return Table(
-        "robustness", title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests("robustness")
+    return _learners(
+        lab, "robustness", "Retrained networks on pictures made against themselves, %", GRADIENT, _fresh
     )
 
 
@@ -277,7 +271,6 @@ def _worth(lab: Lab) -> Table:
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
             rho = np.ones(len(lab.done)) if strategy == BENIGN else realism(far[strategy], largest)
             features = lab.features(eyes, strategy, eyes)
-
             setting = Setting(kind, weighted, draws=lab.drawing.draws, seed=lab.drawing.seed)
             row: Row = {"network": eyes.name, "strategy": strategy, "membership": kind, "weighted": weighted}
             before = _points(lab, eyes.network, features, rho)
@@ -287,10 +280,7 @@ def _worth(lab: Lab) -> Table:
                 row |= _bounded("gain", gain_of(before, after, setting))
             rows.append(row)
     reference = [
-        {"network": NETWORKS[network], "strategy": one, "membership": kind, "weighted": True, "worth": value}
-        for network, kinds in figures()["worth"].items()
-        for kind, values in kinds.items()
-        for one, value in values.items()
+        row | {"weighted": True, "worth": value} for row, value in _paper("worth", "membership", "strategy")
     ]
     note = (
         f"Natural logarithm. Realism by {METRICS[distance].name}, over the largest distance of a network's "
@@ -313,15 +303,8 @@ def _realism(lab: Lab) -> Table:
                 | {"overall": _rounded(far.mean(metric, counted))}
             )
     reference = [
-        {
-            "network": NETWORKS[network],
-            "strategy": one,
-            "metric": metric.upper(),
-            **dict(zip(CLASSES, values, strict=True)),
-        }
-        for network, metrics in figures()["realism"].items()
-        for metric, strategies in metrics.items()
-        for one, values in strategies.items()
+        row | {"metric": row["metric"].upper(), **_by_class(values)}
+        for row, values in _paper("realism", "metric", "strategy")
     ]
     absent = [METRICS[name].name for name in METRICS if name not in lab.measures]
     note = (
@@ -338,19 +321,12 @@ def _transfer(lab: Lab) -> Table:
     for source, target in product(lab.eyes, lab.eyes):
         for strategy in (BENIGN, *GRADIENT) if source is not target else ():
             said = right(target.network, lab.features(source, strategy, target), labels)
-            answers = lab.judged(said, lab.done)
             row = {"source": source.name, "target": target.name, "strategy": strategy}
-            rows.append({**row, **_overall(lab, answers), **_by_class(lab, answers)})
-    other = {"vgg16": "resnet50", "resnet50": "vgg16"}
+            rows.append(row | _with_classes(lab, lab.judged(said, lab.done)))
+    other = dict(zip(NETWORKS.values(), reversed(NETWORKS.values()), strict=True))
     reference = [
-        {
-            "source": NETWORKS[network],
-            "target": NETWORKS[other[network]],
-            "strategy": one,
-            **_paper_by_class(values),
-        }
-        for network, strategies in figures()["transfer"].items()
-        for one, values in strategies.items()
+        row | {"source": row["network"], "target": other[row["network"]], **_by_class(values)}
+        for row, values in _paper("transfer", "strategy")
     ]
     note = () if rows else ("Two networks are needed: --networks squeezenet,FILE.",)
     columns = ("source", "target", "strategy", *lab.classes, "overall", "at_paper_sizes")
@@ -380,10 +356,8 @@ def _sizes(lab: Lab) -> Table:
         for one in lab.classes
     ]
     reference = [
-        {
-            "class": f"{one} (paper)",
-            **dict(zip(("test objects", "train objects", "val objects"), counts, strict=True)),
-        }
+        {"class": f"{one} (paper)"}
+        | {f"{split} objects": n for split, n in zip(("test", "train", "val"), counts, strict=True)}
         for one, counts in figures()["sizes"].items()
     ]
     columns = ("class", *(f"{split} objects" for split in SPLITS), "train pictures", "test pictures")
@@ -398,14 +372,8 @@ def _order(
         apart = theirs[second] - theirs[first]
         if apart:
             one = ours[first].below(ours[second], lab.drawing)
-            row = {
-                "network": eyes.name,
-                "table": table,
-                "first": first,
-                "second": second,
-                "paper": round(apart, 4),
-            }
-            yield {**row, **_bounded("ours", one), "verdict": verdict(apart, one)}
+            row: Row = {"network": eyes.name, "table": table, "first": first, "second": second}
+            yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": verdict(apart, one)}
 
 
 def _strategies_in_order(lab: Lab) -> list[Row]:
@@ -418,15 +386,14 @@ def _strategies_in_order(lab: Lab) -> list[Row]:
 
 def _parameters_in_order(lab: Lab) -> list[Row]:
     rows: list[Row] = []
-    moved = ("vertex", "pose", _BOTH)
     for eyes, strategy in product(lab.deep, GRADIENT):
-        theirs: dict[str, float] = dict(zip(moved, figures()["parameters"]["vgg16"][strategy], strict=True))
-        ours = {one: _moved(lab, eyes, strategy, one) for one in moved}
+        theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
+        ours = {one: _moved(lab, eyes, strategy, one) for one in _COMPARED}
         rows += _order(lab, f"parameters, {NAMES[strategy]}", eyes, theirs, ours)
     return rows
 
 
-def _learners_in_order(lab: Lab, table: str, tried: Callable[[Lab, Eyes, str], dict[str, Answers]]) -> list[Row]:
+def _learners_in_order(lab: Lab, table: str, tried: _Tried) -> list[Row]:
     """For each test: is a retrained network better than the benign one?"""
     rows: list[Row] = []
     for eyes in lab.deep:

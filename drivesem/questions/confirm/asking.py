@@ -33,7 +33,7 @@ def confirm_run(config: Confirm) -> tuple[Confirmation, Answer]:
     worker = build()
     # Frames are kept by the result they belong to, so that another name of the run's folder is not in the way.
     claim(out, config, _WRITTEN, (*PRESENTATION, "run", "root", "seed"))
-    frames = KeptFrames(run, out, CONFIRMED, load)
+    frames = KeptFrames(run.folder, out, CONFIRMED, load)
     names = [frame.result.identifier for frame in run.frames]
     confirmed, failed = frames.ask(names, worker, build, config, Bar("drawing frames again", stays=False))
     if not confirmed:

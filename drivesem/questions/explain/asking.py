@@ -33,7 +33,7 @@ def explain_run(config: Explain) -> Answer:
     build = partial(ExplainWorker, config, trusted_attack(run.folder, config.trust), parse_params(run.params), out)
     work = build()
     claim(out, config, _WRITTEN, _FREE)
-    frames = KeptFrames(run, out, EXPLANATION, read_explanation)
+    frames = KeptFrames(run.folder, out, EXPLANATION, read_explanation)
     explanations, failed = frames.ask(names, work, build, config, Bar("explaining frames"))
     if not explanations:
         raise UsageError("--run", "a run with frames that can be explained", "; ".join(failed.values()))

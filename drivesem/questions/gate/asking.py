@@ -38,7 +38,7 @@ def gate_run(config: Gate) -> tuple[bool, Answer]:
         below = out / "runs" / str(place)
         build = partial(GateWorker, config, run, below)
         names = [frame.result.identifier for frame in run.frames if certain_losses(frame.result)]
-        kept, left = KeptFrames(run, below, GATE, load).ask(
+        kept, left = KeptFrames(run.folder, below, GATE, load).ask(
             names, build(), build, config, Bar(f"comparing in {run.name}", remaining=True)
         )
         mark = f"{run.name}/" if len(runs) > 1 else ""

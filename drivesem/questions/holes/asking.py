@@ -53,7 +53,7 @@ def holes_run(config: Holes) -> Answer:
         build = partial(HolesWorker, config, run, below)
         names = [frame.result.identifier for frame in run.frames] if config.contrast else _chosen(run)
         bar = Bar(f"looking around failures of {run.name}", remaining=True)
-        kept, left = KeptFrames(run, below, HOLES, load).ask(
+        kept, left = KeptFrames(run.folder, below, HOLES, load).ask(
             names if _chosen(run) else [], build(), build, config, bar
         )
         found |= {mark + one.identifier: one for one in kept}
@@ -135,7 +135,7 @@ def _inside(
     below = out / hashlib.sha256(repr(sorted(rules.items())).encode()).hexdigest()[:12]
     build = partial(InsideWorker, config, run, rules, further, below)
     bar = Bar(f"checking rules of {run.name}", remaining=True)
-    return KeptFrames(run, below, further.file, load_inside).ask(list(rules), build(), build, config, bar)
+    return KeptFrames(run.folder, below, further.file, load_inside).ask(list(rules), build(), build, config, bar)
 
 
 def _of_run(

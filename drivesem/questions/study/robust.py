@@ -167,7 +167,7 @@ def states_of(
     build = partial(Judge, run, attack, detectors, study.states, folder)
     names = [frame.result.identifier for frame in run.frames]
     read = partial(load_record, kind=FrameStates, schema=SCHEMA)
-    return KeptFrames(run, folder, ROBUST, read).ask(
+    return KeptFrames(run.folder, folder, ROBUST, read).ask(
         names, build(), build, study, Bar("asking all detectors", remaining=True)
     )
 

@@ -78,7 +78,7 @@ def test_attack_in_words(standins, tmp_path, capsys):
     code, told, _ = answer(capsys, "attack", "--out", str(tmp_path / "run"), "--limit", "3", "--method", "halton")
     assert code == 0
     assert "accuracy, %" in told
-    assert "report: " in told
+    assert f"written to {tmp_path / 'run' / 'report.html'}" in told
 
 
 def test_limit_takes_classes_in_turn(standins, tmp_path, capsys):
@@ -98,6 +98,9 @@ def test_data_and_training(standins, tmp_path, capsys):
     )
     assert code == 0
     assert trained["accuracy"]["train"] == 1.0
+    low, high = trained["intervals"]["test"]
+    assert 0 <= low < trained["accuracy"]["test"] <= high <= 1
+    assert trained["intervals"]["train"] == [pytest.approx(18 / (18 + 1.96**2), abs=1e-3), 1.0]
     assert len(trained["epochs"]) == 30
     network = loading.load_classifier(trained["weights"], standins.classes)
     images, labels = pictures.read_pictures(out, "test", standins.classes)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.classify.objects.types import CLASSES
+from drivesem.classify.paper import figures
 from drivesem.classify.study.figures import Answers, Drawing, keeping_shares, verdict
-from drivesem.classify.study.paper import figures
 from drivesem.evaluation.resampling import Interval
 
 DRAWING = Drawing(50, 0)

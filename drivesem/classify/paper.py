@@ -35,9 +35,7 @@ REMARKS: dict[str, tuple[str, ...]] = {
 @cache
 def figures() -> dict[str, Any]:
     """The tables by name, as `paper.yaml` says."""
-    return yaml.safe_load(
-        resources.files("drivesem.classify.study").joinpath("paper.yaml").read_text(encoding="utf-8")
-    )
+    return yaml.safe_load(resources.files("drivesem.classify").joinpath("paper.yaml").read_text(encoding="utf-8"))
 
 
 def theirs(architecture: str) -> str:
