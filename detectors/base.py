@@ -28,12 +28,18 @@ def raised(error: Exception) -> str:
     """What a user's code raised, and where: `ValueError: why (mine.py:12, in forward)`. The place is the innermost
     outside of installed libraries and of this package.
     """
-    frames = traceback.extract_tb(error.__traceback__)
-    home = str(Path(__file__).parent)
-    own = [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(home)]
-    place = (own or frames)[-1]
+    if isinstance(error, SyntaxError) and error.filename:  # no line of it was run
+        return f"{type(error).__name__}: {error.msg} ({Path(error.filename).name}:{error.lineno})"
+    place = (outside(error) or traceback.extract_tb(error.__traceback__))[-1]
     said = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {said} ({Path(place.filename).name}:{place.lineno}, in {place.name})"
+
+
+def outside(error: Exception) -> list[traceback.FrameSummary]:
+    """The places that an error came through outside of installed libraries and of this package: a user's code."""
+    frames = traceback.extract_tb(error.__traceback__)
+    home = str(Path(__file__).parent)
+    return [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(home)]
 
 
 @runtime_checkable

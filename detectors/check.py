@@ -19,10 +19,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes
-from detectors.base import Detector, DetectorError, Plantable, Predictor, Raw, predict, raised
+from detectors.base import Detector, DetectorError, Plantable, Predictor, Raw, outside, predict, raised
 from detectors.types import Detections, Targets
 
-Verdict = Literal["ok", "failed", "not tried"]
+Verdict = Literal["ok", "failed", "raised", "not tried"]
 Plant = Callable[[Any, Tensor, int], Any]
 """Raw predictions, a box (4,) px and a label, to the same with this prediction alone."""
 
@@ -76,8 +76,13 @@ class Report:
 
     @property
     def failed(self) -> tuple[Finding, ...]:
-        """What was broken."""
-        return tuple(finding for finding in self.findings if finding.verdict == "failed")
+        """What was broken, by what a method gives or by its raising."""
+        return tuple(finding for finding in self.findings if finding.verdict in ("failed", "raised"))
+
+    @property
+    def raised(self) -> tuple[Finding, ...]:
+        """What the detector's own code raised."""
+        return tuple(finding for finding in self.findings if finding.verdict == "raised")
 
     def require(self) -> Report:
         """The same; raises DetectorError with all that was broken, where anything was."""
@@ -169,7 +174,7 @@ def _try(name: str, promise: Callable[[Trial], str], trial: Trial) -> Finding:
     except _Broken as reason:
         return Finding(name, "failed", str(reason))
     except Exception as error:  # whatever a detector of anybody's raises is a finding
-        return Finding(name, "failed", raised(error))
+        return Finding(name, "raised" if outside(error) else "failed", raised(error))
 
 
 def _facts(trial: Trial) -> str:

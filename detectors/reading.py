@@ -59,5 +59,15 @@ def read_state(path: Path, what: str) -> Any:
                 raise ValueError(f"parts of {claimed:,} bytes in a file of {path.stat().st_size:,}")
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # pickle, zip and torch have errors of their own
-        lines = itertools.islice((line.strip() for line in str(error).splitlines() if line.strip()), 2)
-        raise DetectorError(f"{path}: expected {what}, found {' '.join(lines) or type(error).__name__}") from None
+        raise DetectorError(f"{path}: expected {what}, found {unreadable(error)}") from None
+
+
+def unreadable(error: Exception) -> str:
+    """Why torch could not read a file, without its advice to let code run."""
+    _, found, reason = str(error).rpartition("WeightsUnpickler error:")
+    lines = list(
+        itertools.islice((line.strip() for line in reason.splitlines() if line.strip()), 1 if found else 2)
+    )
+    if found and lines:
+        return f"more than tensors and plain values ({lines[0].partition('. Please')[0]})"
+    return " ".join(lines[:2]) or type(error).__name__

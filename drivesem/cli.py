@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import gc
 import importlib
+import math
 import os
 import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from types import FrameType
-from typing import NoReturn
 
 from drivesem.run.allocation import keep_freed
 from drivesem.run.lock import let_go
@@ -30,6 +31,8 @@ _EXIT_PIPE = 141
 _EXIT_ENDED = 143
 _CODE = re.compile(r"(?:^|[,@])(?:module|torchscript|export|ultralytics):([^,]+)")
 """Detectors whose files are code (`detectors.adapters.choose.RUNS_CODE`, which a test holds this against)."""
+_ENDING_SECONDS = 5.0
+"""In which a command that is interrupted ends; after that Ctrl-C counts again."""
 _LONGEST_LINE = 2000
 """Characters: what is wrong with a file may be what it holds."""
 
@@ -38,12 +41,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 nobody reads
     on, 143 ended by SIGTERM.
     """
+    with _interrupted_once(last=argv is None):
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     try:
         config = parse(sys.argv[1:] if argv is None else argv)
         from drivesem.store import stored  # which needs numpy, and --help does not
 
         _tell_of_code(config)
-        with _sigterm_interrupts(), let_go(), stored(config) as config:
+        with let_go(), stored(config) as config:
             return _run(config)
     except KeyboardInterrupt as error:
         sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
@@ -51,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the interpreter's last words go
         return _EXIT_PIPE
-    except (ValueError, OSError) as error:
+    except Exception as unknown:
+        error = _of_detector(unknown) or unknown
         if not _is_bad_input(error):
             raise
         sys.stderr.write(f"drivesem: {' '.join(shown(error, _LONGEST_LINE).split())}\n")
@@ -63,20 +72,30 @@ class _EndedError(KeyboardInterrupt):
 
 
 @contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
-    """What systems that share machines send before they kill ends a command as Ctrl-C does."""
+def _interrupted_once(last: bool) -> Iterator[None]:
+    """Let SIGTERM, which systems that share machines send before they kill, end a command as Ctrl-C does. While a
+    command ends, neither counts again for some seconds, so that it can clean up. last: the process does nothing
+    else, and they do not count again at all once the command is done.
+    """
     if threading.current_thread() is not threading.main_thread():  # a signal's handler can't be set elsewhere
         yield
         return
+    interrupted_s = -math.inf
 
-    def end(number: int, frame: FrameType | None) -> NoReturn:
-        raise _EndedError
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted_s
+        if time.monotonic() - interrupted_s > _ENDING_SECONDS:
+            interrupted_s = time.monotonic()
+            raise KeyboardInterrupt if number == signal.SIGINT else _EndedError
 
-    before = signal.signal(signal.SIGTERM, end)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, end)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # neither ignored nor somebody else's
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_IGN if last and interrupted_s > -math.inf else handler)
 
 
 def _tell_of_code(config: Command) -> None:
@@ -86,6 +105,15 @@ def _tell_of_code(config: Command) -> None:
         for text in value if isinstance(value, tuple) else (value,):
             for word in _CODE.findall(text) if isinstance(text, str) else ():
                 sys.stderr.write(f"drivesem: {option(setting.name)}: runs the code in {shown(word)}\n")
+
+
+def _of_detector(error: Exception) -> UsageError | None:
+    """An error that a detector of the user's own raised, as one of the setting that names it."""
+    module = sys.modules.get("detectors.adapters.module")  # nothing heavy is imported to find out
+    if module is None or _is_bad_input(error):
+        return None
+    told = module.blamed(error)
+    return None if told is None else UsageError("--detector", module.RAISES_NOTHING, told)
 
 
 def _is_bad_input(error: Exception) -> bool:

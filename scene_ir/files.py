@@ -49,6 +49,8 @@ _MOST_YAML = 1 << 18
 _INTEGERS = 1 << 63
 """Integers lie below it, as in the arrays that are made of them."""
 _INTEGER_DIGITS = len(str(_INTEGERS))
+_YAML_DIGITS = 200
+"""Characters of an integer in YAML, which may be binary, with underscores."""
 _ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
@@ -338,6 +340,8 @@ class _Loader(yaml.SafeLoader):
 
     def integer(self, node: Any) -> int:
         """What the text of a node says."""
+        if len(node.value) > _YAML_DIGITS:
+            raise ValueError(f"an integer of {len(node.value)} digits, too large for 64 bits")
         return _integer(str(self.construct_yaml_int(node)))
 
 

@@ -15,24 +15,24 @@ from pathlib import Path
 from scene_ir import files
 from tools.same import copy_part, objects_of
 
-_STREETS = 20
+STREETS = 20
 """Generated frames that the small ones are cut from, at different places."""
 _WINDOW_WH = 192, 112
 _SHIFT_PX = 5
 _ACROSS = 15
 
 
-def small_frames(folder: Path, count: int) -> None:
-    """Make `folder`, KITTI's layout: a car a frame, cut from generated streets."""
+def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
+    """Make `folder`, KITTI's layout: a car a frame, cut from so many generated streets."""
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
-        words = ["synth", "--frames", str(_STREETS), "--seed", "11", "--workers", "2", "--out", temporary]
-        subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True)
+        words = ["synth", "--frames", str(streets), "--seed", "11", "--workers", "2", "--out", temporary]
+        subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True, stdout=subprocess.DEVNULL)
         source = Path(temporary) / "training"
         cars = {path.stem: objects_of(path) for path in sorted((source / "label_2").glob("*.txt"))}
-        streets = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]
+        shown = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]
         width, height = _WINDOW_WH
         for number in range(count):
-            name, turn = streets[number % len(streets)], number // len(streets)
+            name, turn = shown[number % len(shown)], number // len(shown)
             left, top, right, bottom = map(float, cars[name][0][4:8])
             # Each time a little to the side: no two pictures are the same.
             down, across = divmod(turn, _ACROSS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import pkgutil
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,17 @@ from torch import nn
 from detectors.adapters.network import NetworkDetector
 from detectors.adapters.spec import checked, load_spec
 from detectors.base import Detector, DetectorError, raised
+
+RAISES_NOTHING = "methods that raise nothing"
+"""What is expected of a detector of the user's own."""
+_LOADED: set[str] = set()
+"""Files of the classes that were loaded."""
+
+
+def blamed(error: Exception) -> str | None:
+    """What a user's class raised, and where, where an error came through the file of one; else None."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return raised(error) if any(frame.filename in _LOADED for frame in frames) else None
 
 
 def load(place: str, spec: Path | None = None) -> Detector:
@@ -62,6 +74,7 @@ def _class(where: str, name: str) -> Any:
         found = None
     if not isinstance(found, type):
         raise DetectorError(f"{where}: expected a class {name}, found {type(found).__name__}")
+    _LOADED.add(str(getattr(sys.modules.get(found.__module__), "__file__", None)))
     return found
 
 

@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from detectors.adapters.module import RAISES_NOTHING
 from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
@@ -20,11 +21,13 @@ from drivesem.settings.errors import UsageError
 
 LEAST_SIDE = 64
 """Of a picture, px: its blocks must be larger than a network's stride."""
-_STYLES = {"ok": "green", "failed": "bold red", "not tried": "dim"}
+_STYLES = {"ok": "green", "failed": "bold red", "raised": "bold red", "not tried": "dim"}
 
 
 def run(config: Check) -> int:
-    """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input."""
+    """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input, a
+    detector whose code raises among it.
+    """
     width, height = _size(config.size)
     check_device(config.device)
     try:
@@ -39,6 +42,8 @@ def run(config: Check) -> int:
         print_json({"detector_setting": config.detector, **asdict(report)})
     else:
         _print(report, config, Console())
+    if report.raised:
+        raise UsageError("--detector", RAISES_NOTHING, report.raised[0].said)
     return 1 if report.failed else 0
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from drivesem.questions.verify.asking import verify_run
+from drivesem.questions.verify.asking import WHOLE_RUN, verify_run
 from drivesem.report.answer import print_json
 from drivesem.report.tables import Sheet
 from drivesem.report.terminal import Console
@@ -13,8 +14,8 @@ from drivesem.run.report.grading import UNKNOWN
 from drivesem.settings.commands import Verify
 from drivesem.settings.devices import check_device
 
-_MOST_SHOWN = 30
-"""Differences that are told on a terminal; verify.json has them all."""
+_MOST_SHOWN, _MOST_ALIKE = 30, 5
+"""Differences that are told on a terminal, and of them those of one check of a frame; verify.json has them all."""
 
 _UNSEALED = (
     "manifest.json is of an earlier version, with hashes of pictures, labels and theta.json alone: settings, loss "
@@ -36,6 +37,16 @@ def run(config: Verify) -> int:
     return 0 if data["agree"] else 1
 
 
+def _told_first(differences: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+    """A few of each frame and check: a changed picture has hundreds, and must not hide a setting. The whole run's,
+    which may explain the others, come first.
+    """
+    kept: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for one in sorted(differences, key=lambda one: one["frame"] != WHOLE_RUN):
+        kept.setdefault((one["frame"], one["check"]), []).append(one)
+    return [one for ours in kept.values() for one in ours[:_MOST_ALIKE]]
+
+
 def _print(data: dict[str, Any], console: Console) -> None:
     rows = tuple(
         (row["name"], row["holds"], str(row["compared"]), str(row["differing"]), str(len(row["frames_differing"])))
@@ -43,12 +54,12 @@ def _print(data: dict[str, Any], console: Console) -> None:
     )
     columns = ("check", "what holds where nothing differs", "compared", "differ", "in frames")
     console.print(Sheet(f"{data['frames']} frames of {data['run']}", columns, rows).table(columns[:2]))
-    for wrong in data["differences"][:_MOST_SHOWN]:
+    told = _told_first(data["differences"])[:_MOST_SHOWN]
+    for wrong in told:
         line = f"{wrong['frame']}: {wrong['check']}: {wrong['field']}"
         line += f": expected {wrong['expected']}, found {wrong['found']}"
         console.print(line, soft_wrap=True, markup=False, highlight=False)
-    left = len(data["differences"]) - _MOST_SHOWN
-    if left > 0:
+    if left := len(data["differences"]) - len(told):
         console.print(f"and {left} more")
     if ungraded := data["frames_ungraded"]:
         console.print(f"{ungraded} frame{'' if ungraded == 1 else 's'}: {UNKNOWN}")

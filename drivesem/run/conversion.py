@@ -49,9 +49,10 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
         table = labels_of_run(source, how.frames)
     else:
         table = read(source, layout, scored=how.scores)
-    odd = table.truncation[(table.truncation > 1) | ((table.truncation < 0) & (table.truncation != -1))]
+    (odd,) = np.nonzero((table.truncation > 1) | ((table.truncation < 0) & (table.truncation != -1)))
     if len(odd):
-        raise FormatError(f"{source}: truncation", "[0, 1], or -1 where it is not known", f"{odd[0]:g}")
+        where = f"{source}: frame {table.frames[table.frame[odd[0]]]}: truncation"
+        raise FormatError(where, "[0, 1], or -1 where unknown", f"{table.truncation[odd[0]]:g}")
     if how.mapping:
         table = renamed(table, how.mapping)
     if layout == "run":

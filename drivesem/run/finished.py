@@ -125,10 +125,10 @@ def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "
 
 
 def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
-    if not (folder / CONFIG).is_file():
-        raise UsageError(setting, "a folder of drivesem attack", folder)
     for file in (CONFIG, METRICS, MANIFEST):
         files.below(folder, file)
+    if not (folder / CONFIG).is_file():
+        raise UsageError(setting, "a folder of drivesem attack", folder)
     settings = files.read_yaml(folder / CONFIG)
     if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
@@ -149,7 +149,7 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     return Run(
         name=name,
         folder=folder,
-        detector=str(settings["detector"]),
+        detector=from_json(str, settings["detector"], f"{folder / CONFIG}: detector"),
         # Runs from before there was a choice followed the default.
         method=str(settings.get("method", Attack().method)),
         params=params,

@@ -13,6 +13,7 @@ from typing import Any, NoReturn, TypeVar
 
 import torch
 
+from detectors.adapters.module import RAISES_NOTHING, blamed
 from detectors.base import DetectorError
 from drivesem import store
 from drivesem.run.allocation import keep_freed
@@ -60,8 +61,9 @@ def do(job: Any) -> Any:
 
 
 def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
-    """A job's result. SceneError where the device has no room for it. keep_going: an error for which no input is
-    to blame becomes UnforeseenError, which says where it arose.
+    """A job's result. SceneError where the device has no room for it, UsageError for what a user's own detector
+    raised. keep_going: this, and an error for which no input is to blame, becomes UnforeseenError, which says
+    where it arose.
     """
     try:
         result = work(job)
@@ -73,6 +75,8 @@ def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
         raise
     except Exception as error:
         if not keep_going:
+            if (told := blamed(error)) is not None:
+                raise UsageError("--detector", RAISES_NOTHING, told) from error
             raise
         last = traceback.extract_tb(error.__traceback__)[-1]
         found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"

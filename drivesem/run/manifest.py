@@ -18,6 +18,15 @@ from scene_ir.errors import FormatError
 
 OF_PLACE_AND_TIME = ("out", "seconds")
 """Keys of metrics.json and result.json that differ between two runs with the same settings: in no hash."""
+OF_RUN = ("frames_without_vehicles", "frames_failed")
+OF_FRAME = (
+    *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
+    *("failures", "grade_notes", "checked_by", "change"),
+)
+"""What metrics.json and result.json hold that does not follow from other files, or not all of it. Each has a hash
+of its own, so that what was changed has a name."""
+_DIGITS = 16
+"""Of such a hash, hexadecimal: the whole file's is beside it."""
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -41,6 +50,12 @@ def manifest_of(config: Attack, out: Path, names: Sequence[str], metrics: Mappin
         "settings": settings_of(config),
         "metrics": digest_of(metrics),
         "frames": {name: frame_hashes(out / FRAMES / name) for name in names},
+        "fields": {
+            "run": field_hashes(metrics, OF_RUN),
+            "frames": {
+                name: field_hashes(files.read_json(out / FRAMES / name / RESULT), OF_FRAME) for name in names
+            },
+        },
     }
 
 
@@ -56,9 +71,18 @@ def _hash(path: Path, folder: Path) -> str:
     return digest_of(files.read_json(path)) if path == folder / RESULT else files.digest(path)
 
 
+def field_hashes(data: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
+    """The first digits of the SHA-256 of single values of a JSON object, null for those that it lacks."""
+    return {name: _sha(data.get(name))[:_DIGITS] for name in names}
+
+
 def digest_of(data: Any) -> str:
     """SHA-256 of a JSON object without OF_PLACE_AND_TIME. Raises FormatError where it is none."""
     if not isinstance(data, Mapping):
         raise FormatError("a run's figures", "an object", type(data).__name__)
     told = {key: value for key, value in data.items() if key not in OF_PLACE_AND_TIME}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return _sha(told)
+
+
+def _sha(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

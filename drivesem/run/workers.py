@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cv2
@@ -115,7 +118,8 @@ def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Itera
     waiting, pending = iter(jobs), {}
     try:
         # No more jobs at a time than processes: what is pending is what is at work.
-        pending |= {pool.submit(do, job): job for job in islice(waiting, count)}
+        with _unheard():
+            pending |= {pool.submit(do, job): job for job in islice(waiting, count)}
         while pending:
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
             gone = {future for future in done if isinstance(future.exception(), TerminatedWorkerError)}
@@ -131,10 +135,24 @@ def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Itera
         pool.shutdown(kill_workers=True)
 
 
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Processes that start inside never hear of Ctrl-C, which reaches all processes of a terminal, not even while
+    Python itself loads: the one that starts them ends them. There it counts afterwards.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    resource_tracker.ensure_running()  # starting it lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin(parent: int, start: Start) -> None:
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches all processes of a terminal; the first one ends it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
     begin(start)
 

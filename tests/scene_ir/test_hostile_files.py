@@ -82,7 +82,7 @@ BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("a
     ("content", "said"),
     [
         ("[" * 20_000, "nested too deep"),
-        ("a: " + "9" * 5000, "digits"),
+        ("a: " + "9" * 5000, "an integer of 5000 digits, too large for 64 bits"),
         (f"a: {1 << 64}", "too large for 64 bits"),
         (BOMB, r"an alias \(\*a\)"),
         ("a: &a [*a]", r"an alias \(\*a\)"),

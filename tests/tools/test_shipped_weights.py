@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -10,6 +12,8 @@ from detectors.registry import SHIPPED, load_detector
 from detectors.types import CLASSES
 from drivesem.data.classes import KITTI
 from drivesem.synth.frames import generate_frame
+from scene_ir import files
+from tools.beside import ROOT
 
 SEED, INDEX = 2026, 13
 """A held-out street; no frame that the detectors were trained, chosen or judged on."""
@@ -30,3 +34,11 @@ def test_near_cars_are_found(name: str) -> None:
     sure = (found.scores >= detector.t_star) & (found.labels == CLASSES.index("Car"))
     overlap = iou_matrix(boxes_xyxy[near], found.boxes_xyxy[sure])
     assert float((overlap.max(1).values > 0.5).float().mean()) == 1.0
+
+
+FILES = [path for part in ("detectors", "drivesem", "scene_ir") for path in (ROOT / part).rglob("*.safetensors")]
+
+
+@pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: path.stem)
+def test_a_card_has_the_sha_of_every_file(path: Path) -> None:
+    files.check_card(path, files.read_bytes(path))

@@ -125,7 +125,7 @@ def exposure() -> Exposure:
     return Exposure(image, depth, classes, CLASSES, instances, camera, np.eye(4), tuple(things), labels)
 
 
-def _dataset(layout: str, root: Path) -> None:
+def dataset(layout: str, root: Path) -> None:
     place, writer = Place(1, "01", "clone", 1, "train"), WRITERS[layout](root)
     writer.finish([writer.write(place, exposure())])
 
@@ -269,7 +269,7 @@ def _run_with_scene(root: Path) -> None:
     save_scene(scene(), root / "scene")
 
 
-def _net() -> YoloV3:
+def net() -> YoloV3:
     """A Darknet of two layers."""
     layers = [
         Section("net", {"height": "32", "width": "32", "channels": "3"}),
@@ -286,7 +286,7 @@ def _cloud() -> bytes:
 
 
 def _kitti(root: Path) -> None:
-    _dataset("kitti", root)
+    dataset("kitti", root)
     files.write_bytes(root / "training" / "velodyne" / "000001.bin", _cloud())
 
 
@@ -344,7 +344,7 @@ def _kept(root: Path) -> None:
 
 
 def _weights(root: Path) -> None:
-    save_detector(_net(), root / "net.safetensors")
+    save_detector(net(), root / "net.safetensors")
 
 
 def _states(root: Path) -> None:
@@ -513,16 +513,16 @@ FORMATS: dict[str, Format] = {
         ),
         Format(
             "virtual kitti 2",
-            partial(_dataset, "vkitti2"),
+            partial(dataset, "vkitti2"),
             each(partial(_frames, "vkitti2"), partial(_table, "vkitti2")),
         ),
         Format(
             "coco json",
-            partial(_dataset, "coco"),
+            partial(dataset, "coco"),
             each(partial(_frames, "coco"), partial(_table, "coco")),
             ("**/*.json",),
         ),
-        Format("yolo", partial(_dataset, "yolo"), each(partial(_frames, "yolo"), partial(_table, "yolo"))),
+        Format("yolo", partial(dataset, "yolo"), each(partial(_frames, "yolo"), partial(_table, "yolo"))),
         Format("scene folder", partial(save_scene, scene()), load_scene),
         Format("run", _run, each(load_run, _report), ("*.json", "*.yaml", "**/*.json", "**/*.png"), share=0.1),
         Format("theta.json", _run_with_scene, _theta, ("frames/a/*.json",)),
@@ -538,7 +538,7 @@ FORMATS: dict[str, Format] = {
             ),
             share=0.25,
         ),
-        Format("darknet", lambda root: darknet.save(_net(), root / "net.cfg"), _darknet),
+        Format("darknet", lambda root: darknet.save(net(), root / "net.cfg"), _darknet),
         Format("obj", _meshes, partial(_meshes_of, ("a.obj",)), ("a.obj", "a.mtl", "image.png")),
         Format("glb", _meshes, partial(_meshes_of, ("a.glb", "own.glb", "a.gltf")), ("*.glb", "*.gltf", "*.bin")),
         Format("ply", _meshes, partial(_meshes_of, ("a.ply", "text.ply")), ("*.ply",)),

@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 import detectors.registry
+from detectors.reading import unreadable
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
 from drivesem.classify.networks.resnet import ResNet50
 from drivesem.classify.networks.squeezenet import SqueezeNet
 from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.weights import load_into, read_weights
 
@@ -40,7 +42,7 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
         expected = f"{SqueezeNet.architecture}, {trained}, or an ONNX file (.onnx)"
         known = ", which tells ImageNet's classes apart: train it on these (classify train --network)"
         raise FormatError("--network", expected, name_or_path + (known if _is_library(name_or_path) else ""))
-    metadata, tensors = read_weights(path)
+    metadata, tensors = _read(path)
     network = _made(metadata.get("architecture"), classes_of(path, metadata), f"{path}: architecture")
     if network.classes != tuple(classes):
         expected = f"one for the {len(classes)} classes {', '.join(classes)}"
@@ -99,6 +101,13 @@ def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -
     detectors.registry.write_weights(path, metadata, tensors)
 
 
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """As `read_weights`; the shipped file is held against its model card first."""
+    if path == SHIPPED:
+        files.check_card(path, files.read_bytes(path))
+    return read_weights(path)
+
+
 def ready(network: Classifier, device: str = "cpu") -> Classifier:
     """Frozen, in eval mode, channels-last."""
     network.requires_grad_(False)
@@ -133,15 +142,13 @@ def _is_library(architecture: str) -> bool:
 def _tensors(path: Path) -> dict[str, Tensor]:
     """Floating tensors of a weights file. Raises FormatError."""
     if path.suffix not in _TORCH_FILES:
-        return read_weights(path)[1]
+        return _read(path)[1]
     try:
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise FormatError(str(path), "a file that can be read", error.strerror) from error
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise FormatError(
-            str(path), "tensors by name, as torch.save writes them", str(error).splitlines()[0]
-        ) from error
+        raise FormatError(str(path), "tensors by name, as torch.save writes them", unreadable(error)) from error
     if not isinstance(loaded, dict) or not all(isinstance(tensor, Tensor) for tensor in loaded.values()):
         raise FormatError(str(path), "tensors by name (a state_dict)", type(loaded).__name__)
     return {str(name): tensor for name, tensor in loaded.items() if tensor.is_floating_point()}

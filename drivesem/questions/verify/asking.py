@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,15 @@ from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import grader_of, params_of, summary_of
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import CONFIG, FRAMES, detector_of, settings_of, trusted_attack
-from drivesem.run.manifest import digest_of
+from drivesem.run.manifest import OF_RUN, digest_of, field_hashes
+from drivesem.run.records import from_json
 from drivesem.run.results import SCHEMA
 from drivesem.settings.commands import Attack, Verify
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-_WHOLE_RUN = "(run)"
+WHOLE_RUN = "(run)"
 """Stands for a frame's name where a difference is the run's."""
 _NOT_COMPUTED = ("schema", "out", "seconds", "frames_without_vehicles", "frames_failed")
 """Of metrics.json: what does not follow from the frames. The last two are in its hash."""
@@ -68,6 +69,7 @@ class VerifyWorker:
             aim=Aim.of(attack.target_objects, attack.target_classes),
             t_star=t_star_of(detector, attack.t_star),
             hashes=self.manifest.frames,
+            field_hashes=self.manifest.frame_fields,
             sealed=self.manifest.settings is not None,
             grader=grader_of(replace(attack, confirm=False), detector),
         )
@@ -80,12 +82,15 @@ class VerifyWorker:
 @dataclass(frozen=True, slots=True)
 class Manifest:
     """What manifest.json says. settings, metrics: those of the run and the digest of its figures, None in runs of
-    earlier versions, which hashed pictures, labels and theta.json alone; frames: hashes by frame and file.
+    earlier versions, which hashed pictures, labels and theta.json alone; frames: hashes by frame and file;
+    run_fields, frame_fields: of single values of metrics.json and, by frame, of result.json, none in earlier runs.
     """
 
     settings: Mapping[str, Any] | None
     metrics: str | None
     frames: Mapping[str, Mapping[str, str]]
+    run_fields: Mapping[str, str]
+    frame_fields: Mapping[str, Mapping[str, str]]
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
@@ -96,7 +101,14 @@ class Manifest:
             raise FormatError(f"{path}: frames", "hashes by frame and file", "something else")
         if not isinstance(settings, dict | None):
             raise FormatError(f"{path}: settings", "settings by name", type(settings).__name__)
-        return cls(settings, data.get("metrics"), frames)
+        fields = from_json(_Fields, data.get("fields", {}), f"{path}: fields")
+        return cls(settings, data.get("metrics"), frames, fields.run, fields.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fields:
+    run: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 def _totals(run: Run, worker: VerifyWorker) -> CheckLog:
@@ -104,6 +116,7 @@ def _totals(run: Run, worker: VerifyWorker) -> CheckLog:
     log, metrics, manifest = CheckLog(), files.read_json(run.folder / METRICS), worker.manifest
     if manifest.settings is not None:
         log.same("files", METRICS, manifest.metrics, digest_of(metrics))
+        log.each("files", METRICS, manifest.run_fields, field_hashes(metrics, OF_RUN))
         now = settings_of(worker.attack)
         # A setting that came with a later version had its default before.
         before = settings_of(Attack()) | dict(manifest.settings)
@@ -140,7 +153,7 @@ def _data(
 ) -> dict[str, Any]:
     """JSON's form."""
     differences: list[tuple[str, Disagreement]] = [(c.identifier, d) for c in checked for d in c.differences]
-    differences += [(_WHOLE_RUN, d) for d in totals.differences]
+    differences += [(WHOLE_RUN, d) for d in totals.differences]
     rows = []
     for check, holds in CHECKS.items():
         ours = [(name, d) for name, d in differences if d.check == check]

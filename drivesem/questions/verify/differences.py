@@ -43,6 +43,11 @@ class CheckLog:
         """Compare exactly."""
         self.told(check, name, expected, found, agrees=expected == found)
 
+    def each(self, check: str, file: str, expected: Mapping[str, str], found: Mapping[str, str]) -> None:
+        """Compare what is expected of the values of a file, by name."""
+        for name, value in expected.items():
+            self.same(check, f"{file}: {name}", value, found.get(name))
+
     def told(self, check: str, name: str, expected: object, found: object, agrees: bool) -> None:
         """Count a comparison whose outcome is known."""
         self.compared[check] = self.compared.get(check, 0) + 1

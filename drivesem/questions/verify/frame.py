@@ -33,7 +33,7 @@ from drivesem.run.frame import (
     target_records,
 )
 from drivesem.run.looking import as_picture, detections_in
-from drivesem.run.manifest import frame_hashes
+from drivesem.run.manifest import OF_FRAME, field_hashes, frame_hashes
 from drivesem.run.results import BoxRecord, Failure, FrameResult, load_frame
 from drivesem.truth.certificate import Rule
 from drivesem.truth.grades import Count, Grade
@@ -72,8 +72,8 @@ _LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "size_l
 @dataclass(frozen=True)
 class Given:
     """What the run's settings say. hashes: of files in frames' folders, by frame and name, as the manifest has
-    them; sealed: whether that is all of their files; t_star: score from which a detection counts; grader: of
-    certificates alone.
+    them; field_hashes: of values in their result.json; sealed: whether hashes are of all their files; t_star:
+    score from which a detection counts; grader: of certificates alone.
     """
 
     detector: Predictor
@@ -85,6 +85,7 @@ class Given:
     aim: Aim
     t_star: float
     hashes: Mapping[str, Mapping[str, str]]
+    field_hashes: Mapping[str, Mapping[str, str]]
     sealed: bool
     grader: Grader
 
@@ -125,6 +126,8 @@ def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
     known, found = given.hashes.get(identifier, {}), frame_hashes(folder)
     for name in sorted(known.keys() | found.keys()) if given.sealed else known:
         log.same("files", name, known.get(name, _NO_FILE), found.get(name, _NO_FILE))
+    values = field_hashes(files.read_json(folder / RESULT), OF_FRAME)
+    log.each("files", RESULT, given.field_hashes.get(identifier, {}), values)
     check_change(log, folder, result, rest, perturbed, given.params, given.budget, given.parametrisation)
     check_feasibility(log, result, rest, perturbed, reach_of(given.budget, given.parametrisation))
     size = (base.camera.height, base.camera.width)

@@ -1,11 +1,17 @@
 """The shipped classifier on embedded objects that it was not trained on."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 import torch
 
+from drivesem.classify.networks import loading
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.types import CLASSES
 from drivesem.classify.scenes import ObjectScene, generated_background, in_turn
+from scene_ir.errors import FormatError
 
 
 @pytest.mark.slow
@@ -19,3 +25,17 @@ def test_held_out_objects_are_told_apart():
         picture = ObjectScene(name, model, view, generated_background(f"{name}-{view}")).picture().clamp(0, 1)
         right.append(int(network(picture[None])[0].argmax()) == model.label)
     assert sum(right) / len(right) >= 0.95
+
+
+def test_it_is_held_to_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load_classifier("squeezenet", CLASSES)
+    for suffix in (".safetensors", ".md"):
+        shutil.copy(loading.SHIPPED.with_suffix(suffix), tmp_path)
+    path = tmp_path / loading.SHIPPED.name
+    monkeypatch.setattr(loading, "SHIPPED", path)
+    data = path.read_bytes()
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(FormatError, match=r"squeezenet-objects\.safetensors: expected the SHA-256 of"):
+        load_classifier("squeezenet", CLASSES)
+    with pytest.raises(FormatError, match="expected the SHA-256 of"):
+        loading.to_train("squeezenet", None, CLASSES, torch.Generator())

@@ -36,6 +36,26 @@ def test_a_broken_one_ends_in_1(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "broken" in said
 
 
+RAISING = """
+from detectors.squeezedet import SqueezeDet
+
+class Raising(SqueezeDet):
+    def {method}:
+        raise KeyError("wheels")
+"""
+
+
+@pytest.mark.parametrize("method", ["forward(self, images)", "decode(self, raw)", "loss(self, raw, targets)"])
+def test_one_whose_code_raises_ends_in_2(method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(RAISING.format(method=method))
+    assert main(["check", "--detector", f"module:{path}:Raising", "--size", "96x64"]) == 2
+    said = capsys.readouterr()
+    assert "raised" in said.out
+    expected = "drivesem: --detector: expected methods that raise nothing, found KeyError: 'wheels'"
+    assert said.err.splitlines()[-1] == f"{expected} (mine.py:6, in {method.partition('(')[0]})"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -92,8 +92,11 @@ def test_photographs(folder: Callable[..., Path], said: Callable[..., str], tmp_
     ("given", "message"),
     [
         ({"height": "-1.5"}, "000000.txt:1: height: expected metres, or -1, found -1.5"),
-        ({"truncated": "-5"}, "truncation: expected [0, 1], or -1 where it is not known, found -5"),
-        ({"truncated": "1.5"}, "truncation: expected [0, 1], or -1 where it is not known, found 1.5"),
+        ({"truncated": "-5"}, "frame 000000: truncation: expected [0, 1], or -1 where unknown, found -5"),
+        (
+            {"truncated": "1.5"},
+            "frame 000000: truncation: expected [0, 1], or -1 where unknown, found 1.5",
+        ),
     ],
 )
 def test_labels_that_are_converted(
@@ -210,6 +213,8 @@ def test_settings_of_runs(
     assert old in text
     (run / "config.yaml").write_text(text.replace(old, new))
     assert message in said("verify", "--run", run)
+    if "detector" in old:
+        assert message in said("worth", run, "--distance", "none")
 
 
 RAISING = """
@@ -241,7 +246,28 @@ def test_a_detector_that_raises(said: Callable[..., str], tmp_path: Path, name: 
     path.write_text(RAISING.replace("def broken(:", ""))
     assert message in said("check", "--detector", f"module:{path}:{name}")
     path.write_text(RAISING)
-    assert "SyntaxError" in said("check", "--detector", f"module:{path}:{name}")
+    line = said("check", "--detector", f"module:{path}:{name}")
+    assert line.endswith("SyntaxError: invalid syntax (mine.py:14)")
+
+
+LATE = """
+from detectors.squeezedet import SqueezeDet
+
+class Late(SqueezeDet):
+    def decode(self, raw):
+        raise KeyError("wheels")
+"""
+
+
+def test_a_detector_that_raises_when_it_is_attacked(
+    said: Callable[..., str], small_kitti: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(LATE)
+    words = ("attack", "--dataset", "kitti", "--root", small_kitti, "--no-fit", "--params", "translate")
+    line = said(*words, "--workers", "1", "--out", tmp_path / "out", "--detector", f"module:{path}:Late")
+    expected = "--detector: expected methods that raise nothing, found KeyError: 'wheels' (mine.py:6, in decode)"
+    assert line == f"drivesem: {expected}"
 
 
 @pytest.mark.parametrize(
@@ -389,6 +415,9 @@ def test_links_of_a_run_stay_in_it(
     (run / "metrics.json").unlink()
     (run / "metrics.json").symlink_to("/etc/passwd")
     assert "metrics.json: expected a file in" in said("worth", run, "--distance", "none")
+    (run / "config.yaml").unlink()
+    (run / "config.yaml").symlink_to("/dev/zero")
+    assert "config.yaml: expected a file in" in said("worth", run, "--distance", "none")
 
 
 def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

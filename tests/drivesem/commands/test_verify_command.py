@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -95,7 +96,7 @@ def unseal(run: Path) -> None:
     """Make a run's manifest as earlier versions wrote it."""
 
     def earlier(data: dict[str, Any]) -> None:
-        del data["settings"], data["metrics"]
+        del data["settings"], data["metrics"], data["fields"]
         kept = {"benign.png", "rerender.png", "counterexample.png", "theta.json", "labels_paper.txt"}
         for name, hashes in data["frames"].items():
             data["frames"][name] = {part: hashes[part] for part in hashes.keys() & {*kept, "labels_moved.txt"}}
@@ -259,6 +260,22 @@ def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> Non
     assert found == dict.fromkeys(pictures, share)
 
 
+def test_what_is_wrong_in_many_ways_hides_nothing_else(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A picture with other detections makes differences by the dozen."""
+    result = run / FRAME / "result.json"
+    change(result, lambda data: data["detections_benign"].extend(data["detections_benign"] * 40))
+    settings = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99"))
+    capsys.readouterr()
+    assert main(["verify", "--run", str(run), "--workers", "1"]) == 1
+    said = capsys.readouterr().out
+    lines = [line for line in said.splitlines() if ": expected " in line]
+    assert lines[0].startswith("(run): ")
+    assert "(run): settings: config.yaml: steps: expected 99, found 10" in lines
+    assert len([line for line in lines if ": detections: " in line]) == 5
+    assert re.search(r"^and \d+ more$", said, re.MULTILINE)
+
+
 def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
     for name in ("labels_paper.txt", "labels_moved.txt"):
         lines = (run / FRAME / name).read_text().splitlines()
@@ -331,18 +348,19 @@ def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, 
         return told(data)
 
     found = spoil(grade="certain")
-    assert set(found) == {"result.json", "failures[0].grade", "metrics.json: grades.certain"}
+    files_changed = {"result.json", "result.json: failures"}
+    assert set(found) == {*files_changed, "failures[0].grade", "metrics.json: grades.certain"}
     assert (found["failures[0].grade"]["expected"], found["failures[0].grade"]["found"]) == (
         "certain",
         "threshold",
     )
     found = spoil(error="missed")
     kinds = {f"metrics.json: kinds.{kind}" for kind in ("background", "missed")}
-    assert set(found) == {"result.json", "failures[0].error", *kinds}
+    assert set(found) == {*files_changed, "failures[0].error", *kinds}
     # As many draws as a certificate needs, and the grade that would follow from them.
     held = {"before": 16, "before_draws": 16, "after": 16, "after_draws": 16}
     found = spoil(count={**asdict(failure.count), **held}, grade="certain")
-    assert set(found) == {"result.json", "failures[0].count", "metrics.json: grades.certain"}
+    assert set(found) == {*files_changed, "failures[0].count", "metrics.json: grades.certain"}
     verify(run, code=0)
 
 
@@ -395,8 +413,8 @@ def nested(*keys: Any, value: Any) -> Callable[[Any], None]:
         (nested("t_star", value=0.6), "metrics.json: t_star"),
         (nested("passes", value=1), "metrics.json: passes"),
         (nested("phantoms_by_class", "Car", value=5), "metrics.json: phantoms_by_class.Car"),
-        (nested("frames_without_vehicles", value=9), "metrics.json"),
-        (nested("frames_failed", value={"demo-007": "why"}), "metrics.json"),
+        (nested("frames_without_vehicles", value=9), "metrics.json: frames_without_vehicles"),
+        (nested("frames_failed", value={"demo-007": "why"}), "metrics.json: frames_failed"),
     ],
 )
 def test_each_figure_of_the_run(
@@ -409,16 +427,21 @@ def test_each_figure_of_the_run(
 @pytest.mark.parametrize(
     ("edit", "field"),
     [
-        (nested("loss_trace", value=[9.0]), "result.json"),
+        (nested("loss_trace", value=[9.0]), "result.json: loss_trace"),
         (nested("queries", value=1), "metrics.json: queries"),
-        (nested("active_constraints", value=["objects[0]: road"]), "result.json"),
+        (nested("queries", value=1), "result.json: queries"),
+        (nested("active_constraints", value=["objects[0]: road"]), "result.json: active_constraints"),
+        (nested("violated_at_start", value=["objects[0]: road"]), "result.json: violated_at_start"),
+        (nested("became_ignored", value=[0]), "result.json: became_ignored"),
+        (nested("checked_by", value="outlines"), "result.json: checked_by"),
+        (nested("change", value="a car is gone"), "result.json: change"),
         (nested("identity_psnr_db", value=31.0), "identity_psnr_db"),
         (nested("failures", 0, "index", value=1), "failures[0].index"),
         (
             nested("failures", 0, "peer", value={"by": "yolov3-slim", "before": 8, "after": 8, "draws": 8}),
-            "result.json",
+            "result.json: failures",
         ),
-        (nested("grade_notes", value=["no peer"]), "result.json"),
+        (nested("grade_notes", value=["no peer"]), "result.json: grade_notes"),
     ],
 )
 def test_each_figure_of_a_frame(
@@ -426,6 +449,13 @@ def test_each_figure_of_a_frame(
 ) -> None:
     change(run / FRAME / "result.json", edit)
     assert {field, "result.json"} <= set(told(verify(run)))
+
+
+def test_runs_from_before_values_had_hashes_of_their_own(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+    change(run / "manifest.json", lambda data: data.pop("fields"))
+    verify(run, code=0)
+    change(run / FRAME / "result.json", nested("loss_trace", value=[9.0]))
+    assert set(told(verify(run))) == {"result.json"}
 
 
 def test_settings_overlays_and_files_that_were_added_or_taken_away(

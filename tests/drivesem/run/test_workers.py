@@ -170,23 +170,58 @@ def lingering(folder: str) -> Callable[[int], None]:
     return partial(linger, folder=folder)
 
 
+# As in a terminal: what a shell starts in the background ignores Ctrl-C.
+_STOPPED = """
+import signal
+from functools import partial
+
+from drivesem.run.workers import outcomes
+from drivesem.settings.blocks import Sharing
+from tests.drivesem.run.test_workers import lingering
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+list(outcomes(None, partial(lingering, {folder!r}), [1, 2], Sharing(workers=2)))
+"""
+
+
+def children(pid: int) -> list[int]:
+    """Workers of a process that have been started, however far they are."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            parent = int(path.with_name("stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"popen_loky" in path.read_bytes():
+                found.append(int(path.parent.name))
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    return found
+
+
 _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs Linux's /proc")
+
+
+@_NO_PROC
+@pytest.mark.parametrize("after_s", [0.0, 0.05, 0.2])
+def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, tmp_path: Path) -> None:
+    (tmp_path / "stopped.py").write_text(_STOPPED.format(folder=str(tmp_path)))
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, str(tmp_path / "stopped.py")]
+    with subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as parent:
+        assert parent.stderr is not None
+        assert _soon(lambda: len(children(parent.pid)) > 0)
+        time.sleep(after_s)
+        os.killpg(parent.pid, signal.SIGINT)
+        said = parent.stderr.read()
+    assert said.count("Traceback") == 1, said  # of the script itself, which catches nothing
 
 
 @_NO_PROC
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_path: Path) -> None:
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
-    (tmp_path / "stopped.py").write_text(
-        "import signal\n"
-        "from drivesem.settings.blocks import Sharing\n"
-        "from drivesem.run.workers import outcomes\n"
-        "from tests.drivesem.run.test_workers import lingering\n"
-        "from functools import partial\n"
-        # As in a terminal: what a shell starts in the background ignores Ctrl-C.
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        f"list(outcomes(None, partial(lingering, {str(tmp_path)!r}), [1, 2], Sharing(workers=2)))\n"
-    )
+    (tmp_path / "stopped.py").write_text(_STOPPED.format(folder=str(tmp_path)))
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     command = [sys.executable, str(tmp_path / "stopped.py")]
     with subprocess.Popen(

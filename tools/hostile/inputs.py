@@ -1,0 +1,387 @@
+"""What hostile commands are given: files that were made to break a reader, from data that is generated."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from detectors.registry import SHIPPED, read_weights, write_weights
+from detectors.yolov3 import darknet
+from scene_ir import files
+from tools.fuzz.formats import dataset, net
+from tools.small_frames import small_frames
+
+MARK = "mark"
+"""File that foreign code makes where it is run."""
+FRAME = "frames/n00000"
+"""The one frame of the run that is spoiled."""
+GIGABYTE = 1 << 30
+
+Make = Callable[["Ground", Path], object]
+"""Writes what a command is given into an empty folder."""
+
+
+class Ground:
+    """Valid data that inputs are made of, each when it is first needed. folder: a temporary one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @cached_property
+    def kitti(self) -> Path:
+        """Two generated frames of 192x112 px, a car in each, in KITTI's layout."""
+        with files.whole_folder(self._folder / "kitti") as part:
+            small_frames(part, 2, streets=3)
+        return self._folder / "kitti"
+
+    @cached_property
+    def run(self) -> Path:
+        """An attack on the first of them, in which the car is lost."""
+        words = f"attack --dataset kitti --root {self.kitti} --no-fit --params weather,translate,rotate"
+        words += " --method random --queries 8 --limit 1 --workers 1 --out"
+        out = self._folder / "run"
+        whole = [sys.executable, "-m", "drivesem.cli", *words.split(), str(out)]
+        done = subprocess.run(whole, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise RuntimeError(f"the run that is to be spoiled: exit code {done.returncode}: {done.stderr[-500:]}")
+        return out
+
+
+def nothing(ground: Ground, place: Path) -> None:
+    """For a command that needs no files."""
+
+
+def text(name: str, content: str) -> Make:
+    """A file."""
+    return lambda ground, place: files.write_text(place / name, content)
+
+
+def both(*makers: Make) -> Make:
+    """One after the other."""
+
+    def make(ground: Ground, place: Path) -> None:
+        for maker in makers:
+            maker(ground, place)
+
+    return make
+
+
+# ---- runs and scenes ----
+
+
+def run(ground: Ground, place: Path) -> None:
+    """The run, as `run`."""
+    shutil.copytree(ground.run, place / "run")
+
+
+def scene(ground: Ground, place: Path) -> None:
+    """The scene of its frame, as `scene`."""
+    shutil.copytree(ground.run / FRAME / "scene", place / "scene")
+
+
+def edited(path: str, *keys: Any, value: Any) -> Make:
+    """Change one value of a JSON file, by the keys to it."""
+
+    def make(ground: Ground, place: Path) -> None:
+        data = json.loads((place / path).read_text())
+        inner = data
+        for key in keys[:-1]:
+            inner = inner[key]
+        if inner[keys[-1]] == value:
+            raise RuntimeError(f"{path}: {keys}: is {value!r} already")
+        inner[keys[-1]] = value
+        (place / path).write_text(json.dumps(data))
+
+    return make
+
+
+def setting(name: str, value: str) -> Make:
+    """Change a setting of the run's config.yaml, as text."""
+
+    def make(ground: Ground, place: Path) -> None:
+        path = place / "run" / "config.yaml"
+        lines = path.read_text().splitlines()
+        (at,) = (number for number, line in enumerate(lines) if line.startswith(f"{name}: "))
+        lines[at] = f"{name}: {value}"
+        path.write_text("\n".join(lines) + "\n")
+
+    return make
+
+
+def linked(path: str, target: str) -> Make:
+    """Put a link in the place of a file."""
+
+    def make(ground: Ground, place: Path) -> None:
+        (place / path).unlink(missing_ok=True)
+        (place / path).symlink_to(target)
+
+    return make
+
+
+def brightened(ground: Ground, place: Path) -> None:
+    """One corner of the counterexample, by hand."""
+    path = place / "run" / FRAME / "counterexample.png"
+    image = files.read_image(path)
+    image[:20, :20] ^= 64
+    files.write_png(path, image)
+
+
+def overlay(ground: Ground, place: Path) -> None:
+    """The photograph in place of the picture with boxes."""
+    frame = place / "run" / FRAME
+    shutil.copy(frame / "benign.png", frame / "overlay.png")
+
+
+def labels(ground: Ground, place: Path) -> None:
+    """The moved label, 3 px to the side."""
+    path = place / "run" / FRAME / "labels_moved.txt"
+    words = path.read_text().split()
+    words[4] = f"{float(words[4]) - 3:.2f}"
+    path.write_text(" ".join(words) + "\n")
+
+
+# ---- code ----
+
+EVIL = f"""
+from pathlib import Path
+
+Path({MARK!r}).touch()
+
+class D:
+    pass
+"""
+
+
+class _Touching:
+    """Makes the mark where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return open, (MARK, "w")
+
+
+def pickled_arrays(ground: Ground, place: Path) -> None:
+    """Objects, which are pickles, in the arrays of a scene."""
+    with (place / "scene" / "arrays.npz").open("wb") as file:
+        np.savez(file, depth=np.array([_Touching()], dtype=object))
+
+
+def pickled_weights(name: str) -> Make:
+    """A state_dict with something else in it."""
+
+    def make(ground: Ground, place: Path) -> None:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        torch.save({"layer.weight": torch.ones(2), "more": _Touching()}, place / name)
+
+    return make
+
+
+# ---- pictures and arrays ----
+
+
+def png(name: str, width: int, height: int) -> Make:
+    """A PNG whose header says a size, with next to nothing behind it."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    data = b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    return lambda ground, place: files.write_bytes(place / name, data)
+
+
+def one_pixel(name: str) -> Make:
+    """A photograph of 1x1 px."""
+    return lambda ground, place: files.write_png(place / name, np.zeros((1, 1, 3), np.uint8))
+
+
+def claiming_arrays(ground: Ground, place: Path) -> None:
+    """An array that says it has 10^12 numbers, and has none."""
+    head = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + "\n"
+    member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
+    with zipfile.ZipFile(place / "scene" / "arrays.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth.npy", member)
+
+
+def bomb(told: int | None = None) -> Make:
+    """4 GB of zeros in 4 MB. told: the size that the archive's list says instead, bytes."""
+
+    def make(ground: Ground, place: Path) -> None:
+        path = place / "scene" / "arrays.npz"
+        zeros = bytes(1 << 24)
+        with (
+            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+            archive.open("depth.npy", "w", force_zip64=True) as member,
+        ):
+            for _ in range(4 * GIGABYTE // len(zeros) - 1):
+                member.write(zeros)
+        if told is not None:
+            data = bytearray(path.read_bytes())
+            at = data.rindex(b"PK\x01\x02")
+            data[at + 24 : at + 28] = struct.pack("<I", told)
+            path.write_bytes(data)
+
+    return make
+
+
+def ply(name: str, faces: int) -> Make:
+    """A mesh whose header says so many faces, and that has none."""
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    return lambda ground, place: files.write_bytes(place / name, head.encode() + bytes(36))
+
+
+# ---- data sets ----
+
+
+def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | None = None) -> Make:
+    """The generated frames as `kitti`. cars: how often the first frame's label is written; lines: words of it by
+    place, that are others; focal: of its camera.
+    """
+
+    def make(ground: Ground, place: Path) -> None:
+        shutil.copytree(ground.kitti, place / "kitti")
+        part = place / "kitti" / "training"
+        label, calib = part / "label_2" / "n00000.txt", part / "calib" / "n00000.txt"
+        words = label.read_text().split()
+        for at, word in (lines or {}).items():
+            words[at] = word
+        label.write_text((" ".join(words) + "\n") * cars)
+        if focal is not None:
+            calib.write_text(f"P2: {focal} 0 96 0 0 {focal} 56 0 0 0 1 0\n")
+
+    return make
+
+
+def equal_detections(ground: Ground, place: Path) -> None:
+    """80,000 times the same in a frame, as `found`."""
+    for path in (ground.kitti / "training" / "label_2").iterdir():
+        files.write_text(place / "found" / path.name, f"{path.read_text().strip()} 0.5\n" * 80_000)
+
+
+def coco(table: str, key: str, value: Any) -> Make:
+    """The made picture and its labels as `coco`, one value changed."""
+
+    def make(ground: Ground, place: Path) -> None:
+        dataset("coco", place / "coco")
+        edited(COCO, table, 0, key, value=value)(ground, place)
+
+    return make
+
+
+COCO = "coco/annotations/instances_train.json"
+
+
+def layout(name: str) -> Make:
+    """The made picture and its labels in a layout, as a folder of that name."""
+    return lambda ground, place: dataset(name, place / name)
+
+
+# ---- networks ----
+
+
+def weights(**changed: str) -> Make:
+    """SqueezeDet's, as `weights.safetensors`, with other metadata."""
+
+    def make(ground: Ground, place: Path) -> None:
+        metadata, tensors = read_weights(SHIPPED["squeezedet"])
+        write_weights(place / "weights.safetensors", metadata | changed, tensors)
+
+    return make
+
+
+def claiming_weights(ground: Ground, place: Path) -> None:
+    """A header of 1 KB that says there are 2 GB."""
+    told = {"weight": {"dtype": "F32", "shape": [1 << 29], "data_offsets": [0, 1 << 31]}}
+    header = json.dumps(told).encode().ljust(1024)
+    files.write_bytes(place / "weights.safetensors", struct.pack("<Q", len(header)) + header)
+
+
+def layers(ground: Ground, place: Path) -> None:
+    """A Darknet of 20,000 layers, as `net.cfg`."""
+    files.write_text(place / "net.cfg", "[net]\nchannels=3\n" + "[shortcut]\nfrom=-1\n" * 20_000)
+
+
+def anchors(ground: Ground, place: Path) -> None:
+    """A Darknet of 100,000 anchors, as `net.cfg`."""
+    _darknet(place)
+    path = place / "net.cfg"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join("anchors=" + "10,13," * 100_000 if "anchors" in line else line for line in lines))
+
+
+def names(ground: Ground, place: Path) -> None:
+    """A Darknet whose class names are no UTF-8."""
+    _darknet(place)
+    (place / "net.names").write_bytes(b"\xff\xfe\n")
+
+
+def _darknet(place: Path) -> None:
+    darknet.save(net(), place / "net.cfg")
+
+
+# ---- what is in the wrong form ----
+
+DEEP = "[" * 200_000
+DIGITS = "9" * 5000
+
+
+def spoiled(path: str, content: str) -> Make:
+    """Another text in the place of a file."""
+    return lambda ground, place: (place / path).write_text(content)
+
+
+# ---- detectors of the user's own ----
+
+
+def detector(method: str = "", does: str = "pass", beside: str = "") -> Make:
+    """SqueezeDet with another method, as `mine.py:Mine`. does: its first line, line 7 of the file; beside: what
+    else the file has.
+    """
+    body = f"    {method}\n        {does}\n" if method else "    pass\n"
+    return text(
+        "mine.py", f"from detectors.squeezedet import SqueezeDet\n{beside}\n\n\nclass Mine(SqueezeDet):\n{body}"
+    )
+
+
+BLIND = """
+import torch
+
+from detectors.squeezedet import SqueezeDet
+from detectors.types import Detections
+
+
+class Mine(SqueezeDet):
+    def decode(self, raw):
+        none = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+        return [none] * len(raw)
+"""
+"""One that finds no car, in a file `mine.py`."""
+
+MODULE = """
+import torch
+
+
+class Mine(torch.nn.Module):
+    pass
+"""
+
+SCRIPT = """
+from drivesem.cli import main
+
+code = main("derender --dataset kitti --root kitti --no-fit --workers 2 --out scenes".split())
+raise SystemExit(code)
+"""
+"""Two workers, and no guard by the module's name."""
