@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 import detectors.registry
-from detectors.reading import unreadable
+from detectors.reading import read_state
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
@@ -140,15 +139,10 @@ def _is_library(architecture: str) -> bool:
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:
-    """Floating tensors of a weights file. Raises FormatError."""
+    """Floating tensors of a weights file. Raises FormatError, or DetectorError for what is none."""
     if path.suffix not in _TORCH_FILES:
         return _read(path)[1]
-    try:
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise FormatError(str(path), "a file that can be read", error.strerror) from error
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise FormatError(str(path), "tensors by name, as torch.save writes them", unreadable(error)) from error
+    loaded = read_state(path, "tensors by name, as torch.save writes them")
     if not isinstance(loaded, dict) or not all(isinstance(tensor, Tensor) for tensor in loaded.values()):
         raise FormatError(str(path), "tensors by name (a state_dict)", type(loaded).__name__)
     return {str(name): tensor for name, tensor in loaded.items() if tensor.is_floating_point()}

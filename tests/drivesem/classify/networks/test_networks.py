@@ -1,6 +1,7 @@
 """Classifiers: torchvision's names of weights, passes checked by hand, files and what is wrong with them."""
 
 import json
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import nn
 
+from detectors.base import DetectorError
 from drivesem.classify.networks import libraries as libraries_module
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
@@ -202,10 +204,18 @@ def test_names_and_files_that_are_no_networks(tmp_path):
     with pytest.raises(FormatError, match="--weights: expected a file with weights of vgg16, found nothing"):
         to_train("vgg16", None, CLASSES, seeded())
     (tmp_path / "torn.pth").write_bytes(b"PK no weights")
-    with pytest.raises(FormatError, match=r"torn\.pth"):
+    with pytest.raises(DetectorError, match=r"torn\.pth"):
         to_train("vgg16", str(tmp_path / "torn.pth"), CLASSES, seeded())
-    with pytest.raises(FormatError, match=r"gone\.pth"):
+    with pytest.raises(DetectorError, match=r"gone\.pth"):
         to_train("vgg16", str(tmp_path / "gone.pth"), CLASSES, seeded())
+    torch.save({"w": torch.zeros(1 << 20)}, tmp_path / "plain.pth")
+    with zipfile.ZipFile(tmp_path / "plain.pth") as plain:
+        parts = {name: plain.read(name) for name in plain.namelist()}
+    with zipfile.ZipFile(tmp_path / "packed.pth", "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, data in parts.items():
+            packed.writestr(name, data)
+    with pytest.raises(DetectorError, match=r"packed\.pth: .* parts of 4,\d+,\d+ bytes in a file of"):
+        to_train("vgg16", str(tmp_path / "packed.pth"), CLASSES, seeded())
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(FormatError, match=r"list\.pth: expected tensors by name"):
         to_train("vgg16", str(tmp_path / "list.pth"), CLASSES, seeded())
