@@ -83,6 +83,17 @@ def clip_boxes(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(boxes_xyxy.clamp(min=0), limit)
 
 
+def kept_within(values: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
+    """Values kept in [low, high]; their gradient is 1 there, at the bounds too, and 0 beyond. low, high: numbers,
+    or tensors of the values' shape.
+
+    `torch.clamp` has 1, 0.5 or 0 at a bound, as torch's version has it; codes begin there, and a photograph's
+    saturated pixels lie there.
+    """
+    kept = torch.clamp(values.detach(), low, high)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return torch.where((values >= low) & (values <= high), values, kept) if values.requires_grad else kept
+
+
 def weld(vertices: Tensor, within: float = 1e-6) -> Tensor:
     """Which place (V,) int64, counted from 0, each of the vertices (V, 3) is at: those at one place share it."""
     keys = (vertices.detach() / within).round().to(torch.int64)

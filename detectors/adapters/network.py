@@ -117,7 +117,8 @@ def torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
     try:
         with warnings.catch_warnings():
             # torch has a successor for new files; these are there.
-            warnings.simplefilter("ignore", DeprecationWarning)
+            for kind in (DeprecationWarning, FutureWarning):
+                warnings.simplefilter("ignore", kind)
             network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
     except (RuntimeError, ValueError) as error:
         raise DetectorError(f"{path}: expected a TorchScript file, found {_last_line(error)}") from None

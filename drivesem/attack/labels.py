@@ -8,7 +8,7 @@ hand-drawn boxes meet projected ones at a mean IoU of 0.975 only).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -293,6 +293,19 @@ def to_kitti_labels(
         size_lhw=size_lhw.detach()[rows],
         ignore_xyxy=labels.regions_xyxy,
     )
+
+
+def with_others(labels: Labels, others: Labels | None) -> Labels:
+    """Labels of a scene's vehicles, and of what it leaves as it is (`SceneIR.others`: people, trams), as objects.
+
+    `to_kitti_labels` and a run's files tell of these as regions, after those of the labels. None, of scenes that
+    do not know: the labels as they are. Where a vehicle that moved now hides a person is not told.
+    """
+    if others is None:
+        return labels
+    names = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
+    columns = {name: torch.cat([getattr(labels, name), getattr(others, name)]) for name in names}
+    return replace(others, kind=(*labels.kind, *others.kind), **columns)
 
 
 def _kind(category: int) -> str:

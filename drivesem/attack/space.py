@@ -19,7 +19,7 @@ from drivesem.attack.regions import ROI_DIM, Regions
 from drivesem.attack.theta import ParameterSpec, ThetaSpace
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.geometry import yaw_matrix
+from scene_ir.geometry import kept_within, yaw_matrix
 from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
 
@@ -389,6 +389,4 @@ def _ground_axes_of(scene: SceneIR) -> Tensor:
 
 def _within(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
     """start + change within [low, high], or up to `start` where that lies outside: 0 changes nothing."""
-    value, lowest, highest = start + change, start.clamp(max=low), start.clamp(min=high)
-    # On a bound, where most codes begin, torch.clamp's gradient is 1, 0.5 or 0, as torch's version has it.
-    return torch.where((value >= lowest) & (value <= highest), value, torch.clamp(value.detach(), lowest, highest))
+    return kept_within(start + change, start.clamp(max=low), start.clamp(min=high))

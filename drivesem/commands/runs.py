@@ -13,11 +13,11 @@ from drivesem.commands.attack import told_grades
 from drivesem.report.answer import print_json
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
-from drivesem.run.folder import CONFIG, FRAMES, attack_of, settings_of
+from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
 from drivesem.run.frame import RESULT
-from drivesem.run.lock import hold
+from drivesem.run.lock import held_elsewhere, hold
 from drivesem.run.parts import merge
-from drivesem.settings.commands import Attack, Runs
+from drivesem.settings.commands import DEFAULT_COMBO, Attack, Runs
 from drivesem.settings.errors import UsageError
 from drivesem.store import place
 from drivesem.truth.grades import Grade
@@ -54,7 +54,8 @@ def _line(row: Mapping[str, Any]) -> str:
     grades, frames = row["grades"], f"{row['frames']} frame{'' if row['frames'] == 1 else 's'}"
     what = f"{row['params']} by {row['method']} on {row['detector']}, {row['mb']:.0f} MB"
     if grades is None:
-        return f"{row['run']}: {frames}, not finished (the same command goes on); {what}"
+        stands = "being made now" if row["running"] else "not finished (the same command goes on)"
+        return f"{row['run']}: {frames}, {stands}; {what}"
     held = [f"{grades[grade]} {grade}" for grade in (Grade.CERTAIN, Grade.CONFIRMED) if grade in grades]
     found = f"{', '.join(held)} of {grades.get(Grade.THRESHOLD, 0)} failures by threshold"
     return f"{row['run']}: {frames}, {found}; {what}"
@@ -65,7 +66,8 @@ def _runs_in(folder: Path) -> list[Path]:
         raise UsageError("FOLDER", "a folder with runs of drivesem attack", folder)
     if (folder / CONFIG).is_file():
         return [folder]
-    return sorted(path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
+    runs = (path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
+    return sorted(run for run in runs if is_attack(run))
 
 
 def _row(folder: Path) -> dict[str, Any]:
@@ -74,9 +76,10 @@ def _row(folder: Path) -> dict[str, Any]:
     return {
         "run": str(folder),
         "finished": bool(figures),
+        "running": not figures and held_elsewhere(folder),
         "detector": attack.detector,
         "dataset": attack.dataset,
-        "params": ",".join(figures.get("params", ())) or attack.params or f"combo {attack.combo}",
+        "params": ",".join(figures.get("params", ())) or attack.params or f"combo {attack.combo or DEFAULT_COMBO}",
         "method": attack.method,
         "frames": len(list(folder.glob(f"{FRAMES}/*/{RESULT}"))),
         "grades": figures.get("grades"),

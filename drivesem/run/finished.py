@@ -130,7 +130,7 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     if not (folder / CONFIG).is_file():
         raise UsageError(setting, "a folder of drivesem attack", folder)
     settings = files.read_yaml(folder / CONFIG)
-    if not isinstance(settings, dict) or not {"detector", "params", "combo"} <= settings.keys():
+    if not isinstance(settings, dict) or not {"detector", "dataset", "params", "combo"} <= settings.keys():
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
     if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
         if held_elsewhere(folder):

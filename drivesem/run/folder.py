@@ -76,16 +76,20 @@ def folder_of(given: str | None, default: Path) -> Path:
     return out
 
 
+def is_attack(run: Path) -> bool:
+    """Whether the settings of a run are those of `drivesem attack`, and not of another command."""
+    loaded = files.read_yaml(run / CONFIG)
+    return isinstance(loaded, dict) and set(loaded) <= {field.name for field in fields(Attack)}
+
+
 def attack_of(run: Path) -> Attack:
     """The configuration of a run of `drivesem attack`. Raises UsageError where the folder is none."""
     path = run / CONFIG
     if not path.is_file():
         raise UsageError("--run", "a run's folder, with its config.yaml", run)
-    loaded = files.read_yaml(path)
-    known = {field.name for field in fields(Attack)}
-    if not isinstance(loaded, dict) or not set(loaded) <= known:
+    if not is_attack(run):
         raise UsageError("--run", "a run of drivesem attack", run)
-    attack: Attack = from_json(Attack, loaded, str(path))
+    attack: Attack = from_json(Attack, files.read_yaml(path), str(path))
     try:
         # The run that a placebo was like may be gone.
         replace(attack, like=attack.like and str(run)).check()

@@ -92,6 +92,9 @@ def _refused(command: str, text: str) -> UsageError:
     stray = re.search(r"Unrecognized options: (.*)", text)
     if stray is not None:
         return UsageError("command line", f"options of drivesem {command} (its --help lists them)", stray[1])
+    missing = re.search(r"Required options.*? Missing from drivesem \S+: (\{[^}]*\}|[^\s,]+)", text)
+    if missing is not None:
+        return UsageError(missing[1], f"a value (drivesem {command} --help says which)", "none")
     return UsageError("command line", "known options (see drivesem --help)", text)
 
 
@@ -140,7 +143,7 @@ def preset_words(path: str, command: str) -> list[str]:
     """
     given, path = path, preset_path(path)
     if not Path(path).is_file():
-        raise UsageError("--config", _presets_for(command), given)
+        raise UsageError("--config", _presets_for(command), _meant(given, _names_for(command)))
     loaded = _mapping(path)
     wanted = loaded.pop(_FOR, command)
     commands = wanted if isinstance(wanted, list) else [wanted]
@@ -166,9 +169,14 @@ def commands_of(path: str) -> list[str]:
     return [str(name) for name in wanted] if isinstance(wanted, list) else [str(wanted)]
 
 
+def _names_for(command: str) -> list[str]:
+    """The presets for a command."""
+    return [name for name, path in presets().items() if command in commands_of(str(path))]
+
+
 def _presets_for(command: str) -> str:
     """What --config takes."""
-    names = [name for name, path in presets().items() if command in commands_of(str(path))]
+    names = _names_for(command)
     return "a YAML file" + (f", or a preset: {', '.join(names)}" if names else "")
 
 

@@ -14,7 +14,7 @@ from detectors.base import Predictor
 from detectors.training import Sample
 from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import HEADLINE, JudgedClasses
-from drivesem.attack.labels import LabelMode
+from drivesem.attack.labels import LabelMode, with_others
 from drivesem.data import kitti
 from drivesem.evaluation.coco import ClassScores, evaluate
 from drivesem.run.frame import RESULT, as_targets
@@ -25,7 +25,7 @@ from drivesem.truth.redraw.choose import SecondRenderers
 from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.io import load_scene
+from scene_ir.io import load_others, load_scene
 
 Stage = Literal["benign", "rerender", "counterexample"]
 """The photograph, the same rendered again without any change, and what the attack made of it."""
@@ -53,7 +53,7 @@ class AttackedFrame:
 
 class AttackedSamples(Sequence[Sample]):
     """To train on: photographs, as they are or rendered again, with benign labels, or counterexamples with those
-    of a mode; read each time.
+    of a mode; read each time. People and whatever else the scenes leave as it is have their own labels.
     """
 
     def __init__(
@@ -62,9 +62,11 @@ class AttackedSamples(Sequence[Sample]):
         self._frames = frames
         self._stage: Stage = stage
         name = f"labels_{mode if stage == 'counterexample' else 'paper'}.txt"
-        self._targets = [
-            training_targets(kitti.read_labels(frame.folder / name), TRAINED, classes) for frame in frames
+        labels = [
+            with_others(kitti.read_labels(frame.folder / name), load_others(frame.folder / "scene"))
+            for frame in frames
         ]
+        self._targets = [training_targets(of_frame, TRAINED, classes) for of_frame in labels]
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -12,13 +12,13 @@ from torch import Tensor
 from detectors.training import Sample
 from detectors.types import Targets
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Labeller, to_kitti_labels
+from drivesem.attack.labels import Labeller, to_kitti_labels, with_others
 from drivesem.attack.space import SIX, Parameter, ParameterSpace
 from drivesem.data import kitti
 from drivesem.training.frames import FrameStore
 from drivesem.training.targets import TRAINED, training_targets
 from scene_ir import files
-from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
+from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.errors import SceneError
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
@@ -96,7 +96,7 @@ def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Label
         drawn = torch.from_numpy(generator.uniform(-1, 1, space.dim).astype(np.float32)) ** 3 * reach
         theta = torch.where(drawn < 0, -drawn * space.lower, drawn * space.upper)
         image, labels, _ = state_at(feasible.project(theta).theta, space, compositor, labeller, scene)
-        found.append((image, _with_others(labels, frame.labels)))
+        found.append((image, labels))
     return found
 
 
@@ -104,21 +104,12 @@ def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Label
 def state_at(
     theta: Tensor, space: ParameterSpace, compositor: Compositor, labeller: Labeller, base: SceneIR
 ) -> tuple[np.ndarray, Labels, Targets]:
-    """The scene at theta (D,): pixels (H, W, 3) uint8 RGB, its labels as a file holds them, and the same as
-    targets, whose first rows are all of the scene's objects. base: the scene of the labels that move along.
+    """The scene at theta (D,): pixels (H, W, 3) uint8 RGB, its labels, those of people and whatever else stays
+    among them, and targets as they are judged, whose first rows are all of the scene's objects. base: the scene of
+    the labels that move along.
     """
     moved = space.apply(space.scene, theta)
     render = compositor.render(moved)
     labels = labeller.moved(moved, render)
-    return to_uint8(render.image), to_kitti_labels(labels, base, moved), labels.targets
-
-
-def _with_others(moved: Labels, original: Labels) -> Labels:
-    """Labels of vehicles that moved, and those of all else, which did not."""
-    rows = torch.tensor([i for i, kind in enumerate(original.kind) if kind not in VEHICLES], dtype=torch.int64)
-    names = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
-    return Labels(
-        kind=(*moved.kind, *(original.kind[i] for i in rows.tolist())),
-        ignore_xyxy=moved.ignore_xyxy,
-        **{name: torch.cat([getattr(moved, name), getattr(original, name)[rows]]) for name in names},
-    )
+    every = with_others(to_kitti_labels(labels, base, moved), base.others)
+    return to_uint8(render.image), every, labels.targets

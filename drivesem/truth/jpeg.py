@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesem.truth.banded import Matrix, Separable
+from scene_ir.geometry import kept_within
 
 _LUMINANCE = np.array(
     [
@@ -83,7 +84,7 @@ class Codec:
         back = torch.linalg.inv(to_ycc.double()).to(image) / 255
         offset = back @ image.new_tensor([[128.0], [0.5], [0.5]])
         rgb = torch.addmm(offset, back, torch.cat([light, colour]).flatten(1))
-        return rgb.view_as(image).clamp(0, 1)
+        return kept_within(rgb.view_as(image), 0, 1)
 
 
 def _step(value: Any) -> Any:

@@ -12,6 +12,7 @@ import kornia
 import torch
 from torch import Tensor
 
+from scene_ir.geometry import kept_within
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.texture import lab, rgb_of, smoothstep
@@ -70,8 +71,8 @@ def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend:
 def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
     """The leaf model on rows (R, 3); gaps (R,) in [0, 1] says where a thin crown lets light through."""
     hue, shift, density = code.unbind(-1)
-    lightness, a, b = lab(rgb.clamp(0.0, 1.0)).unbind(-1)
-    level = (lightness / 100.0).clamp(*model.LEVEL)
+    lightness, a, b = lab(kept_within(rgb, 0.0, 1.0)).unbind(-1)
+    level = kept_within(lightness / 100.0, *model.LEVEL)
     lifted = torch.sigmoid(torch.logit(level) + model.LEAF_LIGHTNESS * shift)
     chroma = (1.0 + model.LEAF_CHROMA * hue) * (lifted / level).sqrt()
     level = lifted

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import to_clip, weld
+from scene_ir.geometry import kept_within, to_clip, weld
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Fragments, Layout
 from scene_ir.types import Camera, check_finite, check_shape
@@ -118,7 +118,7 @@ class LitMesh:
             materials.shininess.to(clip)[face],
             lights,
         )
-        return torch.zeros_like(seen[:, :3]).index_add(0, hit, light.clamp(_DARKEST, 1) ** GAMMA)
+        return torch.zeros_like(seen[:, :3]).index_add(0, hit, kept_within(light, _DARKEST, 1) ** GAMMA)
 
     def corners(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of vertices (V, 3) in camera space each face's corners (F, 3, 3); their unit normals (3F, 3), towards

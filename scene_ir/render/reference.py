@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from scene_ir.geometry import kept_within
 from scene_ir.raster import verbs
 from scene_ir.render import channels, model, texture
 from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
@@ -103,7 +104,7 @@ def layers(prepared: Prepared, objects: Objects, drawn: Drawn, sun: Sun | None =
     else:
         plain = prepared.own_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
         own = _mesh_attributes(prepared, drawn, rows, plain)
-        colour = prepared.own_colour(rows.xy, rows.owner, own, sun).clamp(0.0, 1.0)
+        colour = kept_within(prepared.own_colour(rows.xy, rows.owner, own, sun), 0.0, 1.0)
         z = own[:, channels.OWN_DEPTH]
         shaded = _Shaded(colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT])
     colour, depth = shaded.colour, shaded.depth
@@ -253,7 +254,7 @@ def _completion(
     )
     rgb, alpha = seen[:, : channels.ALPHA], seen[:, channels.ALPHA : channels.HIDDEN]
     straight = rgb / alpha.clamp(min=model.LEAST_MIRRORED_ALPHA)
-    return colour + weight[:, None] * (straight.clamp(0.0, 1.0) - colour)
+    return colour + weight[:, None] * (kept_within(straight, 0.0, 1.0) - colour)
 
 
 def _shadow_factors(prepared: Prepared, objects: Objects, drawn: Drawn) -> Tensor:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scene_ir.geometry import kept_within
 from scene_ir.raster import verbs
 from scene_ir.render import model
 from scene_ir.render.surfaces import nearest_true
@@ -239,7 +240,7 @@ def apply_texture_code(
     if index.numel() == 0:
         return colour
     alpha = opacity[index]
-    straight = (colour[index] / alpha.clamp(min=model.LEAST_ALPHA)[:, None]).clamp(0.0, 1.0)
+    straight = kept_within(colour[index] / alpha.clamp(min=model.LEAST_ALPHA)[:, None], 0.0, 1.0)
     arguments = (height[index], base_lightness[index])
     change = _paint(straight, code[index], *arguments) - _paint(
         straight, torch.zeros_like(code[index]), *arguments
@@ -251,14 +252,14 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
     """The paint model: a curve in CIE L*, shifts of a* and b*, and a veil of dust. rgb (R, 3), code (R, 5)."""
     lightness, a, b = lab(rgb).unbind(-1)
     shift, red, yellow, gloss, dirt = code.unbind(-1)
-    level = (lightness / 100.0).clamp(*model.LEVEL)
+    level = kept_within(lightness / 100.0, *model.LEVEL)
     glossy = gloss * model.GLOSS_GAIN * (lightness - base_lightness) / model.GLOSSY_L
     level = torch.sigmoid(torch.logit(level) + model.LIGHTNESS_GAIN * shift + glossy)
     room = 4.0 * level * (1.0 - level)
     red, yellow = a + model.CHROMA_GAIN * red * room, b + model.CHROMA_GAIN * yellow * room
     changed = torch.stack([100.0 * level, red, yellow], dim=-1)
     out = rgb_of(changed)
-    veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * height.clamp(0.0, 1.0)))[:, None]
+    veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * kept_within(height, 0.0, 1.0)))[:, None]
     return out + veil * (out.new_tensor(model.DUST_RGB) - out)
 
 
@@ -314,7 +315,7 @@ def shade(
     foot, *heights = model.OCCLUDED
     occluded = foot + (1.0 - foot) * smoothstep(height, *heights)
     diffuse = daylight(normal, sun, sunlight) * occluded
-    cos = (normal * to_eye).sum(-1).clamp(0.0, 1.0)
+    cos = kept_within((normal * to_eye).sum(-1), 0.0, 1.0)
     mirror = 2.0 * cos[:, None] * normal - to_eye
     sky_up = -mirror[:, 1]
     ground, horizon, zenith = (
@@ -327,7 +328,9 @@ def shade(
     least, more = model.GLASS_MIRRORS
     mirrored = model.PAINT_MIRRORS * paint * fresnel + glass * (least + more * fresnel)
     strength = mirrored * (0.5 + 0.5 * occluded)
-    glint = ((mirror * sun).sum(-1).clamp(0.0, 1.0)).pow(40) * (model.GLINT[0] * paint + model.GLINT[1] * glass)
+    glint = kept_within((mirror * sun).sum(-1), 0.0, 1.0).pow(40) * (
+        model.GLINT[0] * paint + model.GLINT[1] * glass
+    )
     lit = albedo * diffuse[:, None]
     return lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)
 

@@ -89,7 +89,7 @@ RULES = (
                 *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.truth.redraw"),
                 *("drivesem.attack.contrast", "drivesem.attack.labels.Difficulty"),
             ),
-            ("torch", "numpy", "scipy", "cv2", "pyrender", "OpenGL"),
+            ("torch", "numpy", "scipy", "cv2", "pyrender", "OpenGL", "triton"),
             never=("drivesem.truth.redraw.compositor",),
         )
         for name in ("photograph", "baking", "placing", "screen", "shadows", "weathering")

@@ -31,6 +31,7 @@ from tools.bench import (
     derender,
     evaluation,
     found,
+    install,
     label_free,
     moves,
     parts,
@@ -75,6 +76,7 @@ def run(config: BenchTool) -> int:
         "rivals": _rivals,
         "eval": _eval,
         "viewer": _viewer,
+        "install": _install,
     }
     return conduct(config, _PROGRAM, measure[config.what])
 
@@ -193,6 +195,23 @@ def _viewer(config: BenchTool, console: Console) -> Measured:
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
     return _measured(viewer, {"rows": [asdict(row) for row in rows]})
+
+
+def _install(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    rows = list(watched(install.measure(config.quick), 20, console))
+    parts = (
+        (install.STEPS_TITLE, install.STEPS, install.StepRow),
+        (install.SIZES_TITLE, install.SIZES, install.SizeRow),
+        (install.STARTS_TITLE, install.STARTS, install.StartRow),
+    )
+    of_kind = [
+        (title, columns, [asdict(row) for row in rows if isinstance(row, kind)]) for title, columns, kind in parts
+    ]
+    sections = [Section(title, columns, told) for title, columns, told in of_kind if told]
+    names = ("steps", "sizes", "starts")
+    fields = {name: told for name, (_, _, told) in zip(names, of_kind, strict=True)}
+    return Measured({**fields, "method": install.METHOD}, sections)
 
 
 def _measured(benchmark: Any, fields: dict[str, Any]) -> Measured:

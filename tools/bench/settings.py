@@ -32,6 +32,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
             "rivals",
             "eval",
             "viewer",
+            "install",
         ]
     ] = "derender"
     """derender: de-rendered generated frames beside the generator's truth; parts: where the
@@ -41,7 +42,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
     of photographs beside the photograph and ours; weather: the compositor's weather beside the generator's; synth:
     the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many frames
-    beside pycocotools; viewer: how long drivesem view takes to answer a slider."""
+    beside pycocotools; viewer: how long drivesem view takes to answer a slider; install:
+    megabytes and seconds from a clone to the first report, and of each start."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import importlib
 import os
 import warnings
 from collections.abc import Sequence
@@ -225,6 +227,10 @@ def _pyrender() -> Any:
     if platform is None:
         raise NoSecondRendererError("pyrender", _EXPECTED, "neither")
     os.environ[_PLATFORM] = platform
+    # torch's optimisers load its compiler, where that is installed. Its LLVM and that of Mesa, which draws without
+    # a GPU, go together in this order alone: the other way round the process ends.
+    with contextlib.suppress(Exception):
+        importlib.import_module("triton")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pyrender's own dependencies, while they are imported

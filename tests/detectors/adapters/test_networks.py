@@ -41,7 +41,8 @@ def scripted(tmp_path: Path) -> Path:
     path = tmp_path / "tiny.pt"
     with warnings.catch_warnings():
         # torch deprecates the writing of TorchScript; files of it stay
-        warnings.simplefilter("ignore", DeprecationWarning)
+        for kind in (DeprecationWarning, FutureWarning):
+            warnings.simplefilter("ignore", kind)
         torch.jit.script(Tiny().eval()).save(str(path))
     path.with_suffix(".yaml").write_text(f"size: {SIDE}\nclasses: {CLASSES}\nt_star: 0.4\n")
     return path

@@ -103,6 +103,18 @@ def test_a_run_that_stopped_early_is_listed(
     assert "run: 1 frame, not finished (the same command goes on)" in capsys.readouterr().out
 
 
+def test_runs_of_other_commands_are_passed_over(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`drivesem drive` puts its folder beside them, with frames too."""
+    shutil.copytree(parts / "part2", tmp_path / "run")
+    (tmp_path / "clip" / "frames").mkdir(parents=True)
+    (tmp_path / "clip" / "config.yaml").write_text("detector: squeezedet\nclip: null\nbend: 3\n")
+    assert [row["run"] for row in told(["list", str(tmp_path)], capsys)["runs"]] == [str(tmp_path / "run")]
+    assert main(["runs", "list", str(tmp_path / "clip")]) == 2
+    assert "expected a run of drivesem attack, found" in capsys.readouterr().err
+
+
 def test_prune_removes_what_a_killed_command_left(
     parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -45,6 +45,23 @@ def finished(taken: TakenClip, tmp_path_factory: pytest.TempPathFactory) -> Path
     return out
 
 
+@pytest.mark.parametrize("words", ["export --to kitti --out out", "retrain --out out", "verify", "explain"])
+def test_it_is_told_from_an_attack_that_was_killed(
+    words: str,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command, *rest = words.split()
+    assert main([command, str(finished), *rest]) == 2
+    error = capsys.readouterr().err
+    assert "--run: expected a" in error
+    assert "of drivesem attack, found" in error
+    assert "stopped early" not in error
+
+
 def test_what_is_written(finished: Path, taken: TakenClip) -> None:
     told = json.loads((finished / "drive.json").read_text())
     assert told["frames"] == 3

@@ -48,11 +48,14 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(
 ) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "config.yaml").write_text("detector: squeezedet\nparams: rotate\ncombo: null\n")
+    (folder / "config.yaml").write_text("detector: squeezedet\ndataset: demo\nparams: null\ncombo: null\n")
     with another_process(folder):
         assert held_elsewhere(folder)
         assert main(["explain", str(folder)]) == 2
         assert f"found {folder}, into which an attack is still writing" in capsys.readouterr().err
+        (folder / "frames").mkdir()
+        assert main(["runs", "list", str(tmp_path)]) == 0
+        assert "run: 0 frames, being made now; combo 2 by si-fgsm" in capsys.readouterr().out
     assert not held_elsewhere(folder)
     assert main(["explain", str(folder)]) == 2
     assert f"found {folder}, which stopped early" in capsys.readouterr().err

@@ -63,7 +63,8 @@ def test_processes_make_their_own_and_hand_errors_back() -> None:
 
 def test_processes_begin_once_for_all_jobs() -> None:
     found = in_order([job for job in range(20) if job != 3], Sharing(workers=2))
-    assert len({value[1] for value in found.values() if isinstance(value, tuple)}) == 2, "a start takes seconds"
+    processes = {value[1] for value in found.values() if isinstance(value, tuple)}
+    assert len(processes) <= 2, "a start takes seconds; on a busy machine one is done before the other has begun"
 
 
 @pytest.mark.parametrize("kind", [ShapeError, RangeError, FormatError, UsageError])

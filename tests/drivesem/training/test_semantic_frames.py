@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from detectors.types import CLASSES
+from drivesem.attack.labels import Labeller, to_kitti_labels, with_others
+from drivesem.attack.space import SIX, ParameterSpace
+from drivesem.data import kitti
 from drivesem.data.kitti import KittiDataset
+from drivesem.training.attacked import AttackedSamples, Stage, frames_of
 from drivesem.training.frames import FrameStore
-from drivesem.training.semantic import VARIANTS, SemanticFrames
+from drivesem.training.semantic import VARIANTS, SemanticFrames, state_at
+from drivesem.training.targets import TRAINED, training_targets
+from scene_ir.io import load_scene, save_scene
+from scene_ir.render.compositor import Compositor
 
 
 def store(root: Path, cache: Path) -> FrameStore:
@@ -51,3 +61,50 @@ def test_vehicles_move_and_their_labels_too(tmp_path: Path) -> None:
     assert np.array_equal(plain[0], benign_image)
     again = SemanticFrames(frames, tmp_path / "again", 1.0, 0).draw(index, 5, np.random.default_rng(0))
     assert np.array_equal(again[0], drawn[0][0])
+
+
+PEOPLE = ("Pedestrian", "Tram")
+
+
+def test_what_stays_keeps_its_labels(tmp_path: Path, small_run: Path) -> None:
+    """A person and a tram beside the cars: objects among the labels of a state, not regions."""
+    scene = load_scene(small_run / "frames" / "demo-000" / "scene")
+    boxes = torch.tensor([[20.0, 150.0, 50.0, 230.0], [1000.0, 100.0, 1100.0, 200.0]])
+    row = to_kitti_labels(Labeller(scene).paper(), scene, scene).rows([0, 0])
+    region = torch.tensor([[300.0, 10.0, 320.0, 20.0]])
+    others = replace(row, kind=PEOPLE, boxes_xyxy=boxes, ignore_xyxy=region)
+    scene = replace(scene, others=others, ignore=torch.cat([region, boxes]))
+    space, compositor = ParameterSpace(scene, SIX), Compositor(scene)
+    labeller = Labeller(scene, compositor.render(scene))
+    _, labels, judged = state_at(torch.zeros(space.dim), space, compositor, labeller, scene)
+    assert labels.kind[-2:] == PEOPLE
+    assert torch.equal(labels.boxes_xyxy[-2:], boxes)
+    assert torch.equal(labels.ignore_xyxy, region)
+    assert int(judged.ignore[len(scene.objects) :].sum()) == 3 * len(CLASSES), "they are not judged"
+    written = tmp_path / "labels.txt"
+    assert with_others(labels, None) is labels
+    kitti.write_labels(written, labels)
+    targets = training_targets(kitti.read_labels(written), TRAINED, CLASSES)
+    person = targets.labels == CLASSES.index("Pedestrian")
+    assert targets.ignore[person].tolist() == [False]
+
+
+@pytest.mark.parametrize("stage", ["benign", "rerender", "counterexample"])
+def test_a_runs_pictures_have_people(stage: Stage, small_run: Path, tmp_path: Path) -> None:
+    """To a detector that knows people, pictures without any would say that there are none."""
+    shutil.copytree(small_run, tmp_path / "run")
+    (frame,) = frames_of(tmp_path / "run")
+    before = AttackedSamples([frame], stage, "moved", CLASSES)[0][1]
+    scene = load_scene(frame.folder / "scene")
+    region = torch.tensor([[20.0, 150.0, 50.0, 230.0]])
+    for name in ("labels_moved.txt", "labels_paper.txt"):
+        labels = kitti.read_labels(frame.folder / name)
+        kitti.write_labels(frame.folder / name, replace(labels, ignore_xyxy=region))
+    others = replace(labels.rows([0]), kind=("Cyclist",), boxes_xyxy=region, ignore_xyxy=region[:0])
+    save_scene(replace(scene, others=others, ignore=region), frame.folder / "scene")
+    after = AttackedSamples([frame], stage, "moved", CLASSES)[0][1]
+    cyclist = after.labels == CLASSES.index("Cyclist")
+    assert after.boxes_xyxy[cyclist & ~after.ignore].tolist() == region.tolist()
+    assert len(after) == len(before) + 1
+    for_cars = AttackedSamples([frame], stage, "moved", ("Car",))[0][1]
+    assert region[0].tolist() not in for_cars.boxes_xyxy.tolist(), "to others they are background"

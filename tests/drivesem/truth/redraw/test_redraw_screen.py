@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,3 +86,26 @@ def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytes
     assert "\n" not in str(told.value)
     assert "PYOPENGL_PLATFORM" not in os.environ
     shared_screen.cache_clear()
+
+
+@pytest.mark.usefixtures("screen")
+def test_torchs_compiler_is_loaded_before_the_driver(tmp_path: Path) -> None:
+    """A process that draws and then trains: with both LLVMs the other order is a segmentation fault."""
+    (tmp_path / "triton.py").write_text("import sys\nprint('OpenGL' in sys.modules)\n")
+    program = "import torch, drivesem.truth.redraw.screen as s; s.shared_screen(); print('triton' in sys.modules)"
+    both = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[4])])
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import sys; {program}"],
+        env={**os.environ, "PYTHONPATH": both},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout) == (0, "False\nTrue\n"), ended.stderr
+
+
+@pytest.mark.usefixtures("screen")
+def test_a_process_that_draws_can_train() -> None:
+    program = "import torch, drivesem.truth.redraw.screen as s; s.shared_screen(); import torch._dynamo"
+    ended = subprocess.run([sys.executable, "-c", program], cwd=Path(__file__).parents[4], check=False)
+    assert ended.returncode == 0

@@ -1,0 +1,176 @@
+"""What drivesem costs before it finds anything: from a clone to the first report, megabytes, and each start."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivesem.bench.tables import Columns
+from drivesem.bench.timing import Spread
+from drivesem.settings.errors import UsageError
+from tools.versions import ROOT, Ended, Run, run_words
+
+STEPS_TITLE, SIZES_TITLE, STARTS_TITLE = "From a clone to the first report", "What lies on the disk", "Starts"
+STEPS: Columns = {"step": ("step", "step"), "seconds": ("s", "s"), "mb": ("MB on the disk", "MB")}
+SIZES: Columns = {"package": ("package", "package"), "version": ("version", "version"), "mb": ("MB", "MB")}
+STARTS: Columns = {
+    "command": ("command", "command"), "repetitions": ("starts", "starts"), "first": ("first, s", "first"),
+    "seconds": ("s", "s"), "iqr": ("IQR", "IQR"),
+}  # fmt: skip
+METHOD = (
+    "The README's words, typed one after another into a fresh folder: git clone of this repository as committed; "
+    "a virtual environment; pip install with the tested versions, by pip's own settings and cache; the README's "
+    "attack on ten generated streets, which compiles the renderer's kernels first. Seconds of the clock. MB are a "
+    "million bytes of files. Packages: the largest of that environment by the files that each one lists, and "
+    "drivesem by its wheel. Starts: commands in that environment, each a process of its own, from its start to "
+    "its end; first: the first one, which reads files that the system may not have at hand; then the median and "
+    "quartiles of the others. With --quick the environment is the one that measures."
+)
+ATTACK = ("attack", "--combo", "2")
+ONE_FRAME = ("attack", "--limit", "1", "--steps", "1", "--nuisances", "off", "--no-confirm", "--workers", "1")
+"""The least that attacks a frame."""
+QUICK_STARTS, FULL_STARTS = 2, 7
+_LARGEST = 8
+_MB = 1e6
+_SIZES = """
+import json
+from importlib.metadata import distributions
+def size(one):
+    paths = (one.locate_file(file) for file in one.files or ())
+    return sum(path.stat().st_size for path in paths if path.is_file())
+print(json.dumps([[one.name, one.version, size(one)] for one in distributions()]))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class StepRow:
+    """A step. mb: of what it made."""
+
+    step: str
+    seconds: float
+    mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class SizeRow:
+    """An installed package, or all others together."""
+
+    package: str
+    version: str
+    mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class StartRow:
+    """A command that is started again and again. first: seconds of the first time; seconds, iqr: of the others."""
+
+    command: str
+    repetitions: int
+    first: float
+    seconds: float
+    iqr: float
+
+
+Row = StepRow | SizeRow | StartRow
+
+
+def measure(quick: bool, run: Run = run_words) -> Iterator[Row]:
+    """Rows of all three tables, as they are known. UsageError naming a step that fails."""
+    starts = QUICK_STARTS if quick else FULL_STARTS
+    with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as made:
+        work = Path(made)
+        if quick:
+            python, folder = sys.executable, ROOT
+        else:
+            python, folder = str(work / "environment" / "bin" / "python"), work / "clone"
+            yield from _steps(work, run)
+        yield from _sizes(python, work, run)
+        for words in _commands(python, work, attack=not quick):
+            yield _start(words, starts, folder, run)
+
+
+def _steps(work: Path, run: Run) -> Iterator[StepRow]:
+    """A clone, an environment, an installation, an attack, and their sum."""
+    clone, environment = work / "clone", work / "environment"
+    own = str(environment / "bin" / "python")
+    steps: list[tuple[str, Sequence[str], Path, Path]] = [
+        ("git clone", ["git", "clone", "-q", str(ROOT), str(clone)], work, clone),
+        ("python3 -m venv", [sys.executable, "-m", "venv", str(environment)], work, environment),
+        (
+            "pip install -c constraints.txt -e .",
+            [own, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."],
+            clone,
+            environment,
+        ),
+        (
+            f"drivesem {' '.join(ATTACK)}",
+            [*_kernels(work), own, "-m", "drivesem.cli", *ATTACK],
+            clone,
+            clone / "runs",
+        ),
+    ]
+    rows: list[StepRow] = []
+    for name, words, folder, place in steps:
+        before = _mb(place)
+        taken, _ = _timed(words, folder, run)
+        rows.append(StepRow(name, round(taken, 1), round(_mb(place) - before, 1)))
+        yield rows[-1]
+    yield StepRow("in all", round(sum(row.seconds for row in rows), 1), round(sum(row.mb for row in rows), 1))
+
+
+def _kernels(work: Path) -> list[str]:
+    """Words before a command: compiled kernels are kept there, not where those of other runs are."""
+    return ["env", f"WARP_CACHE_PATH={work / 'kernels'}"]
+
+
+def _sizes(python: str, work: Path, run: Run) -> Iterator[SizeRow]:
+    """drivesem's wheel, the largest packages, the others."""
+    wheels = work / "wheels"
+    _timed([python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(ROOT)], work, run)
+    _, said = _timed([python, "-c", _SIZES], work, run)
+    found: list[tuple[str, str, int]] = [(name, version, size) for name, version, size in json.loads(said)]
+    own = next((version for name, version, _ in found if name == "drivesem"), "")
+    yield SizeRow("drivesem, its wheel", own, round(_mb(wheels), 1))
+    ordered = sorted((one for one in found if one[0] != "drivesem"), key=lambda one: -one[2])
+    for name, version, size in ordered[:_LARGEST]:
+        yield SizeRow(name, version, round(size / _MB, 1))
+    rest = ordered[_LARGEST:]
+    yield SizeRow(f"{len(rest)} others", "", round(sum(size for *_, size in rest) / _MB, 1))
+
+
+def _commands(python: str, work: Path, attack: bool) -> Iterator[tuple[str, Sequence[str]]]:
+    """What is started: its name, its words."""
+    program = [python, "-m", "drivesem.cli"]
+    yield "python -c 'import drivesem'", [python, "-c", "import drivesem"]
+    yield "drivesem --version", [*program, "--version"]
+    yield "drivesem", program
+    yield "drivesem attack --help", [*program, "attack", "--help"]
+    if attack:
+        words = [*_kernels(work), *program, *ONE_FRAME, "--no-resume", "--out", str(work / "again")]
+        yield f"drivesem {' '.join(ONE_FRAME)}", words
+
+
+def _start(command: tuple[str, Sequence[str]], repetitions: int, folder: Path, run: Run) -> StartRow:
+    name, words = command
+    first, *others = (_timed(words, folder, run)[0] for _ in range(repetitions))
+    spread = Spread.of(others)
+    return StartRow(name, repetitions, round(first, 2), round(spread.median, 2), round(spread.iqr, 2))
+
+
+def _timed(words: Sequence[str], folder: Path, run: Run) -> tuple[float, str]:
+    """Seconds, and what was said."""
+    start = time.perf_counter()
+    ended: Ended = run(words, folder)
+    if ended.failed:
+        raise UsageError("bench install", "steps that work", f"{' '.join(words)[:200]}: {ended.failed}")
+    return time.perf_counter() - start, ended.said
+
+
+def _mb(path: Path) -> float:
+    """MB of a folder's files; 0 where there is none."""
+    return sum(one.lstat().st_size for one in path.rglob("*") if one.is_file() and not one.is_symlink()) / _MB
