@@ -41,6 +41,7 @@ from drivesem.training.mixture import Mixture
 from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 from scene_ir.errors import SceneError
+from scene_ir.io import SCHEMA, VERSION
 from scene_ir.types import Labels
 
 PRESETS = Path(__file__).parents[4] / "configs"
@@ -75,6 +76,7 @@ def attacked(frame: Callable[..., object], tmp_path: Path) -> list[AttackedFrame
             files.write_png(folder / f"{name}.png", np.full((60, 90, 3), value + i, np.uint8))
         kitti.write_labels(folder / "labels_paper.txt", labelled(10.0))
         kitti.write_labels(folder / "labels_moved.txt", labelled(20.0))
+        files.write_json(folder / "scene" / "scene.json", {"schema": SCHEMA, "version": VERSION, "others": None})
         files.write_text(folder / "result.json", dump_frame(frame(f"{i}", success=i > 0)))
         found.append(AttackedFrame(folder))
     return found
