@@ -186,6 +186,14 @@ list(outcomes(None, partial(lingering, {folder!r}), [1, 2], Sharing(workers=2)))
 """
 
 
+def parent_of_workers(folder: Path) -> subprocess.Popen[str]:
+    """A script in a session of its own, whose two workers say in `folder` that they work."""
+    (folder / "stopped.py").write_text(_STOPPED.format(folder=str(folder)))
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, str(folder / "stopped.py")]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
 def children(pid: int) -> list[int]:
     """Workers of a process that have been started, however far they are."""
     found = []
@@ -205,12 +213,7 @@ _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="nee
 @_NO_PROC
 @pytest.mark.parametrize("after_s", [0.0, 0.05, 0.2])
 def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, tmp_path: Path) -> None:
-    (tmp_path / "stopped.py").write_text(_STOPPED.format(folder=str(tmp_path)))
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    command = [sys.executable, str(tmp_path / "stopped.py")]
-    with subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as parent:
+    with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
         assert _soon(lambda: len(children(parent.pid)) > 0)
         time.sleep(after_s)
@@ -223,12 +226,7 @@ def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_path: Path) -> None:
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
-    (tmp_path / "stopped.py").write_text(_STOPPED.format(folder=str(tmp_path)))
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    command = [sys.executable, str(tmp_path / "stopped.py")]
-    with subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as parent:
+    with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
         assert _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
         workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("[12]-*")]
