@@ -135,7 +135,7 @@ def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch
 
 
 def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1", "--out", str(tmp_path / "run")]
+    words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1", "--out", str(tmp_path / "a")]
     assert main(words) == 2
     assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
     with pytest.raises(UsageError, match="--address"):
