@@ -174,7 +174,7 @@ def run(case: Case, folder: Path, ground: Ground) -> Done:
     with (folder / "out.txt").open("w") as out, (folder / "err.txt").open("w") as err:
         launcher = subprocess.Popen(words, cwd=place, env=_environment(folder), stdout=out, stderr=err)
         started = answer.with_name(answer.name + ".started")
-        if not _soon(started.exists):
+        if not soon(started.exists):
             raise RuntimeError(f"{case.name}: the command did not start")
         session = int(started.read_text())
         used, sent, ended, left = {}, 0.0, 0.0, []
@@ -183,7 +183,7 @@ def run(case: Case, folder: Path, ground: Ground) -> Done:
             launcher.wait(_STUCK_SECONDS)
             used = json.loads(answer.read_text())
             # What was interrupted may take so long; what ended by itself has nothing to wait for.
-            _soon(lambda: not _members(session), max(sent + END_SECONDS - time.monotonic(), 0) if sent else 1.0)
+            soon(lambda: not _members(session), max(sent + END_SECONDS - time.monotonic(), 0) if sent else 1.0)
         except subprocess.TimeoutExpired:
             pass
         finally:  # also where this one is interrupted
@@ -213,7 +213,7 @@ def _environment(folder: Path) -> dict[str, str]:
 
 def _send(signals: Signals, session: int, place: Path) -> float:
     """Wait until the command is as far as it is to be, and signal it. -> when the last was sent, by the clock."""
-    _soon(lambda: not _members(session) or (not signals.ready or any(place.glob(signals.ready))), _STUCK_SECONDS)
+    soon(lambda: not _members(session) or (not signals.ready or any(place.glob(signals.ready))), _STUCK_SECONDS)
     begin = time.monotonic()
     for seconds in signals.after:
         time.sleep(max(begin + seconds - time.monotonic(), 0))
@@ -228,7 +228,8 @@ def _signal(send: Callable[[int, int], None], whom: int, number: int) -> None:
         return
 
 
-def _soon(what: Callable[[], bool], seconds: float = 30.0) -> bool:
+def soon(what: Callable[[], bool], seconds: float = 30.0) -> bool:
+    """Whether something holds within so many seconds; returns once it does."""
     until = time.monotonic() + seconds
     while not what():
         if time.monotonic() > until:

@@ -22,6 +22,7 @@ from drivesem.run.workers import outcomes
 from drivesem.settings.blocks import Sharing
 from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
+from tools.hostile.trial import soon
 
 
 def square(job: int, offset: int = 0) -> tuple[int, int]:
@@ -215,7 +216,7 @@ _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="nee
 def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, tmp_path: Path) -> None:
     with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
-        assert _soon(lambda: len(children(parent.pid)) > 0)
+        assert soon(lambda: len(children(parent.pid)) > 0, 60)
         time.sleep(after_s)
         os.killpg(parent.pid, signal.SIGINT)
         said = parent.stderr.read()
@@ -228,7 +229,7 @@ def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_pa
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
     with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
-        assert _soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2)
+        assert soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2, 60)
         workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("[12]-*")]
         start = time.monotonic()
         if number == signal.SIGINT:  # as a terminal sends it: to all of them
@@ -236,19 +237,10 @@ def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_pa
         else:
             parent.send_signal(number)
         parent.wait()
-        assert _soon(lambda: not any(_lives(pid) for pid in workers), 10)
+        assert soon(lambda: not any(_lives(pid) for pid in workers), 10)
         took, said = time.monotonic() - start, parent.stderr.read()
     assert took < 5
     assert said.count("Traceback") == (number == signal.SIGINT), "of the script itself, which catches nothing"
-
-
-def _soon(what: Callable[[], bool], seconds: float = 60) -> bool:
-    until = time.monotonic() + seconds
-    while not what():
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 def _lives(pid: int) -> bool:
