@@ -24,8 +24,8 @@ IOU_THRESHOLDS = np.linspace(0.5, 0.95, round((0.95 - 0.5) / 0.05) + 1)
 
 MAX_DETECTIONS = 100
 """Detections judged an image and class, as COCO does."""
-_IOU_50, _IOU_70 = 0, 4
-"""Places of 0.5 and 0.7 among COCO's thresholds 0.5, 0.55, ..., 0.95."""
+IOU_50, IOU_70 = 0, 4
+"""Places of 0.5 and 0.7 among IOU_THRESHOLDS."""
 
 
 SCORE_TITLES = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
@@ -62,6 +62,11 @@ class Scores:
     overall: ClassScores
     per_class: dict[str, ClassScores]
 
+    @classmethod
+    def of(cls, per_class: dict[str, ClassScores], headline: str) -> Scores:
+        """From the figures of each class."""
+        return cls(headline=per_class[headline], overall=_overall(list(per_class.values())), per_class=per_class)
+
     def to_json(self) -> dict[str, Any]:
         """The headline's figures in front, `overall` and `per_class` beside them."""
         return {
@@ -89,7 +94,7 @@ def evaluate(
         raise ValueError(f"headline: expected one of {', '.join(classes)}, found {headline!r}")
     evaluator = _run(targets, detections, classes)
     per_class = {name: _class_scores(evaluator, k, len(targets), t_star) for k, name in enumerate(classes)}
-    return Scores(headline=per_class[headline], overall=_overall(list(per_class.values())), per_class=per_class)
+    return Scores.of(per_class, headline)
 
 
 def fastest_engine(truth_ids: Integers | None = None) -> Engine:
@@ -226,14 +231,12 @@ def _class_scores(evaluator: Any, k: int, images: int, t_star: float) -> ClassSc
     hits = [
         score
         for e in entries
-        for score, match, ignored in zip(
-            e["dtScores"], e["dtMatches"][_IOU_50], e["dtIgnore"][_IOU_50], strict=True
-        )
+        for score, match, ignored in zip(e["dtScores"], e["dtMatches"][IOU_50], e["dtIgnore"][IOU_50], strict=True)
         if match > 0 and not ignored
     ]
     return ClassScores(
-        ap50=float(precision[_IOU_50].mean()),
-        ap70=float(precision[_IOU_70].mean()),
+        ap50=float(precision[IOU_50].mean()),
+        ap70=float(precision[IOU_70].mean()),
         ap=float(precision.mean()),
         recall=len(hits) / objects,
         recall_at_t_star=sum(score >= t_star for score in hits) / objects,

@@ -74,28 +74,40 @@ def average_precision(tally: Tally, rule: Rule, weights: Floats | None = None) -
     coco: 101 samples 0, 0.01, ..., 1 (pycocotools). kitti: 40 samples 1/40, ..., 1 of the plain curve. voc: the
     whole area (VOC 2010 and later). voc07: 11 samples 0, 0.1, ..., 1.
     """
-    objects = tally.count(weights)
-    if objects <= 0:
+    if tally.count(weights) <= 0:
         return None
     if not len(tally.score):
         return 0.0
-    hits, misfires = tally.curve(weights)
-    recall = hits / objects
-    # pycocotools divides so; where nothing was weighed yet, precision is 0
-    precision = hits / (hits + misfires + np.spacing(1))
-    best = np.maximum.accumulate(precision[::-1])[::-1]
     if rule == "voc":
-        rise = np.diff(recall, prepend=0.0)
-        return float(rise @ best)
+        recall, best = _envelope(tally, weights)
+        return float(np.diff(recall, prepend=0.0) @ best)
+    return float(sampled_precision(tally, rule, weights).mean())
+
+
+def sampled_precision(
+    tally: Tally, rule: Literal["coco", "kitti", "voc07"], weights: Floats | None = None
+) -> Floats:
+    """The best precision at each sample's recall or a higher one, of a tally with objects; 0 beyond its recall."""
     samples = {
         "coco": _COCO_RECALL,
         "kitti": np.arange(1, KITTI_SAMPLES) / (KITTI_SAMPLES - 1),
         "voc07": np.arange(11) / 10,
     }[rule]
+    if not len(tally.score):
+        return np.zeros(len(samples))
+    recall, best = _envelope(tally, weights)
     # 1e-12: a recall of 0.3 that was computed as 3 / 10 must reach the sample 0.1 * 3; pycocotools has no margin
     margin = 0.0 if rule == "coco" else 1e-12
     places = np.searchsorted(recall, samples - margin, side="left")
-    return float(np.where(places < len(best), best[np.minimum(places, len(best) - 1)], 0.0).mean())
+    return np.where(places < len(best), best[np.minimum(places, len(best) - 1)], 0.0)
+
+
+def _envelope(tally: Tally, weights: Floats | None) -> tuple[Floats, Floats]:
+    """Recall (E,) at each step, and the best precision (E,) there or at a higher one."""
+    hits, misfires = tally.curve(weights)
+    # pycocotools divides so; where nothing was weighed yet, precision is 0
+    precision = hits / (hits + misfires + np.spacing(1))
+    return hits / tally.count(weights), np.maximum.accumulate(precision[::-1])[::-1]
 
 
 def sampled_curve(tally: Tally, samples: int = 101) -> list[list[float]]:

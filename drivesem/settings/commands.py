@@ -67,7 +67,7 @@ Search = Literal[
 ]  # fmt: skip
 """Attacks that look for failures; the placebo looks for none."""
 
-KEPT_STUDIES = ("single", "multi", "grades", "searches", "samples", "steps", "attribution")
+KEPT_STUDIES = ("single", "multi", "grades", "searches", "samples", "steps", "attribution", "transfer", "retrain")
 """Studies that keep what their tables are computed from."""
 _AGAIN = ("name", "kept", "out", "bootstrap", "json")
 """Settings of a study that is told again."""
@@ -233,8 +233,8 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     kept: Annotated[str | None, Folder(), tyro.conf.arg(aliases=["--from"])] = None
-    """Single, multi, grades, searches, samples, steps, attribution: the folder OUT/kept of such a study, whose
-    tables are told again; it needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
+    """All but labels and classification: the folder OUT/kept of such a study, whose tables are told again; it
+    needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""

@@ -27,6 +27,7 @@ from drivesem.data.layouts import read_table
 from drivesem.data.photographs import photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
+from drivesem.evaluation.matches import Matches
 from drivesem.questions.realism import weights as realism_weights
 from drivesem.questions.study.arms import Arm
 from drivesem.questions.study.asking import study_run
@@ -34,7 +35,6 @@ from drivesem.questions.study.counts import (
     ArmCounts,
     CountedFailure,
     FrameCounts,
-    Matches,
     SeenObject,
     StudyCounts,
 )

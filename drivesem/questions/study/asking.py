@@ -16,7 +16,10 @@ from drivesem.questions.study.attribution import Plan, attributed, write_waterfa
 from drivesem.questions.study.attribution import told as told_of_factors
 from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import grades_of
-from drivesem.questions.study.kept import KEPT, NOT_TOLD, keep, load_kept
+from drivesem.questions.study.kept import keep, load_kept
+from drivesem.questions.study.kept_retrain import keep_retrain, load_retrain
+from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
+from drivesem.questions.study.kept_transfer import keep_transfer, load_transfer
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
 from drivesem.questions.study.lessons import CACHE, FRAMES, POOL, RETRAINED
@@ -27,6 +30,8 @@ from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
 from drivesem.questions.study.searches import costs_of, depths_of, seen_of, standing_of
 from drivesem.questions.study.success import against, curve_of
+from drivesem.questions.study.taught import RetrainCounts, taught
+from drivesem.questions.study.transfer import TransferCounts, matrix_of
 from drivesem.questions.transfer.asking import DETECTIONS
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
@@ -77,10 +82,9 @@ def study_run(config: Study) -> Answer:
 def _again(config: Study, folder: Path) -> Answer:
     """The tables of a study that was kept."""
     out = folder_of(config.out, folder)
-    kept = load_kept(folder, config.name)
-    draws = kept.settings.bootstrap if config.bootstrap is None else config.bootstrap
-    study = replace(kept.settings, bootstrap=draws)
-    answer = _answer(study, out, _found(study, kept.counts, kept.confirmed))
+    settings, told = _AGAIN.get(config.name, _kept)(folder, config.name)
+    study = settings if config.bootstrap is None else replace(settings, bootstrap=config.bootstrap)
+    answer = _answer(study, out, told(study))
     if config.out is not None:
         answer.write()
     return answer
@@ -94,6 +98,30 @@ def _answer(study: Study, out: Path, found: _Found) -> Answer:
     data, told, draw = found
     command = command_line("study", study, (*NOT_TOLD, "name")).replace("study", f"study {study.name}", 1)
     return report.answer_of(told, out, data, command, draw)
+
+
+_Kept = tuple[Study, Callable[[Study], _Found]]
+"""Settings of a study that was kept, and what is found with such settings."""
+
+
+def _kept(folder: Path, name: str) -> _Kept:
+    """Of arms."""
+    kept = load_kept(folder, name)
+    return kept.settings, partial(_found, counts=kept.counts, confirmed=kept.confirmed)
+
+
+def _kept_transfer(folder: Path, name: str) -> _Kept:
+    settings, counts = load_transfer(folder)
+    return settings, partial(_transferred, counts=counts)
+
+
+def _kept_retrain(folder: Path, name: str) -> _Kept:
+    settings, counts = load_retrain(folder)
+    return settings, partial(_retrained, counts=counts)
+
+
+_AGAIN = {"transfer": _kept_transfer, "retrain": _kept_retrain}
+"""Studies that keep more than arms."""
 
 
 def _arms(config: Study, out: Path, console: Console) -> _Found:
@@ -152,7 +180,13 @@ def _transfer(config: Study, out: Path, console: Console) -> _Found:
     workers = workers_of(arms)
     asked = transfer.detectors_asked(config, out)
     claim(out, config, _WRITTEN, (*_FREE, "detectors", "sources"))
-    found = transfer.run(config, arms, workers, asked, out)
+    counts = transfer.run(config, arms, workers, asked, out)
+    keep_transfer(out / KEPT, config, counts)
+    return _transferred(config, counts)
+
+
+def _transferred(config: Study, counts: TransferCounts) -> _Found:
+    found = matrix_of(config, counts)
     return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
 
 
@@ -160,7 +194,13 @@ def _retrain(config: Study, out: Path, console: Console) -> _Found:
     """Detectors trained on with counterexamples."""
     ready = retrain.prepare(config, out)
     claim(out, config, _WRITTEN, _FREE_IN_RETRAIN)
-    found = retrain.run(config, ready, out, console)
+    counts = retrain.run(config, ready, out, console)
+    keep_retrain(out / KEPT, config, counts)
+    return _retrained(config, counts)
+
+
+def _retrained(config: Study, counts: RetrainCounts) -> _Found:
+    found = taught(config, counts)
     return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
 
 

@@ -10,59 +10,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from detectors.types import CLASSES, Detections, Targets
+from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE
-from drivesem.evaluation.coco import IOU_THRESHOLDS
-from drivesem.evaluation.curves import Tally
-from drivesem.evaluation.instances import Floats, Integers
-from drivesem.evaluation.matching import NOTHING
-from drivesem.evaluation.outcome import Outcome
+from drivesem.evaluation.matches import Matches
 from drivesem.questions.study.arms import Arm
 from drivesem.questions.study.running import ArmRun, Ran
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-
-FALSE, TRUE, IGNORED = range(3)
-"""What a detection is at one IoU."""
-
-
-@dataclass(frozen=True, slots=True)
-class Matches:
-    """N detections of HEADLINE in the pictures of F frames, beside the labels of one mode. frame (N,), ascending;
-    score (N,): as float32 has them; marks (N, T): FALSE, TRUE or IGNORED at each of IOU_THRESHOLDS; objects (F,):
-    how many there are to find.
-    """
-
-    frame: Integers
-    score: Floats
-    marks: Integers
-    objects: Floats
-
-    @classmethod
-    def of(cls, targets: Sequence[Targets], detections: Sequence[Detections], label: int) -> Matches:
-        """Matched as COCO does. The i-th of both belong to one frame."""
-        candidates = Outcome.of(targets, detections, label).candidates
-        found, truths = candidates.found, candidates.truths
-        marks = np.full((len(found), len(IOU_THRESHOLDS)), FALSE)
-        for place, overlap in enumerate(IOU_THRESHOLDS):
-            match = candidates.coco(overlap)
-            marks[match.truth != NOTHING, place] = TRUE
-            marks[match.excused, place] = IGNORED
-        objects = np.bincount(truths.frame[~truths.ignore], minlength=truths.frames)
-        return cls(found.frame, found.score, marks, objects.astype(np.float64))
-
-    def tally(self, place: int) -> Tally:
-        """At one of IOU_THRESHOLDS."""
-        order = np.argsort(-self.score, kind="stable")
-        rows = order[self.marks[order, place] != IGNORED]
-        hits = self.marks[rows, place] == TRUE
-        return Tally(
-            score=self.score[rows],
-            frame=self.frame[rows],
-            hits=hits.astype(np.float64),
-            misfires=(~hits).astype(np.float64),
-            objects=self.objects,
-        )
 
 
 @dataclass(frozen=True, slots=True)

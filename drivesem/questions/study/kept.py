@@ -8,53 +8,44 @@ a detection of HEADLINE, with what it is beside the labels), `failures.csv`, and
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
-from itertools import pairwise
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.questions.confirm.report import Confirmation, Share
-from drivesem.questions.study.arms import PLACEBO, RANDOM, Arm, attack_of, draws_of
+from drivesem.questions.study.arms import PLACEBO, RANDOM, Arm, attack_of
 from drivesem.questions.study.attribution import Plan
-from drivesem.questions.study.counts import (
-    TRUE,
-    ArmCounts,
-    CountedFailure,
-    FrameCounts,
-    Matches,
-    SeenObject,
-    StudyCounts,
+from drivesem.questions.study.counts import ArmCounts, CountedFailure, FrameCounts, SeenObject, StudyCounts
+from drivesem.questions.study.kept_rows import (
+    MOST,
+    MOST_DRAWS,
+    STUDY,
+    Marked,
+    check_marks,
+    check_score,
+    check_settings,
+    marked,
+    matches_of,
+    read_rows,
+    require,
+    settings_of,
+    write_rows,
 )
-from drivesem.run.records import dump_rows, load_record, load_rows
+from drivesem.run.records import load_record
 from drivesem.settings.commands import Study
-from drivesem.settings.errors import UsageError
 from drivesem.truth.grades import Grade, Kind
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-KEPT = "kept"
-"""The folder, in the study's."""
-NOT_TOLD = ("out", "json", "resume", "workers")
-"""Settings that say nothing about a study."""
 _SCHEMA = 1
-_STUDY, _FRAMES, _DETECTIONS = "study.json", "frames.csv", "detections.csv.gz"
+_FRAMES, _DETECTIONS = "frames.csv", "detections.csv.gz"
 _FAILURES, _OBJECTS = "failures.csv", "objects.csv"
-_MOST_BYTES = 1 << 28
-"""Of a file, unpacked: some million detections."""
-_LEAST, _MOST = 1e-30, 1 << 31
-"""No measure but 0 is below the one, and none reaches the other: ratios are finite."""
-_MEASURE = f"0, or from {_LEAST:g} to below {_MOST}"
-_MOST_DRAWS = 100_000
-"""Of frames; and of an arm's steps and queries."""
+_LEAST = 1e-30
+"""No measure but 0 is below it: ratios are finite."""
+_MEASURE = f"0, or from {_LEAST:g} to below {MOST}"
 _OF_AN_ARM = ("detector", "method", "keep", "steps", "queries")
 """Settings of an arm that tables ask for."""
-_MARKS = "fti"
-"""Letters of FALSE, TRUE and IGNORED."""
 _SHARED = tuple(field.name for field in fields(FrameCounts) if field.name not in ("identifier", "failures"))
 """What a row of frames.csv has as `FrameCounts` has it."""
 
@@ -150,7 +141,7 @@ def keep(folder: Path, study: Study, counts: StudyCounts, confirmed: Mapping[str
     """Write it whole. counts: what came of the study's arms."""
     head = {
         "schema": _SCHEMA,
-        "settings": {name: value for name, value in asdict(study).items() if name not in NOT_TOLD},
+        "settings": settings_of(study),
         "arms": [
             asdict(one.arm) | {"config": {name: getattr(one.arm.config, name) for name in _OF_AN_ARM}}
             for one in counts.arms
@@ -172,25 +163,24 @@ def keep(folder: Path, study: Study, counts: StudyCounts, confirmed: Mapping[str
     )
     seen = (ObjectRow(name, *astuple(one)) for name, objects in counts.seen.items() for one in objects)
     with files.whole_folder(folder) as into:
-        files.write_json(into / _STUDY, head)
-        files.write_text(into / _FRAMES, dump_rows(FrameRow, frames))
-        packed = gzip.compress(dump_rows(DetectionRow, detections).encode("utf-8"), mtime=0)
-        files.write_bytes(into / _DETECTIONS, packed)
-        files.write_text(into / _FAILURES, dump_rows(FailureRow, failures))
-        files.write_text(into / _OBJECTS, dump_rows(ObjectRow, seen))
+        files.write_json(into / STUDY, head)
+        write_rows(into / _FRAMES, FrameRow, frames)
+        write_rows(into / _DETECTIONS, DetectionRow, detections)
+        write_rows(into / _FAILURES, FailureRow, failures)
+        write_rows(into / _OBJECTS, ObjectRow, seen)
 
 
 def _rows(arms: Sequence[ArmCounts]) -> tuple[list[FrameRow], list[DetectionRow]]:
     """What the detector finds in a photograph stands once, with the first arm of which it is the same."""
     frames: list[FrameRow] = []
     detections: list[DetectionRow] = []
-    known: dict[str, list[tuple[str, int, list[_Marked]]]] = {}
+    known: dict[str, list[tuple[str, int, list[Marked]]]] = {}
     for one in arms:
         arm, paper, moved = one.arm.name, one.after["paper"], one.after["moved"]
-        befores, papers, moveds = map(_marked, (one.before, paper, moved))
+        befores, papers, moveds = map(marked, (one.before, paper, moved))
         for place, frame in enumerate(one.frames):
             name, cars = frame.identifier, int(one.before.objects[place])
-            alike = [by for by, n, marked in known.get(name, ()) if (n, marked) == (cars, befores[place])]
+            alike = [by for by, n, rows in known.get(name, ()) if (n, rows) == (cars, befores[place])]
             if not alike:
                 known.setdefault(name, []).append((arm, cars, befores[place]))
                 detections += [DetectionRow(arm, name, "photograph", *row, None) for row in befores[place]]
@@ -204,47 +194,29 @@ def _rows(arms: Sequence[ArmCounts]) -> tuple[list[FrameRow], list[DetectionRow]
     return frames, detections
 
 
-_Marked = tuple[float, str]
-"""A score and its marks."""
-
-
-def _marked(matches: Matches) -> list[list[_Marked]]:
-    """The detections of each frame."""
-    words = ["".join(letters) for letters in np.array(list(_MARKS))[matches.marks]]
-    rows = [(_short(s), w.rstrip(w[-1]) + w[-1]) for s, w in zip(matches.score.tolist(), words, strict=True)]
-    ends = np.searchsorted(matches.frame, np.arange(len(matches.objects) + 1)).tolist()
-    return [rows[start:end] for start, end in pairwise(ends)]
-
-
-def _short(score: float) -> float:
-    """The number of the fewest digits that float32 does not tell from this one."""
-    short = float(str(np.float32(score)))
-    return short if np.float32(short) == score else score
-
-
 def load_kept(folder: Path, name: str) -> Kept:
     """A study of that name that `keep` wrote. Raises FormatError naming file, and row or field."""
-    head: _Head = load_record(folder / _STUDY, _Head, _SCHEMA)
-    _check_head(head, name, str(folder / _STUDY))
+    head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
+    _check_head(head, name, str(folder / STUDY))
     frames = _frames(folder / _FRAMES, head)
-    marked = _detections(folder / _DETECTIONS, frames)
+    seen_by = _detections(folder / _DETECTIONS, frames)
     failures = _failures(folder / _FAILURES, frames)
     seen = _seen(folder / _OBJECTS, head.frames)
     arms = []
     for arm in head.arms:
         rows = [frames[arm.name, frame] for frame in head.frames]
         cars, moved = ([getattr(row, key) for row in rows] for key in ("cars", "cars_moved"))
-        before = [marked[row.photograph, row.frame, "photograph"] for row in rows]
-        after = [marked[row.arm, row.frame, "counterexample"] for row in rows]
+        before = [seen_by[row.photograph, row.frame, "photograph"] for row in rows]
+        after = [seen_by[row.arm, row.frame, "counterexample"] for row in rows]
         where = f"{folder / _DETECTIONS}: arm {arm.name}"
         arms.append(
             ArmCounts(
                 arm=arm,
                 frames=tuple(_frame(row, failures[row.arm, row.frame]) for row in rows),
-                before=_matches([[(r.score, r.benign) for r in one] for one in before], cars, where),
+                before=matches_of([[(r.score, r.benign) for r in one] for one in before], cars, where),
                 after={
-                    "paper": _matches([[(r.score, r.benign) for r in one] for one in after], cars, where),
-                    "moved": _matches([[(r.score, r.moved or "") for r in one] for one in after], moved, where),
+                    "paper": matches_of([[(r.score, r.benign) for r in one] for one in after], cars, where),
+                    "moved": matches_of([[(r.score, r.moved or "") for r in one] for one in after], moved, where),
                 },
             )
         )
@@ -264,39 +236,32 @@ def _share(name: str, failures: int, survive: int) -> Share:
 
 def _check_head(head: _Head, name: str, where: str) -> None:
     study, arms = head.settings, [arm.name for arm in head.arms]
-    _require(study.name == name, f"{where}: settings.name", name, study.name)
-    try:
-        replace(study, pace=None, kept=None).check()  # the folder of other seconds may be gone
-    except UsageError as error:
-        raise FormatError(f"{where}: settings: {error.field}", error.expected, error.actual) from error
-    _require(study.seed >= 0, f"{where}: settings.seed", "at least 0", study.seed)
-    draws = draws_of(study)
-    _require(draws <= _MOST_DRAWS, f"{where}: settings.bootstrap", f"at most {_MOST_DRAWS}", draws)
-    _require(any(arm.control is None for arm in head.arms), f"{where}: arms", "one that is no control", "none")
+    check_settings(study, name, where)
+    require(any(arm.control is None for arm in head.arms), f"{where}: arms", "one that is no control", "none")
     needed = [arm.name for arm in Plan.of(study, attack_of(study)).arms()] if name == "attribution" else []
     missing = [arm for arm in needed if arm not in arms]
-    _require(not missing, f"{where}: arms", f"one named {missing[:1]}", "none")
+    require(not missing, f"{where}: arms", f"one named {missing[:1]}", "none")
     for place, arm in enumerate(head.arms):
         here = f"{where}: arms[{place}]"
-        _require(arms.index(arm.name) == place, f"{here}.name", "each name once", arm.name)
+        require(arms.index(arm.name) == place, f"{here}.name", "each name once", arm.name)
         beside = (None, RANDOM, PLACEBO) if arm.of in arms else (None,)
-        _require(arm.control in beside, f"{here}.control", "random or placebo of an arm, or null", arm.control)
-        _require(arm.reference is None or 0 <= arm.reference <= 1, f"{here}.reference", "0 to 1", arm.reference)
+        require(arm.control in beside, f"{here}.control", "random or placebo of an arm, or null", arm.control)
+        require(arm.reference is None or 0 <= arm.reference <= 1, f"{here}.reference", "0 to 1", arm.reference)
         for key, value in (("steps", arm.config.steps), ("queries", arm.config.queries)):
-            good = value is None or 1 <= value <= _MOST_DRAWS
-            _require(good, f"{here}.config.{key}", f"1 to {_MOST_DRAWS}", value)
-    _require(len(set(head.frames)) == len(head.frames), f"{where}: frames", "each once", "one twice")
+            good = value is None or 1 <= value <= MOST_DRAWS
+            require(good, f"{here}.config.{key}", f"1 to {MOST_DRAWS}", value)
+    require(len(set(head.frames)) == len(head.frames), f"{where}: frames", "each once", "one twice")
     passed = head.frames_without_vehicles
-    _require(0 <= passed < _MOST, f"{where}: frames_without_vehicles", "a count", passed)
+    require(0 <= passed < MOST, f"{where}: frames_without_vehicles", "a count", passed)
     for arm, one in head.confirmed.items():
         here = f"{where}: confirmed.{arm}"
         alike = bool(one.shares) and all(
             one.shares.keys() == other.shares.keys() for other in head.confirmed.values()
         )
-        _require(arm in arms and alike, here, "an arm, with the same shares as others", list(one.shares))
+        require(arm in arms and alike, here, "an arm, with the same shares as others", list(one.shares))
         for failures, survive in one.shares.values():
-            good = 0 <= survive <= failures <= _MOST_DRAWS
-            _require(good, here, "failures, and how many of them survive", (failures, survive))
+            good = 0 <= survive <= failures <= MOST_DRAWS
+            require(good, here, "failures, and how many of them survive", (failures, survive))
 
 
 _Key = tuple[str, str]
@@ -306,19 +271,19 @@ _Key = tuple[str, str]
 def _frames(path: Path, head: _Head) -> dict[_Key, FrameRow]:
     wanted = {(arm.name, frame) for arm in head.arms for frame in head.frames}
     found: dict[_Key, FrameRow] = {}
-    for where, row in load_rows(_text(path), FrameRow, str(path)):
-        _require((row.arm, row.frame) in wanted, where, f"an arm and a frame of {_STUDY}", (row.arm, row.frame))
-        _require((row.arm, row.frame) not in found, where, "each frame once an arm", row.frame)
+    for where, row in read_rows(path, FrameRow):
+        require((row.arm, row.frame) in wanted, where, f"an arm and a frame of {STUDY}", (row.arm, row.frame))
+        require((row.arm, row.frame) not in found, where, "each frame once an arm", row.frame)
         for name in ("queries", "passes", "seconds", "size", "judged", "cars", "cars_moved"):
             value = getattr(row, name)
-            _require(value == 0 or _LEAST <= value < _MOST, f"{where}: {name}", _MEASURE, value)
+            require(value == 0 or _LEAST <= value < MOST, f"{where}: {name}", _MEASURE, value)
         found[row.arm, row.frame] = row
     for key in wanted - found.keys():
         raise FormatError(str(path), f"a row of arm {key[0]}, frame {key[1]}", "none")
     for row in found.values():
         first = found.get((row.photograph, row.frame))
         good = first is not None and (first.photograph, first.cars) == (row.photograph, row.cars)
-        _require(good, f"{path}: photograph", "an arm that has its own and as many cars", row.photograph)
+        require(good, f"{path}: photograph", "an arm that has its own and as many cars", row.photograph)
     return found
 
 
@@ -330,43 +295,26 @@ def _detections(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[tuple[str, 
     found: dict[tuple[str, str, str], list[DetectionRow]] = {
         (*key, picture): [] for key in frames for picture in ("photograph", "counterexample")
     }
-    text = files.text_of(files.read_gzip(path, _MOST_BYTES), path)
-    for where, row in load_rows(text, DetectionRow, str(path)):
+    for where, row in read_rows(path, DetectionRow):
         frame, photograph = frames.get((row.arm, row.frame)), row.picture == "photograph"
-        _require(frame is not None, where, f"an arm and a frame of {_FRAMES}", (row.arm, row.frame))
+        require(frame is not None, where, f"an arm and a frame of {_FRAMES}", (row.arm, row.frame))
         own = frame is None or frame.photograph == row.arm
-        _require(own or not photograph, where, "no photograph of an arm that has another's", row.arm)
-        _require(0 <= row.score <= 1, f"{where}: score", "0 to 1", row.score)
-        _require((row.moved is None) == photograph, f"{where}: moved", "marks of counterexamples alone", row.moved)
-        for name, word in (("benign", row.benign), ("moved", row.moved)):
-            good = word is None or (len(word) <= len(IOU_THRESHOLDS) and {*word} <= {*_MARKS})
-            _require(good, f"{where}: {name}", f"at most {len(IOU_THRESHOLDS)} of the letters {_MARKS}", word)
+        require(own or not photograph, where, "no photograph of an arm that has another's", row.arm)
+        check_score(where, row.score)
+        require((row.moved is None) == photograph, f"{where}: moved", "marks of counterexamples alone", row.moved)
+        check_marks(f"{where}: benign", row.benign)
+        check_marks(f"{where}: moved", row.moved)
         found[row.arm, row.frame, row.picture].append(row)
     return found
 
 
-def _matches(frames: Sequence[Sequence[_Marked]], objects: Sequence[int], where: str) -> Matches:
-    """Of the detections of each frame."""
-    rows = [row for frame in frames for row in frame]
-    words = [list(word.ljust(len(IOU_THRESHOLDS), word[-1])) for _, word in rows]
-    letters = np.array(words, dtype="U1").reshape(-1, len(IOU_THRESHOLDS))
-    marks = np.select([letters == letter for letter in _MARKS], list(range(len(_MARKS))))
-    frame = np.repeat(np.arange(len(frames)), [len(one) for one in frames])
-    score = np.array([score for score, _ in rows], np.float32).astype(np.float64)
-    hits = np.zeros((len(frames), len(IOU_THRESHOLDS)), np.int64)
-    np.add.at(hits, frame, marks == TRUE)
-    most = np.array(objects, np.float64)
-    _require(bool((hits.max(axis=1, initial=0) <= most).all()), where, "no more true ones than objects", "more")
-    return Matches(frame, score, marks, most)
-
-
 def _failures(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[_Key, list[CountedFailure]]:
     found: dict[_Key, list[CountedFailure]] = {key: [] for key in frames}
-    for where, row in load_rows(_text(path), FailureRow, str(path)):
-        _require((row.arm, row.frame) in found, where, f"an arm and a frame of {_FRAMES}", (row.arm, row.frame))
-        _require(0 <= (row.object or 0) < _MOST, f"{where}: object", "at least 0", row.object)
+    for where, row in read_rows(path, FailureRow):
+        require((row.arm, row.frame) in found, where, f"an arm and a frame of {_FRAMES}", (row.arm, row.frame))
+        require(0 <= (row.object or 0) < MOST, f"{where}: object", "at least 0", row.object)
         for name, value, known in (("kind", row.kind, Kind), ("grade", row.grade, Grade)):
-            _require(
+            require(
                 value is None or value in map(str, known), f"{where}: {name}", f"one of {', '.join(known)}", value
             )
         found[row.arm, row.frame].append(CountedFailure(row.object, row.kind, row.grade, row.asked))
@@ -375,21 +323,12 @@ def _failures(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[_Key, list[Co
 
 def _seen(path: Path, frames: Sequence[str]) -> dict[str, tuple[SeenObject, ...]]:
     found: dict[str, list[SeenObject]] = {name: [] for name in frames}
-    for where, row in load_rows(_text(path), ObjectRow, str(path)):
-        _require(row.frame in found, f"{where}: frame", f"a frame of {_STUDY}", row.frame)
-        _require(0 <= row.object < _MOST, f"{where}: object", "at least 0", row.object)
+    for where, row in read_rows(path, ObjectRow):
+        require(row.frame in found, f"{where}: frame", f"a frame of {STUDY}", row.frame)
+        require(0 <= row.object < MOST, f"{where}: object", "at least 0", row.object)
         known = [one.index for one in found[row.frame]]
-        _require(row.object not in known, f"{where}: object", "each once a frame", row.object)
+        require(row.object not in known, f"{where}: object", "each once a frame", row.object)
         for name in ("height_px", "depth_m"):
-            _require(getattr(row, name) >= 0, f"{where}: {name}", "at least 0", getattr(row, name))
+            require(getattr(row, name) >= 0, f"{where}: {name}", "at least 0", getattr(row, name))
         found[row.frame].append(SeenObject(row.object, row.height_px, row.depth_m))
     return {name: tuple(objects) for name, objects in found.items()}
-
-
-def _text(path: Path) -> str:
-    return files.read_text(path, _MOST_BYTES)
-
-
-def _require(good: bool, where: str, expected: str, found: object) -> None:
-    if not good:
-        raise FormatError(where, expected, "nothing" if found is None else found)

@@ -11,9 +11,10 @@ from drivesem.evaluation.resampling import Interval
 from drivesem.questions.study.lessons import BENIGN
 from drivesem.questions.study.plots import DPI, bars, place_of
 from drivesem.questions.study.report import OWN_PROTOCOL, Told
-from drivesem.questions.study.retrain import Judged, Taught
 from drivesem.questions.study.robust import ANYWHERE, AROUND, CONTROLS, GOAL, REDRAWN, redrawn_of
-from drivesem.questions.study.rows import FIGURES, MODES, feasible_fraction
+from drivesem.questions.study.rows import FIGURES, MODES
+from drivesem.questions.study.running import feasible_of
+from drivesem.questions.study.taught import Judged, Taught
 from drivesem.questions.transfer.matrix import AP50, BROKEN, LOST
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.plots import COLOURS, STYLE
@@ -71,7 +72,7 @@ def _robust(found: Taught) -> Sheet:
         *(_DETECTOR, "anywhere", "fewer than benign", "fewer than random", "second renderer", "fewer than benign"),
         *("around failures", "fewer than benign", "phantoms", "AP50 falls", _GOAL),
     )
-    title = f"Failures a car, {found.state_frames} held-out frames, {found.study.states} states each, %"
+    title = f"Failures a car, {len(found.counts.states)} held-out frames, {found.study.states} states each, %"
     return Sheet(title, columns, tuple(lines))
 
 
@@ -143,9 +144,9 @@ def _further(rows: Sequence[Judged]) -> Sheet:
 
 def _training(found: Taught) -> Sheet:
     lines = []
-    for lesson, count in found.lessons.values():
+    for lesson in found.lessons:
         config = lesson.config
-        pictures = f"{count} {_SHOWN[lesson.pictures]}"
+        pictures = f"{found.counts.shown[lesson.name]} {_SHOWN[lesson.pictures]}"
         lines.append(
             (
                 *(lesson.name, pictures, lesson.labels, f"{config.fraction:g}, {config.mix}", config.window),
@@ -160,11 +161,11 @@ def notes(found: Taught) -> list[str]:
     """What the columns mean."""
     spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
     rows = found.rows
-    attacked, frames = len(found.learned.runs[0].results), rows[0].known.frames
+    learned, judged = found.attacks
     lines = [
-        f"{attacked} frames were attacked by {found.learned.runs[0].arm.name} to train on, beside {found.benign} "
-        f"benign frames; "
-        f"{frames} others, which no detector was trained on, to judge by.",
+        f"{learned.frames} frames were attacked by {found.counts.attack} to train on, beside "
+        f"{found.counts.benign} benign frames; "
+        f"{rows[0].known.frames} others, which no detector was trained on, to judge by.",
         f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
         "Gain: over the detector as it was, on the same pictures, and for fresh ones over what the attack on it "
         "leaves. Only fresh counterexamples say whether a detector became robust: the known ones were made for "
@@ -183,15 +184,13 @@ def notes(found: Taught) -> list[str]:
     ]
     if found.chances:
         lines.append(_of_robust(found))
-    lines += [f"Left out: {name}: {reason}." for name, reason in found.left_out.items()]
-    results = [r for ran in (found.learned, found.judged) for run in ran.runs for r in run.results]
-    lines.append(
-        f"Feasible by the independent check: {percent(feasible_fraction(results))} % of all attacked frames."
-    )
-    passed = found.learned.without_vehicles + found.judged.without_vehicles
+    lines += [f"Left out: {name}: {reason}." for name, reason in found.counts.left_out.items()]
+    share = percent(feasible_of(learned, judged))
+    lines.append(f"Feasible by the independent check: {share} % of all attacked frames.")
+    passed = learned.without_vehicles + judged.without_vehicles
     if passed:
         lines.append(f"{passed} frames without vehicles passed over.")
-    failed = {**found.learned.failed, **found.judged.failed}
+    failed = {**learned.failed, **judged.failed}
     lines += [f"Frame {name} could not be used: {reason}" for name, reason in failed.items()]
     return lines
 

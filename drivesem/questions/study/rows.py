@@ -9,9 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivesem.evaluation.coco import IOU_THRESHOLDS
+from drivesem.evaluation.matches import Matches
 from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interval, Recalled, differences, holm
 from drivesem.questions.study.arms import matching
-from drivesem.questions.study.counts import ArmCounts, FrameCounts, Matches
+from drivesem.questions.study.counts import ArmCounts, FrameCounts
 from drivesem.report.paper import PAPER_BENIGN
 
 FIGURES = {"ap50": "AP50", "ap70": "AP70", "ap": "AP50:95", "recall": "recall"}

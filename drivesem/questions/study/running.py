@@ -44,6 +44,32 @@ class Ran:
     failed: dict[str, str]
 
 
+@dataclass(frozen=True, slots=True)
+class AttackFacts:
+    """What is said of attacks as such. frames: that all arms have; pictures: attacked, of all arms; feasible: of
+    these, in how many the independent check finds nothing violated; without_vehicles, failed: as of `Ran`.
+    """
+
+    frames: int
+    pictures: int
+    feasible: int
+    without_vehicles: int
+    failed: dict[str, str]
+
+    @classmethod
+    def of(cls, ran: Ran) -> AttackFacts:
+        """Of finished runs."""
+        checked = [result.feasible for run in ran.runs for result in run.results]
+        frames = len(ran.runs[0].results)
+        return cls(frames, len(checked), sum(checked), ran.without_vehicles, ran.failed)
+
+
+def feasible_of(*attacks: AttackFacts) -> float | None:
+    """Share of the attacked pictures in which nothing is violated; None where there are none."""
+    pictures = sum(one.pictures for one in attacks)
+    return sum(one.feasible for one in attacks) / pictures if pictures else None
+
+
 def run_arms(arms: Sequence[Arm], workers: Sequence[Worker], out: Path) -> Ran:
     """Run or continue all arms in `out / ARMS`. workers: of the arms, as `workers_of` makes them.
 

@@ -14,10 +14,19 @@ from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Interval, differences
 from drivesem.questions.study.arms import Arm, draws_of
 from drivesem.questions.study.report import OWN_PROTOCOL, Told
-from drivesem.questions.study.rows import MODES, feasible_fraction
-from drivesem.questions.study.running import ARMS, Ran, run_arms
-from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, rows_of
-from drivesem.questions.transfer.matrix import AP50, BROKEN, FRAMES, LOST, TRANSFER, TransferRow
+from drivesem.questions.study.rows import MODES
+from drivesem.questions.study.running import ARMS, AttackFacts, feasible_of, run_arms
+from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, pairs_of
+from drivesem.questions.transfer.matrix import (
+    AP50,
+    BROKEN,
+    FRAMES,
+    LOST,
+    TRANSFER,
+    PairCounts,
+    TransferRow,
+    row_of,
+)
 from drivesem.questions.transfer.report import bounded
 from drivesem.questions.transfer.report import sheets as matrix_sheets
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
@@ -66,25 +75,51 @@ class Before:
 
 
 @dataclass(frozen=True, slots=True)
+class AskedArm:
+    """An arm that is no control, by its name; placebo: of the arm beside it, None without; references: the paper's
+    mAP of a pair with it by the target's name, benign and attacked.
+    """
+
+    name: str
+    placebo: str | None
+    references: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class TransferCounts:
+    """What the tables are computed from. pairs: of each arm, controls too, and each target; failed: pictures that
+    could not be used, and why.
+    """
+
+    attacks: AttackFacts
+    sources: tuple[AskedArm, ...]
+    pairs: Sequence[PairCounts]
+    failed: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class Matrix:
-    """All that the study found. failed: pictures that could not be used, and why."""
+    """All that the study found."""
 
     study: Study
     draws: int
-    ran: Ran
+    counts: TransferCounts
     rows: Sequence[Before]
-    failed: Mapping[str, str]
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Frames and pictures that could not be used, and why."""
+        return {**self.counts.attacks.failed, **self.counts.failed}
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        results = [result for run in self.ran.runs for result in run.results]
         return {
             "study": self.study.name,
             "headline": HEADLINE,
             "frames": self.rows[0].row.frames,
-            "frames_without_vehicles": self.ran.without_vehicles,
-            "frames_failed": {**self.ran.failed, **self.failed},
-            "feasible_fraction": feasible_fraction(results),
+            "frames_without_vehicles": self.counts.attacks.without_vehicles,
+            "frames_failed": self.failed,
+            "feasible_fraction": feasible_of(self.counts.attacks),
             "bootstrap": self.draws,
             "rows": [one.flat() for one in self.rows],
         }
@@ -98,34 +133,36 @@ def detectors_asked(study: Study, out: Path) -> list[Asked]:
 
 
 def run(
-    study: Study,
-    arms: Sequence[Arm],
-    workers: Sequence[Worker],
-    asked: Sequence[Asked],
-    out: Path,
-) -> Matrix:
+    study: Study, arms: Sequence[Arm], workers: Sequence[Worker], asked: Sequence[Asked], out: Path
+) -> TransferCounts:
     """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
     ran = run_arms(arms, workers, out)
     runs = load_runs([str(out / ARMS / arm.folder) for arm in arms])
-    named = [replace(run, name=arm.of or arm.name) for run, arm in zip(runs, arms, strict=True)]
-    settings = _settings(study)
-    rows, failed = rows_of(named, asked, settings)
-    split = {run.folder: rows[i * len(asked) : (i + 1) * len(asked)] for i, run in enumerate(named)}
+    named = [replace(run, name=arm.name) for run, arm in zip(runs, arms, strict=True)]
+    pairs, failed = pairs_of(named, asked, _settings(study))
+    sources = []
+    for arm in (arm for arm in arms if arm.control is None):
+        placebo = next((one.name for one in arms if one.of == arm.name), None)
+        references = {target.name: _reference(arm.config, target) for target in asked}
+        told = {name: one for name, one in references.items() if one is not None}
+        sources.append(AskedArm(arm.name, placebo, told))
+    return TransferCounts(AttackFacts.of(ran), tuple(sources), pairs, failed)
+
+
+def matrix_of(study: Study, counts: TransferCounts) -> Matrix:
+    """What follows from it."""
     draws = draws_of(study)
+    rows = {(one.source.name, one.target.name): row_of(one, draws, study.seed) for one in counts.pairs}
     found: list[Before] = []
-    for arm, one in zip(arms, named, strict=True):
-        if arm.control is not None:
-            continue
-        beside = next((o for a, o in zip(arms, named, strict=True) if a.of == arm.name), None)
-        for place, target in enumerate(asked):
-            placebo = None if beside is None else split[beside.folder][place]
-            reference = _reference(arm.config, target)
-            row = split[one.folder][place]
+    for source in counts.sources:
+        for target in dict.fromkeys(name for _, name in rows):
+            row = rows[source.name, target]
+            placebo = None if source.placebo is None else rows[source.placebo, target]
             beyond = {}
             if placebo is not None:
                 beyond = {mode: _beyond(row, placebo, mode, draws, study.seed) for mode in MODES}
-            found.append(Before(row, placebo, beyond, reference))
-    return Matrix(study, draws, ran, found, failed)
+            found.append(Before(row, placebo, beyond, source.references.get(target)))
+    return Matrix(study, draws, counts, found)
 
 
 def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
@@ -140,7 +177,6 @@ def _settings(study: Study) -> Asking:
         workers=study.workers,
         device=study.device,
         keep_going=study.keep_going,
-        bootstrap=study.bootstrap,
     )
 
 
@@ -155,7 +191,7 @@ def _reference(attack: Attack, target: Asked) -> tuple[float, float] | None:
 
 def told(found: Matrix) -> Told:
     """The study as text."""
-    sources = list(dict.fromkeys(one.row.run.name for one in found.rows))
+    sources = list(dict.fromkeys(one.row.source.name for one in found.rows))
     short = [_plain(sheet(found.rows), sources) for sheet in (_precision, _falls, _broken)]
     further = matrix_sheets([one.row for one in found.rows])[0]
     whole = [*short, replace(further, title=f"{HEADLINE}, further figures, %")]
@@ -204,7 +240,7 @@ def _has_references(rows: Sequence[Before]) -> bool:
 
 
 def _sides(row: TransferRow) -> tuple[str, str]:
-    return row.run.name, row.target.name
+    return row.source.name, row.target.name
 
 
 def _fall(row: TransferRow, mode: str) -> Interval:
@@ -250,10 +286,9 @@ def notes(found: Matrix) -> list[str]:
         "source lost. Frames too: of the frames that fail the source, those that fail the target. Counted from t* "
         f"on: {stars}.",
     ]
-    share = feasible_fraction([result for run in found.ran.runs for result in run.results])
-    lines.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
-    if found.ran.without_vehicles:
-        lines.append(f"{found.ran.without_vehicles} frames without vehicles passed over.")
-    reasons = {**found.ran.failed, **found.failed}
-    lines += [f"{name} could not be used: {reason}" for name, reason in reasons.items()]
+    attacks = found.counts.attacks
+    lines.append(f"Feasible by the independent check: {percent(feasible_of(attacks))} % of all attacked frames.")
+    if attacks.without_vehicles:
+        lines.append(f"{attacks.without_vehicles} frames without vehicles passed over.")
+    lines += [f"{name} could not be used: {reason}" for name, reason in found.failed.items()]
     return lines

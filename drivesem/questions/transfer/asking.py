@@ -13,7 +13,7 @@ from detectors.base import DetectorError, Predictor
 from detectors.registry import SHIPPED
 from drivesem.attack.judging import DEFAULT_T_STAR, HEADLINE, JudgedClasses, t_star_of
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.questions.transfer.matrix import Target, TransferRow, row
+from drivesem.questions.transfer.matrix import PairCounts, ShownRun, Target, row_of
 from drivesem.questions.transfer.report import answer_of
 from drivesem.report.answer import Answer
 from drivesem.run.finished import PICTURES, Frame, Run, load_runs
@@ -100,17 +100,18 @@ def transfer_run(config: Transfer) -> Answer:
     detectors = detectors_of(specs, config, out)
     # Detections are kept by content, so that no setting of an earlier call is in the way.
     claim(out, config, _WRITTEN, presentation=[field.name for field in fields(config)])
-    rows, failed = rows_of(runs, detectors, config)
+    pairs, failed = pairs_of(runs, detectors, config)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
+    rows = [row_of(pair, draws, config.seed) for pair in pairs]
     data = {"rows": [r.to_json() for r in rows], "headline": HEADLINE, "bootstrap": draws, "frames_failed": failed}
     answer = answer_of(out, rows, draws, failed, data)
     answer.write()
     return answer
 
 
-def rows_of(
+def pairs_of(
     runs: Sequence[Run], detectors: Sequence[Asked], config: Asking
-) -> tuple[list[TransferRow], dict[str, str]]:
+) -> tuple[list[PairCounts], dict[str, str]]:
     """Each run before each detector, and the pictures that could not be used, with reasons.
 
     Raises UsageError where no frame of a run is left, SceneError for a bad picture unless `keep_going`.
@@ -119,21 +120,21 @@ def rows_of(
     pictures = [path for run in runs for frame in run.frames for path in frame.pictures.values()]
     for asked in detectors:
         failed |= look(asked.order, asked.predictor, pictures, config, asked.name)
-    draws = DRAWS if config.bootstrap is None else config.bootstrap
-    rows: list[TransferRow] = []
+    pairs: list[PairCounts] = []
     for run in runs:
         frames = [f for f in run.frames if not any(str(p) in failed for p in f.pictures.values())]
         if not frames:
             raise UsageError("--run", "a run with frames that can be read", run.folder)
-        rows += [_row(run, asked, frames, config, draws) for asked in detectors]
-    return rows, failed
+        pairs += [_pair(run, asked, frames, config) for asked in detectors]
+    return pairs, failed
 
 
-def _row(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking, draws: int) -> TransferRow:
+def _pair(run: Run, asked: Asked, frames: Sequence[Frame], config: Asking) -> PairCounts:
     memory, predictor = Memory(asked.order, asked.predictor), asked.predictor
     otherwise = DEFAULT_T_STAR if config.t_star is None else config.t_star
     t_star = t_star_of(predictor, asked.t_star, otherwise)
-    target = Target(asked.name, asked.order.detector, JudgedClasses.of(predictor), t_star)
+    target = Target(asked.name, asked.order.detector, JudgedClasses.of(predictor).names, t_star)
     found = {name: [memory.recall(frame.pictures[name]) for frame in frames] for name in PICTURES}
+    source = ShownRun(run.name, run.detector, run.method, run.params)
     with torch.no_grad():
-        return row(run, target, [frame.result for frame in frames], found, draws, config.seed)
+        return PairCounts.of(source, target, [frame.result for frame in frames], found)

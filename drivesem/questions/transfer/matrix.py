@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from detectors.types import CLASSES, Detections, Targets
+from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import HEADLINE, JudgedClasses
 from drivesem.evaluation import coco, failures
-from drivesem.evaluation.curves import Tally
-from drivesem.evaluation.outcome import OVERLAP, Outcome
-from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interval, Recalled, differences, intervals
-from drivesem.run.finished import Run
+from drivesem.evaluation.coco import IOU_50
+from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.resampling import Averaged, Figure, Interval, Recalled, differences, intervals, rate
 from drivesem.run.frame import as_targets
 from drivesem.run.results import FrameResult
 from drivesem.run.tally import at_least
 from drivesem.truth.grades import Grade
 
 AP50, RECALL = "AP50", "recall"
+SHOWN = {"benign": "benign", "rerendered": "rerendered", "paper": "attacked", "moved": "attacked"}
+"""What figures are of: the photographs, these rendered again, and the counterexamples by either label mode; and
+their pictures, of `finished.PICTURES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShownRun:
+    """A run that is shown: its name, and its attack."""
+
+    name: str
+    detector: str
+    method: str
+    params: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +41,101 @@ class Target:
 
     name: str
     detector: str
-    judged: JudgedClasses
+    classes: tuple[str, ...]
     t_star: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLosses:
+    """One frame before a target, by moved labels. found: objects that it finds in the photograph; lost: those of
+    them that it loses; source_lost, source_certain: those of them that the source lost, and lost for certain;
+    both_lost, both_certain: those of these that the target loses too; source_broken, broken: whether the picture
+    fails the source, and the target, by a lost object or a phantom; phantoms: of the target.
+    """
+
+    identifier: str
+    found: int
+    lost: int
+    source_lost: int
+    both_lost: int
+    source_certain: int
+    both_certain: int
+    source_broken: bool
+    broken: bool
+    phantoms: int
+
+
+@dataclass(frozen=True, slots=True)
+class PairCounts:
+    """What one target made of one run: all that its row is computed from. pictures: by the names of SHOWN and by
+    judged class, what is detected in all frames.
+    """
+
+    source: ShownRun
+    target: Target
+    frames: tuple[FrameLosses, ...]
+    pictures: Mapping[str, Mapping[str, Matches]]
+
+    @classmethod
+    def of(
+        cls,
+        source: ShownRun,
+        target: Target,
+        results: Sequence[FrameResult],
+        found: Mapping[str, Sequence[Detections]],
+    ) -> PairCounts:
+        """Of a run's frames. found: detections in the pictures of PICTURES, one for each result, with labels among
+        the judged classes.
+        """
+        judged = JudgedClasses(target.classes, target.classes)
+        benign = [judged.targets(as_targets(r.targets_benign, CLASSES)) for r in results]
+        moved = [judged.targets(as_targets(r.targets_moved, CLASSES)) for r in results]
+        truth = {name: moved if name == "moved" else benign for name in SHOWN}
+        frames = []
+        sure = at_least(Grade.CERTAIN)
+        for i, result in enumerate(results):
+            failed = failures.find(benign[i], found["benign"][i], moved[i], found["attacked"][i], target.t_star)
+            seen = failures.judge(benign[i], found["benign"][i], target.t_star).found & ~moved[i].ignore
+            known = set(seen.nonzero()[:, 0].tolist())
+            losses = [f for f in result.failures if f.kind == "lost"]
+            theirs = known & {f.index for f in losses}
+            certain = known & {f.index for f in losses if sure(f)}
+            one = FrameLosses(
+                identifier=result.identifier,
+                found=len(known),
+                lost=len(failed.lost),
+                source_lost=len(theirs),
+                both_lost=len(theirs & set(failed.lost)),
+                source_certain=len(certain),
+                both_certain=len(certain & set(failed.lost)),
+                source_broken=result.success_moved,
+                broken=failed.success,
+                phantoms=len(failed.phantoms),
+            )
+            frames.append(one)
+        matches = {
+            name: {one: Matches.of(truth[name], found[at], label) for label, one in enumerate(target.classes)}
+            for name, at in SHOWN.items()
+        }
+        return cls(source, target, tuple(frames), matches)
+
+    def scores(self, name: str) -> coco.Scores:
+        """The figures in the pictures of that name."""
+        classes = {one: matches.scores(self.target.t_star) for one, matches in self.pictures[name].items()}
+        return coco.Scores.of(classes, HEADLINE)
+
+    def shares(self) -> dict[str, tuple[list[int], list[int]]]:
+        """Frame by frame, how many of how many, by the names of shares."""
+        rows = self.frames
+        others = [f.source_lost - f.source_certain for f in rows]
+        return {
+            TRANSFER: ([f.both_lost for f in rows], [f.source_lost for f in rows]),
+            CERTAIN: ([f.both_certain for f in rows], [f.source_certain for f in rows]),
+            THRESHOLD: ([f.both_lost - f.both_certain for f in rows], others),
+            LOST: ([f.lost for f in rows], [f.found for f in rows]),
+            FRAMES: ([f.source_broken and f.broken for f in rows], [f.source_broken for f in rows]),
+            BROKEN: ([f.broken for f in rows], [1] * len(rows)),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +147,7 @@ class TransferRow:
     and in the counterexamples by label mode, to be weighed by frames beside another row's.
     """
 
-    run: Run
+    source: ShownRun
     target: Target
     frames: int
     benign: coco.Scores
@@ -58,11 +163,11 @@ class TransferRow:
     def flat(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
         found: dict[str, Any] = {
-            "name": f"{self.run.name} -> {self.target.name}",
-            "source": self.run.name,
-            "source_detector": self.run.detector,
-            "method": self.run.method,
-            "params": self.run.params,
+            "name": f"{self.source.name} -> {self.target.name}",
+            "source": self.source.name,
+            "source_detector": self.source.detector,
+            "method": self.source.method,
+            "params": self.source.params,
             "target": self.target.name,
             "target_detector": self.target.detector,
             "t_star": self.target.t_star,
@@ -98,96 +203,35 @@ that the target found in the photograph: those it loses. Of the frames that fail
 target, by a lost object or a phantom. Of all frames: those that fail the target. All by `moved` labels."""
 
 
-def row(
-    run: Run,
-    target: Target,
-    results: Sequence[FrameResult],
-    found: dict[str, list[Detections]],
-    draws: int,
-    seed: int,
-) -> TransferRow:
-    """The figures of the run's frames. found: detections in the pictures of PICTURES, one for each result, with
-    labels among the judged classes; draws: of the bootstrap over frames.
-    """
-    judged, names = target.judged, target.judged.names
-    truth = {
-        "benign": [judged.targets(as_targets(r.targets_benign, CLASSES)) for r in results],
-        "moved": [judged.targets(as_targets(r.targets_moved, CLASSES)) for r in results],
-    }
-    truth["paper"] = truth["benign"]
-
-    def scores(labels: str, pictures: str) -> coco.Scores:
-        return coco.evaluate(truth[labels], found[pictures], names, target.t_star, HEADLINE)
-
-    rng = np.random.default_rng(seed)
-    label = names.index(HEADLINE)
-    figures = {
-        name: figures_of(truth[name], found[pictures], label)
-        for name, pictures in (("benign", "benign"), ("paper", "attacked"), ("moved", "attacked"))
-    }
+def row_of(pair: PairCounts, draws: int, seed: int) -> TransferRow:
+    """The figures of a pair. draws: of the bootstrap over frames."""
+    rng, frames = np.random.default_rng(seed), len(pair.frames)
+    figures = {name: figures_of(pair.pictures[name][HEADLINE]) for name in ("benign", "paper", "moved")}
     drops = {
-        mode: tuple(_fall(one) for one in differences(figures[mode], figures["benign"], len(results), draws, rng))
+        mode: tuple(one.interval for one in differences(figures[mode], figures["benign"], frames, draws, rng))
         for mode in ("paper", "moved")
     }
-    tallies, phantoms = _tallies(results, truth, found, target.t_star)
-    shares = intervals(
-        [Figure(name, (Recalled(tally),)) for name, tally in tallies.items()], len(results), draws, rng
-    )
+    shares = pair.shares()
+    rates = [
+        rate(name, np.array(hits, np.float64), np.array(of, np.float64)) for name, (hits, of) in shares.items()
+    ]
     return TransferRow(
-        run=run,
-        target=target,
-        frames=len(results),
-        benign=scores("benign", "benign"),
-        rerendered=scores("benign", "rerendered"),
-        paper=scores("paper", "attacked"),
-        moved=scores("moved", "attacked"),
+        source=pair.source,
+        target=pair.target,
+        frames=frames,
+        benign=pair.scores("benign"),
+        rerendered=pair.scores("rerendered"),
+        paper=pair.scores("paper"),
+        moved=pair.scores("moved"),
         drops=drops,
-        shares={share.name: share for share in shares},
-        counts={name: (int(t.hits.sum()), int(t.objects.sum())) for name, t in tallies.items()},
-        phantoms=phantoms,
+        shares={share.name: share for share in intervals(rates, frames, draws, rng)},
+        counts={name: (sum(hits), sum(of)) for name, (hits, of) in shares.items()},
+        phantoms=sum(frame.phantoms for frame in pair.frames),
         figures=figures,
     )
 
 
-def _fall(one: Difference) -> Interval:
-    return one.interval
-
-
-def figures_of(targets: Sequence[Targets], found: Sequence[Detections], label: int) -> list[Figure]:
+def figures_of(matches: Matches) -> list[Figure]:
     """AP50 and RECALL of one class, to be weighed by frames."""
-    outcome = Outcome.of(targets, found, label)
-    tally = outcome.candidates.tally(outcome.candidates.coco(OVERLAP), 0)
+    tally = matches.tally(IOU_50)
     return [Figure(AP50, (Averaged(tally, "coco"),)), Figure(RECALL, (Recalled(tally),))]
-
-
-def _tallies(
-    results: Sequence[FrameResult],
-    truth: dict[str, list[Targets]],
-    found: dict[str, list[Detections]],
-    t_star: float,
-) -> tuple[dict[str, Tally], int]:
-    """Hits and objects of each share, frame by frame, and how many phantoms there are."""
-    names = (TRANSFER, CERTAIN, THRESHOLD, LOST, FRAMES, BROKEN)
-    sure = at_least(Grade.CERTAIN)
-    hits, objects = ({name: np.zeros(len(results)) for name in names} for _ in range(2))
-    phantoms = 0
-    for i, result in enumerate(results):
-        benign, moved = truth["benign"][i], truth["moved"][i]
-        failed = failures.find(benign, found["benign"][i], moved, found["attacked"][i], t_star)
-        seen = failures.judge(benign, found["benign"][i], t_star).found & ~moved.ignore
-        known = set(seen.nonzero()[:, 0].tolist())
-        losses = [f for f in result.failures if f.kind == "lost"]
-        theirs = known & {f.index for f in losses}
-        certain = known & {f.index for f in losses if sure(f)}
-        for name, lost in ((TRANSFER, theirs), (CERTAIN, certain), (THRESHOLD, theirs - certain)):
-            objects[name][i], hits[name][i] = len(lost), len(lost & set(failed.lost))
-        objects[LOST][i], hits[LOST][i] = len(known), len(failed.lost)
-        objects[FRAMES][i], hits[FRAMES][i] = result.success_moved, result.success_moved and failed.success
-        objects[BROKEN][i], hits[BROKEN][i] = 1, failed.success
-        phantoms += len(failed.phantoms)
-    frames = np.arange(len(results))
-    tallies = {
-        name: Tally(np.ones(len(results)), frames, hits[name], np.zeros(len(results)), objects[name])
-        for name in names
-    }
-    return tallies, phantoms

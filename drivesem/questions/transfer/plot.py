@@ -28,7 +28,7 @@ def write_heatmap(path: Path, rows: Sequence[TransferRow]) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    sources = list(dict.fromkeys(row.run.name for row in rows))
+    sources = list(dict.fromkeys(row.source.name for row in rows))
     targets = list(dict.fromkeys(row.target.name for row in rows))
     panels: list[tuple[str, Callable[[TransferRow], float | None]]] = [
         ("drop of AP50, moved labels, %", lambda row: row.flat()["drop_moved"]),
@@ -41,7 +41,7 @@ def write_heatmap(path: Path, rows: Sequence[TransferRow]) -> None:
         figure = Figure(figsize=(len(panels) * width, height), layout="constrained")
         for place, (title, value) in enumerate(panels, start=1):
             axes = figure.add_subplot(1, len(panels), place)
-            table = {(row.run.name, row.target.name): value(row) for row in rows}
+            table = {(row.source.name, row.target.name): value(row) for row in rows}
             _panel(axes, [[table[s, t] for t in targets] for s in sources])
             axes.set_title(title, loc="left", fontsize=11)
             axes.set_xticks(range(len(targets)), [_short(t) for t in targets], rotation=20, ha="right")

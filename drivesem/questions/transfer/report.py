@@ -32,7 +32,7 @@ def sheets(rows: Sequence[TransferRow]) -> list[Sheet]:
     figures: list[tuple[str, ...]] = []
     shares: list[tuple[str, ...]] = []
     for row in rows:
-        sides = (row.run.name, row.target.name)
+        sides = (row.source.name, row.target.name)
         for name in ("benign", "paper", "moved"):
             scores = getattr(row, name)
             one = scores.headline

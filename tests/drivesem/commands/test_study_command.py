@@ -93,7 +93,7 @@ def test_tables_come_again_from_what_is_kept(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["labels"], "--kept: expected study single, multi, grades, searches, samples, steps, attribution, found"),
+        (["labels"], "--kept: expected study single, multi, grades"),
         (["single"], "settings.name: expected single, found multi"),
         (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
     ],

@@ -14,19 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesem.evaluation.coco import IOU_THRESHOLDS
+from drivesem.evaluation.matches import FALSE, IGNORED, TRUE, Matches
 from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM, Arm
-from drivesem.questions.study.counts import (
-    FALSE,
-    IGNORED,
-    TRUE,
-    ArmCounts,
-    CountedFailure,
-    FrameCounts,
-    Matches,
-    SeenObject,
-    StudyCounts,
-)
+from drivesem.questions.study.counts import ArmCounts, CountedFailure, FrameCounts, SeenObject, StudyCounts
 from drivesem.questions.study.kept import keep, load_kept
 from drivesem.questions.study.rows import rows_of
 from drivesem.run.results import Failure

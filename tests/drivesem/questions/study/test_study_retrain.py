@@ -19,17 +19,17 @@ from rich.console import Console
 
 from detectors.registry import load_detector, save_detector
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.methods.base import Attack
 from drivesem.cli import main
+from drivesem.evaluation.matches import Matches
 from drivesem.questions.study import lessons, retrain, retrain_report
+from drivesem.questions.study.counts import ArmCounts
 from drivesem.questions.study.lessons import BENIGN, lessons_of, reference_of
 from drivesem.questions.study.report import OWN_PROTOCOL, answer_of
-from drivesem.questions.study.retrain import Taught
-from drivesem.questions.study.running import Ran
-from drivesem.questions.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, Target, TransferRow, row
+from drivesem.questions.study.running import AttackFacts
+from drivesem.questions.study.taught import RetrainCounts, SeenBenign, Taught, taught
+from drivesem.questions.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, PairCounts, ShownRun, Target, row_of
 from drivesem.questions.transfer.report import sheets as transfer_sheets
-from drivesem.run.finished import Run
 from drivesem.run.frame import as_detections
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.results import Failure, FrameResult
@@ -54,14 +54,15 @@ def benign_frames(missed: Sequence[int]) -> tuple[list[Detections], list[Targets
     return [none if i in missed else hit for i in range(FRAMES)], wanted
 
 
-def seen(missed: Sequence[int] = ()) -> retrain.Seen:
-    return retrain.seen_by(load_detector("squeezedet"), *benign_frames(missed), 0.5)
+def seen(missed: Sequence[int] = ()) -> SeenBenign:
+    found, wanted = benign_frames(missed)
+    return SeenBenign(Matches.of(wanted, found, 0), 0.5)
 
 
-def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferRow:
+def known(name: str, results: Sequence[FrameResult], kept: int) -> PairCounts:
     """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
-    run = Run(BENIGN, Path("run"), "squeezedet", "si-fgsm", "rotate", ())
-    target = Target(name, name, JudgedClasses(CLASSES, CLASSES), 0.5)
+    source = ShownRun(BENIGN, "squeezedet", "si-fgsm", "rotate")
+    target = Target(name, name, CLASSES, 0.5)
     found = {
         "benign": [as_detections(r.detections_benign, CLASSES) for r in results],
         "rerendered": [as_detections(r.detections_benign, CLASSES) for r in results],
@@ -70,7 +71,7 @@ def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferRow:
             for i, r in enumerate(results)
         ],
     }
-    return row(run, target, results, found, DRAWS, 0)
+    return PairCounts.of(source, target, results, found)
 
 
 def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
@@ -80,7 +81,7 @@ def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult
         replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
         for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
     ]
-    told = known("target", results, 3)
+    told = row_of(known("target", results, 3), DRAWS, 0)
     assert told.counts[CERTAIN] == (1, 1)
     assert told.counts[THRESHOLD] == (0, 3)
     assert told.counts[TRANSFER] == (1, 4)
@@ -92,19 +93,24 @@ def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult
 @pytest.fixture
 def found(frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]) -> Taught:
     """Four frames: the detector as it was loses a car in all of them; the retrained ones in half."""
-    study = Study(name="retrain", quick=True, **THEIRS)  # pyright: ignore[reportArgumentType]
+    study = Study(name="retrain", quick=True, bootstrap=DRAWS, **THEIRS)  # pyright: ignore[reportArgumentType]
     plan = lessons_of(study)
     lost = [frame(str(i), found=False, success=True) for i in range(4)]
     half = [frame(str(i), found=i < 2, success=i >= 2) for i in range(4)]
     names = [BENIGN, *(lesson.name for lesson in plan)]
     runs = [arm_run(arm(name), lost if name == BENIGN else half) for name in names]
-    before = {name: seen() if name == BENIGN else seen([0]) for name in names}
-    rows = retrain.rows_for(
-        study, plan, before, [known(name, lost, 0 if name == BENIGN else 2) for name in names], runs, DRAWS
+    counts = RetrainCounts(
+        attack="combo 2",
+        learned=AttackFacts(4, 4, 4, 1, {}),
+        judged=AttackFacts(4, 4 * len(names), 4 * len(names), 0, {"9": "no camera"}),
+        shown={lesson.name: 4 for lesson in plan},
+        benign=4,
+        benign_frames=tuple(f"{i:03d}" for i in range(FRAMES)),
+        seen={name: seen() if name == BENIGN else seen([0]) for name in names},
+        known=[known(name, lost, 0 if name == BENIGN else 2) for name in names],
+        fresh=[ArmCounts.of(run) for run in runs],
     )
-    learned = Ran((arm_run(arm("combo 2"), lost),), 1, {})
-    taught = {lesson.name: (lesson, 4) for lesson in plan}
-    return Taught(study, DRAWS, learned, Ran(tuple(runs), 0, {"9": "no camera"}), taught, 4, rows)
+    return taught(study, counts)
 
 
 def test_the_drop_is_paired_over_frames(found: Taught) -> None:
@@ -233,7 +239,8 @@ def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable
 
 def test_without_new_attacks_there_is_no_table_of_them(found: Taught) -> None:
     rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
-    less = replace(found, rows=rows, left_out={"the same, consistently": "no failure"})
+    counts = replace(found.counts, left_out={"the same, consistently": "no failure"})
+    less = replace(found, rows=rows, counts=counts)
     assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
     assert less.rows[1].flat()["fresh_moved_ap50"] is None
     told = retrain_report.told(less)
@@ -279,6 +286,11 @@ def test_the_whole_study_and_going_on(
             patch.setattr(place, name, never)
         assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == data
+    kept = shutil.copytree(out / "kept", tmp_path / "kept")
+    assert main(["study", "retrain", "--from", str(kept), "--out", str(tmp_path / "again"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == data
+    for name in ("study.md", "study.csv", "robust.csv", "study.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
     # other weights: what was attacked with the old ones is no longer fresh
     shutil.copy(out / "retrained" / "ours" / "retrained.safetensors", out / "retrained" / "re-rendered")
     assert main(words) == 0

@@ -104,6 +104,20 @@ def test_asked_again_nothing_is_attacked_or_looked_at(
     assert studied(capsys, "--out", finished, "--detectors", "yolov3-slim") == before
 
 
+def test_what_is_kept_tells_the_same_without_a_run(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also of a study that an earlier version finished: the same command keeps it."""
+    before = (finished / "study.json").read_bytes()
+    shutil.rmtree(finished / "kept")
+    studied(capsys, "--out", finished)
+    kept = Path(shutil.move(finished / "kept", tmp_path / "kept"))
+    assert main(["study", "transfer", "--from", str(kept), "--out", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "study.json").read_bytes() == before
+    for name in ("study.md", "study.csv", "study.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
+
+
 def test_a_detector_that_finds_nothing_has_nothing_to_lose(
     finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,51 @@
+"""Detections with what they are beside the labels: their figures are pycocotools', to the last bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from detectors.types import Detections, Targets
+from drivesem.evaluation.coco import Scores, evaluate
+from drivesem.evaluation.matches import Matches
+
+CLASSES = ("Car", "Truck", "Cyclist")
+
+
+def random_frames(seed: int, frames: int) -> tuple[list[Targets], list[Detections]]:
+    """Crowded: objects overlap one another, some are ignored, scores tie; in the first frame more than 100 are
+    detected, and there is no cyclist.
+    """
+    draw = np.random.default_rng(seed)
+    targets, found = [], []
+    for frame in range(frames):
+        count = int(draw.integers(0, 9))
+        corners = draw.uniform(0, 150, (count, 2))
+        boxes = np.concatenate([corners, corners + draw.uniform(18, 70, (count, 2))], 1)
+        labels, ignore = draw.integers(0, 2, count), draw.random(count) < 0.2
+        targets.append(Targets(torch.tensor(boxes).float(), torch.tensor(labels), torch.tensor(ignore)))
+        times = 40 if frame == 0 else 3
+        near = np.repeat(boxes, times, 0) + draw.normal(0, 4, (count * times, 4))
+        scores = torch.tensor(draw.random(len(near)).round(1 if seed % 2 else 6)).float()
+        whose = torch.tensor(np.where(draw.random(len(near)) < 0.9, np.repeat(labels, times), 1))
+        found.append(Detections(torch.tensor(near).float(), whose, scores))
+    return targets, found
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
+    targets, found = random_frames(seed, 6)
+    expected = evaluate(targets, found, CLASSES, 0.4)
+    own = {name: Matches.of(targets, found, label).scores(0.4) for label, name in enumerate(CLASSES)}
+    assert own == expected.per_class
+    assert own["Car"].objects > 3
+    assert Scores.of(own, "Car") == expected
+
+
+def test_nothing_to_find_or_nothing_found() -> None:
+    targets, found = random_frames(1, 4)
+    empty = [Targets(t.boxes_xyxy[:0], t.labels[:0], t.ignore[:0]) for t in targets]
+    none = [Detections(d.boxes_xyxy[:0], d.labels[:0], d.scores[:0]) for d in found]
+    for case in ((targets, none), (empty, found)):
+        assert Matches.of(*case, 0).scores(0.4) == evaluate(*case, CLASSES, 0.4).headline
