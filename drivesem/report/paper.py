@@ -14,5 +14,7 @@ PAPER_SINGLE = {
 }
 PAPER_COMBOS = {1: 0.82, 2: 0.659, 3: 0.808, 4: 0.987}
 """The paper's mAP after the attack, by parameter and by combination."""
+PAPER_LPIPS, PAPER_FID = 0.52, 0.10
+"""Of the paper's pictures and their photographs; of which of them, and by which network, it does not say."""
 PAPER_TRANSFER = (0.9128, 0.875)
 """The paper's mAP of a YOLOv3, trained on KITTI: on benign frames, and on counterexamples against SqueezeDet."""

@@ -25,6 +25,9 @@ FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
 SHARING = ("workers", "engine", "address", "keep_going")
 """Settings of who shares the frames."""
+ARMS, HELD_OUT, RETRAINED = "arms", "held-out", "retrained"
+"""In a study's folder: that of its runs, the name of the run on held-out frames against the detector that is
+retrained, and the folder of retrained detectors."""
 PRESENTATION = (
     *SHARING,
     "out",

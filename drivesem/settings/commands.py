@@ -541,6 +541,11 @@ class Worth(Draws, Command):
     where known."""
     after: str | None = None
     """The same table of a second or retrained classifier."""
+    study: str | None = None
+    """Instead of runs, the folder of a finished study, such as multi, single or retrain: of each arm how real
+    its pictures are, as drivesem realism tells it, and their worth; of retrain also what its detectors gained."""
+    metrics: str = "available"
+    """With --study, as of drivesem realism."""
     distance: str | None = None
     """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
     lpips-alex where its weights are on disk, else perceptual (docs/realism.md)."""
@@ -559,11 +564,14 @@ class Worth(Draws, Command):
 
     def check(self) -> None:
         super().check()
-        one = bool(self.runs) != (self.table is not None)
-        refuse(not one, "RUN", "folders of drivesem attack, or --table", "both" if self.runs else "nothing")
+        given = sum((bool(self.runs), self.table is not None, self.study is not None))
+        ways = "folders of drivesem attack, or --table, or --study"
+        refuse(given != 1, "RUN", ways, "several of them" if given else "nothing")
         refuse(self.after is not None and self.table is None, "--after", "--table beside it", "none")
         twice = self.second is not None and self.table is not None
         refuse(twice, "--second", "runs (--after is a second table)", f"--table {self.table}")
+        other = self.metrics != "available" and self.study is None
+        refuse(other, "--metrics", "--study beside it (drivesem realism measures runs)", "none")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,6 @@ from drivesem.classify.study.looking import Eyes
 from drivesem.classify.study.retraining import chances, right
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism.measures import METRICS, missing
-from drivesem.questions.worth.asking import PREFERRED
 from drivesem.questions.worth.measures import (
     MEMBERSHIPS,
     Floats,
@@ -32,6 +31,7 @@ from drivesem.questions.worth.measures import (
     realism,
     worth_of,
 )
+from drivesem.questions.worth.runs import PREFERRED
 from drivesem.report.tables import Sheet
 
 Row = dict[str, Any]

@@ -24,7 +24,8 @@ from drivesem.settings.errors import UsageError
 AVAILABLE = "available"
 _WORDS = ("run", "parameters", "where", "metric")
 _SIDES = {"benign": "photograph", "rerendered": "re-render", "attacked": "counterexample"}
-_REGION = {"frame": "frame", "boxes": "vehicles"}
+REGION = {"frame": "frame", "boxes": "vehicles"}
+"""What people call the parts of a picture."""
 _NOTE = (
     "Mean over frames, and 95 % of the bootstrap over frames. Vehicles: the rectangle around each vehicle "
     "before and after, at least 64 px a side; a frame's figure is their mean. PSNR is that of the mean "
@@ -135,11 +136,8 @@ def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> Sheet:
     for run, row in table:
         metric = METRICS[row.metric]
         name = f"{metric.name}, {metric.unit}" if metric.unit else metric.name
-        cells = lines.setdefault((run.name, run.params, _REGION[row.region], name), [str(row.pictures)])
-        infinite = metric.squared and row.pictures > 0
-        mean, low, high = (_shown(end, infinite) for end in (row.value, row.low, row.high))
-        bounded = row.low is not None or (infinite and row.high is not None)
-        cells.insert(-1, f"{mean} ({low} to {high})" if bounded and row.low != row.high else mean)
+        cells = lines.setdefault((run.name, run.params, REGION[row.region], name), [str(row.pictures)])
+        cells.insert(-1, shown(row))
     rows = [(*key, *cells) for key, cells in lines.items()]
     cut = 0 if several else 2
     return Sheet("distances between pictures", columns[cut:], tuple(row[cut:] for row in rows))
@@ -149,7 +147,15 @@ def _between(first: str, second: str) -> str:
     return f"{_SIDES[first]} and {_SIDES[second]}"
 
 
-def _shown(value: float | None, infinite: bool) -> str:
+def shown(row: RealismRow) -> str:
+    """A figure and its bounds."""
+    infinite = METRICS[row.metric].squared and row.pictures > 0
+    mean, low, high = (_digits(end, infinite) for end in (row.value, row.low, row.high))
+    bounded = row.low is not None or (infinite and row.high is not None)
+    return f"{mean} ({low} to {high})" if bounded and row.low != row.high else mean
+
+
+def _digits(value: float | None, infinite: bool) -> str:
     """Three digits that count."""
     if value is None:
         return "inf" if infinite else "-"

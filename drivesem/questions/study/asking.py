@@ -22,12 +22,12 @@ from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
 from drivesem.questions.study.kept_transfer import keep_transfer, load_transfer
 from drivesem.questions.study.labels import label_sets
 from drivesem.questions.study.largest import largest, write_largest
-from drivesem.questions.study.lessons import CACHE, FRAMES, POOL, RETRAINED
+from drivesem.questions.study.lessons import CACHE, FRAMES, POOL
 from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, Told
 from drivesem.questions.study.robust import STATES
 from drivesem.questions.study.rows import rows_of
-from drivesem.questions.study.running import ARMS, Ran, run_arms, workers_of
+from drivesem.questions.study.running import Ran, run_arms, workers_of
 from drivesem.questions.study.searches import costs_of, depths_of, seen_of, standing_of
 from drivesem.questions.study.success import against, curve_of
 from drivesem.questions.study.taught import RetrainCounts, taught
@@ -36,7 +36,7 @@ from drivesem.questions.transfer.asking import DETECTIONS
 from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
 from drivesem.report.terminal import Console
-from drivesem.run.folder import PRESENTATION, claim, folder_of
+from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from drivesem.settings.commands import KEPT_STUDIES, Confirm, Study
 from drivesem.settings.text import command_line
 from drivesem.training.known import warn_of_overlaps

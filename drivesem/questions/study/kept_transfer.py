@@ -129,10 +129,12 @@ def write_pairs(folder: Path, pairs: Sequence[PairCounts]) -> None:
             seen, again, attacked = (shown[name][place] for name in shown)
             # by target and frame, whatever the run
             before = known.setdefault(("", target, frame.identifier), [])
-            alike = [by for by, n, rows in before if (n, rows) == (counts[0], seen)]
-            rows = [("photograph", row) for row in seen if not alike]
-            rows += [("re-render", row) for row in again if again != seen]
-            rows += [("counterexample", row) for row in attacked]
+            alike = [by for by, n, same in before if (n, same) == (counts[0], seen)]
+            told: dict[Picture, list[_Found]] = {
+                "photograph": [] if alike else seen,
+                "re-render": [] if again == seen else again,
+                "counterexample": attacked,
+            }
             if not alike:
                 before.append((source, counts[0], seen))
             losses = {name: getattr(frame, name) for name in _LOSSES}
@@ -140,7 +142,7 @@ def write_pairs(folder: Path, pairs: Sequence[PairCounts]) -> None:
             objects += [
                 ToFindRow(*key, *row) for row in zip(pair.target.classes, *counts, strict=True) if any(row[1:])
             ]
-            detections += [FoundRow(*key, picture, *row) for picture, row in rows]
+            detections += [FoundRow(*key, picture, *row) for picture, rows in told.items() for row in rows]
     head = {"schema": _SCHEMA, "pairs": [{"source": asdict(p.source), "target": asdict(p.target)} for p in pairs]}
     files.write_json(folder / _PAIRS, head)
     write_rows(folder / _FRAMES, PairRow, frames)

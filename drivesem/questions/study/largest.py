@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from drivesem.questions.study.counts import size_of
-from drivesem.questions.study.running import ARMS, ArmRun
+from drivesem.questions.study.running import ArmRun
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, write_picture, write_text
+from drivesem.run.folder import ARMS
 from drivesem.run.results import FrameResult
 from scene_ir import files
 

@@ -15,10 +15,10 @@ from detectors.training import Sample
 from drivesem.data.joined import open_folders
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.questions.study.arms import PLACEBO, Arm, attack_of
-from drivesem.questions.study.running import ARMS
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker
+from drivesem.run.folder import ARMS, HELD_OUT, RETRAINED
 from drivesem.run.protocol import follows_paper
 from drivesem.run.workers import mapping
 from drivesem.scenes.sources import SceneSource
@@ -35,8 +35,8 @@ from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir.types import SceneIR
 
 BENIGN = "benign detector"
-RETRAINED, CACHE, FRAMES, POOL = "retrained", "cache", "frames", "pool"
-"""Folders: trained detectors, decoded frames, frames that were made, pictures that are trained on."""
+CACHE, FRAMES, POOL = "cache", "frames", "pool"
+"""Folders: decoded frames, frames that were made, pictures that are trained on."""
 Pictures = Stage | Literal["random", "generator", "around"]
 """Of an attacked frame; random edits of the same size, by the compositor or the generator; states around a certain
 failure."""
@@ -97,7 +97,7 @@ class Lesson:
     @property
     def run(self) -> str:
         """Folder of the attack on held-out frames, against its detector."""
-        return f"held-out-{self.folder}"
+        return f"{HELD_OUT}-{self.folder}"
 
     @property
     def labels(self) -> str:
@@ -212,7 +212,7 @@ def judging_arms(study: Study, lessons: Sequence[Lesson], out: Path) -> list[Arm
         base = replace(base, seed=study.seed + 1)  # other streets
     else:
         base = replace(base, root=study.held_out or study.root)
-    arms = [Arm(BENIGN, "held-out", base)]
+    arms = [Arm(BENIGN, HELD_OUT, base)]
     for lesson in lessons if study.reattack else ():
         retrained = replace(base, detector=str(weights_of(out, lesson)))
         arms.append(Arm(lesson.name, lesson.run, retrained))

@@ -17,14 +17,15 @@ from drivesem.questions.study import lessons as plan
 from drivesem.questions.study import robust
 from drivesem.questions.study.arms import Arm
 from drivesem.questions.study.counts import ArmCounts
-from drivesem.questions.study.lessons import BENIGN, RETRAINED, Lesson, Parts, Taken
-from drivesem.questions.study.running import ARMS, ArmRun, AttackFacts, run_arms, workers_of
+from drivesem.questions.study.lessons import BENIGN, Lesson, Parts, Taken
+from drivesem.questions.study.running import ArmRun, AttackFacts, run_arms, workers_of
 from drivesem.questions.study.taught import RetrainCounts, SeenBenign
 from drivesem.questions.transfer.asking import detectors_of, pairs_of
 from drivesem.questions.transfer.matrix import PairCounts
 from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker, select_frames
 from drivesem.run.finished import load_runs
+from drivesem.run.folder import ARMS, RETRAINED
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.looking import weights_digest
 from drivesem.run.results import BoxRecord

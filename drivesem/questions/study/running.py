@@ -11,14 +11,12 @@ from drivesem.attack.judging import JudgedClasses
 from drivesem.questions.study.arms import Arm
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import WRITTEN, Worker, attack_frames, select_frames
-from drivesem.run.folder import PRESENTATION, claim
+from drivesem.run.folder import ARMS, PRESENTATION, claim
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
 
-ARMS = "arms"
-"""Folder of the arms' runs."""
 _FREE = (*PRESENTATION, "like")
 """Settings of an arm that may change on the way: the study's folder may have moved, and what lies in it."""
 

@@ -15,8 +15,8 @@ from drivesem.evaluation import failures
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import Difference, Interval, differences, intervals, rate, wilson
 from drivesem.questions.study.counts import ArmCounts, FrameCounts, SeenObject
-from drivesem.questions.study.running import ARMS, ArmRun
-from drivesem.run.folder import FRAMES
+from drivesem.questions.study.running import ArmRun
+from drivesem.run.folder import ARMS, FRAMES
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
 from drivesem.run.tally import at_least, certain_losses

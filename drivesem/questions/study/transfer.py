@@ -15,7 +15,7 @@ from drivesem.evaluation.resampling import Interval, differences
 from drivesem.questions.study.arms import Arm, draws_of
 from drivesem.questions.study.report import OWN_PROTOCOL, Told
 from drivesem.questions.study.rows import MODES
-from drivesem.questions.study.running import ARMS, AttackFacts, feasible_of, run_arms
+from drivesem.questions.study.running import AttackFacts, feasible_of, run_arms
 from drivesem.questions.transfer.asking import Asked, detector_names, detectors_of, pairs_of
 from drivesem.questions.transfer.matrix import (
     AP50,
@@ -33,6 +33,7 @@ from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
 from drivesem.report.tables import Sheet, percent
 from drivesem.run.attack import Worker
 from drivesem.run.finished import load_runs
+from drivesem.run.folder import ARMS
 from drivesem.run.protocol import follows_paper
 from drivesem.settings.blocks import Asking
 from drivesem.settings.commands import DEFAULT_COMBO, Attack, Study

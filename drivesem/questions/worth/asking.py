@@ -11,45 +11,38 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from detectors.base import DetectorError
-from detectors.types import CLASSES, Detections
-from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.questions.realism.comparison import Measures, frame_parts
-from drivesem.questions.realism.measures import METRICS, load, missing
-from drivesem.questions.transfer.asking import DETECTIONS
+from drivesem.questions.realism.comparison import frame_parts
+from drivesem.questions.realism.measures import load
+from drivesem.questions.worth.by_arm import by_arm
 from drivesem.questions.worth.measures import (
     MEMBERSHIPS,
-    Floats,
     Integers,
     Points,
     Setting,
     classified,
-    detected,
     gain_of,
-    joined,
     realism,
     worth_of,
 )
+from drivesem.questions.worth.runs import (
+    SHOWN,
+    SecondDetector,
+    distance_of,
+    distances_of,
+    own_points,
+    realism_of,
+)
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from drivesem.run.finished import METRICS as RUN_FIGURES
-from drivesem.run.finished import Frame, Run, load_runs
+from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import folder_of
-from drivesem.run.frame import as_detections, as_targets
-from drivesem.run.looking import Memory, Order, look
-from drivesem.run.results import BoxRecord
-from drivesem.settings.blocks import Sharing
 from drivesem.settings.commands import Worth
 from drivesem.settings.errors import UsageError
-from drivesem.training.retraining import WEIGHTS
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-PREFERRED = ("lpips-alex", "perceptual")
-"""The distance behind realism: LPIPS as in the paper where its weights are there."""
 _DISTANCES = ("distance", "realism")
 """Columns of a table that are no class."""
 _SUM_TOLERANCE = 1e-3
@@ -75,8 +68,12 @@ def worth_run(config: Worth) -> Answer:
     """Count, and write what is said of it. Raises UsageError or SceneError for bad input."""
     base = math.e if config.base == "e" else _number(config.base)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    first = Path(config.table).parent if config.table is not None else Path(config.runs[0])
+    first = Path(config.table).parent if config.table is not None else Path(config.study or config.runs[0])
     out = folder_of(config.out, first / "worth")
+    if config.study is not None:
+        answer = by_arm(config, base, draws, distance_of(config), out)
+        answer.write()
+        return answer
     facts: dict[str, Any] = {"base": config.base, "bootstrap": draws}
     if config.table is not None:
         entries, names = _tables(Path(config.table), None if config.after is None else Path(config.after))
@@ -84,7 +81,7 @@ def worth_run(config: Worth) -> Answer:
         distance = None
     else:
         runs = load_runs(config.runs, config.limit, "RUN")
-        distance = _distance(config)
+        distance = distance_of(config)
         entries, names = _runs(runs, config, distance, out)
         weighted = [False] if distance is None else [False, True]
     facts |= {"distance": distance, "detectors": names}
@@ -115,96 +112,26 @@ def _number(text: str) -> float:
     return value
 
 
-def _distance(config: Worth) -> str | None:
-    folder = None if config.weights is None else Path(config.weights)
-    if config.distance == "none":
-        return None
-    if config.distance is None:
-        return next(name for name in PREFERRED if missing(name, folder) is None)
-    known = [name for name, metric in METRICS.items() if metric.pairwise and not metric.squared and name != "ssim"]
-    if config.distance not in known:
-        raise UsageError("--distance", f"none, {', '.join(known)}", repr(config.distance))
-    return config.distance
-
-
 def _runs(runs: Sequence[Run], config: Worth, distance: str | None, out: Path) -> tuple[list[Entry], list[str]]:
     """Photographs and counterexamples of each run, and the names of the detectors."""
     attacked = sorted({one.detector for one in runs})
     if len(attacked) > 1:
         raise UsageError("RUN", "runs against one detector", " and ".join(attacked))
-    second = None if config.second is None else _Second(config, out)
+    second = None if config.second is None else SecondDetector(config.second, config, out)
     folder = None if config.weights is None else Path(config.weights)
     measures = {} if distance is None else load([distance], folder, fetch=False)
-    far = [[_distances(frame, measures) for frame in one.frames] for one in runs]
-    largest = max((float(d.max(initial=0)) for frames in far for d in frames), default=0.0)
+    far = [
+        [distances_of(f, frame_parts(f, measures) if measures else None, distance or "") for f in one.frames]
+        for one in runs
+    ]
+    rho = realism_of(far)
     entries: list[Entry] = []
-    for one, distances in zip(runs, far, strict=True):
-        t_star = float(files.read_json(one.folder / RUN_FIGURES)["t_star"])
-        for picture, name in (("benign", "photographs"), ("attacked", "counterexamples")):
-            sides: tuple[list[Points], list[Points]] = ([], [])
-            for frame, d in zip(one.frames, distances, strict=True):
-                rho = None if picture == "benign" else realism(d, largest)
-                found = getattr(frame.result, f"detections_{picture}")
-                sides[0].append(_points(frame, picture, as_detections(found, CLASSES), t_star, rho))
-                if second is not None:
-                    asked = second.find(frame.pictures[picture])
-                    sides[1].append(_points(frame, picture, asked, second.t_star, rho))
-            other = joined(sides[1]) if second is not None else None
-            entries.append(Entry(f"{one.name} ({one.params}): {name}", joined(sides[0]), other))
+    for one, own in zip(runs, rho, strict=True):
+        for picture, name in SHOWN.items():
+            weights = own if picture == "attacked" else None
+            other = None if second is None else second.points(one, picture, weights)
+            entries.append(Entry(f"{one.name} ({one.params}): {name}", own_points(one, picture, weights), other))
     return entries, attacked if second is None else [*attacked, second.name]
-
-
-def _kept(frame: Frame) -> list[tuple[BoxRecord, BoxRecord]]:
-    """Objects that are judged before and after."""
-    result = frame.result
-    pairs = zip(result.targets_benign, result.targets_moved, strict=True)
-    return [(a, b) for a, b in pairs if not (a.ignore or b.ignore)]
-
-
-def _distances(frame: Frame, measures: Measures) -> Floats:
-    """Of each judged object's surroundings before and after (M,), by the one measure; 0 without one."""
-    kept = _kept(frame)
-    if not measures:
-        return np.zeros(len(kept))
-    (name,) = measures
-    parts = frame_parts(frame, measures).region("boxes")
-    by_index = {part.index: part.distances[name]["benign", "attacked"] for part in parts}
-    return np.array([by_index[a.index] for a, _ in kept], np.float64)
-
-
-def _points(frame: Frame, picture: str, found: Detections, t_star: float, rho: Floats | None) -> Points:
-    result = frame.result
-    records = result.targets_benign if picture == "benign" else result.targets_moved
-    other = result.targets_moved if picture == "benign" else result.targets_benign
-    targets = as_targets(records, CLASSES)
-    # The same objects before and after, or the sets could not be compared.
-    targets.ignore.logical_or_(torch.tensor([box.ignore for box in other], dtype=torch.bool))
-    return detected(targets, found, t_star, rho)
-
-
-class _Second:
-    """Another detector, or the same one retrained: what it finds is remembered by the pictures' content."""
-
-    def __init__(self, config: Worth, out: Path) -> None:
-        assert config.second is not None
-        path = Path(config.second)
-        name = str(path / WEIGHTS) if (path / WEIGHTS).is_file() else config.second
-        self._settings = Sharing(workers=1)
-        self._order = Order(name, config.device, config.tiles, out / DETECTIONS)
-        try:
-            self._predictor = self._order.load()
-            self._names = JudgedClasses.of(self._predictor).names
-        except DetectorError as error:
-            raise UsageError("--second", "a detector, or a run of drivesem retrain", error) from error
-        self._memory = Memory(self._order, self._predictor)
-        self.name, self.t_star = name, t_star_of(self._predictor)
-
-    def find(self, picture: Path) -> Detections:
-        """Detections whose labels are places in CLASSES."""
-        look(self._order, self._predictor, [picture], self._settings, self.name)
-        found = self._memory.recall(picture)
-        places = torch.tensor([CLASSES.index(name) for name in self._names])
-        return Detections(found.boxes_xyxy, places[found.labels], found.scores)
 
 
 def _tables(path: Path, after: Path | None) -> tuple[list[Entry], list[str]]:

@@ -160,6 +160,79 @@ def test_tables(tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
     assert (tmp_path / "worth" / "worth.json").is_file()
 
 
+def study_of(write_run: Callable[..., Path], folder: Path, name: str, *arms: str) -> Path:
+    """A finished study whose arms are these runs; in the first nothing is changed."""
+    for place, arm in enumerate(arms):
+        write_run(folder / "arms" / arm, same=place == 0)
+    files.write_text(folder / "config.yaml", f"name: {name}\n")
+    return folder
+
+
+def test_arms_of_a_study(
+    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
+) -> None:
+    """Each arm as realism and worth tell it alone, beside the paper's figures; controls are left out."""
+    study = study_of(write_run, tmp_path / "study", "multi", "combo-1", "combo-2", "combo-2-placebo")
+    placebo = study / "arms" / "combo-2-placebo" / "config.yaml"
+    files.write_text(placebo, files.read_text(placebo).replace("method: si-fgsm", "method: placebo"))
+    data = worth("--study", study, "--metrics", "psnr,ssim,perceptual", "--distance", "perceptual")
+    still, moved = data["rows"]
+    assert (still["arm"], moved["arm"]) == ("combo-1", "combo-2")
+    assert (still["frame_psnr"], still["frame_ssim"], still["vehicles_perceptual"]) == (None, 1, 0)
+    assert moved["frame_psnr_low"] <= moved["frame_psnr"] <= moved["frame_psnr_high"]
+    assert 0 < moved["vehicles_ssim"] < moved["frame_ssim"] < 1
+    assert (still["frames"], still["vehicles"], data["gains"]) == (3, 6, [])
+    assert data["reference"] == {"lpips": 0.52, "fid": 0.1}
+    own = worth(study / "arms" / "combo-2", "--distance", "perceptual")
+    for key, of, weighted in (
+        ("worth_photographs_binary", "photographs", False),
+        ("worth_counterexamples_fractional", "counterexamples", False),
+        ("worth_counterexamples_binary_by_realism", "counterexamples", True),
+    ):
+        kind = "fractional" if "fractional" in key else "binary"
+        row = pick(own, of, membership=kind, realism_weight=weighted)
+        assert (moved[key], moved[f"{key}_low"]) == (row["value"], row["low"])
+    text = (study / "worth" / "arms.md").read_text()
+    assert "| the paper | - | - | - | - | 0.52 | 0.10 |" in text
+    lines = list(csv.DictReader((study / "worth" / "arms.csv").read_text().splitlines()))
+    assert [line["arm"] for line in lines] == ["combo-1", "combo-2"]
+
+
+def test_what_a_study_retrained_gained(
+    write_run: Callable[..., Path],
+    tmp_path: Path,
+    worth: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each detector that was retrained, on the held-out counterexamples of the one before."""
+    study = study_of(write_run, tmp_path / "study", "retrain", "combo-2", "held-out", "held-out-ours")
+    for name in ("ours", "benign"):
+        files.write_text(study / "retrained" / name / WEIGHTS, "")
+    monkeypatch.setattr(looking, "load_predictor", lambda name, *_: Sees(2 if "ours" in name else 0))
+    data = worth("--study", study, "--metrics", "ssim", "--distance", "none")
+    gains = {row["second"]: row for row in data["gains"] if row["membership"] == "binary"}
+    assert {row["arm"] for row in data["gains"]} == {"held-out"}
+    before = 8 / 12 * entropy(2 / 8, 6 / 8)
+    assert gains["ours"]["gain"] == pytest.approx(before)
+    assert gains["benign"]["gain"] == pytest.approx(before - math.log(2))
+    assert gains["benign"]["worth"] == pytest.approx(math.log(2))
+    assert len(data["rows"]) == 3
+    assert (study / "worth" / "gains.csv").is_file()
+
+
+def test_what_is_no_finished_study(
+    write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    run = write_run(tmp_path / "run")
+    assert "--study: expected the folder of a finished drivesem study" in refused("worth", "--study", str(run))
+    (tmp_path / "empty").rmdir()
+    study = study_of(write_run, tmp_path / "study", "multi", "combo-1")
+    (study / "arms" / "combo-1" / "metrics.json").unlink()
+    assert "--study: expected a finished run" in refused("worth", "--study", str(study))
+    (tmp_path / "empty").rmdir()
+    assert "--metrics: expected --study beside it" in refused("worth", str(run), "--metrics", "ssim")
+
+
 def test_a_table_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "answers.csv"
     path.write_text(TABLE)
@@ -196,8 +269,8 @@ def test_bad_input(write_run: Callable[..., Path], tmp_path: Path, refused: Call
         (tmp_path / "empty").rmdir()
         return line
 
-    assert "RUN: expected folders of drivesem attack, or --table, found nothing" in says()
-    assert "found both" in says(run, "--table", "x.csv")
+    assert "RUN: expected folders of drivesem attack, or --table, or --study, found nothing" in says()
+    assert "found several of them" in says(run, "--table", "x.csv")
     assert "--after: expected --table beside it" in says(run, "--after", "x.csv")
     assert "--second: expected runs" in says("--table", "x.csv", "--second", "squeezedet")
     assert "--base: expected e, or a number above 1, found '1'" in says(run, "--base", "1")

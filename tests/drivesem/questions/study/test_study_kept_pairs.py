@@ -36,14 +36,14 @@ FEW = ("Car", "Truck")
 
 
 def before(
-    results: Sequence[FrameResult], run: str, target: str, classes: Sequence[str], missed: Sequence[int] = ()
+    results: Sequence[FrameResult], run: str, target: str, classes: tuple[str, ...], missed: Sequence[int] = ()
 ) -> PairCounts:
     """A run before a detector that finds nothing in some of the photographs rendered again, and what the run's own
     finds elsewhere.
     """
 
     def seen(records: Sequence[BoxRecord]) -> Any:
-        return as_detections([one for one in records if one.label in classes], classes)
+        return as_detections(tuple(one for one in records if one.label in classes), classes)
 
     found = {
         "benign": [seen((*r.detections_benign, CYCLIST)) for r in results],
@@ -52,7 +52,7 @@ def before(
         ],
         "attacked": [seen(r.detections_attacked) for r in results],
     }
-    source, asked = ShownRun(run, "squeezedet", "si-fgsm", "rotate"), Target(target, target, tuple(classes), 0.35)
+    source, asked = ShownRun(run, "squeezedet", "si-fgsm", "rotate"), Target(target, target, classes, 0.35)
     return PairCounts.of(source, asked, results, found)
 
 
@@ -85,7 +85,7 @@ def transferred(
 
 
 def retrained(
-    attacked: Sequence[FrameResult], frame: Callable[..., FrameResult], run: Callable[..., ArmCounts], arm: Any
+    attacked: list[FrameResult], frame: Callable[..., FrameResult], run: Callable[..., ArmCounts], arm: Any
 ) -> tuple[Study, RetrainCounts]:
     """A detector as it was and two lessons; the second renderer drew one of three frames."""
     study = Study(name="retrain", quick=True, bootstrap=DRAWS, arms="benign,random,ours")

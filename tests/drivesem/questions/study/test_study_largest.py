@@ -7,7 +7,7 @@ import pytest
 
 from drivesem.questions.study.arms import PLACEBO
 from drivesem.questions.study.largest import SHOWN, WIDTH_PX, largest, write_largest
-from drivesem.questions.study.running import ARMS
+from drivesem.run.folder import ARMS
 from scene_ir import files
 
 
