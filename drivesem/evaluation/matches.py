@@ -10,7 +10,7 @@ import numpy as np
 from detectors.types import Detections, Targets
 from drivesem.evaluation.coco import IOU_50, IOU_70, IOU_THRESHOLDS, ClassScores
 from drivesem.evaluation.curves import Tally, sampled_precision
-from drivesem.evaluation.instances import Floats, Integers
+from drivesem.evaluation.instances import Booleans, Floats, Integers
 from drivesem.evaluation.matching import NOTHING
 from drivesem.evaluation.outcome import Outcome
 
@@ -55,6 +55,14 @@ class Matches:
             misfires=(~hits).astype(np.float64),
             objects=self.objects,
         )
+
+    def telling(self) -> Booleans:
+        """Which detections (N,) have a say in the figures, however frames are weighed: those from the lowest true
+        one on, without what is ignored at every IoU. False ones below it come after the last step of recall.
+        """
+        true = (self.marks == TRUE).any(axis=1)
+        lowest = self.score[true].min(initial=np.inf)
+        return (self.score >= lowest) & (self.marks != IGNORED).any(axis=1)
 
     def scores(self, t_star: float) -> ClassScores:
         """The figures that `coco.evaluate` gives of the same pictures, to the last bit."""

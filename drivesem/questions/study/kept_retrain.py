@@ -107,7 +107,7 @@ def keep_retrain(folder: Path, study: Study, counts: RetrainCounts) -> None:
     detections = (
         BenignDetectionRow(detector, name, *row)
         for detector, one in counts.seen.items()
-        for name, rows in zip(counts.benign_frames, marked(one.matches), strict=True)
+        for name, rows in zip(counts.benign_frames, marked(one.matches, one.matches.telling()), strict=True)
         for row in rows
     )
     states = (

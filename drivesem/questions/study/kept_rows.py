@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from drivesem.evaluation.coco import IOU_THRESHOLDS
+from drivesem.evaluation.instances import Booleans
 from drivesem.evaluation.matches import TRUE, Matches
 from drivesem.questions.study.arms import draws_of
 from drivesem.run.records import dump_rows, load_rows
@@ -56,11 +57,13 @@ def check_settings(study: Study, name: str, where: str) -> None:
     require(draws <= MOST_DRAWS, f"{where}: settings.bootstrap", f"at most {MOST_DRAWS}", draws)
 
 
-def marked(matches: Matches) -> list[list[Marked]]:
-    """The detections of each frame."""
-    words = ["".join(letters) for letters in np.array(list(MARKS))[matches.marks]]
-    rows = [(_short(s), w.rstrip(w[-1]) + w[-1]) for s, w in zip(matches.score.tolist(), words, strict=True)]
-    ends = np.searchsorted(matches.frame, np.arange(len(matches.objects) + 1)).tolist()
+def marked(matches: Matches, kept: Booleans | None = None) -> list[list[Marked]]:
+    """The detections of each frame. kept (N,): which of them, by default all."""
+    chosen = np.ones(len(matches.score), np.bool_) if kept is None else kept
+    words = ["".join(letters) for letters in np.array(list(MARKS))[matches.marks[chosen]]]
+    scores = matches.score[chosen].tolist()
+    rows = [(_short(s), w.rstrip(w[-1]) + w[-1]) for s, w in zip(scores, words, strict=True)]
+    ends = np.searchsorted(matches.frame[chosen], np.arange(len(matches.objects) + 1)).tolist()
     return [rows[start:end] for start, end in pairwise(ends)]
 
 

@@ -151,13 +151,19 @@ def write_pairs(folder: Path, pairs: Sequence[PairCounts]) -> None:
 
 
 def _found(pair: PairCounts, name: str) -> list[list[_Found]]:
-    """What is detected in the pictures of that name, frame by frame; paper: with the marks of moved labels."""
+    """What is detected in the pictures of that name and has a say in a figure, frame by frame; paper: with the
+    marks of moved labels.
+    """
     frames: list[list[_Found]] = [[] for _ in pair.frames]
     for category, matches in pair.pictures[name].items():
-        moved = marked(pair.pictures["moved"][category]) if name == "paper" else None
-        for place, rows in enumerate(marked(matches)):
-            others = [None] * len(rows) if moved is None else [marks for _, marks in moved[place]]
-            frames[place] += [(category, *row, other) for row, other in zip(rows, others, strict=True)]
+        kept, moved = matches.telling(), None
+        if name == "paper":
+            other = pair.pictures["moved"][category]
+            kept |= other.telling()
+            moved = marked(other, kept)
+        for place, rows in enumerate(marked(matches, kept)):
+            words = [None] * len(rows) if moved is None else [word for _, word in moved[place]]
+            frames[place] += [(category, *row, word) for row, word in zip(rows, words, strict=True)]
     return frames
 
 

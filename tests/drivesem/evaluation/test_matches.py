@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from detectors.types import Detections, Targets
-from drivesem.evaluation.coco import Scores, evaluate
+from drivesem.evaluation.coco import IOU_THRESHOLDS, Scores, evaluate
 from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.resampling import Averaged, Recalled
 
 CLASSES = ("Car", "Truck", "Cyclist")
 
@@ -43,9 +44,26 @@ def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
     assert Scores.of(own, "Car") == expected
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_what_has_no_say_changes_no_figure(seed: int) -> None:
+    """To the last bit, at any weights of the frames."""
+    matches = Matches.of(*random_frames(seed, 6), 0)
+    kept = matches.telling()
+    assert 0 < kept.sum() < len(kept)
+    less = Matches(matches.frame[kept], matches.score[kept], matches.marks[kept], matches.objects)
+    assert less.telling().all()
+    assert less.scores(0.4) == matches.scores(0.4)
+    draws = np.random.default_rng(seed).multinomial(6, np.full(6, 1 / 6), 200).astype(np.float64)
+    for place in range(len(IOU_THRESHOLDS)):
+        one, other = less.tally(place), matches.tally(place)
+        for figure in (Recalled, lambda tally: Averaged(tally, "coco")):
+            assert [figure(one).value(w) for w in draws] == [figure(other).value(w) for w in draws]
+
+
 def test_nothing_to_find_or_nothing_found() -> None:
     targets, found = random_frames(1, 4)
     empty = [Targets(t.boxes_xyxy[:0], t.labels[:0], t.ignore[:0]) for t in targets]
     none = [Detections(d.boxes_xyxy[:0], d.labels[:0], d.scores[:0]) for d in found]
     for case in ((targets, none), (empty, found)):
+        assert not Matches.of(*case, 0).telling().any()
         assert Matches.of(*case, 0).scores(0.4) == evaluate(*case, CLASSES, 0.4).headline
