@@ -158,7 +158,7 @@ class Taught:
 
 def _training(lesson: Lesson) -> dict[str, Any]:
     told = ("seed", "steps", "batch", "window", "scale", "rate", "fraction", "mix", "loss", "precision")
-    return {"pictures": lesson.pictures, "labels": lesson.labels, "consistency": lesson.consistency} | {
+    return {"pictures": lesson.pictures, "labels": lesson.labels, "weight": lesson.weight} | {
         key: getattr(lesson.config, key) for key in told
     }
 
