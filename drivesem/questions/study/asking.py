@@ -20,7 +20,7 @@ from drivesem.questions.study.kept import keep, load_kept
 from drivesem.questions.study.kept_retrain import keep_retrain, load_retrain
 from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
 from drivesem.questions.study.kept_transfer import keep_transfer, load_transfer
-from drivesem.questions.study.labels import label_sets
+from drivesem.questions.study.labels import label_frames, label_sets
 from drivesem.questions.study.largest import largest, write_largest
 from drivesem.questions.study.lessons import CACHE, FRAMES, POOL
 from drivesem.questions.study.plots import write_plot
@@ -37,7 +37,7 @@ from drivesem.questions.transfer.plot import write_heatmap
 from drivesem.report.answer import Answer
 from drivesem.report.terminal import Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
-from drivesem.settings.commands import KEPT_STUDIES, Confirm, Study
+from drivesem.settings.commands import Confirm, Study
 from drivesem.settings.text import command_line
 from drivesem.training.known import warn_of_overlaps
 from drivesem.truth.redraw.choose import SecondRenderers
@@ -132,15 +132,15 @@ def _arms(config: Study, out: Path, console: Console) -> _Found:
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
         SecondRenderers(workers[0].config.dataset, workers[0].config.root).check()
     ran = run_arms(arms, workers, out)
-    first = ran.runs[0]
-    counts = StudyCounts.of(ran, seen_of(first, depths_of(first, out)) if config.name == "searches" else None)
+    counts = StudyCounts.of(ran)
+    if config.name == "searches":
+        counts = replace(counts, seen=seen_of(ran.runs[0], depths_of(ran.runs[0], out)))
+    elif config.name == "labels":
+        counts = replace(counts, labels={one.arm.name: label_frames(one) for one in ran.runs})
     confirmed = _confirmed(config, ran, out)
     write_largest(out / _LARGEST, largest(ran.runs, out))
-    if config.name in KEPT_STUDIES:
-        keep(out / KEPT, config, counts, confirmed)
-        return _found(config, counts, confirmed)
-    found = _findings(config, counts)
-    return _text(replace(found, confirmed=confirmed, label_sets=[label_sets(one) for one in ran.runs]))
+    keep(out / KEPT, config, counts, confirmed)
+    return _found(config, counts, confirmed)
 
 
 def _found(config: Study, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> _Found:
@@ -211,7 +211,8 @@ _STUDIES = {"attribution": _attribution, "transfer": _transfer, "retrain": _retr
 def _findings(config: Study, counts: StudyCounts) -> Findings:
     draws, arms = draws_of(config), counts.arms
     grades = [grades_of(one, draws, config.seed) for one in arms if one.graded]
-    found = Findings(config, draws, counts, rows_of(arms, draws, config.seed), grades=grades)
+    labels = [label_sets(name, frames) for name, frames in counts.labels.items()]
+    found = Findings(config, draws, counts, rows_of(arms, draws, config.seed), grades=grades, label_sets=labels)
     if config.name == "searches":
         costs, standing = costs_of(arms, counts.seen, draws, config.seed), standing_of(arms, counts.seen)
         return replace(found, costs=costs, standing=standing)

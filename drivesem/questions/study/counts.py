@@ -14,6 +14,7 @@ from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.matches import Matches
 from drivesem.questions.study.arms import Arm
+from drivesem.questions.study.labels import FrameLabels
 from drivesem.questions.study.running import ArmRun, Ran
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
@@ -113,18 +114,19 @@ class SeenObject:
 @dataclass(frozen=True, slots=True)
 class StudyCounts:
     """All arms, on the same frames. without_vehicles: frames that were passed over; failed: those that could not
-    be used, and why; seen: by frame, where a study asks for them.
+    be used, and why; seen: by frame, labels: by arm, frame by frame, where a study asks for them.
     """
 
     arms: tuple[ArmCounts, ...]
     without_vehicles: int
     failed: Mapping[str, str]
     seen: Mapping[str, tuple[SeenObject, ...]] = field(default_factory=dict)
+    labels: Mapping[str, tuple[FrameLabels, ...]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, ran: Ran, seen: Mapping[str, tuple[SeenObject, ...]] | None = None) -> StudyCounts:
-        """Of finished runs."""
-        return cls(tuple(map(ArmCounts.of, ran.runs)), ran.without_vehicles, ran.failed, seen or {})
+    def of(cls, ran: Ran) -> StudyCounts:
+        """Of finished runs, without what only some studies ask for."""
+        return cls(tuple(map(ArmCounts.of, ran.runs)), ran.without_vehicles, ran.failed)
 
     @property
     def frames(self) -> list[FrameCounts]:

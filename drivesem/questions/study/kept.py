@@ -3,7 +3,8 @@ detector or run.
 
 A folder: `study.json` (settings, arms, frames), `frames.csv` (a row an arm and frame), `detections.csv.gz` (a row
 a detection of HEADLINE, with what it is beside the labels), `failures.csv`, and `objects.csv`, what the study
-`searches` finds in the photographs. Columns are the fields of the classes below.
+`searches` finds in the photographs; of the study `labels` also `labels.csv` (a row an object of an arm's frame)
+and `label_failures.csv`. Columns are the fields of the classes below.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from drivesem.questions.study.kept_rows import (
     MOST_DRAWS,
     STUDY,
     Marked,
+    check_count,
     check_marks,
     check_score,
     check_settings,
@@ -32,6 +34,7 @@ from drivesem.questions.study.kept_rows import (
     settings_of,
     write_rows,
 )
+from drivesem.questions.study.labels import OVERLAPS, FrameLabels, Mistakes
 from drivesem.run.records import load_record
 from drivesem.settings.commands import Study
 from drivesem.truth.grades import Grade, Kind
@@ -41,6 +44,8 @@ from scene_ir.errors import FormatError
 _SCHEMA = 1
 _FRAMES, _DETECTIONS = "frames.csv", "detections.csv.gz"
 _FAILURES, _OBJECTS = "failures.csv", "objects.csv"
+_LABELS, _LABEL_FAILURES = "labels.csv", "label_failures.csv"
+"""Of the study `labels` alone."""
 _LEAST = 1e-30
 """No measure but 0 is below it: ratios are finite."""
 _MEASURE = f"0, or from {_LEAST:g} to below {MOST}"
@@ -109,6 +114,29 @@ class ObjectRow:
 
 
 @dataclass(frozen=True, slots=True)
+class LabelRow:
+    """One object of an arm's frame. iou: of its benign and its moved label."""
+
+    arm: str
+    frame: str
+    object: int
+    iou: float
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFailureRow:
+    """One frame of an arm where a detection meets a label from that IoU on, as `Mistakes` has it."""
+
+    arm: str
+    frame: str
+    iou: float
+    paper: bool
+    moved: bool
+    lost_paper: int
+    lost_only_unmoved: int
+
+
+@dataclass(frozen=True, slots=True)
 class Survivors:
     """What a second renderer said of an arm. frames: that it drew; shares: failures, and those that survive."""
 
@@ -168,6 +196,8 @@ def keep(folder: Path, study: Study, counts: StudyCounts, confirmed: Mapping[str
         write_rows(into / _DETECTIONS, DetectionRow, detections)
         write_rows(into / _FAILURES, FailureRow, failures)
         write_rows(into / _OBJECTS, ObjectRow, seen)
+        if counts.labels:
+            _write_labels(into, counts)
 
 
 def _rows(arms: Sequence[ArmCounts]) -> tuple[list[FrameRow], list[DetectionRow]]:
@@ -192,6 +222,18 @@ def _rows(arms: Sequence[ArmCounts]) -> tuple[list[FrameRow], list[DetectionRow]
             by = (alike or [arm])[0]
             frames.append(FrameRow(arm, name, by, **told, cars=cars, cars_moved=int(moved.objects[place])))
     return frames, detections
+
+
+def _write_labels(folder: Path, counts: StudyCounts) -> None:
+    told = [
+        (arm.arm.name, frame.identifier, labels)
+        for arm in counts.arms
+        for frame, labels in zip(arm.frames, counts.labels[arm.arm.name], strict=True)
+    ]
+    objects = (LabelRow(*key, index, iou) for *key, one in told for index, iou in one.iou.items())
+    failed = (LabelFailureRow(*key, iou, *astuple(own)) for *key, one in told for iou, own in one.mistakes.items())
+    write_rows(folder / _LABELS, LabelRow, objects)
+    write_rows(folder / _LABEL_FAILURES, LabelFailureRow, failed)
 
 
 def load_kept(folder: Path, name: str) -> Kept:
@@ -220,7 +262,8 @@ def load_kept(folder: Path, name: str) -> Kept:
                 },
             )
         )
-    counts = StudyCounts(tuple(arms), head.frames_without_vehicles, head.frames_failed, seen)
+    labels = _labels(folder, head) if name == "labels" else {}
+    counts = StudyCounts(tuple(arms), head.frames_without_vehicles, head.frames_failed, seen, labels)
     confirmed = {
         arm: Confirmation(
             one.frames, {}, tuple(_share(n, failed, kept) for n, (failed, kept) in one.shares.items()), {}, None
@@ -332,3 +375,33 @@ def _seen(path: Path, frames: Sequence[str]) -> dict[str, tuple[SeenObject, ...]
             require(getattr(row, name) >= 0, f"{where}: {name}", "at least 0", getattr(row, name))
         found[row.frame].append(SeenObject(row.object, row.height_px, row.depth_m))
     return {name: tuple(objects) for name, objects in found.items()}
+
+
+def _labels(folder: Path, head: _Head) -> dict[str, tuple[FrameLabels, ...]]:
+    keys = [(arm.name, frame) for arm in head.arms for frame in head.frames]
+    overlaps: dict[_Key, dict[int, float]] = {key: {} for key in keys}
+    mistakes: dict[_Key, dict[float, Mistakes]] = {key: {} for key in keys}
+    for where, row in read_rows(folder / _LABELS, LabelRow):
+        own = overlaps.get((row.arm, row.frame))
+        require(own is not None, where, f"an arm and a frame of {STUDY}", (row.arm, row.frame))
+        check_count(f"{where}: object", row.object)
+        require(row.object not in (own or {}), f"{where}: object", "each once a frame", row.object)
+        require(0 <= row.iou <= 1, f"{where}: iou", "0 to 1", row.iou)
+        overlaps[row.arm, row.frame][row.object] = row.iou
+    for where, row in read_rows(folder / _LABEL_FAILURES, LabelFailureRow):
+        require((row.arm, row.frame) in mistakes, where, f"an arm and a frame of {STUDY}", (row.arm, row.frame))
+        require(row.iou in OVERLAPS, f"{where}: iou", f"one of {', '.join(map(str, OVERLAPS))}", row.iou)
+        check_count(f"{where}: lost_paper", row.lost_paper)
+        check_count(f"{where}: lost_only_unmoved", row.lost_only_unmoved, row.lost_paper)
+        one = Mistakes(row.paper, row.moved, row.lost_paper, row.lost_only_unmoved)
+        mistakes[row.arm, row.frame][row.iou] = one
+    for key, own in mistakes.items():
+        missing = [iou for iou in OVERLAPS if iou not in own]
+        require(not missing, str(folder / _LABEL_FAILURES), f"rows of arm {key[0]}, frame {key[1]}", "none")
+    return {
+        arm.name: tuple(
+            FrameLabels(overlaps[arm.name, name], {iou: mistakes[arm.name, name][iou] for iou in OVERLAPS})
+            for name in head.frames
+        )
+        for arm in head.arms
+    }

@@ -90,10 +90,20 @@ def test_tables_come_again_from_what_is_kept(
     assert "combo 1" in capsys.readouterr().out
 
 
+def test_labels_come_again_from_what_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study_asking, "arms_of", lambda config, out: arms_of(config, out)[:1])
+    out = tmp_path / "labels"
+    data = study(["study", "labels", *WORDS[2:], "--out", str(out), "--json"], capsys)
+    assert data["label_sets"][0]["objects"] > 0
+    assert study(["study", "labels", "--from", str(out / "kept"), "--json"], capsys) == data
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["labels"], "--kept: expected study single, multi, grades"),
+        (["classification"], "--kept: expected any study but this, found study classification"),
         (["single"], "settings.name: expected single, found multi"),
         (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
     ],

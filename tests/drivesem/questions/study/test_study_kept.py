@@ -19,7 +19,9 @@ from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM, Arm
 from drivesem.questions.study.counts import ArmCounts, CountedFailure, FrameCounts, SeenObject, StudyCounts
 from drivesem.questions.study.kept import keep, load_kept
+from drivesem.questions.study.labels import label_frames, label_sets
 from drivesem.questions.study.rows import rows_of
+from drivesem.questions.study.running import ArmRun
 from drivesem.run.results import Failure
 from drivesem.settings.commands import Attack, Study
 from drivesem.truth.grades import Agreement, Grade, Kind
@@ -70,6 +72,40 @@ def test_it_comes_back_and_so_do_its_rows(counts: StudyCounts, tmp_path: Path) -
     # a photograph stands once: the placebo's is the attack's, the other detector's its own
     text = gzip.decompress((tmp_path / "kept" / "detections.csv.gz").read_bytes()).decode()
     assert text.count("photograph") == 4 * 2 + 4
+
+
+@pytest.fixture
+def labelled(
+    frame: Callable[..., Any], arm_run: Callable[..., ArmRun], arm: Callable[..., Arm]
+) -> tuple[Study, StudyCounts]:
+    """The study of labels: cars that move away from their labels; one is ignored, one is lost."""
+    results = [frame(f"{i:03d}", moved_by=11.0 * i, found=i < 3) for i in range(4)]
+    ignored = replace(results[1].targets_moved[1], ignore=True)
+    results[1] = replace(results[1], targets_moved=(results[1].targets_moved[0], ignored))
+    run = arm_run(arm("translate"), results)
+    counts = StudyCounts((ArmCounts.of(run),), 0, {}, labels={"translate": label_frames(run)})
+    return replace(STUDY, name="labels"), counts
+
+
+def test_labels_come_back(labelled: tuple[Study, StudyCounts], tmp_path: Path) -> None:
+    study, counts = labelled
+    keep(tmp_path / "kept", study, counts, {})
+    again = load_kept(tmp_path / "kept", "labels").counts
+    assert again.labels == counts.labels
+    one = label_sets("translate", again.labels["translate"])
+    assert (one.objects, one.counted[0.5].only_unmoved, one.counted[0.7].lost_only_unmoved) == (7, 1, 2)
+    for file, old, new, message in (
+        ("labels.csv", "translate,000,1", "translate,000,0", "labels.csv:3: object: expected each once a frame"),
+        ("labels.csv", "1.0", "1.5", "labels.csv:2: iou: expected 0 to 1"),
+        ("label_failures.csv", "000,0.5", "000,0.4", "label_failures.csv:2: iou: expected one of 0.5, 0.7"),
+        ("label_failures.csv", "000,0.5", "000,0.7", "expected rows of arm translate, frame 000"),
+    ):
+        keep(tmp_path / "kept", study, counts, {})
+        path = tmp_path / "kept" / file
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new, 1))
+        with pytest.raises(FormatError, match=message):
+            load_kept(tmp_path / "kept", "labels")
 
 
 def test_equal_counts_give_equal_bytes(counts: StudyCounts, tmp_path: Path) -> None:

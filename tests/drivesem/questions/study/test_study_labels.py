@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivesem.questions.study.labels import label_sets
+from drivesem.questions.study.labels import LabelSets, label_frames, label_sets
 
 
 def iou(shift: float) -> float:
@@ -10,10 +10,14 @@ def iou(shift: float) -> float:
     return (50 - shift) / (50 + shift)
 
 
+def sets_of(run) -> LabelSets:
+    return label_sets(run.arm.name, label_frames(run))
+
+
 def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
     """The detector follows the car: any failure is the labels'. 10 px is an IoU of 0.67, 40 px one of 0.11."""
     shifts = [0.0, 10.0, 40.0, 40.0]
-    found = label_sets(arm_run(arm("translate"), [frame(str(i), moved_by=s) for i, s in enumerate(shifts)]))
+    found = sets_of(arm_run(arm("translate"), [frame(str(i), moved_by=s) for i, s in enumerate(shifts)]))
     assert (found.frames, found.objects) == (4, 8)
     assert found.iou["least"] == pytest.approx(iou(40))
     assert found.iou["median"] == 1.0
@@ -28,12 +32,12 @@ def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
 
 
 def test_a_car_that_is_really_lost_is_lost_by_both(frame, arm_run, arm) -> None:
-    one = label_sets(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counted[0.5]
+    one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counted[0.5]
     assert (one.paper, one.moved, one.only_unmoved) == (1, 1, 0)
     assert (one.lost_paper, one.lost_only_unmoved) == (1, 0)
 
 
 def test_no_objects(arm_run, arm) -> None:
-    found = label_sets(arm_run(arm("mesh"), []))
+    found = sets_of(arm_run(arm("mesh"), []))
     assert found.objects == 0
     assert set(found.iou.values()) == set(found.below.values()) == {None}

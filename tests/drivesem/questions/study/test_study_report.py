@@ -14,7 +14,7 @@ from rich.console import Console
 from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.counts import ArmCounts, StudyCounts
-from drivesem.questions.study.labels import label_sets
+from drivesem.questions.study.labels import label_frames, label_sets
 from drivesem.questions.study.plots import write_plot
 from drivesem.questions.study.report import Findings, answer_of, notes, sheets, told
 from drivesem.questions.study.rows import rows_of
@@ -63,7 +63,8 @@ def sampled(frame, counted, arm) -> Findings:
 def labelled(frame, arm_run, arm) -> Findings:
     run = arm_run(arm("translate"), [frame("0", moved_by=40.0), frame("1")])
     counts = StudyCounts((ArmCounts.of(run),), 0, {})
-    return Findings(Study(name="labels"), 0, counts, rows_of(counts.arms, 0, 0), label_sets=[label_sets(run)])
+    sets = [label_sets("translate", label_frames(run))]
+    return Findings(Study(name="labels"), 0, counts, rows_of(counts.arms, 0, 0), label_sets=sets)
 
 
 def cells(found: Findings, title: str, arm: str) -> dict[str, str]:
