@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -39,7 +40,15 @@ from drivesem.questions.study.counts import (
     StudyCounts,
 )
 from drivesem.questions.study.kept import keep
+from drivesem.questions.study.kept_retrain import keep_retrain
+from drivesem.questions.study.kept_transfer import keep_transfer
+from drivesem.questions.study.lessons import BENIGN, lessons_of
+from drivesem.questions.study.robust import KINDS, Counted, FrameStates
+from drivesem.questions.study.running import AttackFacts
+from drivesem.questions.study.taught import RetrainCounts, SeenBenign
+from drivesem.questions.study.transfer import AskedArm, TransferCounts
 from drivesem.questions.survey.page import Item, read_answers, read_key, write_key
+from drivesem.questions.transfer.matrix import SHOWN, FrameLosses, PairCounts, ShownRun, Target
 from drivesem.questions.verify.change import THETA, check_change
 from drivesem.questions.verify.differences import CheckLog
 from drivesem.run.finished import load_run
@@ -331,16 +340,64 @@ def _survey(root: Path) -> None:
     files.write_text(root / "answers.csv", f"{head}\n{name},me,0123abcd,1,Car,7,3.5\n")
 
 
-def _kept(root: Path) -> None:
-    """What a study of one arm and frame keeps; the packed table as text, too, so that its words are damaged."""
+def _counted() -> tuple[Matches, ArmCounts]:
+    """An arm of one frame, and what is found in its pictures."""
     marks = np.array([[1] * 10, [0] * 9 + [2]])
-    found = Matches(np.zeros(2, np.int64), np.array([0.75, 0.5]), marks, np.ones(1))
+    found = Matches(np.zeros(2, np.int64), np.array([0.75, 0.8]), marks, np.ones(1))
     lost = CountedFailure(0, "missed", "certain", True)
     frame = FrameCounts("a", 10, 30, 1.5, True, True, True, 0.5, 2, (lost,))
-    one = ArmCounts(Arm("rotate", "rotate", Attack()), (frame,), found, {"paper": found, "moved": found})
+    return found, ArmCounts(Arm("rotate", "rotate", Attack()), (frame,), found, {"paper": found, "moved": found})
+
+
+def _kept(root: Path) -> None:
+    """What a study of one arm and frame keeps."""
     seen = {"a": (SeenObject(0, 30.0, 12.0),)}
-    keep(root, Study(name="single"), StudyCounts((one,), 1, {"b": "no camera"}, seen), {})
-    files.write_bytes(root / "detections.csv", files.read_gzip(root / "detections.csv.gz"))
+    keep(root, Study(name="single"), StudyCounts((_counted()[1],), 1, {"b": "no camera"}, seen), {})
+    _unpack(root)
+
+
+def _pair(source: str, target: str) -> PairCounts:
+    found = _counted()[0]
+    losses = FrameLosses("a", 2, 1, 1, 1, 1, 1, True, True, 1)
+    pictures = {name: {"Car": found} for name in SHOWN}
+    shown = ShownRun(source, "squeezedet", "si-fgsm", "rotate")
+    return PairCounts(shown, Target(target, target, ("Car",), 0.5), (losses,), pictures)
+
+
+def _kept_transfer(root: Path) -> None:
+    source = AskedArm("squeezedet", "placebo", {"squeezedet": (0.994, 0.659)})
+    pairs = [_pair(name, "squeezedet") for name in ("squeezedet", "placebo")]
+    counts = TransferCounts(AttackFacts(1, 2, 2, 1, {"b": "no camera"}), (source,), pairs, {"a.png": "cut off"})
+    keep_transfer(root, Study(name="transfer"), counts)
+    _unpack(root)
+
+
+def _kept_retrain(root: Path) -> None:
+    study = Study(name="retrain", arms="benign", quick=True)
+    names = [BENIGN, *(lesson.name for lesson in lessons_of(study))]
+    found, arm = _counted()
+    states = FrameStates("a", "", {kind: Counted(4, (2, 1), 3, (0, 1)) for kind in KINDS}, "")
+    counts = RetrainCounts(
+        attack="combo 2",
+        learned=AttackFacts(1, 1, 1, 0, {}),
+        judged=AttackFacts(1, 2, 2, 0, {}),
+        shown={names[1]: 1},
+        benign=1,
+        benign_frames=("a",),
+        seen={name: SeenBenign(found, 0.5) for name in names},
+        known=[_pair(BENIGN, name) for name in names],
+        fresh=[replace(arm, arm=replace(arm.arm, name=name)) for name in names],
+        left_out={"ours": "none"},
+        states=[states],
+    )
+    keep_retrain(root, study, counts)
+    _unpack(root)
+
+
+def _unpack(root: Path) -> None:
+    """Packed tables as texts, too, so that their words are damaged."""
+    for path in root.rglob("*.gz"):
+        files.write_bytes(path.with_suffix(""), files.read_gzip(path))
 
 
 def _weights(root: Path) -> None:
@@ -463,9 +520,10 @@ def _answers(root: Path) -> None:
     read_answers(root / "answers.csv", name, items)
 
 
-def _told_again(root: Path) -> None:
-    files.write_bytes(root / "detections.csv.gz", gzip.compress((root / "detections.csv").read_bytes()))
-    study_run(Study(name="single", kept=str(root), bootstrap=0))
+def _told_again(root: Path, name: _KeptStudy) -> None:
+    for path in root.rglob("*.gz"):
+        files.write_bytes(path, gzip.compress(path.with_suffix("").read_bytes()))
+    study_run(Study(name=name, kept=str(root), bootstrap=0))
 
 
 def _report(root: Path) -> None:
@@ -482,6 +540,12 @@ def _darknet(root: Path) -> None:
     detector.decode(detector(torch.zeros(1, 3, 32, 64)))
 
 
+_KeptStudy = Literal["single", "transfer", "retrain"]
+_KEPT: dict[_KeptStudy, Callable[[Path], None]] = {
+    "single": _kept,
+    "transfer": _kept_transfer,
+    "retrain": _kept_retrain,
+}
 FORMATS: dict[str, Format] = {
     one.name: one
     for one in (
@@ -546,6 +610,9 @@ FORMATS: dict[str, Format] = {
         Format("state dict", _states, lambda root: realism_weights.read(root / "state.pth")),
         Format("onnx", _graphs, each(_predict, _segment)),
         Format("survey", _survey, _answers),
-        Format("kept study", _kept, _told_again, ("*.json", "*.csv"), share=0.25),
+        *(
+            Format(f"kept {name}", make, partial(_told_again, name=name), ("**/*.json", "**/*.csv"), share=0.25)
+            for name, make in _KEPT.items()
+        ),
     )
 }

@@ -1,7 +1,7 @@
 """What `drivesem study retrain` keeps.
 
 A folder: `study.json` (settings, lessons, what was left out), `benign.csv` (a row a held-out benign frame),
-`benign_detections.csv.gz` (what each detector finds in them), `states.csv` (a row a frame, kind of states and
+`benign_detections.csv.gz` (what each detector finds in them), `states.csv.gz` (a row a frame, kind of states and
 detector), and two folders as other studies have them: `known`, the counterexamples of the detector as it was
 before all (`kept_transfer`), and `fresh`, attacks on held-out frames against each (`kept`).
 """
@@ -38,7 +38,7 @@ from drivesem.settings.commands import Study
 from scene_ir import files
 
 _SCHEMA = 1
-_BENIGN, _DETECTIONS, _STATES = "benign.csv", "benign_detections.csv.gz", "states.csv"
+_BENIGN, _DETECTIONS, _STATES = "benign.csv", "benign_detections.csv.gz", "states.csv.gz"
 _KNOWN, _FRESH = "known", "fresh"
 
 

@@ -1,7 +1,7 @@
 """What `drivesem study transfer` keeps, and what any study keeps of detectors before the pictures of runs.
 
 The latter is a folder of `pairs.json` (runs and detectors), `frames.csv` (a row a run, detector and frame),
-`objects.csv` (what there is to find) and `detections.csv.gz`; the study's has `study.json` beside them.
+`objects.csv.gz` (what there is to find) and `detections.csv.gz`; the study's has `study.json` beside them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from drivesem.settings.commands import Study
 from scene_ir import files
 
 _SCHEMA = 1
-_PAIRS, _FRAMES, _OBJECTS, _DETECTIONS = "pairs.json", "frames.csv", "objects.csv", "detections.csv.gz"
+_PAIRS, _FRAMES, _OBJECTS, _DETECTIONS = "pairs.json", "frames.csv", "objects.csv.gz", "detections.csv.gz"
 _LOSSES = tuple(field.name for field in fields(FrameLosses) if field.name != "identifier")
 Picture = Literal["photograph", "re-render", "counterexample"]
 PICTURES: dict[str, Picture] = {

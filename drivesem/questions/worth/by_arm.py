@@ -203,7 +203,9 @@ def _worth(arms: Sequence[ArmFigures]) -> Sheet:
             f"{SHOWN[picture]}, {setting.kind}{', realism weight' if setting.weighted else ''}"
             for picture, setting in one.worth
         ]
-        lines.append((one.run.name, one.run.detector, *map(_number, one.worth.values())))
+        detector = Path(one.run.detector)
+        name = detector.parent.name if detector.name == WEIGHTS else str(detector)
+        lines.append((one.run.name, name, *map(_number, one.worth.values())))
     return Sheet("Information worth", ("arm", "detector", *heads), tuple(lines))
 
 
