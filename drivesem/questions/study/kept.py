@@ -230,8 +230,12 @@ def _write_labels(folder: Path, counts: StudyCounts) -> None:
         for arm in counts.arms
         for frame, labels in zip(arm.frames, counts.labels[arm.arm.name], strict=True)
     ]
-    objects = (LabelRow(*key, index, iou) for *key, one in told for index, iou in one.iou.items())
-    failed = (LabelFailureRow(*key, iou, *astuple(own)) for *key, one in told for iou, own in one.mistakes.items())
+    objects = (LabelRow(arm, frame, *own) for arm, frame, one in told for own in one.iou.items())
+    failed = (
+        LabelFailureRow(arm, frame, iou, *astuple(own))
+        for arm, frame, one in told
+        for iou, own in one.mistakes.items()
+    )
     write_rows(folder / _LABELS, LabelRow, objects)
     write_rows(folder / _LABEL_FAILURES, LabelFailureRow, failed)
 
