@@ -16,9 +16,8 @@ def run(config: Study) -> int:
     if config.name == "classification":
         from drivesem.classify.study.asking import study_run as classification_run
 
-        say(classification_run(config), config.json)
-    elif config.kept is not None and config.out is None:
-        show(study_run(config), config.json)
+        answer = classification_run(config)
     else:
-        say(study_run(config), config.json)
+        answer = study_run(config)
+    (show if config.kept is not None and config.out is None else say)(answer, config.json)
     return 0

@@ -231,7 +231,7 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     out: Place = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     kept: Annotated[str | None, Folder(), tyro.conf.arg(aliases=["--from"])] = None
-    """All but classification: the folder OUT/kept of such a study, whose tables are told again; it
+    """The folder OUT/kept of such a study, whose tables are told again; it
     needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
@@ -329,7 +329,6 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
         )
         beside = f"study {self.name}"
         if self.kept is not None:
-            refuse(self.name == "classification", "--kept", "any study but this", beside)
             for field in fields(self):
                 value, alone = getattr(self, field.name), "none beside --kept, which has the study's own settings"
                 refuse(field.name not in _AGAIN and value != field.default, option(field.name), alone, value)

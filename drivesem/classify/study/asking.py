@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 from drivesem.classify.study.arms import ARMS
+from drivesem.classify.study.kept import keep_results, load_results
 from drivesem.classify.study.lab import PICTURES, TABLES, Lab
 from drivesem.classify.study.looking import LOOKED
+from drivesem.classify.study.results import Facts, Results
 from drivesem.classify.study.retraining import RETRAINED
 from drivesem.classify.study.tables import ORDERS, flat, remarks, tables_of
+from drivesem.questions.study.kept_rows import KEPT
 from drivesem.report.answer import Answer
-from drivesem.run.folder import PRESENTATION, claim
+from drivesem.run.folder import PRESENTATION, claim, folder_of
 from drivesem.settings.commands import Study
 from drivesem.settings.text import command_line
 
 _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
-    *(ARMS, LOOKED, RETRAINED, PICTURES),
+    *(ARMS, KEPT, LOOKED, RETRAINED, PICTURES),
 )
 _FREE = (*PRESENTATION, "bootstrap", "tables", "networks", "fresh")
 """Settings that may change on the way: they add attacks, and alter none."""
@@ -32,36 +38,59 @@ _NOTE = (
 
 
 def study_run(study: Study) -> Answer:
-    """Run or continue it, and write what is said. Raises UsageError or SceneError for bad input."""
+    """Run or continue it, and write what is said; tell one that was kept, and write it where --out is given.
+
+    Raises UsageError or SceneError for bad input.
+    """
+    if study.kept is not None:
+        return _again(study, Path(study.kept))
     lab = Lab.of(study)
     claim(lab.out, lab.study, _WRITTEN, _FREE)
     lab.attack()
     lab.teach()
-    found = tables_of(lab)
+    results = Results(Facts.of(study, lab), lab)
+    answer = _answer(study, results, lab.out)
+    keep_results(lab.out / KEPT, results)
+    answer.write()
+    return answer
+
+
+def _again(study: Study, folder: Path) -> Answer:
+    results = load_results(folder)
+    told = results.facts.study
+    if study.bootstrap is not None:
+        told = replace(told, bootstrap=study.bootstrap)
+        results.facts = replace(results.facts, study=told)
+    answer = _answer(told, results, folder_of(study.out, folder))
+    if study.out is not None:
+        answer.write()
+    return answer
+
+
+def _answer(study: Study, results: Results, out: Path) -> Answer:
+    found, facts = tables_of(results), results.facts
     command = command_line("study", study, ("out", "json", "resume", "workers", "name"))
-    answer = Answer(
-        out=lab.out,
+    return Answer(
+        out=out,
         name="study",
         heading="Image classifiers",
         data={
             "study": study.name,
-            "out": str(lab.out),
-            "networks": [eyes.name for eyes in lab.eyes],
+            "out": str(out),
+            "networks": [one.name for one in facts.networks],
             "objects": study.objects or "embedded",
-            "pictures": {"test": len(lab.done), "train": len(lab.train), "retrained": len(lab.few)},
-            "bootstrap": lab.drawing.draws,
+            "pictures": facts.counts,
+            "bootstrap": results.drawing.draws,
             "tables": {
                 one.name: {"rows": one.rows, "reference": one.reference, "notes": remarks(one)} for one in found
             },
-            "frames_failed": dict(sorted(lab.failed.items())),
+            "frames_failed": facts.failed,
         },
         tables={one.name: flat(one.rows) for one in found if one.rows},
         sheets=[one.sheet() for one in found],
-        notes=[_NOTE.format(draws=lab.drawing.draws), *(note for one in found for note in remarks(one))],
+        notes=[_NOTE.format(draws=results.drawing.draws), *(note for one in found for note in remarks(one))],
         words=_WORDS,
         printed=[one.sheet(classes=False) for one in found if one.name != ORDERS],
         lead=[f"`{command.replace('study', f'study {study.name}', 1)}`", ""],
-        failed=dict(sorted(lab.failed.items())),
+        failed=facts.failed,
     )
-    answer.write()
-    return answer

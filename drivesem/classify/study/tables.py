@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
-from drivesem.classify.networks.base import Classifier
 from drivesem.classify.objects.types import CLASSES, SPLITS
 from drivesem.classify.paper import NETWORKS, REMARKS, figures
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, NAMES, STRATEGIES, preset
 from drivesem.classify.study.figures import Answers, verdict
-from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE, Lab
-from drivesem.classify.study.looking import Eyes
-from drivesem.classify.study.retraining import chances, right
+from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE
+from drivesem.classify.study.results import OVERALL, Network, Results
 from drivesem.evaluation.resampling import Interval
-from drivesem.questions.realism.measures import METRICS, missing
+from drivesem.questions.realism.measures import METRICS
 from drivesem.questions.worth.measures import (
     MEMBERSHIPS,
-    Floats,
-    Points,
     Setting,
-    classified,
     gain_of,
     realism,
     worth_of,
 )
-from drivesem.questions.worth.runs import PREFERRED
 from drivesem.report.tables import Sheet
 
 Row = dict[str, Any]
@@ -107,10 +100,10 @@ def _bounded(name: str, one: Interval) -> Row:
     return {key: None if value is None else round(value, 5) for key, value in found.items()}
 
 
-def tables_of(lab: Lab) -> list[Table]:
+def tables_of(lab: Results) -> list[Table]:
     """All that are wanted, and what they say of orders."""
-    found = [_BUILDERS[name](lab) for name in lab.tables]
-    orders = [row for name in lab.tables for row in _ORDERS.get(name, lambda lab: [])(lab)]
+    found = [_BUILDERS[name](lab) for name in lab.facts.tables]
+    orders = [row for name in lab.facts.tables for row in _ORDERS.get(name, lambda lab: [])(lab)]
     if orders:
         held, turned = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
         note = (
@@ -126,7 +119,7 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 5)
 
 
-def _overall(lab: Lab, answers: Answers) -> Row:
+def _overall(lab: Results, answers: Answers) -> Row:
     found = {"pictures": len(answers.right), **_bounded("overall", answers.overall(lab.drawing))}
     if lab.classes == CLASSES:
         sizes = [counts[0] for counts in figures()["sizes"].values()]
@@ -134,7 +127,7 @@ def _overall(lab: Lab, answers: Answers) -> Row:
     return found
 
 
-def _with_classes(lab: Lab, answers: Answers) -> Row:
+def _with_classes(lab: Results, answers: Answers) -> Row:
     own = zip(lab.classes, answers.by_class(len(lab.classes)), strict=True)
     return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
 
@@ -156,28 +149,21 @@ def _by_class(values: Sequence[float]) -> Row:
     return dict(zip((*CLASSES, "overall"), values, strict=False))
 
 
-def _attacked(lab: Lab, eyes: Eyes, strategy: str) -> Answers:
-    """What a network made of the test pictures, under a strategy or as they are."""
-    if strategy == BENIGN:
-        return lab.answers("test", eyes, lab.strategies[0], lab.done, before=True)
-    return lab.answers("test", eyes, strategy, lab.done)
-
-
-def _degradation(lab: Lab) -> Table:
+def _degradation(lab: Results) -> Table:
     rows = []
-    for eyes, strategy in product(lab.eyes, (BENIGN, *STRATEGIES)):
-        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, _attacked(lab, eyes, strategy))}
-        rows.append(row | {"certain": None if strategy == BENIGN else lab.certain(eyes, strategy)})
+    for eyes, strategy in product(lab.networks, (BENIGN, *STRATEGIES)):
+        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, lab.attacked(eyes, strategy))}
+        rows.append(row | {"certain": None if strategy == BENIGN else lab.certain_of(eyes, strategy)})
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
     columns = ("network", "strategy", *lab.classes, "overall", "at_paper_sizes", "certain")
     return Table("degradation", "Accuracy by class and strategy, %", columns, rows, reference)
 
 
-def _moved(lab: Lab, eyes: Eyes, strategy: str, params: str) -> Answers:
-    return lab.answers("test" if params == _BOTH else params, eyes, strategy, lab.done)
+def _moved(lab: Results, eyes: Network, strategy: str, params: str) -> Answers:
+    return lab.attacked(eyes, strategy, "test" if params == _BOTH else params)
 
 
-def _parameters(lab: Lab) -> Table:
+def _parameters(lab: Results) -> Table:
     moved = (*SINGLE[:3], _BOTH, SINGLE[3])
     rows = [
         {"network": eyes.name, "strategy": one, "params": what, **_overall(lab, _moved(lab, eyes, one, what))}
@@ -193,13 +179,13 @@ def _parameters(lab: Lab) -> Table:
     return Table("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,))
 
 
-def _hyperparameters(lab: Lab) -> Table:
+def _hyperparameters(lab: Results) -> Table:
     rows, reference = [], []
     for network, strategy in product(NETWORKS, GRADIENT):
         settings = {"strategy": strategy, "settings": NETWORKS[network]}
         settings |= {key: preset(network, strategy).get(key) for key in _SETTINGS}
         for eyes in lab.deep:
-            answers = lab.answers("test" if network == eyes.theirs else network, eyes, strategy, lab.done)
+            answers = lab.attacked(eyes, strategy, "test" if network == eyes.theirs else network)
             rows.append({"network": eyes.name, **settings, **_overall(lab, answers)})
         value = figures()["degradation"][network][strategy][-1]
         reference.append({"network": NETWORKS[network], **settings, "overall": value})
@@ -207,11 +193,11 @@ def _hyperparameters(lab: Lab) -> Table:
     return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference)
 
 
-_Tried = Callable[[Lab, Eyes, str], Mapping[str, Answers]]
+_Tried = Callable[[Results, Network, str], Mapping[str, Answers]]
 """A network that was trained so, on each of TESTS."""
 
 
-def _on_tests(lab: Lab, network: str, train: str, found: Mapping[str, Answers]) -> Row:
+def _on_tests(lab: Results, network: str, train: str, found: Mapping[str, Answers]) -> Row:
     row: Row = {"network": network, "trained_on": train}
     for test, answers in found.items():
         row |= _bounded(test, answers.overall(lab.drawing))
@@ -222,21 +208,17 @@ def _paper_on_tests(table: str) -> list[Row]:
     return [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
 
 
-def _known(lab: Lab, eyes: Eyes, trained: str) -> dict[str, Answers]:
+def _known(lab: Results, eyes: Network, trained: str) -> dict[str, Answers]:
     """A network, as it was or retrained, on the pictures that were made against it as it was."""
-    network, labels = lab.taught[eyes.name, trained], lab.labels(lab.done)
-    return {test: lab.judged(right(network, lab.features(eyes, test, eyes), labels), lab.done) for test in TESTS}
+    return {test: lab.known(eyes, trained, test) for test in TESTS}
 
 
-def _fresh(lab: Lab, eyes: Eyes, trained: str) -> dict[str, Answers]:
+def _fresh(lab: Results, eyes: Network, trained: str) -> dict[str, Answers]:
     """A network on few pictures that are made against itself."""
-    few = [one for one in lab.few if one.identifier not in lab.failed]
-    kind = "test" if trained == BENIGN else f"against {trained}"
-    found = {BENIGN: lab.answers(kind, eyes, GRADIENT[0], few, before=True)}
-    return found | {test: lab.answers(kind, eyes, test, few) for test in GRADIENT}
+    return {test: lab.fresh(eyes, trained, test) for test in TESTS}
 
 
-def _learners(lab: Lab, table: str, title: str, trained: Sequence[str], tried: _Tried) -> Table:
+def _learners(lab: Results, table: str, title: str, trained: Sequence[str], tried: _Tried) -> Table:
     rows = [
         _on_tests(lab, eyes.name, one, tried(lab, eyes, one))
         for eyes, one in product(lab.deep, (BENIGN, *trained))
@@ -244,39 +226,31 @@ def _learners(lab: Lab, table: str, title: str, trained: Sequence[str], tried: _
     return Table(table, title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests(table))
 
 
-def _retraining(lab: Lab) -> Table:
+def _retraining(lab: Results) -> Table:
     title = "Retrained networks on pictures made against the benign one, %"
     return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), _known)
 
 
-def _robustness(lab: Lab) -> Table:
+def _robustness(lab: Results) -> Table:
     return _learners(
         lab, "robustness", "Retrained networks on pictures made against themselves, %", GRADIENT, _fresh
     )
 
 
-def _points(lab: Lab, network: Classifier, features: Tensor, rho: Floats) -> Points:
-    """Test pictures by their features; what is drawn together are an object's."""
-    answers = lab.judged([True] * len(features), lab.done)
-    found = classified(chances(network, features).numpy(), answers.label, rho)
-    return replace(found, unit=answers.unit)
-
-
-def _worth(lab: Lab) -> Table:
+def _worth(lab: Results) -> Table:
     rows: list[Row] = []
-    distance = next(name for name in PREFERRED if missing(name, None) is None)
-    for eyes in lab.eyes:
-        far = {one: lab.apart(eyes, one).pairs[distance] for one in STRATEGIES}
+    distance = lab.facts.distance
+    for eyes in lab.networks:
+        far = {one: lab.far(eyes, one, distance) for one in STRATEGIES}
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
-            rho = np.ones(len(lab.done)) if strategy == BENIGN else realism(far[strategy], largest)
-            features = lab.features(eyes, strategy, eyes)
+            rho = np.ones(len(lab.labels)) if strategy == BENIGN else realism(far[strategy], largest)
             setting = Setting(kind, weighted, draws=lab.drawing.draws, seed=lab.drawing.seed)
             row: Row = {"network": eyes.name, "strategy": strategy, "membership": kind, "weighted": weighted}
-            before = _points(lab, eyes.network, features, rho)
+            before = lab.points(eyes, strategy, rho)
             row |= _bounded("worth", worth_of(before, setting))
-            if strategy in GRADIENT and (eyes.name, strategy) in lab.taught:
-                after = _points(lab, lab.taught[eyes.name, strategy], features, rho)
+            if lab.taught(eyes, strategy):
+                after = lab.points(eyes, strategy, rho, trained=strategy)
                 row |= _bounded("gain", gain_of(before, after, setting))
             rows.append(row)
     reference = [
@@ -290,23 +264,18 @@ def _worth(lab: Lab) -> Table:
     return Table("worth", "Information worth", columns, rows, reference, (note,))
 
 
-def _realism(lab: Lab) -> Table:
-    labels, rows = np.array(lab.labels(lab.done)), []
-    for eyes, strategy in product(lab.eyes, STRATEGIES):
-        far, counted = lab.apart(eyes, strategy), _attacked(lab, eyes, BENIGN).right
-        for metric in lab.measures:
-            name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
-            kept = {one: counted & (labels == place) for place, one in enumerate(lab.classes)}
-            values = {one: _rounded(far.mean(metric, which)) for one, which in kept.items()}
-            rows.append(
-                {"network": eyes.name, "strategy": strategy, "metric": name, **values}
-                | {"overall": _rounded(far.mean(metric, counted))}
-            )
+def _realism(lab: Results) -> Table:
+    rows = []
+    for eyes, strategy, metric in product(lab.networks, STRATEGIES, lab.facts.measures):
+        name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
+        row: Row = {"network": eyes.name, "strategy": strategy, "metric": name}
+        kinds = (*lab.classes, OVERALL)
+        rows.append(row | {kind: _rounded(lab.mean(eyes, strategy, metric, kind)) for kind in kinds})
     reference = [
         row | {"metric": row["metric"].upper(), **_by_class(values)}
         for row, values in _paper("realism", "metric", "strategy")
     ]
-    absent = [METRICS[name].name for name in METRICS if name not in lab.measures]
+    absent = [METRICS[name].name for name in METRICS if name not in lab.facts.measures]
     note = (
         "Pictures that were right before, and what became of them. A Frechet distance of few pictures ranks, and "
         "does not compare with the paper's. "
@@ -316,13 +285,12 @@ def _realism(lab: Lab) -> Table:
     return Table("realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True)
 
 
-def _transfer(lab: Lab) -> Table:
-    labels, rows = lab.labels(lab.done), []
-    for source, target in product(lab.eyes, lab.eyes):
+def _transfer(lab: Results) -> Table:
+    rows = []
+    for source, target in product(lab.networks, lab.networks):
         for strategy in (BENIGN, *GRADIENT) if source is not target else ():
-            said = right(target.network, lab.features(source, strategy, target), labels)
             row = {"source": source.name, "target": target.name, "strategy": strategy}
-            rows.append(row | _with_classes(lab, lab.judged(said, lab.done)))
+            rows.append(row | _with_classes(lab, lab.crossed(source, strategy, target)))
     other = dict(zip(NETWORKS.values(), reversed(NETWORKS.values()), strict=True))
     reference = [
         row | {"source": row["network"], "target": other[row["network"]], **_by_class(values)}
@@ -333,26 +301,23 @@ def _transfer(lab: Lab) -> Table:
     return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
 
 
-def _pixels(lab: Lab) -> Table:
+def _pixels(lab: Results) -> Table:
     rows: list[Row] = []
-    for eyes in lab.deep if pixels.available() else ():
-        found = lab.pixels(eyes)
-        for attack in pixels.ATTACKS:
-            answers = lab.judged(found[attack].tolist(), lab.done)
-            far = {"distance": round(float(found[f"{attack} apart"].mean()), 5)}
-            rows.append({"network": eyes.name, "strategy": attack, **_overall(lab, answers), **far})
+    for eyes, attack in product(lab.deep if lab.facts.toolbox else (), pixels.ATTACKS):
+        answers, apart = lab.on_pixels(eyes, attack)
+        far = {"distance": round(float(apart.mean()), 5)}
+        rows.append({"network": eyes.name, "strategy": attack, **_overall(lab, answers), **far})
     note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
     notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
     return Table("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
 
 
-def _sizes(lab: Lab) -> Table:
-    names = {split: [one.partition("/")[0] for one in lab.objects.names(split)] for split in SPLITS}
-    used = {split: [one.name.partition("/")[0] for one in getattr(lab, split)] for split in ("test", "train")}
+def _sizes(lab: Results) -> Table:
+    objects, used = lab.facts.objects, lab.facts.used
     rows = [
-        {"class": one, **{f"{split} objects": names[split].count(one) for split in SPLITS}}
-        | {f"{split} pictures": used[split].count(one) for split in used}
+        {"class": one, **{f"{split} objects": objects[split][one] for split in SPLITS}}
+        | {f"{split} pictures": used[split][one] for split in used}
         for one in lab.classes
     ]
     reference = [
@@ -365,7 +330,7 @@ def _sizes(lab: Lab) -> Table:
 
 
 def _order(
-    lab: Lab, table: str, eyes: Eyes, theirs: Mapping[str, float], ours: Mapping[str, Answers]
+    lab: Results, table: str, eyes: Network, theirs: Mapping[str, float], ours: Mapping[str, Answers]
 ) -> Iterator[Row]:
     """Each two of the paper's figures that differ, and whether ours differ alike, paired over pictures."""
     for first, second in combinations(theirs, 2):
@@ -376,15 +341,15 @@ def _order(
             yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": verdict(apart, one)}
 
 
-def _strategies_in_order(lab: Lab) -> list[Row]:
+def _strategies_in_order(lab: Results) -> list[Row]:
     rows: list[Row] = []
-    for eyes in lab.eyes:
+    for eyes in lab.networks:
         theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
-        rows += _order(lab, "degradation", eyes, theirs, {one: _attacked(lab, eyes, one) for one in STRATEGIES})
+        rows += _order(lab, "degradation", eyes, theirs, {one: lab.attacked(eyes, one) for one in STRATEGIES})
     return rows
 
 
-def _parameters_in_order(lab: Lab) -> list[Row]:
+def _parameters_in_order(lab: Results) -> list[Row]:
     rows: list[Row] = []
     for eyes, strategy in product(lab.deep, GRADIENT):
         theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
@@ -393,7 +358,7 @@ def _parameters_in_order(lab: Lab) -> list[Row]:
     return rows
 
 
-def _learners_in_order(lab: Lab, table: str, tried: _Tried) -> list[Row]:
+def _learners_in_order(lab: Results, table: str, tried: _Tried) -> list[Row]:
     """For each test: is a retrained network better than the benign one?"""
     rows: list[Row] = []
     for eyes in lab.deep:
@@ -406,7 +371,7 @@ def _learners_in_order(lab: Lab, table: str, tried: _Tried) -> list[Row]:
     return rows
 
 
-_BUILDERS: dict[str, Callable[[Lab], Table]] = {
+_BUILDERS: dict[str, Callable[[Results], Table]] = {
     "degradation": _degradation,
     "worth": _worth,
     "realism": _realism,
@@ -418,7 +383,7 @@ _BUILDERS: dict[str, Callable[[Lab], Table]] = {
     "pixels": _pixels,
     "sizes": _sizes,
 }
-_ORDERS: dict[str, Callable[[Lab], list[Row]]] = {
+_ORDERS: dict[str, Callable[[Results], list[Row]]] = {
     "degradation": _strategies_in_order,
     "parameters": _parameters_in_order,
     "retraining": lambda lab: _learners_in_order(lab, "retraining", _known),

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_transfer(two_networks, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_all_tables(two_networks, tmp_path, capsys):
+def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3")
     code, data, _ = study(capsys, *words, "--train-pictures", "12", "--json")
@@ -156,6 +157,17 @@ def test_all_tables(two_networks, tmp_path, capsys):
     code, again, _ = study(capsys, *words, "--train-pictures", "12", "--json")
     assert (code, again) == (0, data)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("result.json")} == before
+    # and what is kept tells the same without objects, networks or run
+    kept = shutil.copytree(out / "kept", tmp_path / "kept")
+    with monkeypatch.context() as patch:
+        patch.setattr(lab, "open_objects", None)
+        assert main(["study", "classification", "--from", str(kept), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told | {"out": str(out)} == data
+        assert main(["study", "classification", "--from", str(kept), "--out", str(tmp_path / "again")]) == 0
+    for name in ("study.md", "worth.csv", "orders.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+    capsys.readouterr()
     code, _, said = study(capsys, *words, "--train-pictures", "24")
     assert code == 2
     assert "other values of train_pictures" in said

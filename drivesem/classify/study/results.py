@@ -1,0 +1,246 @@
+"""What the study's tables are computed from: answers, chances and distances, of a study at work or of one that was
+kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from drivesem.classify.objects.types import SPLITS
+from drivesem.classify.study import pixels
+from drivesem.classify.study.arms import GRADIENT
+from drivesem.classify.study.figures import Answers, Drawing
+from drivesem.classify.study.lab import BENIGN, Lab
+from drivesem.classify.study.looking import Eyes
+from drivesem.classify.study.retraining import chances, right
+from drivesem.evaluation.resampling import DRAWS
+from drivesem.questions.realism.measures import METRICS, missing, psnr_db
+from drivesem.questions.worth.measures import Floats, Points, classified
+from drivesem.questions.worth.runs import PREFERRED
+from drivesem.settings.commands import Study
+from scene_ir.errors import FormatError
+
+Key = tuple[str, ...]
+OVERALL = "overall"
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """name: for files and people; theirs: the paper's network that it stands beside; deep: whether it is in the
+    tables that take long.
+    """
+
+    name: str
+    theirs: str
+    deep: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What is known before any table. study: its settings; measures: of realism, distance: what its weight is
+    counted from; toolbox: whether attacks on pixels could be made; pictures: those to test on that could be used,
+    by the object's name; few: places of those on which retrained networks were attacked; counts: of pictures, for
+    the JSON; objects, used: by split and class, how many objects there are and how many pictures are of them;
+    failed: pictures that could not be used, and why.
+    """
+
+    study: Study
+    classes: tuple[str, ...]
+    networks: tuple[Network, ...]
+    tables: tuple[str, ...]
+    measures: tuple[str, ...]
+    distance: str
+    toolbox: bool
+    pictures: tuple[str, ...]
+    few: tuple[int, ...]
+    counts: dict[str, int]
+    objects: dict[str, dict[str, int]]
+    used: dict[str, dict[str, int]]
+    failed: dict[str, str]
+
+    @classmethod
+    def of(cls, study: Study, lab: Lab) -> Facts:
+        """Of a study whose attacks and networks are done. study: its settings, as they were typed."""
+        deep = [eyes.name for eyes in lab.deep]
+
+        def by_class(names: list[str]) -> dict[str, int]:
+            kinds = [name.partition("/")[0] for name in names]
+            return {one: kinds.count(one) for one in lab.classes}
+
+        return cls(
+            study=study,
+            classes=lab.classes,
+            networks=tuple(Network(eyes.name, eyes.theirs, eyes.name in deep) for eyes in lab.eyes),
+            tables=lab.tables,
+            measures=tuple(lab.measures) if lab.wants("realism") else (),
+            distance=next(name for name in PREFERRED if missing(name, None) is None),
+            toolbox=pixels.available(),
+            pictures=tuple(one.name for one in lab.done),
+            few=tuple(i for i, one in enumerate(lab.done) if one in lab.few and one.identifier not in lab.failed),
+            counts={"test": len(lab.done), "train": len(lab.train), "retrained": len(lab.few)},
+            objects={split: by_class(list(lab.objects.names(split))) for split in SPLITS},
+            used={split: by_class([one.name for one in getattr(lab, split)]) for split in ("test", "train")},
+            failed=dict(sorted(lab.failed.items())),
+        )
+
+
+@dataclass
+class Results:
+    """What tables ask for. lab: a study at work, of which each answer is noted; None of one that was kept, which
+    has those that were noted. right (M,) bool: of pictures, by what is asked; chances (N, C), distances (N,): of
+    all pictures; sets: Frechet distances; certain: how many failures.
+    """
+
+    facts: Facts
+    lab: Lab | None = None
+    right: dict[Key, np.ndarray] = field(default_factory=dict[Key, np.ndarray])
+    chances: dict[Key, Floats] = field(default_factory=dict[Key, Floats])
+    distances: dict[Key, Floats] = field(default_factory=dict[Key, Floats])
+    sets: dict[Key, float | None] = field(default_factory=dict[Key, "float | None"])
+    certain: dict[Key, int | None] = field(default_factory=dict[Key, "int | None"])
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return self.facts.classes
+
+    @property
+    def networks(self) -> tuple[Network, ...]:
+        return self.facts.networks
+
+    @property
+    def deep(self) -> tuple[Network, ...]:
+        return tuple(one for one in self.facts.networks if one.deep)
+
+    @cached_property
+    def drawing(self) -> Drawing:
+        study = self.facts.study
+        return Drawing(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
+
+    @cached_property
+    def labels(self) -> np.ndarray:
+        """Of all pictures (N,)."""
+        kinds = [name.partition("/")[0] for name in self.facts.pictures]
+        return np.array([self.classes.index(kind) for kind in kinds], np.int64)
+
+    @cached_property
+    def units(self) -> np.ndarray:
+        """Which object each picture (N,) is of."""
+        places = {name: place for place, name in enumerate(sorted({*self.facts.pictures}))}
+        return np.array([places[name] for name in self.facts.pictures], np.int64)
+
+    def attacked(self, network: Network, strategy: str, kind: str = "test") -> Answers:
+        """What a network makes of the pictures, under a strategy or as they are. kind: of the lab's arms."""
+        benign = strategy == BENIGN
+
+        def compute(lab: Lab) -> np.ndarray:
+            by = lab.strategies[0] if benign else strategy
+            return lab.answers(kind, _eyes(lab, network), by, lab.done, before=benign).right
+
+        return self._answers(("attacked", network.name, strategy, kind), compute)
+
+    def known(self, network: Network, trained: str, test: str) -> Answers:
+        """A network, as it was or retrained, on the pictures that were made against it as it was."""
+
+        def compute(lab: Lab) -> np.ndarray:
+            eyes = _eyes(lab, network)
+            features = lab.features(eyes, test, eyes)
+            return np.array(right(lab.taught[network.name, trained], features, self.labels.tolist()))
+
+        return self._answers(("known", network.name, test, trained), compute)
+
+    def fresh(self, network: Network, trained: str, test: str) -> Answers:
+        """A network on few pictures that are made against itself."""
+
+        def compute(lab: Lab) -> np.ndarray:
+            kind = "test" if trained == BENIGN else f"against {trained}"
+            few = [lab.done[place] for place in self.facts.few]
+            by = GRADIENT[0] if test == BENIGN else test
+            return lab.answers(kind, _eyes(lab, network), by, few, before=test == BENIGN).right
+
+        return self._answers(("fresh", network.name, test, trained), compute, np.array(self.facts.few, np.int64))
+
+    def crossed(self, source: Network, strategy: str, target: Network) -> Answers:
+        """Another network on the pictures that were made against one."""
+
+        def compute(lab: Lab) -> np.ndarray:
+            eyes = _eyes(lab, target)
+            features = lab.features(_eyes(lab, source), strategy, eyes)
+            return np.array(right(eyes.network, features, self.labels.tolist()))
+
+        return self._answers(("crossed", source.name, strategy, target.name), compute)
+
+    def on_pixels(self, network: Network, attack: str) -> tuple[Answers, Floats]:
+        """After an attack on pixels, and how far (N,) it went."""
+        key = ("pixels", network.name, attack, "")
+        answers = self._answers(key, lambda lab: lab.pixels(_eyes(lab, network))[attack])
+        found = self._noted(
+            self.distances, key, lambda lab: lab.pixels(_eyes(lab, network))[f"{attack} apart"].astype(np.float64)
+        )
+        return answers, found
+
+    def taught(self, network: Network, trained: str) -> bool:
+        """Whether it was retrained so."""
+        wanted = any(name in self.facts.tables for name in ("retraining", "robustness", "worth"))
+        return wanted and network.deep and trained in GRADIENT
+
+    def points(self, network: Network, strategy: str, rho: Floats, trained: str = "") -> Points:
+        """Pictures before a network, as it was or retrained; what is drawn together are an object's."""
+
+        def compute(lab: Lab) -> Floats:
+            eyes = _eyes(lab, network)
+            judge = lab.taught[network.name, trained] if trained else eyes.network
+            return chances(judge, lab.features(eyes, strategy, eyes)).numpy()
+
+        found = self._noted(self.chances, (network.name, strategy, trained), compute)
+        return replace(classified(found, self.labels, rho), unit=self.units)
+
+    def far(self, network: Network, strategy: str, metric: str) -> Floats:
+        """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors."""
+        key = ("counterexamples", network.name, strategy, metric)
+        return self._noted(self.distances, key, lambda lab: lab.apart(_eyes(lab, network), strategy).pairs[metric])
+
+    def mean(self, network: Network, strategy: str, metric: str, kind: str) -> float | None:
+        """The mean distance, or the sets' one, of what was right before. kind: a class, or OVERALL."""
+        kept = self.attacked(network, BENIGN).right
+        if kind != OVERALL:
+            kept = kept & (self.labels == self.classes.index(kind))
+        if not METRICS[metric].pairwise:
+            key = (network.name, strategy, metric, kind)
+            return self._noted(
+                self.sets, key, lambda lab: lab.apart(_eyes(lab, network), strategy).mean(metric, kept)
+            )
+        if not kept.any():
+            return None
+        mean = float(self.far(network, strategy, metric)[kept].mean())
+        return psnr_db(mean) if METRICS[metric].squared else mean
+
+    def certain_of(self, network: Network, strategy: str) -> int | None:
+        """How many failures are certain, where that was asked."""
+        return self._noted(
+            self.certain, (network.name, strategy), lambda lab: lab.certain(_eyes(lab, network), strategy)
+        )
+
+    def _answers(
+        self, key: Key, compute: Callable[[Lab], np.ndarray], places: np.ndarray | None = None
+    ) -> Answers:
+        found = self._noted(self.right, key, compute).astype(np.bool_)
+        if places is None:
+            return Answers(found, self.labels, self.units)
+        return Answers(found, self.labels[places], self.units[places])
+
+    def _noted(self, store: dict[Key, _T], key: Key, compute: Callable[[Lab], _T]) -> _T:
+        if key not in store:
+            if self.lab is None:
+                raise FormatError("what was kept", f"figures of {', '.join(filter(None, key))}", "none")
+            store[key] = compute(self.lab)
+        return store[key]
+
+
+def _eyes(lab: Lab, network: Network) -> Eyes:
+    return next(eyes for eyes in lab.eyes if eyes.name == network.name)
