@@ -103,7 +103,7 @@ def test_labels_come_again_from_what_is_kept(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["classification"], "--kept: expected any study but this, found study classification"),
+        (["classification"], "study.json: settings: expected a field of _Head, found an unknown one"),
         (["single"], "settings.name: expected single, found multi"),
         (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
     ],
