@@ -21,6 +21,7 @@ from drivesem.questions.realism.measures import METRICS
 from drivesem.questions.study.kept_rows import (
     STUDY,
     check_count,
+    check_name,
     check_settings,
     read_rows,
     require,
@@ -136,6 +137,7 @@ def keep_results(folder: Path, results: Results) -> None:
 
 def load_results(folder: Path) -> Results:
     """What `keep_results` wrote. Raises FormatError naming file, and row or field."""
+    check_name(folder / STUDY, "classification")
     head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
     facts = head.facts
     _check_facts(facts, f"{folder / STUDY}: facts")

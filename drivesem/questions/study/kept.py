@@ -25,6 +25,7 @@ from drivesem.questions.study.kept_rows import (
     Marked,
     check_count,
     check_marks,
+    check_name,
     check_score,
     check_settings,
     marked,
@@ -242,6 +243,7 @@ def _write_labels(folder: Path, counts: StudyCounts) -> None:
 
 def load_kept(folder: Path, name: str) -> Kept:
     """A study of that name that `keep` wrote. Raises FormatError naming file, and row or field."""
+    check_name(folder / STUDY, name)
     head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
     _check_head(head, name, str(folder / STUDY))
     frames = _frames(folder / _FRAMES, head)

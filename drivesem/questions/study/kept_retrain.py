@@ -19,6 +19,7 @@ from drivesem.questions.study.kept_rows import (
     Marked,
     check_count,
     check_marks,
+    check_name,
     check_score,
     check_settings,
     marked,
@@ -130,6 +131,7 @@ def keep_retrain(folder: Path, study: Study, counts: RetrainCounts) -> None:
 def load_retrain(folder: Path) -> tuple[Study, RetrainCounts]:
     """What `keep_retrain` wrote. Raises FormatError naming file, and row or field."""
     where = str(folder / STUDY)
+    check_name(folder / STUDY, "retrain")
     head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
     names = _check_head(head, where)
     known = read_pairs(folder / _KNOWN)

@@ -45,6 +45,14 @@ def settings_of(study: Study) -> dict[str, Any]:
     return {name: value for name, value in asdict(study).items() if name not in NOT_TOLD}
 
 
+def check_name(path: Path, name: str) -> None:
+    """Raises FormatError where a file STUDY is of a study of another name, which has other fields."""
+    data = files.read_json(path)
+    for key in ("settings", "name"):
+        data = data.get(key) if isinstance(data, dict) else None
+    require(data is None or data == name, f"{path}: settings.name", name, data)
+
+
 def check_settings(study: Study, name: str, where: str) -> None:
     """Raises FormatError unless these are the settings of a study of that name."""
     require(study.name == name, f"{where}: settings.name", name, study.name)

@@ -18,6 +18,7 @@ from drivesem.questions.study.kept_rows import (
     Marked,
     check_count,
     check_marks,
+    check_name,
     check_score,
     check_settings,
     marked,
@@ -308,6 +309,7 @@ def keep_transfer(folder: Path, study: Study, counts: TransferCounts) -> None:
 def load_transfer(folder: Path) -> tuple[Study, TransferCounts]:
     """What `keep_transfer` wrote. Raises FormatError naming file, and row or field."""
     where = str(folder / STUDY)
+    check_name(folder / STUDY, "transfer")
     head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
     check_settings(head.settings, "transfer", where)
     check_attacks(f"{where}: attacks", head.attacks)

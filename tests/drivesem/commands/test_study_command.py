@@ -103,7 +103,7 @@ def test_labels_come_again_from_what_is_kept(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["classification"], "study.json: settings: expected a field of _Head, found an unknown one"),
+        (["classification"], "settings.name: expected classification, found multi"),
         (["single"], "settings.name: expected single, found multi"),
         (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
     ],
