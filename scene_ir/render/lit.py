@@ -285,8 +285,9 @@ class _Blend:
         strips.append(_Strip(part, coverage.index_select(0, part) - 1, seen.sight[part], None))
         # What meets nothing goes on with the colour from which its outline is reached, rather across it.
         order = torch.arange(len(outer.there)) + len(outer.there) * ~rim.across
-        first = torch.full_like(seen.sight, 2 * len(order)).scatter_reduce(0, outer.there, order, "amin")
-        source = (first[outer.there] == order) & (coverage.detach()[outer.there] > 0)
+        ends, which = torch.unique(outer.there, return_inverse=True)
+        first = order.new_full((len(ends),), 2 * len(order)).scatter_reduce(0, which, order, "amin")
+        source = (first[which] == order) & (coverage.detach()[outer.there] > 0)
         look = outer.there[source]
         strips.append(_Strip(look, coverage.index_select(0, look), seen.sight[outer.here[source]], None))
         way, share, end = rim.inner.way, rim.inner.share, rim.end
