@@ -286,11 +286,16 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     default the benign frames that judge them."""
     arms: str | None = None
     """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
-    paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
+    worst, paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
     states: NotNegative = 16
     """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
     consistency: Annotated[float, POSITIVE] = 1.0
-    """Retrain: weight of the term of consistent, which compares an object's margins in both of its pictures."""
+    """Retrain: weight of the further term of consistent, which compares an object's margins in both of its
+    pictures, and of worst, which asks for it in the worst of four."""
+    fraction: Share = 0.25
+    """Retrain: share of the extra pictures among all that is shown; not of the paper's protocol."""
+    near: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.5
+    """Retrain: share of the states around a failure that lie near it."""
     reattack: bool = True
     """Retrain: attack held-out frames against each retrained detector too, not against the detector as it was
     alone."""

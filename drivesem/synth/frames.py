@@ -108,10 +108,10 @@ class Truth:
 class SynthFrame:
     """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels:
     KITTI's classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky, semantic (H, W)
-    uint8, a `Semantic`, and instance (H, W) uint16, 0 or track + 1: of each pixel's nearest sample; owner (2H,
-    2W): what each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W): of the background
-    where there is one, of each pixel's first sample; environment: codes 0 and exact maps, likewise; manifest: seed
-    and shapes used.
+    uint8, a `Semantic`, and instance (H, W) uint16, 0 or track + 1 of one of `truths`: of each pixel's nearest
+    sample; owner (2H, 2W): what each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W):
+    of the background where there is one, of each pixel's first sample; environment: codes 0 and exact maps,
+    likewise; manifest: seed and shapes used.
     """
 
     image: np.ndarray
@@ -464,7 +464,10 @@ def render_frame(
     empty = None if plain is None else render_without_actors(plain, picture, setting)
     behind = plain or sight
     closest = kernels.nearest(sight.depth)
-    tracks = np.array([0, *(a.track + 1 for a in plan.actors), 0], np.uint16)  # owner -1, the sky, reads the last
+    # Of an actor with no more than a few samples there is no truth, and so no instance. Owner -1, the sky, reads
+    # the last.
+    told = {truth.actor.track for truth in truths}
+    tracks = np.array([0, *(a.track + 1 if a.track in told else 0 for a in plan.actors), 0], np.uint16)
     vehicles = {t.actor.model for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(
         image=picture.image,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Candidates, Detector, Predictor
@@ -39,7 +41,7 @@ class AroundFailures(Sequence[Sample]):
 
     The pool holds `AT_ONCE` states of each failure, made when one is first drawn, and is another one as soon as
     all of it may have been shown: after so many steps. Its states lie in `folder`, and follow from the failure,
-    the seed and their number alone; half of them lie near the failure, as a hole may be small.
+    the seed and their number alone; a share of them, `near`, lies near the failure, as a hole may be small.
     attack, params, detector: of the run; pace: views of all failures a step.
     """
 
@@ -53,10 +55,11 @@ class AroundFailures(Sequence[Sample]):
         classes: Sequence[str],
         pace: float,
         seed: int,
+        near: float = 0.5,
     ) -> None:
         self.failures = failures_in(frames)
         self._attack, self._params, self._detector = attack, params, detector
-        self._folder, self._classes, self._seed = folder, classes, seed
+        self._folder, self._classes, self._seed, self._near = folder, classes, seed, near
         self._turns = pace / (AT_ONCE * max(len(self.failures), 1))
 
     def __len__(self) -> int:
@@ -71,7 +74,16 @@ class AroundFailures(Sequence[Sample]):
 
     def number(self, step: int, generator: np.random.Generator) -> int:
         """Of one of the states in the pool of a step."""
-        return AT_ONCE * int(step * self._turns) + int(generator.integers(AT_ONCE))
+        return self.pool(step)[int(generator.integers(AT_ONCE))]
+
+    def pool(self, step: int) -> range:
+        """Numbers of the states in the pool of a step."""
+        first = AT_ONCE * int(step * self._turns)
+        return range(first, first + AT_ONCE)
+
+    def near(self, number: int) -> bool:
+        """Whether a state lies near its failure: evenly spread, so that their share is kept all along."""
+        return math.floor((number + 1) * self._near) > math.floor(number * self._near)
 
     def state(self, index: int, number: int) -> tuple[Sample, Targets]:
         """The number-th state around a failure, to train on; and its targets as they are judged, whose first rows
@@ -95,7 +107,7 @@ class AroundFailures(Sequence[Sample]):
         near = Neighbourhood(objective, feasible, theta, target, Nuisances.of("off"), name)
         with files.whole_folder(folder) as part:
             for number in range(AT_ONCE * turn, AT_ONCE * (turn + 1)):
-                at = near.theta(number, 1.0 if number % 2 == 0 else NEAR)
+                at = near.theta(number, NEAR if self.near(number) else 1.0)
                 image, labels, judged = state_at(
                     at, objective.space, objective.compositor, objective.labeller, objective.benign.scene
                 )
@@ -110,13 +122,10 @@ def failures_in(frames: Sequence[AttackedFrame]) -> list[tuple[AttackedFrame, in
     return [(f, one.index) for f in frames for one in certain_losses(f.result) if one.index is not None]
 
 
-class Consistency:
-    """What a detector says of an object is to be the same in the photograph and in a state around a failure: a
-    term of the loss, by margins, on a pair of pictures a step. weight: of the term; t_star: of margins; window_hw:
-    of the part of both pictures that is seen, with the object that fails in its middle.
+class _Beside:
+    """What further terms of the loss share. weight: of the term; t_star: of margins; window_hw: of the part of
+    each picture that is seen, with the object that fails in its middle.
     """
-
-    name = "consistency"
 
     def __init__(
         self, around: AroundFailures, weight: float, t_star: float, seed: int, window_hw: tuple[int, int]
@@ -124,34 +133,10 @@ class Consistency:
         self._around, self._weight, self._t_star, self._seed = around, weight, t_star, seed
         self._window_hw = window_hw
 
-    def images(self, step: int) -> Tensor:
-        """Of the photograph and of the state: (2, 3, h, w)."""
-        index, (sample, state) = self._pair(step)
-        y0, x0, y1, x1 = self._window(index, sample, state)
-        both = [self._around.failures[index][0].image("benign"), sample[0]]
-        parts = [np.array(image[y0:y1, x0:x1]) for image in both]
-        return torch.stack([torch.from_numpy(part).permute(2, 0, 1).float() / 255 for part in parts])
-
-    def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the objects that are judged in both pictures, and lie in the part that is seen."""
-        index, (sample, state) = self._pair(step)
-        y0, x0, y1, x1 = self._window(index, sample, state)
-        frame = self._around.failures[index][0]
-        known = [box for box in frame.result.targets_benign if box.index is not None]
-        still = as_targets(tuple(known), CLASSES)
-        names = [detector.classes.index(n) if n in detector.classes else -1 for n in CLASSES]
-        labels = torch.tensor(names)[still.labels]
-        both = torch.stack([still.boxes_xyxy, state.boxes_xyxy[: len(known)]]) - torch.tensor([x0, y0, x0, y0])
-        inside = (both[..., :2] >= 0).all(-1) & (both[..., 2:] < torch.tensor([x1 - x0, y1 - y0])).all(-1)
-        judged = ~still.ignore & ~state.ignore[: len(known)] & (labels >= 0) & inside.all(0)
-        rows = judged.nonzero()[:, 0]
-        before, after = (detector.candidates(raw.one(i)) for i in (0, 1))
-        return self._weight * apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
-
-    def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
+    def _drawn(self, step: int) -> tuple[int, np.random.Generator]:
+        """The failure of a step, and what draws further."""
         generator = np.random.default_rng([self._seed, 8, step])
-        index = int(generator.integers(len(self._around)))
-        return index, self._around.state(index, self._around.number(step, generator))
+        return int(generator.integers(len(self._around))), generator
 
     def _window(self, index: int, sample: Sample, state: Targets) -> tuple[int, int, int, int]:
         """First row and column of the part, and those after the last."""
@@ -160,6 +145,97 @@ class Consistency:
         side = np.minimum(self._window_hw, size)
         y0, x0 = np.clip(np.round(middle - side / 2), 0, size - side).astype(int).tolist()
         return y0, x0, y0 + int(side[0]), x0 + int(side[1])
+
+
+class Consistency(_Beside):
+    """What a detector says of an object is to be the same in the photograph and in a state around a failure: a
+    term of the loss, by margins, on a pair of pictures a step.
+    """
+
+    name = "consistency"
+
+    def images(self, step: int) -> Tensor:
+        """Of the photograph and of the state: (2, 3, h, w)."""
+        index, (sample, state) = self._pair(step)
+        window = self._window(index, sample, state)
+        return torch.stack(
+            [_part(self._around.failures[index][0].image("benign"), window), _part(sample[0], window)]
+        )
+
+    def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
+        """Of the objects that are judged in both pictures, and lie in the part that is seen."""
+        index, (sample, state) = self._pair(step)
+        window = self._window(index, sample, state)
+        frame = self._around.failures[index][0]
+        known = [box for box in frame.result.targets_benign if box.index is not None]
+        still = as_targets(tuple(known), CLASSES)
+        labels = _labels(detector, still)
+        both = torch.stack([_shifted(still.boxes_xyxy, window), _shifted(state.boxes_xyxy[: len(known)], window)])
+        judged = ~still.ignore & ~state.ignore[: len(known)] & (labels >= 0) & _inside(both, window).all(0)
+        rows = judged.nonzero()[:, 0]
+        before, after = (detector.candidates(raw.one(i)) for i in (0, 1))
+        return self._weight * apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
+
+    def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
+        index, generator = self._drawn(step)
+        return index, self._around.state(index, self._around.number(step, generator))
+
+
+class Worst(_Beside):
+    """An object is to be found where the detector, as it is at that step, is least sure of it: a term of the loss,
+    the logistic loss of its margin in that one of the pool's states around a failure.
+    """
+
+    name = "worst"
+
+    def images(self, step: int) -> Tensor:
+        """Of all states of the pool: (AT_ONCE, 3, h, w)."""
+        index, states = self._states(step)
+        return torch.stack([_part(sample[0], self._window(index, sample, state)) for sample, state in states])
+
+    def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
+        """Of the object that fails, in the states in which it is judged and lies in the part that is seen."""
+        index, states = self._states(step)
+        target = self._around.failures[index][1]
+        margins = []
+        for number, (sample, state) in enumerate(states):
+            window = self._window(index, sample, state)
+            box, label = _shifted(state.boxes_xyxy[[target]], window), _labels(detector, state)[[target]]
+            if bool(state.ignore[target]) or int(label) < 0 or not bool(_inside(box, window)):
+                continue
+            seen = detector.candidates(raw.one(number))
+            margins.append(of_objects(seen, box, label, box, self._t_star, SHARPNESS))
+        return self._weight * least_sure(margins) if margins else torch.zeros(())
+
+    def _states(self, step: int) -> tuple[int, list[tuple[Sample, Targets]]]:
+        index, _ = self._drawn(step)
+        return index, [self._around.state(index, number) for number in self._around.pool(step)]
+
+
+def _part(image: NDArray[np.uint8], window: tuple[int, int, int, int]) -> Tensor:
+    y0, x0, y1, x1 = window
+    return torch.from_numpy(np.array(image[y0:y1, x0:x1])).permute(2, 0, 1).float() / 255
+
+
+def _shifted(boxes_xyxy: Tensor, window: tuple[int, int, int, int]) -> Tensor:
+    y0, x0, _, _ = window
+    return boxes_xyxy - torch.tensor([x0, y0, x0, y0])
+
+
+def _inside(boxes_xyxy: Tensor, window: tuple[int, int, int, int]) -> Tensor:
+    y0, x0, y1, x1 = window
+    return (boxes_xyxy[..., :2] >= 0).all(-1) & (boxes_xyxy[..., 2:] < torch.tensor([x1 - x0, y1 - y0])).all(-1)
+
+
+def _labels(detector: Detector, targets: Targets) -> Tensor:
+    """Of the detector's classes, -1 where it does not know one."""
+    names = [detector.classes.index(n) if n in detector.classes else -1 for n in CLASSES]
+    return torch.tensor(names)[targets.labels]
+
+
+def least_sure(margins: Sequence[Tensor]) -> Tensor:
+    """Logistic loss () of the least of some margins."""
+    return F.softplus(-torch.cat(list(margins)).min())
 
 
 def apart(

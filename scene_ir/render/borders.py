@@ -96,7 +96,7 @@ def borders(
     points, end = clip.detach().to(torch.float64), start + step
     planes = _planes(points, faces)
     leave = Walk.over(points, faces, edges.across, seen, start, end, backend)
-    enter = Walk.over(points, faces, edges.across, seen[::-1], end, start, backend)
+    enter = Walk.over(points, faces, edges.across, (seen[1], seen[0]), end, start, backend)
     # How much nearer the first surface is, as inverse depth, where it ends and where the second one begins.
     at_leave, at_enter = (
         ((planes[leave.face_at(share)] - planes[enter.face_at(1 - share)]) * (start + share[:, None] * step)).sum(

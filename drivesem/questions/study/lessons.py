@@ -26,7 +26,7 @@ from drivesem.settings.blocks import DEMO
 from drivesem.settings.commands import DEFAULT_COMBO, Retrain, Study
 from drivesem.settings.errors import UsageError
 from drivesem.settings.values import size_hw
-from drivesem.training.around import AroundFailures, Consistency, failures_in
+from drivesem.training.around import AroundFailures, Consistency, Worst, failures_in
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, RedrawnSamples, Stage
 from drivesem.training.frames import FrameStore
 from drivesem.training.mixture import Mixture
@@ -48,12 +48,15 @@ TAUGHT: dict[str, tuple[str, Pictures]] = {
     "ours": ("retrained, ours", "counterexample"),
     "certain": ("retrained on certain failures and around them", "around"),
     "consistent": ("the same, consistently", "around"),
+    "worst": ("the same, and the worst of four", "around"),
     "paper": ("retrained, paper's protocol", "counterexample"),
 }
 """Arms by name: what they are called, and what is shown beside benign frames."""
 _BY_DEFAULT = ("re-rendered", "ours", "paper")
-REPEATED = ("benign", "random", "certain", "consistent")
+REPEATED = ("benign", "random", "certain", "consistent", "worst")
 """Arms that are trained by several seeds."""
+_TERMS = {"consistent": Consistency, "worst": Worst}
+"""Further terms of the loss, by arm."""
 _ATTACKED, _QUICK_ATTACKED = 400, 4
 """Frames whose counterexamples are trained on."""
 _HELD_OUT_SHARE = 0.25
@@ -83,7 +86,7 @@ _QUICK = {"steps": 40, "window": "640x224", "warmup": 10}
 class Lesson:
     """One retraining. folder: short name; pictures: what is shown among benign frames; reference: the paper's mAP
     on counterexamples and on benign frames, of what the paper has, too; arm: of TAUGHT, whose seeds are told
-    together; consistency: weight of that term, 0 for none.
+    together; weight: of the arm's further term, 0 for none.
     """
 
     name: str
@@ -92,7 +95,7 @@ class Lesson:
     config: Retrain
     reference: tuple[float, float] | None
     arm: str
-    consistency: float = 0.0
+    weight: float = 0.0
 
     @property
     def run(self) -> str:
@@ -152,13 +155,14 @@ def arms_asked(study: Study) -> tuple[str, ...]:
 
 
 def lessons_of(study: Study) -> list[Lesson]:
-    """What is trained. All but the paper's protocol differ in their pictures alone, and in consistency's term."""
+    """What is trained. All but the paper's protocol differ in their pictures alone, and in a further term."""
     ours = replace(
         OURS,
         seed=study.seed,
         device=study.device,
         mix=study.mix,
         label_mode=study.label_mode,
+        fraction=study.fraction,
         precision=study.precision,
         # another's weights may have been trained by the published loss: it is what they know
         loss="quality" if study.detector in SHIPPED else "published",
@@ -172,7 +176,7 @@ def lessons_of(study: Study) -> list[Lesson]:
     for arm in arms_asked(study):
         title, pictures = TAUGHT[arm]
         config = paper if arm == "paper" else ours
-        weight = study.consistency if arm == "consistent" else 0.0
+        weight = study.consistency if arm in _TERMS else 0.0
         for turn in range(study.seeds or 1 if arm in REPEATED else 1):
             name, folder = (f"{title}, seed {study.seed + turn}", f"{arm}-seed{turn}") if turn else (title, arm)
             own = replace(config, seed=study.seed + turn)
@@ -321,7 +325,8 @@ def benign_samples(
 @dataclass(frozen=True, slots=True)
 class Taken:
     """Where the pictures of lessons come from. frames: of the attack; random: the same of its placebo, where there
-    is one; worker: that attacked; second: second renderers; folder: keeps what is drawn.
+    is one; worker: that attacked; second: second renderers; folder: keeps what is drawn; near: share of the states
+    around a failure that lie near.
     """
 
     frames: Sequence[AttackedFrame]
@@ -330,12 +335,13 @@ class Taken:
     second: SecondRenderers
     folder: Path
     seed: int
+    near: float
 
     def around(self, config: Retrain, classes: Sequence[str]) -> AroundFailures:
         """Certain failures and what lies around them."""
         attack, params, detector = self.worker.config, self.worker.params, self.worker.detector
         pace, folder = config.batch * config.fraction, self.folder / "around"
-        return AroundFailures(self.frames, attack, params, detector, folder, classes, pace, self.seed)
+        return AroundFailures(self.frames, attack, params, detector, folder, classes, pace, self.seed, self.near)
 
     def missing(self, lesson: Lesson) -> str | None:
         """Why a lesson cannot be held; None where it can. Raises UsageError where no counterexample breaks the
@@ -380,9 +386,9 @@ def learn(
     shown = taken.shown(lesson, detector.classes)
     mixture = Mixture(benign(detector.classes), shown, shares_of(lesson.config))
     beside = None
-    if lesson.consistency and isinstance(shown, AroundFailures):
+    if lesson.weight and isinstance(shown, AroundFailures):
         window_hw = size_hw("--window", lesson.config.window)
-        beside = Consistency(shown, lesson.consistency, detector.t_star, lesson.config.seed, window_hw)
+        beside = _TERMS[lesson.arm](shown, lesson.weight, detector.t_star, lesson.config.seed, window_hw)
     console.print(f"{lesson.name}: {lesson.config.steps} steps", soft_wrap=True)
     train_on(lesson.config, detector, mixture, weights.parent, console, beside)
     facts = {"retrained_from": Path(study.detector).name, "steps": str(lesson.config.steps)}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivesem.evaluation.resampling import Interval
-from drivesem.questions.study.arms import PLACEBO
 from drivesem.questions.study.grades import ArmGrades
 from drivesem.questions.study.labels import OVERLAPS, LabelSets
 from drivesem.questions.study.report import Findings
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _HEIGHT_IN = 4.6
 _LEAST_WIDTH_IN, _GROUP_IN = 6.4, 1.3
+_NAME_CHARACTERS = 13
+"""As many fit under a group of bars."""
 DPI = 150
 """Of a study's picture."""
 _BLACK = "#000000"
@@ -73,7 +75,7 @@ def _falls(axes: Axes, rows: Sequence[StudyRow]) -> None:
         falls = [100 * (PAPER_BENIGN - reference) for _, reference in paper]
         axes.plot([i for i, _ in paper], falls, "D", color=_BLACK, label="the paper", markersize=6, zorder=4)
     axes.axhline(0, color=_BLACK, linewidth=0.8)
-    axes.set_xticks(range(len(rows)), [row.name.replace(", ", "\n") for row in rows])
+    axes.set_xticks(range(len(rows)), [_broken(row.name) for row in rows])
     axes.set_ylabel("fall of AP50, points")
     axes.set_title("What the attack takes from AP50; lines: 95 % of draws of frames", loc="left", fontsize=11)
 
@@ -82,10 +84,14 @@ def _grades(axes: Axes, grades: Sequence[ArmGrades]) -> None:
     """Bars of failures by arm and grade."""
     shown = (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)
     bars(axes, {str(grade): [one.rates[grade] for one in grades] for grade in shown})
-    names = [one.name.replace(", ", "\n").replace(f" {PLACEBO}", f"\n{PLACEBO}") for one in grades]
-    axes.set_xticks(range(len(grades)), names)
+    axes.set_xticks(range(len(grades)), [_broken(one.name) for one in grades])
     axes.set_ylabel("failures, % of objects")
     axes.set_title("Failures by grade; lines: 95 % of draws of frames", loc="left", fontsize=11)
+
+
+def _broken(name: str) -> str:
+    """An arm's name in lines that fit under its bars."""
+    return "\n".join(line for part in name.split(", ") for line in textwrap.wrap(part, _NAME_CHARACTERS))
 
 
 def place_of(group: int, series: int, count: int) -> float:

@@ -273,9 +273,12 @@ def _frames(rows: Sequence[StudyRow]) -> Sheet:
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
         counts = [flat.get(key) for key in ("frames", *keys, "queries")]
         # An arm may have none of the controls that another has; of several seeds there is a mean.
-        lines.append((row.name, *("-" if count is None else f"{round(count, 1):.15g}" for count in counts)))
-    columns = (_ARM, "frames", *MODES, *controls, "queries")
-    return Sheet("Frames in which something was lost or made up", columns, tuple(lines))
+        told = ["-" if count is None else f"{round(count, 1):.15g}" for count in counts]
+        lines.append((row.name, *told[:3], bounded(row.share_broken("moved")), *told[3:]))
+    columns = (_ARM, "frames", *MODES, "moved, %", *controls, "queries")
+    return Sheet(
+        "Frames in which something was lost or made up (in brackets Wilson's 95 %)", columns, tuple(lines)
+    )
 
 
 def _success(found: Findings) -> Sheet:

@@ -156,7 +156,7 @@ class Taught:
 
 def _training(lesson: Lesson) -> dict[str, Any]:
     told = ("seed", "steps", "batch", "window", "scale", "rate", "fraction", "mix", "loss", "precision")
-    return {"pictures": lesson.pictures, "labels": lesson.labels, "consistency": lesson.consistency} | {
+    return {"pictures": lesson.pictures, "labels": lesson.labels, "weight": lesson.weight} | {
         key: getattr(lesson.config, key) for key in told
     }
 
@@ -196,7 +196,7 @@ def run(study: Study, ready: Ready, out: Path, console: Console) -> Taught:
     frames, random = ([_frames(one, out) for one in learned.runs] + [[]])[:2]
     worker, parts = ready.workers[0], ready.parts
     second = SecondRenderers(worker.config.dataset, worker.config.root)
-    taken = Taken(frames, random, worker, second, out / plan.POOL, study.seed)
+    taken = Taken(frames, random, worker, second, out / plan.POOL, study.seed, study.near)
     reasons = {lesson.name: taken.missing(lesson) for lesson in ready.lessons}
     lessons = [lesson for lesson in ready.lessons if reasons[lesson.name] is None]
     benign = partial(plan.benign_samples, parts, frames, out=out)

@@ -9,7 +9,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivesem.evaluation.coco import IOU_THRESHOLDS
-from drivesem.evaluation.resampling import Averaged, Difference, Figure, Interval, Recalled, differences, holm
+from drivesem.evaluation.resampling import (
+    Averaged,
+    Difference,
+    Figure,
+    Interval,
+    Recalled,
+    differences,
+    holm,
+    wilson,
+)
 from drivesem.questions.study.arms import matching
 from drivesem.questions.study.counts import ArmCounts, FrameCounts, Matches
 from drivesem.report.paper import PAPER_BENIGN
@@ -72,6 +81,13 @@ class StudyRow:
         found = [getattr(frame, f"success_{mode}") for run in self.runs for frame in run.frames]
         return sum(found) / len(self.runs)
 
+    def share_broken(self, mode: str) -> Interval:
+        """Of the first seed's frames, with Wilson's 95 %, which also holds of a dozen frames."""
+        found = [getattr(frame, f"success_{mode}") for frame in self.run.frames]
+        if not found:
+            return Interval("broken", None, None, None)
+        return Interval("broken", sum(found) / len(found), *wilson(sum(found), len(found)))
+
     @property
     def name(self) -> str:
         """The arm's."""
@@ -104,6 +120,9 @@ class StudyRow:
             found[f"benign_{key}"] = getattr(self.benign, key)
             found |= {f"{mode}_{key}": getattr(getattr(self, mode), key) for mode in MODES}
         for mode, falls in self.drops.items():
+            broken = self.share_broken(mode)
+            found |= {f"broken_{mode}": broken.value, f"broken_{mode}_low": broken.low}
+            found[f"broken_{mode}_high"] = broken.high
             for key, one in falls.items():
                 name = f"drop_{mode}" if key == "ap50" else f"drop_{mode}_{key}"
                 found |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}

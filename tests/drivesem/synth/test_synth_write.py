@@ -228,3 +228,14 @@ def test_workers_change_nothing(tmp_path, layout):
     list(synthesise(one))
     list(synthesise(two, mapping(Sharing(workers=2))))
     assert tree(two.out) == tree(one.out)
+
+
+def test_a_sliver_of_a_car_at_the_border_has_no_track(tmp_path):
+    # Frame 198 of these drives has a car that reaches into its last row with three samples, two pixels: too
+    # little for ground truth.
+    order = Order(tmp_path, 199, 26, "vkitti1", variations=("clone",), people=False, sequence=50)
+    exposure = expose(render_frame(write.plan_of(write.jobs_of(order)[198])))
+    shown = set(np.unique(exposure.instances).tolist()) - {0}
+    assert shown
+    assert shown <= {thing.track + 1 for thing in exposure.objects}
+    WRITERS["vkitti1"](tmp_path).write(order.places()[198], exposure)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from detectors.types import CLASSES
 from drivesem.attack.space import parse_params
 from drivesem.run.folder import attack_of
 from drivesem.run.results import Failure
-from drivesem.training.around import AT_ONCE, AroundFailures, Consistency, apart, failures_in
+from drivesem.training.around import AT_ONCE, AroundFailures, Consistency, Worst, apart, failures_in, least_sure
 from drivesem.training.attacked import AttackedFrame, RedrawnSamples, frames_of
 from drivesem.truth.redraw.choose import SecondRenderers
 
@@ -117,6 +118,38 @@ def test_changes_are_drawn_by_the_generator(small_run: Path, tmp_path: Path) -> 
     written = (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns
     assert np.array_equal(samples[0][0], image)
     assert (tmp_path / frames[0].name / "picture.png").stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize(("share", "near"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
+def test_so_many_states_lie_near(around: AroundFailures, tmp_path: Path, share: float, near: int) -> None:
+    """Half of them, by turns, unless it is said otherwise."""
+    one = AroundFailures([], None, (), None, tmp_path, CLASSES, 1.0, 0, share)  # pyright: ignore[reportArgumentType]
+    assert [one.near(number) for number in range(8)].count(True) == near
+    assert [around.near(number) for number in range(4)] == [False, True, False, True]
+
+
+def test_the_least_sure_state_counts() -> None:
+    """Logistic loss of a margin of -1: log(1 + e)."""
+    margins = [torch.tensor([2.0]), torch.tensor([-1.0]), torch.tensor([0.5])]
+    assert float(least_sure(margins)) == pytest.approx(math.log1p(math.e))
+    assert float(least_sure(margins[:1])) == pytest.approx(math.log1p(math.exp(-2.0)))
+
+
+def test_the_worst_of_four_on_real_pictures(around: AroundFailures, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All states of the pool are seen; the loss is of the state with the least margin, and reaches the weights."""
+    detector = load_detector("squeezedet").requires_grad_(True).eval()
+    worst = Worst(around, 2.0, detector.t_star, 0, (224, 640))
+    images = worst.images(0)
+    assert images.shape == (AT_ONCE, 3, 224, 640)
+    value = worst.term(detector, detector(images), 0)
+    alone = []
+    for number in range(AT_ONCE):
+        monkeypatch.setattr(around, "pool", lambda _, number=number: range(number, number + 1))
+        alone.append(float(worst.term(detector, detector(worst.images(0)), 0).detach()))
+    assert float(value.detach()) == pytest.approx(max(alone), rel=1e-4)
+    assert max(alone) > min(alone) + 1e-3
+    value.backward()
+    assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())
 
 
 def test_consistency_on_real_pictures(around: AroundFailures) -> None:

@@ -115,12 +115,12 @@ def test_arms_differ_in_their_pictures_alone() -> None:
     lessons = lessons_of(study)
     alike = {replace(one.config, seed=0) for one in lessons if one.arm != "paper"}
     assert len(alike) == 1
-    assert {one.arm: one.consistency for one in lessons if one.consistency} == {"consistent": 0.5}
+    assert {one.arm: one.weight for one in lessons if one.weight} == {"consistent": 0.5, "worst": 0.5}
     seeds = {arm: [one.config.seed for one in lessons if one.arm == arm] for arm in TAUGHT}
     assert seeds == {arm: [0, 1] if arm in REPEATED else [0] for arm in TAUGHT}
     assert len({one.folder for one in lessons}) == len({one.name for one in lessons}) == len(lessons)
     assert {one.arm: one.labels for one in lessons} == {
-        **dict.fromkeys(("random", "generator", "ours", "certain", "consistent"), "moved"),
+        **dict.fromkeys(("random", "generator", "ours", "certain", "consistent", "worst"), "moved"),
         **dict.fromkeys(("benign", "re-rendered", "paper"), "benign"),
     }
     assert [one.arm for one in lessons_of(replace(study, arms="certain, benign", seeds=1))] == [
@@ -243,7 +243,7 @@ def taught(one: Lesson, attacked: list[AttackedFrame], folder: Path) -> Path:
     def benign(classes: Sequence[str]) -> Sequence[object]:
         return lessons.benign_samples(lessons.Parts(None, None, None, None), attacked, classes, folder)
 
-    taken = Taken(attacked, attacked[1:], WORKER, SecondRenderers("demo", None), folder / "pool", 0)
+    taken = Taken(attacked, attacked[1:], WORKER, SecondRenderers("demo", None), folder / "pool", 0, 0.5)
     learn(study, one, taken, benign, weights_of(folder, one), QUIET)  # pyright: ignore[reportArgumentType]
     return weights_of(folder, one)
 
@@ -292,12 +292,12 @@ def test_what_is_learned_is_not_learned_twice(
 
 def test_lessons_that_cannot_be_held_say_why(attacked: list[AttackedFrame], tmp_path: Path) -> None:
     """No failure of these frames is certain, and no generator made them."""
-    taken = Taken(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0)
+    taken = Taken(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0, 0.5)
     reasons = {one.arm: taken.missing(one) for one in lessons_of(Study(name="retrain", arms=",".join(TAUGHT)))}
     none = "no attacked frame has a certain failure of an object"
     assert reasons == {
         **dict.fromkeys(TAUGHT),
-        **dict.fromkeys(("certain", "consistent"), none),
+        **dict.fromkeys(("certain", "consistent", "worst"), none),
         "generator": "no generator made these frames",
     }
 

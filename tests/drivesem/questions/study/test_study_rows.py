@@ -45,6 +45,9 @@ def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
     assert flat["drop_moved"] == pytest.approx(25 / 101)
     assert flat["drop_moved_low"] < flat["drop_moved"] < flat["drop_moved_high"]
     assert flat["successes_moved"] == 4
+    # Wilson's interval of 4 of 8, by hand: 0.5 +- 1.96 sqrt(1/32 + 1.96^2 / 256) / (1 + 1.96^2 / 8)
+    assert flat["broken_moved"] == 0.5
+    assert (flat["broken_moved_low"], flat["broken_moved_high"]) == pytest.approx((0.2152, 0.7848), abs=1e-4)
     assert flat["queries"] == 80
     assert flat["feasible_fraction"] == 1.0
 
