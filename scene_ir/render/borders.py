@@ -94,15 +94,12 @@ def borders(
     first faces of `seen` (P,), (P,) int64, and the others the second. clip (V, 3), faces (F, 3).
     """
     points, end = clip.detach().to(torch.float64), start + step
-    planes = _planes(points, faces)
     leave = Walk.over(points, faces, edges.across, seen, start, end, backend)
     enter = Walk.over(points, faces, edges.across, (seen[1], seen[0]), end, start, backend)
     # How much nearer the first surface is, as inverse depth, where it ends and where the second one begins.
+    nearer = leave.plane - enter.plane
     at_leave, at_enter = (
-        ((planes[leave.face_at(share)] - planes[enter.face_at(1 - share)]) * (start + share[:, None] * step)).sum(
-            dim=1
-        )
-        for share in (leave.end, 1 - enter.end)
+        (nearer * (start + share[:, None] * step)).sum(dim=1) for share in (leave.end, 1 - enter.end)
     )
     through = (1 - enter.end < leave.end) & (at_enter > 0) & (at_leave < 0) & (at_enter - at_leave).isfinite()
     meets = 1 - enter.end + (leave.end - 1 + enter.end) * at_enter / torch.where(through, at_enter - at_leave, 1.0)
@@ -119,11 +116,9 @@ def borders(
     share, slope = _cut(clip, faces, torch.cat([edge, edge_back, ends[apart]]), start[ways], end[ways])
     at = through[apart].nonzero()[:, 0]
     if len(at):
-        plane = _planes(clip, faces[one.face[at]]) - _planes(clip, faces[other.face[at]])
+        plane = _plane(clip, faces, leave.face[apart[at], -1]) - _plane(clip, faces, enter.face[apart[at], -1])
         where = at + len(ways) - len(apart)
-        from_start, slant = ((plane * part[ways[where]]).sum(dim=1) for part in (start, step))
-        tells = (slant < 0) & (from_start >= 0) & (from_start + slant <= 0)
-        met = torch.where(tells, -from_start / torch.where(tells, slant, 1.0), until[apart[at]])
+        met = -(plane * start[ways[where]]).sum(dim=1) / (plane * step[ways[where]]).sum(dim=1)
         share, slope = share.index_put((where,), met), slope.index_put((where,), plane.detach()[:, :2])
     return Borders(
         ways,
@@ -241,11 +236,6 @@ class Walk:
         passed = (self.goes_on & (self.share < room[:, None])).sum(dim=1)
         return self._sight(way, passed[way], room)
 
-    def face_at(self, share: Tensor) -> Tensor:
-        """(P,) the faces that are passed at shares (P,) of the ways."""
-        passed = (self.goes_on & (self.share < share[:, None])).sum(dim=1)
-        return self.face.gather(1, passed[:, None])[:, 0]
-
     def _sight(self, way: Tensor, place: Tensor, room: Tensor) -> Sight:
         """The faces at places (B,) of walks (B,), midway between where they begin and where they are left."""
         begins = torch.where(place > 0, self.share[way, (place - 1).clamp_min(0)], 0.0)
@@ -284,8 +274,8 @@ def _cut(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: Tensor) 
     return share, normal.detach()[:, :2]
 
 
-def _planes(clip: Tensor, faces: Tensor) -> Tensor:
-    """(B, 3) of faces (B, 3): their inverse depth at pixel (x, y, 1) is its product with it; differentiable."""
-    corners = clip.index_select(0, faces.reshape(-1)).reshape(-1, 3, 3).to(torch.float64)
+def _plane(clip: Tensor, faces: Tensor, face: Tensor) -> Tensor:
+    """(B, 3) of faces (B,), as in `Walk`; differentiable."""
+    corners = clip.index_select(0, faces[face].reshape(-1)).reshape(-1, 3, 3).to(torch.float64)
     normals = torch.linalg.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
     return normals.sum(dim=1) / (corners[:, 0] * normals[:, 0]).sum(-1, keepdim=True)
