@@ -1,13 +1,14 @@
 """How well gradients to an object's vertices, pose and light tell what happens: derivatives beside differences.
 
-    python -m tools.object_gradients [bus/0080:left ...] [--params vertex pose lighting] [--times 4]
+    python -m tools.object_gradients [bus/0080:left ...] [--params vertex pose lighting] [--points 8]
 
 Along random directions, in which all coordinates move by a step in the root mean square (vertices: each by
-itself), derivatives by the gradient stand beside central differences: through the picture, times smooth noise,
-and through the shipped classifier's score of the true class. Printed are cosines over directions: with
-differences of the same, and with those of the picture drawn so many times as finely and averaged down, in which
-faces thinner than a pixel do not come and go; the score is linear in these, with its gradient at the picture. By
-default of one held-out object of each class, in a view that is not straight ahead.
+itself), central differences stand beside gradients: through the picture, times smooth noise, and through the
+shipped classifier's score of the true class. Printed are cosines over directions: with the gradient in the middle,
+and with the mean of gradients along the way from the one end of the difference to the other. The first one falls
+short where the slope itself changes over the step, as that of a network does. The second one does not: what
+changes without a jump changes by what its slopes add up to. By default of one held-out object of each class, in a
+view that is not straight ahead.
 """
 
 from __future__ import annotations
@@ -19,76 +20,42 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.sources import open_objects
-from drivesem.classify.scenes import DRAWN_PX, SEEN_PX, VIEWS, ObjectScene, camera, generated_background
+from drivesem.classify.scenes import SEEN_PX, VIEWS, ObjectScene, generated_background
 from drivesem.classify.space import Amounts, Moved, ObjectSpace
-from scene_ir.render.lit import over
 
-STEPS = {"vertex": 1e-4, "pose": 3e-3, "lighting": 1e-2}
+STEPS = {"vertex": 1e-4, "pose": 1e-3, "lighting": 1e-2}
 """Object sizes, rad, shares."""
-Value = Callable[[Tensor], Tensor]
+Values = Callable[[Tensor], Tensor]
+"""theta (D,) to (2,): what is made of the picture, by the noise and by the network."""
 
 
-def pictured(scene: ObjectScene, space: ObjectSpace, times: int) -> Value:
-    """theta (D,) to the picture (3, SEEN_PX, SEEN_PX), drawn `times` as finely as it is for networks."""
-    size = times * DRAWN_PX
-    background = F.interpolate(scene.background[None], (size, size), mode="bilinear")[0]
-
-    def picture(theta: Tensor) -> Tensor:
-        change = space.change(theta)
-        drawn = scene.mesh.render(scene.placed(change), camera(size), scene.lights(change))
-        whole = over(drawn, background)[None]
-        return F.interpolate(whole, (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True)[0]
-
-    return picture
-
-
-def along(value: Value, directions: Tensor) -> Tensor:
-    """Derivatives (N,) along directions (N, D) at 0, by the gradient."""
-    leaf = torch.zeros(directions.shape[1], requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(leaf), leaf)
-    return directions.double() @ gradient.double()
+def slopes(values: Values, theta: Tensor, direction: Tensor) -> Tensor:
+    """Derivatives (2,) along a direction (D,) at theta (D,), by the gradient."""
+    leaf = theta.clone().requires_grad_(True)
+    found = values(leaf)
+    gradients = [torch.autograd.grad(value, leaf, retain_graph=True)[0] for value in found]
+    return torch.stack([gradient.double() @ direction.double() for gradient in gradients])
 
 
 @torch.no_grad()
-def differences(value: Value, directions: Tensor, step: float) -> Tensor:
-    """The same by central differences."""
-    return torch.stack([(value(step * d) - value(-step * d)) / (2 * step) for d in directions])
+def difference(values: Values, step: Tensor) -> Tensor:
+    """The change (2,) of values from one step (D,) before to one behind."""
+    return (values(step) - values(-step)) / 2
 
 
-def cosines(
-    scene: ObjectScene, parameter: str, network: Classifier, told: argparse.Namespace
-) -> tuple[int, Tensor]:
-    """How many coordinates a parameter has, and (4,): through the picture and through the score, each with
-    differences of the same and of the finer picture.
-    """
-    space = ObjectSpace(scene.vertices, (Moved(parameter),), Amounts(0.002, 0.15, 0.2))
-    directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
-    picture, finer = (pictured(scene, space, times) for times in (told.drawn, told.times))
-    noise = torch.randn(1, 3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(0))
-    seen = picture(space.theta0).requires_grad_(True)
-    (felt,) = torch.autograd.grad(score(network, seen, scene), seen)
-    found = []
-    for weight, same in (
-        (F.avg_pool2d(noise, 9, 1, 4)[0], None),
-        (felt, lambda theta: score(network, picture(theta), scene)),
-    ):
-
-        def weighed(draw: Value, weight: Tensor = weight) -> Value:
-            return lambda theta: (draw(theta).double() * weight).sum()
-
-        own = same or weighed(picture)
-        slopes, step = along(own, directions), told.step or STEPS[parameter]
-        for value in (own, weighed(finer)):
-            found.append(F.cosine_similarity(slopes, differences(value, directions, step), dim=0))
-    return space.dim, torch.stack(found)
-
-
-def score(network: Classifier, picture: Tensor, scene: ObjectScene) -> Tensor:
-    """Of the true class."""
-    return network(picture[None])[0, scene.model.label].double()
+def cosines(values: Values, directions: Tensor, step: float, points: int) -> Tensor:
+    """(4,): through the picture, in the middle and along the way, and through the score, of directions (N, D)."""
+    middle, mean, changes = [], [], []
+    for direction in directions:
+        changes.append(difference(values, step * direction) / step)
+        middle.append(slopes(values, torch.zeros_like(direction), direction))
+        places = [((2 * point + 1) / points - 1) * step * direction for point in range(points)]
+        mean.append(torch.stack([slopes(values, place, direction) for place in places]).mean(dim=0))
+    wanted = torch.stack(changes)
+    found = [F.cosine_similarity(torch.stack(one), wanted, dim=0) for one in (middle, mean)]
+    return torch.stack(found).T.reshape(-1)
 
 
 def main() -> None:
@@ -98,23 +65,32 @@ def main() -> None:
     parser.add_argument("--objects", help="a folder of meshes; without it, the embedded objects")
     parser.add_argument("--params", nargs="+", choices=list(STEPS), default=list(STEPS))
     parser.add_argument("--step", type=float, help="instead of each parameter's own")
-    parser.add_argument("--directions", type=int, default=10)
-    parser.add_argument("--times", type=int, default=4, help="how much finer the picture is drawn for differences")
-    parser.add_argument("--drawn", type=int, default=1, help="and for gradients")
+    parser.add_argument("--directions", type=int, default=6)
+    parser.add_argument("--points", type=int, default=8, help="along each way, at which gradients are taken")
     told = parser.parse_args()
     objects = open_objects(told.objects)
     network = load_classifier("squeezenet", objects.classes)
+    noise = torch.randn(1, 3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(0))
+    noise = F.avg_pool2d(noise, 9, 1, 4)[0].double()
     views = list(VIEWS)[1:]
     usual = [f"{kind}/0080:{views[place % 3]}" for place, kind in enumerate(objects.classes)]
     found: dict[str, list[Tensor]] = {name: [] for name in told.params}
-    print("cosines through the picture: same, finer; through the score: same, finer")
+    print("cosines through the picture: in the middle, along the way; through the score: the same")
     for word in told.names or usual:
         name, _, view = word.partition(":")
         scene = ObjectScene(name, objects.load(name), view or views[0], generated_background(name))
         for parameter in told.params:
-            count, row = cosines(scene, parameter, network, told)
+            space = ObjectSpace(scene.vertices, (Moved(parameter),), Amounts(0.002, 0.15, 0.2))
+
+            def values(theta: Tensor, scene: ObjectScene = scene, space: ObjectSpace = space) -> Tensor:
+                picture = scene.picture(space.change(theta))
+                score = network(picture[None])[0, scene.model.label]
+                return torch.stack([(picture.double() * noise).sum(), score.double()])
+
+            directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
+            row = cosines(values, directions, told.step or STEPS[parameter], told.points)
             found[parameter].append(row)
-            print(f"{word}, {parameter}, {count} coordinates: {_row(row)}", flush=True)
+            print(f"{word}, {parameter}, {space.dim} coordinates: {_row(row)}", flush=True)
     for parameter, rows in found.items():
         table = torch.stack(rows)
         print(f"{parameter}: least {_row(table.amin(dim=0))}; median {_row(table.median(dim=0).values)}")

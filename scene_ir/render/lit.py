@@ -15,6 +15,8 @@ from torch import Tensor
 from scene_ir.geometry import kept_within, to_clip, weld
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.render.borders import Edges, Sight, borders, rims
+from scene_ir.render.looks import FINE, Looks, Ways
 from scene_ir.types import Camera, check_finite, check_shape
 
 GAMMA = 1 / 2.2
@@ -27,8 +29,8 @@ UP = 0.4
 """How much more of the environment's light comes from above than from below, either way from the mean."""
 AROUND = 0.2
 """Share of the environment's light that a glossy surface mirrors, where the lamp's counts in full."""
-_SHOWS = 2 / 255
-"""Contrast from which a border between two faces is blended."""
+LOOKS = 2
+"""A pixel is looked at so many times along each side."""
 _TINY = 1e-12
 
 
@@ -63,6 +65,7 @@ class LitMesh:
     vertices: Tensor
     faces: Tensor
     materials: Materials
+    edges: Edges = field(init=False)
     _corner: Tensor = field(init=False)
     _face: Tensor = field(init=False)
 
@@ -71,54 +74,69 @@ class LitMesh:
         check_finite("lit.vertices", self.vertices)
         check_shape("lit.faces", self.faces, None, 3, floating=False)
         check_shape("lit.diffuse", self.materials.diffuse, len(self.faces), 3)
+        materials = self.materials
+        kinds = torch.cat([materials.diffuse, materials.specular[:, None], materials.shininess[:, None]], dim=1)
+        edges = Edges.of(self.vertices.detach(), self.faces, kinds, _CREASE_COS)
+        object.__setattr__(self, "edges", edges)
         corner, face = _smoothed(self.vertices.detach(), self.faces)
         object.__setattr__(self, "_corner", corner)
         object.__setattr__(self, "_face", face)
 
-    def render(self, vertices: Tensor, camera: Camera, lights: Lights, backend: verbs.Backend = "warp") -> Tensor:
-        """The mesh with its vertices (V, 3) moved into camera space: (4, H, W), RGB after gamma, in [0, 1], and
-        coverage. Colours go on beyond the outline where coverage does; elsewhere they are 0.
+    def render(
+        self, vertices: Tensor, camera: Camera, lights: Lights, backend: verbs.Backend = "warp", looks: int = LOOKS
+    ) -> Tensor:
+        """The mesh with its vertices (V, 3) moved into camera space: (4, H, W), RGB after gamma and coverage, both
+        of looks x looks a pixel. RGB is that of what covers; elsewhere it is 0.
 
         Differentiable to vertices and lights, at outlines and at borders between faces too.
         """
-        clip = to_clip(vertices, camera.matrix.to(vertices))
-        everything = torch.tensor([[0, len(vertices)]])
-        rects = verbs.bounding_rects(clip, everything, camera.height, camera.width)
-        layout, faces = Layout.of(rects), torch.tensor([[0, len(self.faces)]])
-        picture = vertices.new_zeros(4, camera.height, camera.width)
-        if layout.size == 0:
-            return picture
-        fragments = verbs.rasterize(clip, self.faces, faces, layout, backend)
-        coverage = verbs.antialias(fragments, clip, self.faces, backend)
-        colour = self._colours(fragments, clip, vertices, lights, backend)
+        clip = to_clip(vertices, _finer(camera.matrix.to(vertices), looks))
+        height, width = looks * camera.height, looks * camera.width
+        rects = verbs.bounding_rects(clip, torch.tensor([[0, len(vertices)]]), height, width)
+        rects = torch.cat([rects[:, :2] // looks, -(-rects[:, 2:] // looks)], dim=1)
         x0, y0, x1, y1 = rects[0].tolist()
-        width = x1 - x0
-        colour = _blended(colour, fragments, clip, self.faces, width)
-        colour = _continued(colour, fragments.face, coverage, width)
-        drawn = torch.cat([colour, coverage[:, None]], dim=1).T.reshape(4, y1 - y0, width)
+        if x1 <= x0 or y1 <= y0:
+            return vertices.new_zeros(4, camera.height, camera.width)
+        fragments = verbs.rasterize(
+            clip, self.faces, torch.tensor([[0, len(self.faces)]]), Layout.of(looks * rects), backend
+        )
+        coverage = verbs.antialias(fragments, clip, self.faces, backend)
+        seen = Looks.of(fragments, looks)
+        blend = _Blend.of(self, seen, clip, coverage, backend)
+        colour = self._colours(blend.face, blend.at, clip, vertices, lights, backend)
+        total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
+        own = len(seen.face)
+        total = total.index_add(0, seen.pixel, colour[:own] * seen.share[:, None].to(colour))
+        for strip in blend.strips:
+            total = strip.added(total, seen, colour)
+        cover = coverage.reshape(1, looks * (y1 - y0), -1)
+        cover = torch.nn.functional.avg_pool2d(cover, looks)[0]
+        rgb = total.T.reshape(3, y1 - y0, x1 - x0) / torch.where(cover > 0, cover, 1.0)
+        drawn = torch.cat([rgb, cover[None]])
         return torch.nn.functional.pad(drawn, (x0, camera.width - x1, y0, camera.height - y1))
 
     def _colours(
-        self, fragments: Fragments, clip: Tensor, vertices: Tensor, lights: Lights, backend: verbs.Backend
+        self, face: Tensor, at: Tensor, clip: Tensor, vertices: Tensor, lights: Lights, backend: verbs.Backend
     ) -> Tensor:
-        """(T, 3) after gamma; 0 where nothing is hit."""
+        """(S, 3) after gamma of faces (S,) at (S, 2) px."""
         corners, normal, _ = self.corners(vertices)
         attributes = torch.cat([corners.reshape(-1, 3), normal], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
-        own = clip.index_select(0, self.faces.reshape(-1))
+        own = clip.index_select(0, self.faces.reshape(-1)) * clip.new_tensor([FINE, FINE, 1.0])
+        place = (FINE * at.to(torch.float64)).round().to(torch.int64)
+        layout = Layout.of(torch.cat([place, place + 1], dim=1))
+        fragments = Fragments(layout, face.to(torch.int32), at[:, 0], torch.tensor([[0, len(self.faces)]]), 0.0)
         seen = verbs.interpolate(fragments, own, flat, attributes, backend)
-        hit = (fragments.face >= 0).nonzero()[:, 0]
-        face = fragments.face[hit].to(torch.int64)
         materials = self.materials
         light = shade(
-            seen[hit, :3],
-            seen[hit, 3:],
+            seen[:, :3],
+            seen[:, 3:],
             materials.diffuse.to(clip)[face],
             materials.specular.to(clip)[face],
             materials.shininess.to(clip)[face],
             lights,
         )
-        return torch.zeros_like(seen[:, :3]).index_add(0, hit, kept_within(light, _DARKEST, 1) ** GAMMA)
+        return kept_within(light, _DARKEST, 1) ** GAMMA
 
     def corners(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of vertices (V, 3) in camera space each face's corners (F, 3, 3); their unit normals (3F, 3), towards
@@ -182,106 +200,101 @@ def _unit(vectors: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vectors, dim=-1, eps=_TINY)
 
 
-def _blended(colour: Tensor, fragments: Fragments, clip: Tensor, faces: Tensor, width: int) -> Tensor:
-    """Colours (T, 3) of one draw with the borders between faces blended: between two pixels that are hit by
-    different faces the border crosses the segment of their centres; whoever's half it cuts takes of the other's
-    colour what lies beyond. So a border that sweeps over pixels changes them continuously, as outlines do.
-    """
-    face = fragments.face
-    place = torch.arange(len(face))
-    first, second, steps = [], [], []
-    for step, (dx, dy) in ((1, (1.0, 0.0)), (width, (0.0, 1.0))):
-        here = place[: len(face) - step]
-        there = here + step
-        pairs = (face[here] >= 0) & (face[there] >= 0) & (face[here] != face[there])
-        if step == 1:
-            pairs &= here % width != width - 1
-        here, there = here[pairs], there[pairs]
-        shows = (colour[here] - colour[there]).detach().abs().amax(dim=1) > _SHOWS
-        first.append(here[shows])
-        second.append(there[shows])
-        steps.append(clip.new_tensor([[dx, dy, 0.0]]).to(torch.float64).expand(int(shows.sum()), 3))
-    here, there, step = torch.cat(first), torch.cat(second), torch.cat(steps)
-    if not len(here):
-        return colour
-    pixels = fragments.layout.pixels()[here].to(torch.float64)
-    start = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
-    share, across = _crossing(clip, faces, face[here], face[there], start, step)
-    # Of a border along the step, the pixels to its sides are the ones that share it.
-    share = torch.where(across, share, 0.5).to(colour)
-    change = colour.index_select(0, there) - colour.index_select(0, here)
-    colour = colour.index_add(0, here, (0.5 - share).clamp_min(0)[:, None] * change)
-    return colour.index_add(0, there, (0.5 - share).clamp_max(0)[:, None] * change)
+def _finer(matrix: Tensor, looks: int) -> Tensor:
+    """A camera's matrix (3, 4), of pictures of `looks` x `looks` pixels where it has one."""
+    finer = looks * matrix[:2] + (looks - 1) / 2 * matrix[2]
+    return torch.cat([finer, matrix[2:]])
 
 
-def _crossing(
-    clip: Tensor, faces: Tensor, one: Tensor, other: Tensor, start: Tensor, step: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Where (P,) in [0, 1] on the segments from pixels (P, 3), (x, y, 1), to those a step (P, 3) further the face
-    `one` (P,), which is seen at the start, gives way to the face `other`; and whether (P,) the border runs across
-    the step rather than along it.
-
-    Where both faces reach over one part of the segment, the border is that of the nearer one there, or where they
-    pass through each other. Where neither does, something thin lies between, mostly the rest of a polygon: the
-    border is that at which the two planes meet.
-    """
-    leaving = _Exit.of(clip, faces, one, start, start + step)
-    entering = _Exit.of(clip, faces, other, start + step, start)
-    leave, enter = leaving.share, 1 - entering.share
-    # How much nearer the first one's plane is, as inverse depth, which is linear on the picture.
-    plane = leaving.plane - entering.plane
-    at_leave, at_enter = (
-        (plane * (start + share.detach()[:, None] * step)).sum(dim=1) for share in (leave, enter)
-    )
-    overlap = enter.detach() < leave.detach()
-    through = overlap & (at_enter.detach() > 0) & (at_leave.detach() < 0)
-    far = at_leave.detach().abs() <= at_enter.detach().abs()
-    chosen = torch.where(overlap, (at_leave + at_enter).detach() >= 0, far)
-    crossed = -(plane * start).sum(dim=1) / torch.where(through, (plane * step).sum(dim=1), 1.0)
-    share = torch.where(through, crossed, torch.where(chosen, leave, enter))
-    slope = torch.where(chosen[:, None], leaving.slope, entering.slope)
-    slope = torch.where(through[:, None], plane.detach()[:, :2], slope)
-    along, across = (slope * step[:, :2]).sum(dim=1).abs(), (slope * (1 - step[:, :2])).sum(dim=1).abs()
-    return share, (along > across) | ((along == across) & (step[:, 0] > 0))
+def _edge_on(clip: Tensor, faces: Tensor) -> Tensor:
+    """Which faces (F,) are too thin in the picture to interpolate on: they have no place on the grid of sights."""
+    corners = (clip[:, :2] / clip[:, 2:])[faces]
+    sides = corners - corners.roll(1, dims=1)
+    double = (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).abs()
+    return double * FINE < 4 * torch.linalg.vector_norm(sides, dim=2).amax(dim=1)
 
 
 @dataclass(frozen=True, slots=True)
-class _Exit:
-    """Where faces are left on segments. share (P,) in [0, 1]; slope (P, 2): of the edge function there,
-    without a gradient; plane (P, 3): inverse depth at pixel (x, y, 1) is its product with it.
+class _Strip:
+    """Parts of looks (P,) that are of another colour than a look: amount (P,), of a look, differentiable, of the
+    sights `more` (P,), and less of the sights `less` (P,), of which there are none where it is None.
     """
 
-    share: Tensor
-    slope: Tensor
-    plane: Tensor
+    look: Tensor
+    amount: Tensor
+    more: Tensor
+    less: Tensor | None
+
+    def added(self, total: Tensor, seen: Looks, colour: Tensor) -> Tensor:
+        """total (pixels, 3) with it; colour (S, 3): of sights."""
+        change = colour.index_select(0, self.more)
+        if self.less is not None:
+            change = change - colour.index_select(0, self.less)
+        amount = self.amount.to(colour) / seen.count**2
+        return total.index_add(0, seen.pixel_of(self.look), amount[:, None] * change)
+
+
+@dataclass(frozen=True, slots=True)
+class _Blend:
+    """What is to be shaded, face (S,) and place (S, 2), looks' sights first, and how it makes pixels."""
+
+    face: Tensor
+    at: Tensor
+    strips: list[_Strip]
 
     @classmethod
-    def of(cls, clip: Tensor, faces: Tensor, face: Tensor, start: Tensor, end: Tensor) -> _Exit:
-        """From start to end (P, 3), of faces (P,) that are seen at the start."""
-        places = faces[face.to(torch.int64)].reshape(-1)
-        corners = clip.index_select(0, places).reshape(-1, 3, 3).to(torch.float64)
-        normals = torch.linalg.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
-        inside, outside = (normals * start[:, None]).sum(-1), (normals * end[:, None]).sum(-1)
-        det = (corners[:, 0] * normals[:, 0]).sum(-1, keepdim=True)
-        leaves = outside.detach() * det.detach().sign() < 0
-        share = torch.where(leaves, inside / torch.where(leaves, inside - outside, 1.0), 1.0)
-        nearest = share.detach().argmin(dim=1, keepdim=True)
-        slope = normals.detach().gather(1, nearest[..., None].expand(-1, 1, 3))[:, 0, :2]
-        return cls(share.gather(1, nearest)[:, 0].clamp(0, 1), slope, normals.sum(dim=1) / det)
+    def of(cls, mesh: LitMesh, seen: Looks, clip: Tensor, coverage: Tensor, backend: verbs.Backend) -> _Blend:
+        """coverage (T,): of looks."""
+        inner, outer = seen.ways(mesh.edges)
+        edge_on = _edge_on(clip.detach(), mesh.faces)
+        faces, places = [seen.face], [seen.at]
 
+        def numbers(sight: Sight, ways: Ways, way: Tensor) -> Tensor:
+            """Of what is seen on ways (B,): of the look that sees it, or where none does of a place of its own."""
+            here, there = ways.here[way], ways.there[way]
+            is_there = (sight.face == seen.face_at(there)) | (edge_on[sight.face] & (sight.share > 0.5))
+            is_there &= seen.face_at(there) >= 0
+            is_here = ~is_there & ((sight.face == seen.face_at(here)) | edge_on[sight.face])
+            new = (~is_here & ~is_there).nonzero()[:, 0]
+            number = torch.where(is_there, seen.sight[there], seen.sight[here])
+            number = number.index_put((new,), sum(map(len, faces)) + torch.arange(len(new)))
+            faces.append(sight.face[new])
+            places.append(ways.start[way[new], :2] + sight.share[new, None] * ways.step[way[new], :2])
+            return number
 
-def _continued(colour: Tensor, face: Tensor, coverage: Tensor, width: int) -> Tensor:
-    """Colours (T, 3), those of pixels that are covered in part and hit by nothing taken from a neighbour."""
-    fringe = ((face < 0) & (coverage.detach() > 0)).nonzero()[:, 0]
-    if not len(fringe):
-        return colour
-    source = torch.full_like(fringe, -1)
-    for step in (-1, 1, -width, width):
-        other = fringe + step
-        inside = (other >= 0) & (other < len(face))
-        if abs(step) == 1:
-            inside &= other // width == fringe // width
-        known = inside & (face[other.clamp(0, len(face) - 1)] >= 0) & (source < 0)
-        source = torch.where(known, other, source)
-    known = source >= 0
-    return colour.index_add(0, fringe[known], colour.index_select(0, source[known]))
+        ends = seen.face_at(inner.here), seen.face_at(inner.there)
+        between = borders(clip, mesh.faces, mesh.edges, ends, inner.start, inner.step, backend)
+        alone = seen.face_at(outer.here)
+        rim = rims(clip, mesh.faces, mesh.edges, alone, outer.start, outer.step, backend)
+        # Looks that an outline cuts beside or below: of them less is seen of the borders along the other axis.
+        cut = [torch.zeros_like(coverage, dtype=torch.bool) for _ in range(2)]
+        for axis, along in enumerate((~outer.down, outer.down)):
+            cut[axis][outer.here[rim.across & along]] = True
+        strips = []
+        way, share = between.way, torch.where(between.across, between.share, 0.5)
+        before, after = (numbers(sight, inner, way) for sight in (between.before, between.after))
+        # Of a border along the way, the looks to its sides are the ones that share it.
+        for look, amount, more, less in (
+            (inner.here[way], 0.5 - share, after, before),
+            (inner.there[way], share - 0.5, before, after),
+        ):
+            aside = torch.where(inner.down[way], cut[0][look], cut[1][look])
+            part = torch.where(aside, coverage.index_select(0, look), 1.0)
+            strips.append(_Strip(look, amount.clamp_min(0) * part, more, less))
+        part = ((seen.fragments.face >= 0) & (coverage.detach() < 1)).nonzero()[:, 0]
+        strips.append(_Strip(part, coverage.index_select(0, part) - 1, seen.sight[part], None))
+        # What meets nothing goes on with the colour from which its outline is reached, rather across it.
+        order = torch.arange(len(outer.there)) + len(outer.there) * ~rim.across
+        ends, which = torch.unique(outer.there, return_inverse=True)
+        first = order.new_full((len(ends),), 2 * len(order)).scatter_reduce(0, which, order, "amin")
+        source = (first[which] == order) & (coverage.detach()[outer.there] > 0)
+        look = outer.there[source]
+        strips.append(_Strip(look, coverage.index_select(0, look), seen.sight[outer.here[source]], None))
+        way, share, end = rim.inner.way, rim.inner.share, rim.end
+        before, after = (numbers(sight, outer, way) for sight in (rim.inner.before, rim.inner.after))
+        for look, amount, shown in (
+            (outer.here[way], end.clamp_max(0.5) - share, rim.inner.across),
+            (outer.there[way], end - share.clamp_min(0.5), rim.inner.across & source[way]),
+        ):
+            strips.append(_Strip(look, torch.where(shown, amount.clamp_min(0), 0.0), after, before))
+        return cls(torch.cat(faces), torch.cat(places), strips)

@@ -1,0 +1,128 @@
+"""Pixels of several looks each: which faces a pixel sees, and by how much of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene_ir.raster.layout import Fragments
+from scene_ir.render.borders import Edges
+
+FINE = 256
+"""Sights lie on a grid so much finer than that of looks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """What `rasterize` found in one draw, count x count looks a pixel. A sight is a face in a pixel: face, pixel
+    (S,) int64, the pixel counted row by row; share (S,): of the pixel's looks that meet it; at (S, 2): its middle,
+    (x, y) in looks. sight (T,) int64: of each look, where it meets a face.
+    """
+
+    fragments: Fragments
+    count: int
+    face: Tensor
+    pixel: Tensor
+    share: Tensor
+    at: Tensor
+    sight: Tensor
+
+    @classmethod
+    def of(cls, fragments: Fragments, count: int) -> Looks:
+        """Of a draw whose rectangle begins and ends with pixels."""
+        x0, y0, x1, y1 = fragments.layout.rects[0].tolist()
+        wide, rows, columns = x1 - x0, (y1 - y0) // count, (x1 - x0) // count
+        face = fragments.face.to(torch.int64).reshape(rows, count, columns, count)
+        parts = [face[:, row, :, column] for row in range(count) for column in range(count)]
+        low, high = parts[0], parts[0]
+        for part in parts[1:]:
+            low, high = low.minimum(part), high.maximum(part)
+        low, same = low.reshape(-1), (low == high).reshape(-1)
+        whole = (same & (low >= 0)).nonzero()[:, 0]
+        numbers = torch.zeros_like(low).index_put((whole,), torch.arange(len(whole)))
+        sight = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
+        corner = torch.tensor([x0, y0])
+        middle = torch.stack([whole % columns, whole // columns], dim=1) * count + corner + (count - 1) / 2
+        # Of pixels that see several faces, or none in part, looks in the order of their faces.
+        mixed = (~same).nonzero()[:, 0]
+        step = torch.arange(count)
+        first = mixed // columns * count * wide + mixed % columns * count
+        looks = first[:, None] + (step[:, None] * wide + step).reshape(-1)
+        seen, order = fragments.face[looks].sort(dim=1)
+        looks = looks.gather(1, order)
+        begins = seen >= 0
+        begins[:, 1:] &= seen[:, 1:] != seen[:, :-1]
+        number = begins.reshape(-1).cumsum(0) - 1
+        hit = (seen >= 0).reshape(-1)
+        number, looks = number[hit], looks.reshape(-1)[hit]
+        some = int(begins.sum())
+        places = torch.stack([looks % wide, looks // wide], dim=1).to(middle)
+        counts = torch.bincount(number, minlength=some).to(middle)
+        centre = middle.new_zeros(some, 2).index_add(0, number, places) / counts[:, None] + corner
+        sight[looks] = number + len(whole)
+        return cls(
+            fragments,
+            count,
+            torch.cat([low[whole], seen[begins].to(torch.int64)]),
+            torch.cat([whole, mixed[begins.nonzero()[:, 0]]]),
+            torch.cat([torch.ones_like(middle[:, 0]), counts / count**2]),
+            torch.cat([middle, centre]),
+            sight,
+        )
+
+    @property
+    def wide(self) -> int:
+        """Looks in a row."""
+        return int(self.fragments.layout.rects[0, 2] - self.fragments.layout.rects[0, 0])
+
+    def pixel_of(self, look: Tensor) -> Tensor:
+        """The pixels (P,) of looks (P,)."""
+        return look // self.wide // self.count * (self.wide // self.count) + look % self.wide // self.count
+
+    def face_at(self, look: Tensor) -> Tensor:
+        """(P,) int64, what looks (P,) see, -1 where that is nothing."""
+        return self.fragments.face[look].to(torch.int64)
+
+    def ways(self, edges: Edges) -> tuple[Ways, Ways]:
+        """Between looks that are neighbours: those that see two faces, but for those of one smooth surface, and
+        those from a look that sees one to a look that sees nothing.
+        """
+        face, wide = self.fragments.face, self.wide
+        here, there = [], []
+        for step in (1, wide):
+            first = (face[step:] != face[:-step]).nonzero()[:, 0]
+            first = first[first % wide != wide - 1] if step == 1 else first
+            here.append(first)
+            there.append(first + step)
+        here, there = torch.cat(here), torch.cat(there)
+        one, other = self.face_at(here), self.face_at(there)
+        inner = ((one >= 0) & (other >= 0)).nonzero()[:, 0]
+        inner = inner[~edges.smooth(one[inner], other[inner])]
+        outwards, inwards = (one >= 0) & (other < 0), (one < 0) & (other >= 0)
+        rim = torch.cat([here[outwards], there[inwards]]), torch.cat([there[outwards], here[inwards]])
+        return Ways.of(self, here[inner], there[inner]), Ways.of(self, *rim)
+
+
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """From looks here to there (P,). start, step (P, 3) float64: where (x, y, 1) the one is, and how far the other
+    from it; down (P,): along a column, not along a row.
+    """
+
+    here: Tensor
+    there: Tensor
+    start: Tensor
+    step: Tensor
+    down: Tensor
+
+    @classmethod
+    def of(cls, looks: Looks, here: Tensor, there: Tensor) -> Ways:
+        wide = looks.wide
+        x0, y0 = looks.fragments.layout.rects[0, :2].tolist()
+        start = torch.stack([here % wide + x0, here // wide + y0, torch.ones_like(here)], dim=1)
+        down = (there - here).abs() != 1
+        sign = (there - here).sign()
+        step = torch.stack([sign * ~down, sign * down, torch.zeros_like(here)], dim=1)
+        return cls(here, there, start.to(torch.float64), step.to(torch.float64), down)
