@@ -29,6 +29,8 @@ _NAME_CHARACTERS = 13
 DPI = 150
 """Of a study's picture."""
 _BLACK = "#000000"
+_HATCHES = ("", "///", "...")
+"""Of bars, where colours begin anew."""
 _GROUP_WIDTH = 0.8
 """Of the bars of a group, in units of the distance from group to group."""
 
@@ -108,7 +110,17 @@ def bars(axes: Axes, series: Mapping[str, Sequence[Interval | None]]) -> None:
                 continue
             place = place_of(group, i, len(series))
             label = name if group == next(g for g, v in enumerate(values) if v and v.value is not None) else None
-            axes.bar(place, 100 * one.value, width * 0.92, color=COLOURS[i], label=label)
+            colour, hatch = COLOURS[i % len(COLOURS)], _HATCHES[i // len(COLOURS) % len(_HATCHES)]
+            axes.bar(
+                place,
+                100 * one.value,
+                width * 0.92,
+                color=colour,
+                hatch=hatch,
+                edgecolor="white",
+                linewidth=0,
+                label=label,
+            )
             if one.low is not None and one.high is not None:
                 axes.plot([place] * 2, [100 * one.low, 100 * one.high], color=_BLACK, linewidth=1.1, zorder=3)
 

@@ -210,6 +210,10 @@ def _of_robust(found: Taught) -> str:
     return text
 
 
+_MOST_IN_THREE = 6
+"""Detectors whose names fit side by side in a legend of three columns: without seeds, they are short."""
+
+
 def write_plot(path: Path, found: Taught) -> None:
     """AP50 of each detector on benign frames, known and fresh counterexamples; the paper's as marks."""
     import matplotlib as mpl
@@ -235,7 +239,12 @@ def write_plot(path: Path, found: Taught) -> None:
         axes.set_xticks(range(len(_GROUPS)), list(_GROUPS.values()))
         axes.set(ylabel=f"{HEADLINE} AP50, %", ylim=(0, 104))
         axes.set_title("Moved labels; lines: 95 % of draws of frames", loc="left", fontsize=11)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, fontsize=9)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.14),
+            ncols=3 if len(series) <= _MOST_IN_THREE else 2,
+            fontsize=9,
+        )
     buffer = io.BytesIO()
     # no date and no version in the file: equal figures give equal bytes
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})

@@ -9,16 +9,19 @@ from pathlib import Path
 
 import cv2
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
+from drivesem.evaluation.resampling import Interval
 from drivesem.questions.confirm.report import Confirmation, Share
 from drivesem.questions.study.arms import PLACEBO, RANDOM
 from drivesem.questions.study.counts import ArmCounts, StudyCounts
 from drivesem.questions.study.labels import label_frames, label_sets
-from drivesem.questions.study.plots import write_plot
+from drivesem.questions.study.plots import bars, write_plot
 from drivesem.questions.study.report import Findings, answer_of, notes, sheets, told
 from drivesem.questions.study.rows import rows_of
 from drivesem.questions.study.success import against, curve_of
+from drivesem.report.plots import COLOURS
 from drivesem.settings.commands import Study
 
 DRAWS = 10
@@ -159,3 +162,10 @@ def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
     assert cells(found, "Car AP50", "rotate")["benign"] == "-"
     answer_of(told(found), tmp_path, {}, "drivesem study single", None).write()
     write_plot(tmp_path / "study.png", found)
+
+
+def test_more_series_than_colours_are_told_apart() -> None:
+    """Each has a look of its own, by colour or hatch."""
+    axes = Figure().add_subplot()
+    bars(axes, {f"detector {i}": [Interval("ap50", 0.5, 0.4, 0.6)] for i in range(2 * len(COLOURS) + 1)})
+    assert len({(bar.get_facecolor(), bar.get_hatch()) for bar in axes.patches}) == 2 * len(COLOURS) + 1
