@@ -53,7 +53,8 @@ def test_every_kept_study_is_told_and_small() -> None:
 @pytest.mark.parametrize("folder", KEPT, ids=lambda folder: folder.name)
 def test_pages_say_what_follows_from_it(folder: Path, tmp_path: Path) -> None:
     kept = json.loads((folder / "study.json").read_text(encoding="utf-8"))
-    name = kept["study"] if "study" in kept else kept["settings"]["name"]
+    settings = kept["facts"]["study"] if "facts" in kept else kept["settings"]
+    name = settings["name"]
     assert main(["study", name, "--from", str(folder), "--out", str(tmp_path / "again")]) == 0
     told = (tmp_path / "again" / "study.md").read_text(encoding="utf-8")
     wrong = [one for begin, text, _ in blocks() if begin == folder.name for one in untrue(text, told)]
