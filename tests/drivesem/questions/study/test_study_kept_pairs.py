@@ -193,6 +193,13 @@ def test_without_new_attacks_or_states(retrain: tuple[Study, RetrainCounts], tmp
     assert taught(study, again).to_json() == taught(study, less).to_json()
 
 
+def refused(load: Callable[[Path], object], kept: Path, message: str) -> None:
+    """In one line."""
+    with pytest.raises(FormatError, match=message) as error:
+        load(kept)
+    assert "\n" not in str(error.value)
+
+
 def changed(path: Path, before: str, after: str) -> None:
     packed = path.suffix == ".gz"
     text = gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
@@ -235,9 +242,7 @@ def test_what_is_damaged_of_transfer_is_one_line(
 ) -> None:
     keep_transfer(tmp_path / "kept", *transfer)
     changed(tmp_path / "kept" / file, old, new)
-    with pytest.raises(FormatError, match=message) as refused:
-        load_transfer(tmp_path / "kept")
-    assert "\n" not in str(refused.value)
+    refused(load_transfer, tmp_path / "kept", message)
 
 
 @pytest.mark.parametrize(
@@ -267,6 +272,4 @@ def test_what_is_damaged_of_retrain_is_one_line(
 ) -> None:
     keep_retrain(tmp_path / "kept", *retrain)
     changed(tmp_path / "kept" / file, old, new)
-    with pytest.raises(FormatError, match=message) as refused:
-        load_retrain(tmp_path / "kept")
-    assert "\n" not in str(refused.value)
+    refused(load_retrain, tmp_path / "kept", message)
