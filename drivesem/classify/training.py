@@ -146,12 +146,7 @@ def _fit_all(
 
 
 def _fit(
-    module: nn.Module,
-    batch: Any,
-    accuracy: Any,
-    count: int,
-    config: Classify,
-    generator: torch.Generator,
+    module: nn.Module, batch: Any, accuracy: Any, count: int, config: Classify, generator: torch.Generator
 ) -> list[dict[str, float]]:
     """Adam, with a rate that falls in a half cosine, over `count` pictures; what each epoch came to."""
     rate = config.rate or _RATES[config.layers]

@@ -51,11 +51,7 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
 
 
 def to_train(
-    architecture: str,
-    weights: str | None,
-    classes: Sequence[str],
-    generator: torch.Generator,
-    anew: bool = False,
+    architecture: str, weights: str | None, classes: Sequence[str], generator: torch.Generator, anew: bool = False
 ) -> Classifier:
     """A network with a new last layer for `classes`, and all else from a file: torchvision's (.pth), or a
     safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions. anew:

@@ -18,13 +18,7 @@ from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE
 from drivesem.classify.study.results import OVERALL, Network, Results
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism.measures import METRICS
-from drivesem.questions.worth.measures import (
-    MEMBERSHIPS,
-    Setting,
-    gain_of,
-    realism,
-    worth_of,
-)
+from drivesem.questions.worth.measures import MEMBERSHIPS, Setting, gain_of, realism, worth_of
 from drivesem.report.tables import Sheet
 
 Row = dict[str, Any]
