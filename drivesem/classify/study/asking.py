@@ -7,10 +7,9 @@ from pathlib import Path
 
 from drivesem.classify.study.arms import ARMS
 from drivesem.classify.study.kept import keep_results, load_results
-from drivesem.classify.study.lab import PICTURES, TABLES, Lab
+from drivesem.classify.study.lab import PICTURES, RETRAINED, TABLES, Lab
 from drivesem.classify.study.looking import LOOKED
 from drivesem.classify.study.results import Facts, Results
-from drivesem.classify.study.retraining import RETRAINED
 from drivesem.classify.study.tables import ORDERS, flat, remarks, tables_of
 from drivesem.questions.study.kept_rows import KEPT
 from drivesem.report.answer import Answer

@@ -14,7 +14,7 @@ from drivesem.classify.networks.base import Classifier
 from drivesem.classify.paper import theirs
 from drivesem.classify.training import embedded
 from drivesem.questions.realism.frechet import Gaussian, frechet
-from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures, psnr_db
+from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures
 from drivesem.questions.worth.measures import Floats
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
@@ -76,15 +76,10 @@ class Apart:
     pairs: Mapping[str, Floats]
     sets: Mapping[str, tuple[Floats, Floats]]
 
-    def mean(self, metric: str, kept: np.ndarray) -> float | None:
-        """Of some pictures, kept (M,) bool: the mean distance, or the sets' one; None where there are too few."""
-        if metric in self.sets:
-            first, second = (side[kept] for side in self.sets[metric])
-            return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
-        if not kept.any():
-            return None
-        mean = float(self.pairs[metric][kept].mean())
-        return psnr_db(mean) if METRICS[metric].squared else mean
+    def between(self, metric: str, kept: np.ndarray) -> float | None:
+        """The distance of the sets of some pictures, kept (M,) bool; None where there are too few."""
+        first, second = (side[kept] for side in self.sets[metric])
+        return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
 
 
 def apart(
