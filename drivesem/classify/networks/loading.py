@@ -14,9 +14,7 @@ from detectors.reading import read_state
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
-from drivesem.classify.networks.resnet import ResNet50
-from drivesem.classify.networks.squeezenet import SqueezeNet
-from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.weights import load_into, read_weights
