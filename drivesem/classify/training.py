@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar, training_bar

@@ -17,7 +17,7 @@ from torch import Tensor
 from drivesem.classify.attack import report_run
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier, ready, save_classifier
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
 from drivesem.classify.paper import NETWORKS
 from drivesem.classify.pictures import Shown, Studio, draw

@@ -9,8 +9,7 @@ import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from drivesem.classify.objects.embedded import KINDS, EmbeddedObjects
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import KINDS, EmbeddedObjects, open_objects
 from drivesem.classify.objects.types import CLASSES, SPLITS, ObjectModel
 from scene_ir.errors import RangeError
 
