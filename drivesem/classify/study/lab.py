@@ -31,13 +31,13 @@ from drivesem.questions.realism.asking import AVAILABLE, chosen
 from drivesem.questions.realism.measures import load
 from drivesem.questions.transfer.asking import words
 from drivesem.questions.worth.measures import Floats
-from drivesem.run.folder import FRAMES, folder_of
+from drivesem.run.folder import FRAMES, RETRAINED, folder_of
 from drivesem.settings.commands import Classify, Study
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 
-PICTURES, RETRAINED = "pictures", "retrained"
-"""Folders of the pictures that are trained on, and of the weights that come of it."""
+PICTURES = "pictures"
+"""Folder of the pictures that are trained on."""
 EPOCHS = 20
 BENIGN, ONWARD = "benign", "benign-on"
 """A network as it was, and trained on with benign pictures alone."""
