@@ -84,12 +84,8 @@ def to_train(
 
 def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -> None:
     """Write weights as float16, what was counted in training as float32."""
-    learned = {key for key, _ in network.named_parameters()}
-    tensors = {
-        key: value.detach().cpu().contiguous().to(torch.float16 if key in learned else torch.float32)
-        for key, value in network.state_dict().items()
-        if value.is_floating_point()
-    }
+    halved = detectors.registry.halved(network)
+    tensors = {key: value for key, value in halved.items() if value.is_floating_point()}
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
     detectors.registry.write_weights(path, metadata, tensors)
 
