@@ -80,7 +80,7 @@ def test_objects_are_those_that_were_published() -> None:
     assert len(rows) == sum(len(kinds) for kinds in KINDS.values())
     for row in rows:
         name, *figures = row.split(",")
-        expected = pytest.approx([float(figure) for figure in figures], rel=1e-5, abs=1e-5)
+        expected = pytest.approx([float(figure) for figure in figures], rel=1e-6)
         assert measured(OBJECTS.load(name)) == expected, name
 
 
