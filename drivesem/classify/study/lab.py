@@ -226,6 +226,12 @@ class Lab:
         frames = self.arms[kind, network, GRADIENT[0] if strategy == BENIGN else strategy].frames(shown)
         return np.array([one.right_before if strategy == BENIGN else one.right_after for one in frames])
 
+    def distances(self, what: str, network: str, strategy: str, metric: str) -> Floats:
+        """Distances (N,) from the pictures before, as `Results.far` says."""
+        if what == "pixels":
+            return self.pixels(self.eyes_of(network))[f"{strategy} apart"].astype(np.float64)
+        return self.apart(network, strategy).pairs[metric]
+
     def chances(self, network: str, strategy: str, trained: str) -> Floats:
         """Softmax (N, C) of a network, as it was or trained so, for the pictures against it as it was."""
         eyes = self.eyes_of(network)

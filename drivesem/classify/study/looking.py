@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.paper import theirs
 from drivesem.classify.training import embedded
 from drivesem.questions.realism.frechet import Gaussian, frechet
 from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures
@@ -48,8 +47,8 @@ class Eyes:
 
     @property
     def theirs(self) -> str:
-        """The network of the paper that it stands beside."""
-        return theirs(self.network.architecture)
+        """The network of the paper that it stands beside: VGG-16, unless it is a ResNet-50."""
+        return "resnet50" if self.network.architecture.startswith("resnet") else "vgg16"
 
     def features(self, name: str, paths: Sequence[Path]) -> Tensor:
         """Features (N, K) of pictures, which are known by a name of their own."""

@@ -104,14 +104,6 @@ class Results:
     certain: dict[Key, int | None] = field(default_factory=dict[Key, "int | None"])
 
     @property
-    def classes(self) -> tuple[str, ...]:
-        return self.facts.classes
-
-    @property
-    def networks(self) -> tuple[Network, ...]:
-        return self.facts.networks
-
-    @property
     def deep(self) -> tuple[Network, ...]:
         return tuple(one for one in self.facts.networks if one.deep)
 
@@ -124,7 +116,7 @@ class Results:
     def labels(self) -> np.ndarray:
         """Of all pictures (N,)."""
         kinds = [name.partition("/")[0] for name in self.facts.pictures]
-        return np.array([self.classes.index(kind) for kind in kinds], np.int64)
+        return np.array([self.facts.classes.index(kind) for kind in kinds], np.int64)
 
     @cached_property
     def units(self) -> np.ndarray:
@@ -144,14 +136,6 @@ class Results:
         places = list(self.facts.few) if what == "fresh" else slice(None)
         return Answers(found, self.labels[places], self.units[places])
 
-    def on_pixels(self, network: Network, attack: str) -> Floats:
-        """How far (N,) an attack on pixels went."""
-
-        def far(lab: Lab) -> Floats:
-            return lab.pixels(lab.eyes_of(network.name))[f"{attack} apart"].astype(np.float64)
-
-        return self._noted(self.distances, ("pixels", network.name, attack, ""), far)
-
     def taught(self, network: Network, trained: str) -> bool:
         """Whether it was retrained so."""
         wanted = any(name in self.facts.tables for name in ("retraining", "robustness", "worth"))
@@ -163,16 +147,18 @@ class Results:
         found = self._noted(self.chances, key, lambda lab: lab.chances(*key))
         return replace(classified(found, self.labels, rho), unit=self.units)
 
-    def far(self, network: Network, strategy: str, metric: str) -> Floats:
-        """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors."""
-        key = ("counterexamples", network.name, strategy, metric)
-        return self._noted(self.distances, key, lambda lab: lab.apart(network.name, strategy).pairs[metric])
+    def far(self, network: Network, strategy: str, metric: str, what: str = "counterexamples") -> Floats:
+        """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors. what: or "pixels",
+        after an attack on these.
+        """
+        key = (what, network.name, strategy, metric)
+        return self._noted(self.distances, key, lambda lab: lab.distances(*key))
 
     def mean(self, network: Network, strategy: str, metric: str, kind: str) -> float | None:
         """The mean distance, or the sets' one, of what was right before. kind: a class, or OVERALL."""
         kept = self.answers("attacked", network, BENIGN).right
         if kind != OVERALL:
-            kept = kept & (self.labels == self.classes.index(kind))
+            kept = kept & (self.labels == self.facts.classes.index(kind))
         if not METRICS[metric].pairwise:
             key = (network.name, strategy, metric, kind)
             return self._noted(self.sets, key, lambda lab: lab.apart(*key[:2]).between(metric, kept))

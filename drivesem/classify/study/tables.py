@@ -115,14 +115,14 @@ def _rounded(value: float | None) -> float | None:
 
 def _overall(lab: Results, answers: Answers) -> Row:
     found = {"pictures": len(answers.right), **_bounded("overall", answers.overall(lab.drawing))}
-    if lab.classes == CLASSES:
+    if lab.facts.classes == CLASSES:
         sizes = [counts[0] for counts in figures()["sizes"].values()]
         found |= _bounded("at_paper_sizes", answers.overall(lab.drawing, sizes))
     return found
 
 
 def _with_classes(lab: Results, answers: Answers) -> Row:
-    own = zip(lab.classes, answers.by_class(len(lab.classes)), strict=True)
+    own = zip(lab.facts.classes, answers.by_class(len(lab.facts.classes)), strict=True)
     return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
 
 
@@ -145,12 +145,12 @@ def _by_class(values: Sequence[float]) -> Row:
 
 def _degradation(lab: Results) -> Table:
     rows = []
-    for eyes, strategy in product(lab.networks, (BENIGN, *STRATEGIES)):
+    for eyes, strategy in product(lab.facts.networks, (BENIGN, *STRATEGIES)):
         answers = lab.answers("attacked", eyes, strategy)
         row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, answers)}
         rows.append(row | {"certain": None if strategy == BENIGN else lab.certain_of(eyes, strategy)})
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
-    columns = ("network", "strategy", *lab.classes, "overall", "at_paper_sizes", "certain")
+    columns = ("network", "strategy", *lab.facts.classes, "overall", "at_paper_sizes", "certain")
     return Table("degradation", "Accuracy by class and strategy, %", columns, rows, reference)
 
 
@@ -213,7 +213,7 @@ def _robustness(lab: Results) -> Table:
 def _worth(lab: Results) -> Table:
     rows: list[Row] = []
     distance = lab.facts.distance
-    for eyes in lab.networks:
+    for eyes in lab.facts.networks:
         far = {one: lab.far(eyes, one, distance) for one in STRATEGIES}
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
@@ -239,10 +239,10 @@ def _worth(lab: Results) -> Table:
 
 def _realism(lab: Results) -> Table:
     rows = []
-    for eyes, strategy, metric in product(lab.networks, STRATEGIES, lab.facts.measures):
+    for eyes, strategy, metric in product(lab.facts.networks, STRATEGIES, lab.facts.measures):
         name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
         row: Row = {"network": eyes.name, "strategy": strategy, "metric": name}
-        kinds = (*lab.classes, OVERALL)
+        kinds = (*lab.facts.classes, OVERALL)
         rows.append(row | {kind: _rounded(lab.mean(eyes, strategy, metric, kind)) for kind in kinds})
     reference = [
         row | {"metric": row["metric"].upper(), **_by_class(values)}
@@ -254,13 +254,13 @@ def _realism(lab: Results) -> Table:
         "does not compare with the paper's. "
         + (f"Without weights on disk: {', '.join(absent)}." if absent else "")
     )
-    columns = ("network", "strategy", "metric", *lab.classes, "overall")
+    columns = ("network", "strategy", "metric", *lab.facts.classes, "overall")
     return Table("realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True)
 
 
 def _transfer(lab: Results) -> Table:
     rows = []
-    for source, target in product(lab.networks, lab.networks):
+    for source, target in product(lab.facts.networks, lab.facts.networks):
         for strategy in (BENIGN, *GRADIENT) if source is not target else ():
             row = {"source": source.name, "target": target.name, "strategy": strategy}
             rows.append(row | _with_classes(lab, lab.answers("crossed", source, strategy, target.name)))
@@ -270,7 +270,7 @@ def _transfer(lab: Results) -> Table:
         for row, values in _paper("transfer", "strategy")
     ]
     note = () if rows else ("Two networks are needed: --networks squeezenet,FILE.",)
-    columns = ("source", "target", "strategy", *lab.classes, "overall", "at_paper_sizes")
+    columns = ("source", "target", "strategy", *lab.facts.classes, "overall", "at_paper_sizes")
     return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
 
 
@@ -279,7 +279,7 @@ def _pixels(lab: Results) -> Table:
     for eyes, attack in product(lab.deep if lab.facts.toolbox else (), pixels.ATTACKS):
         row: Row = {"network": eyes.name, "strategy": attack}
         row |= _overall(lab, lab.answers("pixels", eyes, attack, ""))
-        rows.append(row | {"distance": round(float(lab.on_pixels(eyes, attack).mean()), 5)})
+        rows.append(row | {"distance": round(float(lab.far(eyes, attack, "", "pixels").mean()), 5)})
     note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
     notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
@@ -291,7 +291,7 @@ def _sizes(lab: Results) -> Table:
     rows = [
         {"class": one, **{f"{split} objects": objects[split][one] for split in SPLITS}}
         | {f"{split} pictures": used[split][one] for split in used}
-        for one in lab.classes
+        for one in lab.facts.classes
     ]
     reference = [
         {"class": f"{one} (paper)"}
@@ -316,7 +316,7 @@ def _order(
 
 def _strategies_in_order(lab: Results) -> list[Row]:
     rows: list[Row] = []
-    for eyes in lab.networks:
+    for eyes in lab.facts.networks:
         theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
         ours = {one: lab.answers("attacked", eyes, one) for one in STRATEGIES}
         rows += _order(lab, "degradation", eyes, theirs, ours)
