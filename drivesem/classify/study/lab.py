@@ -251,8 +251,10 @@ class Lab:
     def features(self, source: Eyes, strategy: str, target: Eyes) -> Tensor:
         """What a network's last layer reads of counterexamples against a network; of benign pictures too."""
         benign = strategy == BENIGN
-        paths = pictures(self.arms["test", source.name, GRADIENT[0] if benign else strategy], self.done)
-        return target.features(BENIGN if benign else f"{strategy} against {source.name}", paths[not benign])
+        before, after = pictures(self.arms["test", source.name, GRADIENT[0] if benign else strategy], self.done)
+        if benign:
+            return target.features(BENIGN, before)
+        return target.features(f"{strategy} against {source.name}", after)
 
     def apart(self, network: str, strategy: str) -> Apart:
         """How far counterexamples are from the pictures before."""
