@@ -322,11 +322,9 @@ def retrained(
         learner = copy.deepcopy(network)
         learner.last.requires_grad_(True)
         config = Classify(what="train", epochs=EPOCHS, layers="last")
-        known, truth = (
-            dict.fromkeys(("train", "val"), features),
-            dict.fromkeys(("train", "val"), labels.to(device)),
-        )
-        fit_last(learner, known, truth, config, torch.Generator().manual_seed(seed), onward=True)
+        truth = labels.to(device)
+        known, labelled = {"train": features, "val": features}, {"train": truth, "val": truth}
+        fit_last(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
         save_classifier(ready(learner, device), path, {"trained_on": str(len(labels))})
     return load_classifier(str(path), network.classes, device)
 
