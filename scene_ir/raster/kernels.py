@@ -66,6 +66,9 @@ class Edges:
 @wp.func
 def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are passed over."""
+    if i < count:  # of draws of one pixel each there may be as many as pixels
+        if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
+            return i
     low = int(0)
     high = int(count)
     while high - low > 1:

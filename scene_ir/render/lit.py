@@ -176,7 +176,8 @@ def shade(
 
 def over(drawn: Tensor, background: Tensor) -> Tensor:
     """What `LitMesh.render` drew (4, H, W) before a background (3, H, W)."""
-    return background + drawn[3] * (drawn[:3] - background)
+    colour, cover = drawn.split((3, 1))
+    return background + cover * (colour - background)
 
 
 def _smoothed(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
