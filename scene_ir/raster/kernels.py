@@ -38,6 +38,10 @@ ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
 ALL = wp.constant(wp.uint64((1 << 64) - 1))
+BEYOND = wp.constant(wp.float64(1.0 + 1e-6))
+"""A depth so many times another one is farther, as float32 too."""
+ROUNDING = wp.constant(wp.float64(1e-12))
+"""Of a sum of edge functions, in shares of what it adds up; some thousand times what float64 rounds."""
 LIMIT_PX = wp.constant(wp.float64(1e9))
 """Places beyond this are as good as there: it keeps them within int32."""
 BEHIND = wp.constant(-(1 << 31))
@@ -227,9 +231,15 @@ def fill(
     width: int,
     near: wp.float64,
     alone: bool,
+    layered: bool,
     keys: wp.array(dtype=wp.int64),
 ):
-    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have."""
+    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have.
+    layered: whether many of them are likely to show something nearer already.
+    """
+    n = (e.n0 + e.n1) + e.n2
+    # w = det / n . (x, y, 1): no less than this, whatever the sum rounds to.
+    slack = ROUNDING * (extent(e.n0) + extent(e.n1) + extent(e.n2)) * wp.float64(wp.max(wp.max(box[2], box[3]), 1))
     for y in range(box[1], box[3]):
         row = origin + y * width
         span = wp.vec2i(box[0], box[2])
@@ -238,6 +248,10 @@ def fill(
             span = narrow(span, e.n1, y)
             span = narrow(span, e.n2, y)
         for x in range(span[0], span[1]):
+            if layered:
+                behind = wp.float64(wp.cast(wp.int32(keys[row + x] >> wp.int64(32)), wp.float32))
+                if e.det > (edge(n, x, y) + slack) * (behind * BEYOND):
+                    continue
             e0 = edge(e.n0, x, y)
             e1 = edge(e.n1, x, y)
             e2 = edge(e.n2, x, y)
@@ -264,6 +278,7 @@ def rasterize_kernel(
     faces: wp.array(dtype=wp.vec3i),
     boxes: wp.array(dtype=wp.vec4i),
     near: wp.float64,
+    order: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int64),
 ):
     i = start + wp.tid()
@@ -278,15 +293,19 @@ def rasterize_kernel(
     end = parts[part, FACE_END]
     if x1 <= x0 or row_end <= row:
         end = face
+    sorted = order.shape[0] > 0
     while face < end:
-        box = bounds_of(faces[face], clip, boxes, near)
+        f = face
+        if sorted:
+            f = order[face]
+        box = bounds_of(faces[f], clip, boxes, near)
         box = wp.vec4i(
             wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
         )
         if box[0] < box[2] and box[1] < box[3]:
-            e = edges_of(faces[face], clip, parts[part, CULL])
+            e = edges_of(faces[f], clip, parts[part, CULL])
             if e.det > ZERO:
-                fill(e, face, box, origin, width, near, lanes == 1, keys)
+                fill(e, f, box, origin, width, near, lanes == 1, sorted, keys)
         face += lanes
 
 
@@ -1058,6 +1077,7 @@ def rasterize(
             *_corners(clip, faces),
             _boxes(plan),
             near,
+            array(_front_first(clip, faces, face_ranges, cull)),
             array(keys),
         ]
         launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
@@ -1212,6 +1232,19 @@ def _plan(
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
     launch(corner_kernel, halves(clip.shape[0]), inputs, (), clip.device)
     return Plan(parts, lanes, cuts, outlines, boxes, clip.detach(), version_of(clip))
+
+
+def _front_first(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
+    """Faces (F,) int32 from the nearest to the farthest, where that is worth it: of one draw on a CPU whose backs
+    are seen too, so that most of its faces lie behind others. Else none, (0,).
+    """
+    if clip.device.type != "cpu" or len(face_ranges) != 1 or cull is not None or not len(faces):
+        return face_ranges.new_empty(0, dtype=torch.int32)
+    start, end = face_ranges[0].tolist()
+    nearest = clip[:, 2][faces[start:end]].amin(dim=1)
+    order = torch.arange(len(faces), dtype=torch.int32, device=clip.device)
+    order[start:end] = nearest.argsort().to(torch.int32) + start
+    return order
 
 
 def _corners(clip: Tensor, faces: Tensor) -> list[Any]:
