@@ -208,13 +208,15 @@ def edges_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
 
 
 @wp.func
-def narrow(span: wp.vec2i, n: wp.vec3d, y: int):
-    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it."""
+def narrow(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
+    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it. run: 1 /
+    n[0], once for all rows.
+    """
     base = n[1] * wp.float64(y) + n[2]
     first = span[0]
     end = span[1]
     if wp.abs(n[0]) > STEEP * (wp.abs(n[1] * wp.float64(y)) + wp.abs(n[2])):
-        x = wp.clamp(-base / n[0], -LIMIT_PX, LIMIT_PX)
+        x = wp.clamp(-base * run, -LIMIT_PX, LIMIT_PX)
         if n[0] > ZERO:
             first = wp.max(first, wp.int32(wp.floor(x)) - 1)
         else:
@@ -238,15 +240,17 @@ def fill(
     layered: whether many of them are likely to show something nearer already.
     """
     n = (e.n0 + e.n1) + e.n2
-    # w = det / n . (x, y, 1): no less than this, whatever the sum rounds to.
-    slack = ROUNDING * (extent(e.n0) + extent(e.n1) + extent(e.n2)) * wp.float64(wp.max(wp.max(box[2], box[3]), 1))
+    # The depth's denominator, n . (x, y, 1), is no more than what the pixel will sum up, and this.
+    reach = wp.max(wp.max(wp.abs(box[0]), wp.abs(box[1])), wp.max(wp.abs(box[2]), wp.abs(box[3])))
+    slack = ROUNDING * (extent(e.n0) + extent(e.n1) + extent(e.n2)) * wp.float64(reach + 1)
+    runs = wp.vec3d(ONE / e.n0[0], ONE / e.n1[0], ONE / e.n2[0])
     for y in range(box[1], box[3]):
         row = origin + y * width
         span = wp.vec2i(box[0], box[2])
         if span[1] - span[0] > WIDE:
-            span = narrow(span, e.n0, y)
-            span = narrow(span, e.n1, y)
-            span = narrow(span, e.n2, y)
+            span = narrow(span, e.n0, runs[0], y)
+            span = narrow(span, e.n1, runs[1], y)
+            span = narrow(span, e.n2, runs[2], y)
         for x in range(span[0], span[1]):
             if layered:
                 behind = wp.float64(wp.cast(wp.int32(keys[row + x] >> wp.int64(32)), wp.float32))
