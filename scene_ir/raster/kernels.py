@@ -51,6 +51,8 @@ WIDE = wp.constant(12)
 STEEP = wp.constant(wp.float64(1e-6))
 """An edge function that changes less than this share of itself over a pixel does not tell where it ends."""
 
+TILE = wp.constant(16)
+"""Pixels along each side of the squares of which it is known what they show farthest away."""
 NOTHING = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
 """Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinitely far, face -1."""
 X0, Y0, X1, Y1, ROW, ROW_END, OFFSET, FACE, FACE_END, CULL, FIRST = (wp.constant(i) for i in range(11))
@@ -273,6 +275,47 @@ def fill(
                 wp.atomic_min(keys, row + x, key)
 
 
+@wp.func
+def note_farthest(
+    part: int,
+    x0: int,
+    x1: int,
+    row: int,
+    row_end: int,
+    origin: int,
+    width: int,
+    keys: wp.array(dtype=wp.int64),
+    tiles: wp.array3d(dtype=wp.float32),
+):
+    """What the tiles of a part show farthest away."""
+    for ty in range((row_end - row + TILE - 1) // TILE):
+        for tx in range((x1 - x0 + TILE - 1) // TILE):
+            farthest = wp.int64(0)
+            for y in range(row + ty * TILE, wp.min(row + ty * TILE + TILE, row_end)):
+                for x in range(x0 + tx * TILE, wp.min(x0 + tx * TILE + TILE, x1)):
+                    farthest = wp.max(farthest, keys[origin + y * width + x])
+            tiles[part, ty, tx] = wp.cast(wp.int32(farthest >> wp.int64(32)), wp.float32)
+
+
+@wp.func
+def is_hidden(
+    corner: wp.vec3i,
+    clip: wp.array(dtype=wp.vec3f),
+    part: int,
+    x0: int,
+    row: int,
+    box: wp.vec4i,
+    tiles: wp.array3d(dtype=wp.float32),
+):
+    """Whether all tiles that a triangle in `box` may touch showed nearer things when they were last looked at."""
+    nearest = wp.float64(wp.min(clip[corner[0]][2], wp.min(clip[corner[1]][2], clip[corner[2]][2])))
+    for ty in range((box[1] - row) // TILE, (box[3] - 1 - row) // TILE + 1):
+        for tx in range((box[0] - x0) // TILE, (box[2] - 1 - x0) // TILE + 1):
+            if nearest <= wp.float64(tiles[part, ty, tx]) * BEYOND:
+                return False
+    return True
+
+
 @wp.kernel
 def rasterize_kernel(
     start: int,
@@ -283,6 +326,7 @@ def rasterize_kernel(
     boxes: wp.array(dtype=wp.vec4i),
     near: wp.float64,
     order: wp.array(dtype=wp.int32),
+    tiles: wp.array3d(dtype=wp.float32),
     keys: wp.array(dtype=wp.int64),
 ):
     i = start + wp.tid()
@@ -298,15 +342,22 @@ def rasterize_kernel(
     if x1 <= x0 or row_end <= row:
         end = face
     sorted = order.shape[0] > 0
+    quarter = (end - face) // 4
+    begin = int(face)
     while face < end:
         f = face
         if sorted:
             f = order[face]
+            if quarter > 0 and (face == begin + quarter or face == begin + 2 * quarter):
+                note_farthest(part, x0, x1, row, row_end, origin, width, keys, tiles)
         box = bounds_of(faces[f], clip, boxes, near)
         box = wp.vec4i(
             wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
         )
-        if box[0] < box[2] and box[1] < box[3]:
+        some = box[0] < box[2] and box[1] < box[3]
+        if sorted and some and quarter > 0 and face >= begin + quarter:
+            some = not is_hidden(faces[f], clip, part, x0, row, box, tiles)
+        if some:
             e = edges_of(faces[f], clip, parts[part, CULL])
             if e.det > ZERO:
                 fill(e, f, box, origin, width, near, lanes == 1, sorted, keys)
@@ -1075,13 +1126,19 @@ def rasterize(
     face = torch.empty(size, dtype=torch.int32, device=clip.device)
     depth = torch.empty(size, dtype=torch.float32, device=clip.device)
     if size:
+        order = _front_first(clip, faces, face_ranges, cull)
+        high, wide = (
+            (layout.rects[:, 2:] - layout.rects[:, :2]).amax(dim=0).flip(0).tolist() if len(order) else (0, 0)
+        )
+        tiles = clip.new_empty(len(plan.parts), -(-high // TILE), -(-wide // TILE), dtype=torch.float32)
         inputs = [
             plan.lanes,
             array(plan.parts),
             *_corners(clip, faces),
             _boxes(plan),
             near,
-            array(_front_first(clip, faces, face_ranges, cull)),
+            array(order),
+            array(tiles),
             array(keys),
         ]
         launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
