@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from scene_ir.geometry import kept_within, to_clip, weld
 from scene_ir.raster import verbs
@@ -187,8 +186,8 @@ class _Turned(torch.autograd.Function):
         return vectors.T.contiguous()
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        return gradient.T.contiguous()
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+        return grad_outputs[0].T.contiguous()
 
 
 def over(drawn: Tensor, background: Tensor) -> Tensor:
@@ -205,9 +204,8 @@ class _Over(torch.autograd.Function):
         return background + drawn[3] * (drawn[:3] - background)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None]:
-        drawn, background = ctx.saved_tensors
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor | None]:
+        (gradient,), (drawn, background) = grad_outputs, ctx.saved_tensors
         to_drawn = torch.empty_like(drawn)
         torch.mul(gradient, drawn[3], out=to_drawn[:3])
         to_cover = torch.mul(gradient[0], drawn[0] - background[0], out=to_drawn[3])
