@@ -9,6 +9,8 @@ which triangle a pixel shows; fusing of multiply and add is off for the same rea
 On a CPU the draws are dealt out to the threads, a large one in bands of rows, so that each pixel belongs to one
 thread (`Plan`). Triangles are sorted out by the pixels around their corners, which cost one division a vertex;
 for the outlines only those are cut with rows and columns that have a hit pixel beside an empty one.
+A draw whose backs are seen, most of whose triangles therefore lie behind others, goes from the nearest on and passes
+over what is hidden.
 """
 
 from __future__ import annotations
