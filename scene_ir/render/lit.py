@@ -120,17 +120,18 @@ class LitMesh:
         self, face: Tensor, at: Tensor, clip: Tensor, vertices: Tensor, lights: Lights, backend: verbs.Backend
     ) -> Tensor:
         """(S, 3) after gamma of faces (S,) at (S, 2) px."""
-        corners, normal, _ = self.corners(vertices)
-        attributes = torch.cat([corners.reshape(-1, 3), normal], dim=1)
+        corners, normals, _ = self.corners(vertices)
+        attributes = torch.cat([corners.reshape(-1, 3), normals], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
         own = clip.index_select(0, self.faces.reshape(-1)) * clip.new_tensor([FINE, FINE, 1.0])
         place = (FINE * at.to(torch.float64)).round().to(torch.int64)
         layout = Layout.of(torch.cat([place, place + 1], dim=1))
         fragments = Fragments(layout, face.to(torch.int32), at[:, 0], torch.tensor([[0, len(self.faces)]]), 0.0)
-        seen = verbs.interpolate(fragments, own, flat, attributes, backend)
+        point, normal = verbs.interpolate(fragments, own, flat, attributes, backend).split(3, dim=1)
         materials = self.materials
         light = shade(
-            *seen.split(3, dim=1),
+            point,
+            normal,
             materials.diffuse.to(clip).index_select(0, face),
             materials.specular.to(clip).index_select(0, face),
             materials.shininess.to(clip).index_select(0, face),
