@@ -20,7 +20,7 @@ from drivesem.bench.timing import Clock, Spread, Taken
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import ARCHITECTURES, ready
 from drivesem.classify.objective import ClassifierObjective, aim
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.scenes import ObjectScene, generated_background
 from drivesem.classify.space import Amounts, Moved, ObjectSpace
 from drivesem.run.allocation import keep_freed
