@@ -7,14 +7,18 @@ itself), central differences stand beside gradients: through the picture, times 
 shipped classifier's score of the true class. Printed are cosines over directions: with the gradient in the middle,
 and with the mean of gradients along the way from the one end of the difference to the other. The first one falls
 short where the slope itself changes over the step, as that of a network does. The second one does not: what
-changes without a jump changes by what its slopes add up to. By default of one held-out object of each class, in a
-view that is not straight ahead.
+changes without a jump changes by what its slopes add up to. Of the score, two more say whose doing the
+rest is: the network's gradient in the middle, times how much the picture changes from end to end, beside the
+change of the score, in which no gradient of the renderer has a part; and the whole gradient in the middle beside
+that product, in which the network is the same linear one on both sides. By default of one held-out object of each
+class, in a view that is not straight ahead.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -27,8 +31,29 @@ from drivesem.classify.space import Amounts, Moved, ObjectSpace
 
 STEPS = {"vertex": 1e-4, "pose": 1e-3, "lighting": 1e-2}
 """Object sizes, rad, shares."""
-Values = Callable[[Tensor], Tensor]
-"""theta (D,) to (2,): what is made of the picture, by the noise and by the network."""
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """picture: theta (D,) to (3, H, W); score: of a picture, (); noise (3, H, W)."""
+
+    picture: Callable[[Tensor], Tensor]
+    score: Callable[[Tensor], Tensor]
+    noise: Tensor
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """(2,): what is made of the picture, by the noise and by the network."""
+        picture = self.picture(theta)
+        return torch.stack([(picture.double() * self.noise).sum(), self.score(picture).double()])
+
+    def by_the_network(self, step: Tensor) -> Tensor:
+        """Half of what the score would change by, (), from one step (D,) before to one behind, if the network were
+        the linear one that it is in the middle.
+        """
+        with torch.no_grad():
+            middle, before, behind = (self.picture(place) for place in (0 * step, -step, step))
+        (gradient,) = torch.autograd.grad(self.score(middle.requires_grad_(True)), middle)
+        return (gradient.double() * (behind.double() - before.double())).sum() / 2
 
 
 def slopes(values: Values, theta: Tensor, direction: Tensor) -> Tensor:
@@ -46,16 +71,21 @@ def difference(values: Values, step: Tensor) -> Tensor:
 
 
 def cosines(values: Values, directions: Tensor, step: float, points: int) -> Tensor:
-    """(4,): through the picture, in the middle and along the way, and through the score, of directions (N, D)."""
-    middle, mean, changes = [], [], []
+    """(6,): through the picture, in the middle and along the way, and through the score; of the score what the
+    network's slope leaves, and what the renderer's does; of directions (N, D).
+    """
+    middle, mean, changes, linear = [], [], [], []
     for direction in directions:
         changes.append(difference(values, step * direction) / step)
+        linear.append(values.by_the_network(step * direction) / step)
         middle.append(slopes(values, torch.zeros_like(direction), direction))
         places = [((2 * point + 1) / points - 1) * step * direction for point in range(points)]
         mean.append(torch.stack([slopes(values, place, direction) for place in places]).mean(dim=0))
     wanted = torch.stack(changes)
     found = [F.cosine_similarity(torch.stack(one), wanted, dim=0) for one in (middle, mean)]
-    return torch.stack(found).T.reshape(-1)
+    network = F.cosine_similarity(torch.stack(linear), wanted[:, 1], dim=0)
+    renderer = F.cosine_similarity(torch.stack(middle)[:, 1], torch.stack(linear), dim=0)
+    return torch.cat([torch.stack(found).T.reshape(-1), network[None], renderer[None]])
 
 
 def main() -> None:
@@ -75,18 +105,23 @@ def main() -> None:
     views = list(VIEWS)[1:]
     usual = [f"{kind}/0080:{views[place % 3]}" for place, kind in enumerate(objects.classes)]
     found: dict[str, list[Tensor]] = {name: [] for name in told.params}
-    print("cosines through the picture: in the middle, along the way; through the score: the same")
+    print(
+        "cosines through the picture: in the middle, along the way; through the score: the same; "
+        "what the network's slope leaves of it, what the renderer's does"
+    )
     for word in told.names or usual:
         name, _, view = word.partition(":")
         scene = ObjectScene(name, objects.load(name), view or views[0], generated_background(name))
         for parameter in told.params:
             space = ObjectSpace(scene.vertices, (Moved(parameter),), Amounts(0.002, 0.15, 0.2))
 
-            def values(theta: Tensor, scene: ObjectScene = scene, space: ObjectSpace = space) -> Tensor:
-                picture = scene.picture(space.change(theta))
-                score = network(picture[None])[0, scene.model.label]
-                return torch.stack([(picture.double() * noise).sum(), score.double()])
+            def picture(theta: Tensor, scene: ObjectScene = scene, space: ObjectSpace = space) -> Tensor:
+                return scene.picture(space.change(theta))
 
+            def score(picture: Tensor, label: int = scene.model.label) -> Tensor:
+                return network(picture[None])[0, label]
+
+            values = Values(picture, score, noise)
             directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
             row = cosines(values, directions, told.step or STEPS[parameter], told.points)
             found[parameter].append(row)

@@ -9,6 +9,8 @@ which triangle a pixel shows; fusing of multiply and add is off for the same rea
 On a CPU the draws are dealt out to the threads, a large one in bands of rows, so that each pixel belongs to one
 thread (`Plan`). Triangles are sorted out by the pixels around their corners, which cost one division a vertex;
 for the outlines only those are cut with rows and columns that have a hit pixel beside an empty one.
+A draw whose backs are seen, most of whose triangles therefore lie behind others, goes from the nearest on and passes
+over what is hidden.
 """
 
 from __future__ import annotations
@@ -38,6 +40,10 @@ ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
 ALL = wp.constant(wp.uint64((1 << 64) - 1))
+BEYOND = wp.constant(wp.float64(1.0 + 1e-6))
+"""A depth so many times another one is farther, as float32 too."""
+ROUNDING = wp.constant(wp.float64(1e-12))
+"""Of a sum of edge functions, in shares of what it adds up; some thousand times what float64 rounds."""
 LIMIT_PX = wp.constant(wp.float64(1e9))
 """Places beyond this are as good as there: it keeps them within int32."""
 BEHIND = wp.constant(-(1 << 31))
@@ -47,6 +53,8 @@ WIDE = wp.constant(12)
 STEEP = wp.constant(wp.float64(1e-6))
 """An edge function that changes less than this share of itself over a pixel does not tell where it ends."""
 
+TILE = wp.constant(16)
+"""Pixels along each side of the squares of which it is known what they show farthest away."""
 NOTHING = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
 """Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinitely far, face -1."""
 X0, Y0, X1, Y1, ROW, ROW_END, OFFSET, FACE, FACE_END, CULL, FIRST = (wp.constant(i) for i in range(11))
@@ -66,6 +74,9 @@ class Edges:
 @wp.func
 def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are passed over."""
+    if i < count:  # of draws of one pixel each there may be as many as pixels
+        if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
+            return i
     low = int(0)
     high = int(count)
     while high - low > 1:
@@ -201,13 +212,15 @@ def edges_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
 
 
 @wp.func
-def narrow(span: wp.vec2i, n: wp.vec3d, y: int):
-    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it."""
+def narrow(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
+    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it. run: 1 /
+    n[0], once for all rows.
+    """
     base = n[1] * wp.float64(y) + n[2]
     first = span[0]
     end = span[1]
     if wp.abs(n[0]) > STEEP * (wp.abs(n[1] * wp.float64(y)) + wp.abs(n[2])):
-        x = wp.clamp(-base / n[0], -LIMIT_PX, LIMIT_PX)
+        x = wp.clamp(-base * run, -LIMIT_PX, LIMIT_PX)
         if n[0] > ZERO:
             first = wp.max(first, wp.int32(wp.floor(x)) - 1)
         else:
@@ -224,17 +237,29 @@ def fill(
     width: int,
     near: wp.float64,
     alone: bool,
+    layered: bool,
     keys: wp.array(dtype=wp.int64),
 ):
-    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have."""
+    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have.
+    layered: whether many of them are likely to show something nearer already.
+    """
+    n = (e.n0 + e.n1) + e.n2
+    # The depth's denominator, n . (x, y, 1), is no more than what the pixel will sum up, and this.
+    reach = wp.max(wp.max(wp.abs(box[0]), wp.abs(box[1])), wp.max(wp.abs(box[2]), wp.abs(box[3])))
+    slack = ROUNDING * (extent(e.n0) + extent(e.n1) + extent(e.n2)) * wp.float64(reach + 1)
+    runs = wp.vec3d(ONE / e.n0[0], ONE / e.n1[0], ONE / e.n2[0])
     for y in range(box[1], box[3]):
         row = origin + y * width
         span = wp.vec2i(box[0], box[2])
         if span[1] - span[0] > WIDE:
-            span = narrow(span, e.n0, y)
-            span = narrow(span, e.n1, y)
-            span = narrow(span, e.n2, y)
+            span = narrow(span, e.n0, runs[0], y)
+            span = narrow(span, e.n1, runs[1], y)
+            span = narrow(span, e.n2, runs[2], y)
         for x in range(span[0], span[1]):
+            if layered:
+                behind = wp.float64(wp.cast(wp.int32(keys[row + x] >> wp.int64(32)), wp.float32))
+                if e.det > (edge(n, x, y) + slack) * (behind * BEYOND):
+                    continue
             e0 = edge(e.n0, x, y)
             e1 = edge(e.n1, x, y)
             e2 = edge(e.n2, x, y)
@@ -252,6 +277,47 @@ def fill(
                 wp.atomic_min(keys, row + x, key)
 
 
+@wp.func
+def note_farthest(
+    part: int,
+    x0: int,
+    x1: int,
+    row: int,
+    row_end: int,
+    origin: int,
+    width: int,
+    keys: wp.array(dtype=wp.int64),
+    tiles: wp.array3d(dtype=wp.float32),
+):
+    """What the tiles of a part show farthest away."""
+    for ty in range((row_end - row + TILE - 1) // TILE):
+        for tx in range((x1 - x0 + TILE - 1) // TILE):
+            farthest = wp.int64(0)
+            for y in range(row + ty * TILE, wp.min(row + ty * TILE + TILE, row_end)):
+                for x in range(x0 + tx * TILE, wp.min(x0 + tx * TILE + TILE, x1)):
+                    farthest = wp.max(farthest, keys[origin + y * width + x])
+            tiles[part, ty, tx] = wp.cast(wp.int32(farthest >> wp.int64(32)), wp.float32)
+
+
+@wp.func
+def is_hidden(
+    corner: wp.vec3i,
+    clip: wp.array(dtype=wp.vec3f),
+    part: int,
+    x0: int,
+    row: int,
+    box: wp.vec4i,
+    tiles: wp.array3d(dtype=wp.float32),
+):
+    """Whether all tiles that a triangle in `box` may touch showed nearer things when they were last looked at."""
+    nearest = wp.float64(wp.min(clip[corner[0]][2], wp.min(clip[corner[1]][2], clip[corner[2]][2])))
+    for ty in range((box[1] - row) // TILE, (box[3] - 1 - row) // TILE + 1):
+        for tx in range((box[0] - x0) // TILE, (box[2] - 1 - x0) // TILE + 1):
+            if nearest <= wp.float64(tiles[part, ty, tx]) * BEYOND:
+                return False
+    return True
+
+
 @wp.kernel
 def rasterize_kernel(
     start: int,
@@ -261,6 +327,8 @@ def rasterize_kernel(
     faces: wp.array(dtype=wp.vec3i),
     boxes: wp.array(dtype=wp.vec4i),
     near: wp.float64,
+    order: wp.array(dtype=wp.int32),
+    tiles: wp.array3d(dtype=wp.float32),
     keys: wp.array(dtype=wp.int64),
 ):
     i = start + wp.tid()
@@ -275,15 +343,26 @@ def rasterize_kernel(
     end = parts[part, FACE_END]
     if x1 <= x0 or row_end <= row:
         end = face
+    sorted = order.shape[0] > 0
+    quarter = (end - face) // 4
+    begin = int(face)
     while face < end:
-        box = bounds_of(faces[face], clip, boxes, near)
+        f = face
+        if sorted:
+            f = order[face]
+            if quarter > 0 and (face == begin + quarter or face == begin + 2 * quarter):
+                note_farthest(part, x0, x1, row, row_end, origin, width, keys, tiles)
+        box = bounds_of(faces[f], clip, boxes, near)
         box = wp.vec4i(
             wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
         )
-        if box[0] < box[2] and box[1] < box[3]:
-            e = edges_of(faces[face], clip, parts[part, CULL])
+        some = box[0] < box[2] and box[1] < box[3]
+        if sorted and some and quarter > 0 and face >= begin + quarter:
+            some = not is_hidden(faces[f], clip, part, x0, row, box, tiles)
+        if some:
+            e = edges_of(faces[f], clip, parts[part, CULL])
             if e.det > ZERO:
-                fill(e, face, box, origin, width, near, lanes == 1, keys)
+                fill(e, f, box, origin, width, near, lanes == 1, sorted, keys)
         face += lanes
 
 
@@ -1049,12 +1128,19 @@ def rasterize(
     face = torch.empty(size, dtype=torch.int32, device=clip.device)
     depth = torch.empty(size, dtype=torch.float32, device=clip.device)
     if size:
+        order = _front_first(clip, faces, face_ranges, cull)
+        high, wide = (
+            (layout.rects[:, 2:] - layout.rects[:, :2]).amax(dim=0).flip(0).tolist() if len(order) else (0, 0)
+        )
+        tiles = clip.new_empty(len(plan.parts), -(-high // TILE), -(-wide // TILE), dtype=torch.float32)
         inputs = [
             plan.lanes,
             array(plan.parts),
             *_corners(clip, faces),
             _boxes(plan),
             near,
+            array(order),
+            array(tiles),
             array(keys),
         ]
         launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
@@ -1209,6 +1295,19 @@ def _plan(
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
     launch(corner_kernel, halves(clip.shape[0]), inputs, (), clip.device)
     return Plan(parts, lanes, cuts, outlines, boxes, clip.detach(), version_of(clip))
+
+
+def _front_first(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
+    """Faces (F,) int32 from the nearest to the farthest, where that is worth it: of one draw on a CPU whose backs
+    are seen too, so that most of its faces lie behind others. Else none, (0,).
+    """
+    if clip.device.type != "cpu" or len(face_ranges) != 1 or cull is not None or not len(faces):
+        return face_ranges.new_empty(0, dtype=torch.int32)
+    start, end = face_ranges[0].tolist()
+    nearest = clip[:, 2][faces[start:end]].amin(dim=1)
+    order = torch.arange(len(faces), dtype=torch.int32, device=clip.device)
+    order[start:end] = nearest.argsort().to(torch.int32) + start
+    return order
 
 
 def _corners(clip: Tensor, faces: Tensor) -> list[Any]:

@@ -24,10 +24,12 @@ WALK = 4
 class Edges:
     """Of a mesh's faces (F, 3). across (3F,) int64: beyond edge 3 * face + i, opposite to the face's corner i, the
     edge of who shares it, -1 where nobody does or more than one. creased (3F,): whether looks change there.
+    onwards (F, 3) int64: the faces beyond edges at which they do not, -1 where they do.
     """
 
     across: Tensor
     creased: Tensor
+    onwards: Tensor
 
     @classmethod
     def of(cls, vertices: Tensor, faces: Tensor, looks: Tensor, crease_cos: float) -> Edges:
@@ -48,12 +50,12 @@ class Edges:
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-12)
         here, there = torch.arange(len(across)) // 3, across.clamp_min(0) // 3
         creased = ((normal[here] * normal[there]).sum(dim=1) < crease_cos) | (looks[here] != looks[there]).any(1)
-        return cls(across, creased | (across < 0))
+        creased |= across < 0
+        return cls(across, creased, torch.where(creased, -1, there).reshape(-1, 3))
 
     def smooth(self, one: Tensor, other: Tensor) -> Tensor:
         """Whether faces (P,) share an edge with others (P,) at which looks do not change."""
-        edges = 3 * one[:, None] + torch.arange(3)
-        return ((self.across[edges] // 3 == other[:, None]) & ~self.creased[edges]).any(dim=1)
+        return (self.onwards.index_select(0, one) == other[:, None]).any(dim=1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -34,14 +35,11 @@ class Looks:
         """Of a draw whose rectangle begins and ends with pixels."""
         x0, y0, x1, y1 = fragments.layout.rects[0].tolist()
         wide, rows, columns = x1 - x0, (y1 - y0) // count, (x1 - x0) // count
-        face = fragments.face.to(torch.int64).reshape(rows, count, columns, count)
-        parts = [face[:, row, :, column] for row in range(count) for column in range(count)]
-        low, high = parts[0], parts[0]
-        for part in parts[1:]:
-            low, high = low.minimum(part), high.maximum(part)
+        face = fragments.face.reshape(rows, count, columns, count)
+        low, high = (reduce(of, reduce(of, face.unbind(1)).unbind(2)) for of in (torch.minimum, torch.maximum))
         low, same = low.reshape(-1), (low == high).reshape(-1)
         whole = (same & (low >= 0)).nonzero()[:, 0]
-        numbers = torch.zeros_like(low).index_put((whole,), torch.arange(len(whole)))
+        numbers = torch.zeros_like(low, dtype=torch.int64).index_put((whole,), torch.arange(len(whole)))
         sight = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
         corner = torch.tensor([x0, y0])
         middle = torch.stack([whole % columns, whole // columns], dim=1) * count + corner + (count - 1) / 2
@@ -50,7 +48,7 @@ class Looks:
         step = torch.arange(count)
         first = mixed // columns * count * wide + mixed % columns * count
         looks = first[:, None] + (step[:, None] * wide + step).reshape(-1)
-        seen, order = fragments.face[looks].sort(dim=1)
+        seen, order = fragments.face.index_select(0, looks.reshape(-1)).reshape_as(looks).sort(dim=1)
         looks = looks.gather(1, order)
         begins = seen >= 0
         begins[:, 1:] &= seen[:, 1:] != seen[:, :-1]
@@ -65,7 +63,7 @@ class Looks:
         return cls(
             fragments,
             count,
-            torch.cat([low[whole], seen[begins].to(torch.int64)]),
+            torch.cat([low.index_select(0, whole), seen[begins]]).to(torch.int64),
             torch.cat([whole, mixed[begins.nonzero()[:, 0]]]),
             torch.cat([torch.ones_like(middle[:, 0]), counts / count**2]),
             torch.cat([middle, centre]),
@@ -83,7 +81,7 @@ class Looks:
 
     def face_at(self, look: Tensor) -> Tensor:
         """(P,) int64, what looks (P,) see, -1 where that is nothing."""
-        return self.fragments.face[look].to(torch.int64)
+        return self.fragments.face.index_select(0, look).to(torch.int64)
 
     def ways(self, edges: Edges) -> tuple[Ways, Ways]:
         """Between looks that are neighbours: those that see two faces, but for those of one smooth surface, and
@@ -99,7 +97,7 @@ class Looks:
         here, there = torch.cat(here), torch.cat(there)
         one, other = self.face_at(here), self.face_at(there)
         inner = ((one >= 0) & (other >= 0)).nonzero()[:, 0]
-        inner = inner[~edges.smooth(one[inner], other[inner])]
+        inner = inner[~edges.smooth(one.index_select(0, inner), other.index_select(0, inner))]
         outwards, inwards = (one >= 0) & (other < 0), (one < 0) & (other >= 0)
         rim = torch.cat([here[outwards], there[inwards]]), torch.cat([there[outwards], here[inwards]])
         return Ways.of(self, here[inner], there[inner]), Ways.of(self, *rim)

@@ -105,6 +105,20 @@ def test_fast_is_reference_on_solids(seed: int, nearest_m: float, threads: int, 
     assert_same(fast, everything(clip, faces, ranges, "reference", cull))
 
 
+@given(SEEDS, st.sampled_from([3.0, 0.5, -2.0]), st.sampled_from([1, 2]))
+@settings(max_examples=15)
+def test_one_draw_of_many_layers_is_the_reference_too(seed: int, nearest_m: float, threads: int) -> None:
+    """Its faces are drawn from the nearest on, whatever their order, and what is hidden is passed over."""
+    points, faces, _ = solids(seed, nearest_m)
+    shells = torch.cat([points * torch.tensor([1.0, 1.0, 1.0 + 0.01 * i]) for i in range(4)])
+    layers = torch.cat([faces + i * len(points) for i in range(4)])
+    layers = layers[torch.randperm(len(layers), generator=torch.Generator().manual_seed(seed))]
+    clip, ranges, layout = to_clip(shells), torch.tensor([[5, len(layers)]]), verbs.Layout.of(RECTS[:1])
+    with sharing(threads):
+        fast = everything(clip, layers, ranges, "warp", layout=layout)
+    assert_same(fast, everything(clip, layers, ranges, "reference", layout=layout))
+
+
 @given(SEEDS, st.booleans())
 @settings(max_examples=15)
 def test_closed_solids_look_the_same_without_their_backs(seed: int, inside_out: bool) -> None:

@@ -91,6 +91,15 @@ def test_a_square_before_the_camera(backend):
     torch.testing.assert_close(picture[:, SIZE // 2, SIZE // 2], torch.full((3,), 0.4**GAMMA))
 
 
+def test_what_lies_before_a_background_has_the_gradients_of_differences():
+    generator = torch.Generator().manual_seed(0)
+    drawn, background = (
+        torch.rand(channels, 3, 2, generator=generator, dtype=torch.float64).requires_grad_()
+        for channels in (4, 3)
+    )
+    assert torch.autograd.gradcheck(over, (drawn, background))
+
+
 @pytest.mark.parametrize("mesh", [trimesh.creation.box((0.5, 0.6, 1)), trimesh.creation.icosphere(2, 0.5)])
 def test_both_backends_draw_the_same(mesh):
     lit = solid(mesh)

@@ -1,0 +1,106 @@
+"""What the renderer takes of a step of an attack on a classifier, and how long an attack's steps take.
+
+    python -m tools.object_step [bus/0080:top ...] [--network vgg16] [--rounds 12] [--threads 2]
+
+A step is the gradient of the true class's score to pose and vertices, at a place half a step from the object as
+it is. Measured in turn are the whole step, the picture and its gradient alone, and the network and its gradient to
+the picture alone: medians and quartiles of the processor's milliseconds, which other work on the machine lengthens
+less than the clock's. Then si-FGSM goes five steps that nothing ends early, each with a look at what it leads to.
+Weights are random ones: they do not change how long a network takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+from drivesem.attack.methods.si_fgsm import SiFGSM
+from drivesem.bench.timing import Clock, Spread, Taken
+from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.loading import ARCHITECTURES, ready
+from drivesem.classify.objective import ClassifierObjective, aim
+from drivesem.classify.objects.embedded import open_objects
+from drivesem.classify.scenes import ObjectScene, generated_background
+from drivesem.classify.space import Amounts, Moved, ObjectSpace
+from drivesem.run.allocation import keep_freed
+
+USUAL = ("bus/0080:top", "helmet/0080:right")
+STEPS = 5
+"""Of the paper's attacks."""
+
+
+class Stepping:
+    """The parts of a step on one object before a network."""
+
+    def __init__(self, scene: ObjectScene, network: Classifier) -> None:
+        self.scene, self.network = scene, network
+        self.space = ObjectSpace(scene.vertices, (Moved.VERTEX, Moved.POSE), Amounts(0.002, 0.15, 0.2))
+        self.objective = ClassifierObjective(scene, self.space, network, "logit")
+        chance = torch.rand(self.space.dim, generator=torch.Generator().manual_seed(0))
+        self.theta = self.space.step * (chance - 0.5)
+        self.seen = self.objective.picture(self.theta)
+        self.gradient = torch.randn(self.seen.shape, generator=torch.Generator().manual_seed(1))
+
+    def whole(self) -> None:
+        self.objective.loss_and_grad(self.theta)
+
+    def drawing(self) -> None:
+        """The picture, and from a gradient of it to theta."""
+        leaf = self.theta.clone().requires_grad_(True)
+        picture = self.scene.picture(self.space.change(leaf))
+        torch.autograd.grad(picture, leaf, self.gradient)
+
+    def looking(self) -> None:
+        """The network's score, and its gradient to the picture."""
+        leaf = self.seen.clone().requires_grad_(True)
+        torch.autograd.grad(aim(self.network(leaf[None])[0], self.scene.model.label, "logit"), leaf)
+
+    def attack(self) -> Taken:
+        """Five steps, from a new objective."""
+        objective = ClassifierObjective(self.scene, self.space, self.network, "logit")
+        search = SiFGSM(STEPS, early_stop=False)
+        return Clock().taken(lambda: search(objective.problem(), self.space.theta0, 0))
+
+
+def main() -> None:
+    """Print a line an object."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", default=USUAL, help="OBJECT:VIEW")
+    parser.add_argument("--objects", help="a folder of meshes; without it, the embedded objects")
+    parser.add_argument("--network", choices=list(ARCHITECTURES), default="vgg16")
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--threads", type=int, help="of torch and of the kernels")
+    told = parser.parse_args()
+    keep_freed()
+    if told.threads is not None:
+        torch.set_num_threads(told.threads)
+    objects = open_objects(told.objects)
+    torch.manual_seed(0)
+    network = ready(ARCHITECTURES[told.network](objects.classes))
+    for word in told.names:
+        name, _, view = word.partition(":")
+        scene = ObjectScene(name, objects.load(name), view or "forward", generated_background(name))
+        stepping, clock = Stepping(scene, network), Clock()
+        parts = (stepping.whole, stepping.drawing, stepping.looking)
+        for part in parts:
+            part()  # what is loaded once
+        taken = [[clock.taken(part).cpu_ms for part in parts] for _ in range(told.rounds)]
+        step, drawing, looking = (Spread.of(column) for column in zip(*taken, strict=True))
+        share = Spread.of([100 * drawn / (drawn + looked) for _, drawn, looked in taken])
+        attack = stepping.attack()
+        print(
+            f"{word}, {len(scene.mesh.faces)} triangles, {told.network}: renderer {share.median:.1f} % "
+            f"[{share.q1:.1f}, {share.q3:.1f}] of a step; processor ms: step {_told(step)}, renderer "
+            f"{_told(drawing)}, network {_told(looking)}; {STEPS} steps {attack.ms / 1e3:.2f} s, "
+            f"{attack.cpu_ms / 1e3:.2f} s of the processor",
+            flush=True,
+        )
+
+
+def _told(spread: Spread) -> str:
+    return f"{spread.median:.0f} [{spread.q1:.0f}, {spread.q3:.0f}]"
+
+
+if __name__ == "__main__":
+    main()
