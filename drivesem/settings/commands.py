@@ -288,8 +288,9 @@ class Study(Bootstrap, Grading, Attacking, FrameCommand):
     states: NotNegative = 16
     """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
     consistency: Annotated[float, POSITIVE] = 1.0
-    """Retrain: weight of the further term of consistent, which compares an object's margins in both of its
-    pictures, and of worst, which asks for it in the worst of four."""
+    """Retrain: weight of the further term of consistent, which compares margins of objects and of background in
+    a failure's two pictures, and of worst, which asks for the object in the worst of four and for nothing beside
+    it."""
     fraction: Share = 0.25
     """Retrain: share of the extra pictures among all that is shown; not of the paper's protocol."""
     near: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.5

@@ -26,7 +26,7 @@ from drivesem.settings.commands import Attack
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.semantic import state_at
 from drivesem.training.targets import TRAINED, training_targets
-from drivesem.truth.margin import of_objects
+from drivesem.truth.margin import of_background, of_objects
 from drivesem.truth.neighbourhood import NEAR, Neighbourhood
 from drivesem.truth.nuisances import Nuisances
 from drivesem.truth.views import SHARPNESS
@@ -148,8 +148,8 @@ class _Beside:
 
 
 class Consistency(_Beside):
-    """What a detector says of an object is to be the same in the photograph and in a state around a failure: a
-    term of the loss, by margins, on a pair of pictures a step.
+    """What a detector says of an object, and of all that is none, is to be the same in the photograph and in a
+    state around a failure: a term of the loss, by margins, on a pair of pictures a step.
     """
 
     name = "consistency"
@@ -163,7 +163,9 @@ class Consistency(_Beside):
         )
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the objects that are judged in both pictures, and lie in the part that is seen."""
+        """Of the objects that are judged in both pictures, and lie in the part that is seen; and of what is
+        surest of all that is reported on nothing there, lest scores rise everywhere.
+        """
         index, (sample, state) = self._pair(step)
         window = self._window(index, sample, state)
         frame = self._around.failures[index][0]
@@ -174,7 +176,12 @@ class Consistency(_Beside):
         judged = ~still.ignore & ~state.ignore[: len(known)] & (labels >= 0) & _inside(both, window).all(0)
         rows = judged.nonzero()[:, 0]
         before, after = (detector.candidates(raw.one(i)) for i in (0, 1))
-        return self._weight * apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
+        objects = apart(before, after, (both[0][rows], both[1][rows]), labels[rows], self._t_star)
+        nothing = [
+            of_background(seen, _shifted(there.boxes_xyxy, window), self._t_star, SHARPNESS)
+            for seen, there in ((before, as_targets(frame.result.targets_benign, CLASSES)), (after, state))
+        ]
+        return self._weight * (objects + F.smooth_l1_loss(nothing[1], nothing[0].detach()))
 
     def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
         index, generator = self._drawn(step)
@@ -182,8 +189,9 @@ class Consistency(_Beside):
 
 
 class Worst(_Beside):
-    """An object is to be found where the detector, as it is at that step, is least sure of it: a term of the loss,
-    the logistic loss of its margin in that one of the pool's states around a failure.
+    """An object is to be found where the detector, as it is at that step, is least sure of it, and nothing is to
+    be reported where it is nearest to a phantom: a term of the loss, the logistic losses of these margins, each in
+    that one of the pool's states around a failure in which it is least.
     """
 
     name = "worst"
@@ -194,18 +202,20 @@ class Worst(_Beside):
         return torch.stack([_part(sample[0], self._window(index, sample, state)) for sample, state in states])
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the object that fails, in the states in which it is judged and lies in the part that is seen."""
+        """Of the object that fails, in the states in which it is judged and lies in the part that is seen; and of
+        all that is none, in every state.
+        """
         index, states = self._states(step)
         target = self._around.failures[index][1]
-        margins = []
+        margins, nothing = [], []
         for number, (sample, state) in enumerate(states):
-            window = self._window(index, sample, state)
+            window, seen = self._window(index, sample, state), detector.candidates(raw.one(number))
+            nothing.append(of_background(seen, _shifted(state.boxes_xyxy, window), self._t_star, SHARPNESS)[None])
             box, label = _shifted(state.boxes_xyxy[[target]], window), _labels(detector, state)[[target]]
             if bool(state.ignore[target]) or int(label) < 0 or not bool(_inside(box, window)):
                 continue
-            seen = detector.candidates(raw.one(number))
             margins.append(of_objects(seen, box, label, box, self._t_star, SHARPNESS))
-        return self._weight * least_sure(margins) if margins else torch.zeros(())
+        return self._weight * (least_sure(nothing) + (least_sure(margins) if margins else 0))
 
     def _states(self, step: int) -> tuple[int, list[tuple[Sample, Targets]]]:
         index, _ = self._drawn(step)
@@ -234,7 +244,7 @@ def _labels(detector: Detector, targets: Targets) -> Tensor:
 
 
 def least_sure(margins: Sequence[Tensor]) -> Tensor:
-    """Logistic loss () of the least of some margins."""
+    """Logistic loss () of the least of some margins, each (1,)."""
     return F.softplus(-torch.cat(list(margins)).min())
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from detectors import boxes
 from detectors.base import Candidates
 from drivesem.attack.goals import logits_of
-from drivesem.truth.kinds import MEETS, SAME_PLACE
+from drivesem.truth.kinds import MEETS, SAME_PLACE, TOUCHES
 
 FLOOR = -8.0
 """Of an object that no candidate meets, as of a score of 0.0003 beside a t* of one half: nothing is farther off.
@@ -65,6 +65,25 @@ def of_places(
     overlaps = boxes.iou_matrix(places_xyxy.to(placed), placed)
     margins = [-_best(logits, overlap, SAME_PLACE, t_star, sharpness) for overlap in overlaps]
     return torch.stack(margins) if margins else candidates.log_scores[:0, 0]
+
+
+def of_background(
+    candidates: Candidates, labelled_xyxy: Tensor, t_star: float, sharpness: float | None = None
+) -> Tensor:
+    """Margin () of all that is no labelled thing: t*'s logit less that of the best candidate on nothing, of any
+    class; at most -`FLOOR`. On nothing is what `kinds.judge` calls background.
+
+    labelled_xyxy: (M, 4) px, of everything that has a label, ignored or not. sharpness: as of `of_objects`.
+    """
+    margins = []
+    for label in range(candidates.log_scores.shape[1]):
+        placed = candidates.boxes_of(label)
+        labelled = labelled_xyxy.to(placed)
+        touches = boxes.iou_matrix(placed, labelled) >= TOUCHES
+        on_nothing = ~(touches | (boxes.ioa_matrix(placed, labelled) >= MEETS)).any(dim=1)
+        overlap = on_nothing.to(candidates.log_scores)
+        margins.append(-_best(logits_of(candidates.log_scores[:, label]), overlap, 1.0, t_star, sharpness))
+    return torch.stack(margins).amin()
 
 
 def _best(logits: Tensor, overlap: Tensor, least: float, t_star: float, sharpness: float | None) -> Tensor:

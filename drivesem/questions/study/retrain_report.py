@@ -66,7 +66,7 @@ def _robust(found: Taught) -> Sheet:
             beside = row.fewer.get((kind, CONTROLS[0]))
             cells += [bounded(row.failures[kind]), "-" if beside is None else bounded(beside)]
         falls = "-" if row.title == BENIGN else percent(row.ap50_falls)
-        goal = "-" if row.short_of is None else "; ".join(row.short_of) or "met"
+        goal = "-" if row.short_of is None else ", ".join(row.short_of) or "met"
         lines.append((*cells, bounded(row.phantoms), falls, goal))
     columns = (
         *(_DETECTOR, "anywhere", "fewer than benign", "fewer than random", "second renderer", "fewer than benign"),
@@ -206,7 +206,8 @@ def _of_robust(found: Taught) -> str:
         "Phantoms: pictures with any, of states anywhere. Seeds count together."
     )
     if any(row.short_of is not None for row in found.chances):
-        text += f" The goal: {'; '.join(GOAL)}; the column says what is not so."
+        goal = "; ".join(f"{name}: {what}" for name, what in GOAL.items())
+        text += f" The goal: {goal}. The last column says what is not so."
     return text
 
 

@@ -136,23 +136,30 @@ def test_the_least_sure_state_counts() -> None:
 
 
 def test_the_worst_of_four_on_real_pictures(around: AroundFailures, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All states of the pool are seen; the loss is of the state with the least margin, and reaches the weights."""
+    """All states of the pool are seen. Each loss is of the state with the least margin, that of the object and
+    that of all that is none; and they reach the weights.
+    """
     detector = load_detector("squeezedet").requires_grad_(True).eval()
     worst = Worst(around, 2.0, detector.t_star, 0, (224, 640))
     images = worst.images(0)
     assert images.shape == (AT_ONCE, 3, 224, 640)
     value = worst.term(detector, detector(images), 0)
-    alone = []
+    objects, nothing = [], []
     for number in range(AT_ONCE):
         monkeypatch.setattr(around, "pool", lambda _, number=number: range(number, number + 1))
-        alone.append(float(worst.term(detector, detector(worst.images(0)), 0).detach()))
-    assert float(value.detach()) == pytest.approx(max(alone), rel=1e-4)
-    assert max(alone) > min(alone) + 1e-3
+        raw = detector(worst.images(0))
+        with monkeypatch.context() as patch:
+            patch.setattr("drivesem.training.around.of_background", lambda *_: torch.tensor(float("inf")))
+            objects.append(float(worst.term(detector, raw, 0).detach()))
+        nothing.append(float(worst.term(detector, raw, 0).detach()) - objects[-1])
+    assert float(value.detach()) == pytest.approx(max(objects) + max(nothing), rel=1e-4)
+    assert max(objects) > min(objects) + 1e-3
+    assert max(nothing) > min(nothing) > 0
     value.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())
 
 
-def test_consistency_on_real_pictures(around: AroundFailures) -> None:
+def test_consistency_on_real_pictures(around: AroundFailures, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its weight scales it, and its gradient reaches the detector's weights."""
     detector = load_detector("squeezedet").requires_grad_(True).eval()
     once, twice = (Consistency(around, weight, detector.t_star, 0, (224, 640)) for weight in (1.0, 2.0))
@@ -162,6 +169,15 @@ def test_consistency_on_real_pictures(around: AroundFailures) -> None:
     raw = detector(images)
     value = once.term(detector, raw, 0)
     assert float(value.detach()) > 0
+    margins = iter([torch.tensor(1.0), torch.tensor(-2.0)])
+    with monkeypatch.context() as patch:
+        patch.setattr("drivesem.training.around.of_background", lambda *_: torch.tensor(1.0))
+        objects = once.term(detector, raw, 0)
+        patch.setattr("drivesem.training.around.of_background", lambda *_: next(margins))
+        rises = once.term(detector, raw, 0)
+    assert float(rises.detach()) == pytest.approx(float(objects.detach()) + 2.5), (
+        "background is nearer to a phantom"
+    )
     assert float(twice.term(detector, raw, 0).detach()) == pytest.approx(2 * float(value.detach()))
     value.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())

@@ -55,6 +55,25 @@ def test_the_sign_turns_for_places() -> None:
     assert margin.of_places(candidates(boxes, scores), place + 300, T_STAR).item() == -margin.FLOOR
 
 
+def test_background_is_what_no_label_covers() -> None:
+    """The best candidate of any class on nothing counts. What touches a label, or lies on one for the most part,
+    is no background.
+    """
+    boxes, scores = two()
+    only = logit(T_STAR) - logit(0.9)
+    torch.testing.assert_close(margin.of_background(candidates(boxes, scores), BOX, T_STAR).item(), only)
+    # half of it covered, and a small part of a large label
+    for label in (boxes[1:] + torch.tensor([0, 0, 40.0, 0]), torch.tensor([[300.0, 0.0, 900.0, 300.0]])):
+        covered = torch.cat([BOX, label.to(BOX)])
+        assert margin.of_background(candidates(boxes, scores), covered, T_STAR).item() == -margin.FLOOR
+    nothing = margin.of_background(candidates(boxes, scores), BOX[:0], T_STAR).item()
+    torch.testing.assert_close(nothing, only)
+    by_class = candidates(boxes, scores.flip(1))
+    torch.testing.assert_close(margin.of_background(by_class, BOX, T_STAR).item(), only)
+    soft = margin.of_background(candidates(boxes, scores), BOX, T_STAR, 50.0).item()
+    torch.testing.assert_close(soft, only, atol=1e-6, rtol=0)
+
+
 def test_a_sharp_soft_margin_is_the_margin() -> None:
     pair = candidates(*two())
     hard = margin.of_objects(pair, BOX, LABEL, NOTHING, T_STAR)

@@ -13,7 +13,6 @@ from drivesem.questions.study.robust import (
     ANYWHERE,
     AROUND,
     CONTROLS,
-    GOAL,
     REDRAWN,
     Counted,
     FrameStates,
@@ -54,7 +53,11 @@ def frames(lost: dict[str, tuple[int, ...]], count: int = 12) -> list[FrameState
 
 
 def by_arm(lost: tuple[int, ...], arms=ARMS, falls=FALLS):
-    return {row.arm: row for row in rows_of(frames({ANYWHERE: lost}), arms, falls, DRAWS, 0)}
+    return rows_by_arm(frames({ANYWHERE: lost}), arms, falls)
+
+
+def rows_by_arm(seen: list[FrameStates], arms=ARMS, falls=FALLS):
+    return {row.arm: row for row in rows_of(seen, arms, falls, DRAWS, 0)}
 
 
 def test_shares_are_of_cars_and_paired() -> None:
@@ -76,10 +79,10 @@ def test_shares_are_of_cars_and_paired() -> None:
     ("lost", "falls", "short_of"),
     [
         ((20, 16, 16, 8), 0.004, ()),
-        ((20, 16, 16, 12), 0.004, GOAL[:1]),
-        ((20, 16, 16, 8), 0.006, GOAL[2:3]),
-        ((20, 16, 8, 8), 0.0, GOAL[3:]),
-        ((20, 16, 16, 16), 0.0, (GOAL[0], GOAL[1], GOAL[3])),
+        ((20, 16, 16, 12), 0.004, ("third",)),
+        ((20, 16, 16, 8), 0.006, ("AP50",)),
+        ((20, 16, 8, 8), 0.0, ("random",)),
+        ((20, 16, 16, 16), 0.0, ("third", "benign", "random")),
     ],
     ids=["met", "too little", "too dear", "random does it too", "nothing"],
 )
@@ -88,6 +91,15 @@ def test_what_the_goal_is_short_of(lost: tuple[int, ...], falls: float, short_of
     assert rows["certain"].short_of == short_of
     assert rows["certain"].flat()["goal"] is (not short_of)
     assert {rows[name].short_of for name in (*CONTROLS, "benign detector")} == {None}
+
+
+@pytest.mark.parametrize(("phantoms", "short_of"), [(1, ()), (5, ("phantoms",))])
+def test_failures_bought_with_phantoms_do_not_count(phantoms: int, short_of: tuple[str, ...]) -> None:
+    seen = [
+        replace(one, counts={ANYWHERE: replace(one.counts[ANYWHERE], phantoms=(1, i % 3, 1, phantoms))})
+        for i, one in enumerate(frames({ANYWHERE: (20, 16, 16, 8)}))
+    ]
+    assert rows_by_arm(seen)["certain"].short_of == short_of
 
 
 def test_seeds_count_together() -> None:
@@ -111,7 +123,7 @@ def test_what_nobody_loses_has_no_share_of_it() -> None:
     none = by_arm((0, 0, 0, 0))["certain"]
     assert none.failures[ANYWHERE].value == 0
     assert none.fewer[ANYWHERE, "benign"].value is None
-    assert none.short_of == (GOAL[0], GOAL[1], GOAL[3])
+    assert none.short_of == ("third", "benign", "random")
 
 
 def test_frames_without_a_second_renderer_are_left_out_of_its_share_alone() -> None:
