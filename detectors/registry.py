@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import nn
 
 from detectors import ensemble, planted
 from detectors.adapters import choose
@@ -165,13 +166,17 @@ def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None =
         **({"cfg": cfg.write(detector.cfg)} if isinstance(detector, YoloV3) else {}),
         **(facts or {}),
     }
-    learned = {name for name, _ in detector.named_parameters()}
+    write_weights(path, metadata, halved(detector))
+
+
+def halved(network: nn.Module) -> dict[str, torch.Tensor]:
+    """A network's state, what was learned as float16."""
+    learned = {name for name, _ in network.named_parameters()}
     # What was counted or measured in training need not lie in float16's range.
-    tensors = {
+    return {
         k: v.detach().cpu().contiguous().to(torch.float16 if k in learned else v.dtype)
-        for k, v in detector.state_dict().items()
+        for k, v in network.state_dict().items()
     }
-    write_weights(path, metadata, tensors)
 
 
 def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:

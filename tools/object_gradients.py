@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from drivesem.classify.networks.loading import load_classifier
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.scenes import SEEN_PX, VIEWS, ObjectScene, generated_background
 from drivesem.classify.space import Amounts, Moved, ObjectSpace
 

@@ -20,10 +20,11 @@ import numpy as np
 import torch
 
 from drivesem.classify.confirm import open_renderer
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet
+from drivesem.classify.pictures import Shown
 from drivesem.classify.redraw.base import Solid, likeness
-from drivesem.classify.scenes import VIEWS, ObjectScene, camera, generated_background, scene_name
+from drivesem.classify.scenes import VIEWS, ObjectScene, camera, generated_background
 from scene_ir import files
 from scene_ir.io import to_uint8
 
@@ -38,7 +39,7 @@ def row(objects: ObjectSet, names: list[str], views: list[str], size: int) -> np
     for name in names:
         model = objects.load(name)
         for view in views:
-            identifier = scene_name(name, view)
+            identifier = Shown("test", name, view).identifier
             scene = ObjectScene(identifier, model, view, generated_background(identifier))
             picture = to_uint8(scene.picture().clamp(0, 1))
             tiles.append(cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA))

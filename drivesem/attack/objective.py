@@ -21,7 +21,7 @@ from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
-from drivesem.attack.methods.base import Group, Problem, Score, Views
+from drivesem.attack.methods.base import GRADIENT_PASSES, Group, Problem, Score, Views
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.evaluation import failures
 from drivesem.settings.blocks import KEEP_MB
@@ -32,8 +32,6 @@ from scene_ir.types import Render, SceneIR
 
 OF_DETECTIONS = ("objectness", *goals.GOALS)
 """Terms that need no more than detections."""
-GRADIENT_PASSES = 3
-"""What a gradient counts, where a forward pass of the detector counts 1."""
 _REMEMBERED = 3
 """Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
 
@@ -223,7 +221,7 @@ class Objective:
         return loss, feasible.along(theta, gradient)
 
     def _group(self, parameter: Parameter, where: slice) -> Group:
-        owners = self.space.count if self.space.specs[parameter].per_object else 0
+        owners = self.space.owners(parameter)
         modes = ffd.low_modes() if parameter is Parameter.MESH else None
         smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.SIZE)
         return Group(parameter.value, where, owners, modes, smooth)

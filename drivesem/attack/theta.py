@@ -66,6 +66,10 @@ class ThetaSpace(ABC, Generic[P]):
         """Where theta holds each of its parameters, in its order."""
         return self._slices
 
+    def owners(self, parameter: P) -> int:
+        """How many owners a parameter has: 0 where it is a scene's."""
+        return self.count if self.specs[parameter].per_object else 0
+
     def slice_of(self, parameter: P) -> slice | None:
         """Where theta holds `parameter`, or None where it is held."""
         return self._slices.get(parameter)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from drivesem.classify.attack import network_of
 from drivesem.classify.finished import ClassifyRun, FailureWorker, ask_of_failures
-from drivesem.classify.holes import Poses, bounds_of
+from drivesem.classify.holes import Poses
 from drivesem.classify.objective import Seen
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.gate.report import answer_of
@@ -50,16 +47,14 @@ class GateWorker(FailureWorker[FramePair]):
 
     def answer(self, name: str, source: str, folder: Path) -> FramePair:
         """See `FailureWorker`."""
-        objective, theta = self.run.rebuilt(self.attacker, name)
-        change, label = objective.space.change(theta), objective.scene.model.label
-        poses = Poses(objective, change, self.attacker, f"gate:{name}:{self.config.seed}")
-        rng = np.random.default_rng([self.config.seed, zlib.crc32(name.encode())])
+        poses = Poses.of(self, name)
+        objective = poses.objective
         wrong: list[tuple[bool, bool]] = []
         for number in range(self.config.samples):
             # One half near the failure: a hole may be small beside its neighbourhood.
-            bounds = bounds_of(change, self.config.reach * (1.0 if number % 2 == 0 else NEAR))
-            picture = poses.picture(rng.uniform(bounds[:, 0], bounds[:, 1]), number)
-            after = Seen(self.after(picture[None])[0], label)
+            bounds = poses.bounds(self.config.reach * (1.0 if number % 2 == 0 else NEAR))
+            picture = poses.picture(poses.rng.uniform(bounds[:, 0], bounds[:, 1]), number)
+            after = Seen(self.after(picture[None])[0], objective.scene.model.label)
             wrong.append((not objective.look(picture).right, not after.right))
         before, after = zip(*wrong, strict=True)
         own = self.run.frames[name].label

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from drivesem.classify.objective import Seen
-from drivesem.truth.certificate import Rule
+from drivesem.truth.certificate import Drawn, Rule, count_draws
 from drivesem.truth.grades import SECOND, Agreement, Count
 from drivesem.truth.nuisances import Nuisances
 
@@ -27,27 +27,14 @@ class PictureGrader:
         """Draws of the picture before the change that are right, and of the one after it (3, H, W) that are wrong,
         until no more can change whether the failure is certain: first after the change, then before it.
         """
-        stream = f"certificate:{identifier}:{self.seed}"
-        hw = (int(before.shape[1]), int(before.shape[2]))
-        held: dict[str, list[bool]] = {"after": [], "before": []}
-        margins: dict[str, list[float]] = {"after": [], "before": []}
-        for side, picture, needed in (("after", after, self.rule.after), ("before", before, self.rule.before)):
-            if side == "before" and sum(held["after"]) < self.rule.after:
-                break
-            for number in range(self.rule.draws):
-                if held[side].count(False) > self.rule.draws - needed:
-                    break
-                seen = look(self.nuisances.of_picture(stream, number, hw).picture(picture))
-                held[side].append(seen.right == (side == "before"))
-                margins[side].append(seen.margin)
-        return Count(
-            sum(held["before"]),
-            len(held["before"]),
-            sum(held["after"]),
-            len(held["after"]),
-            _mean(margins["before"]),
-            _mean(margins["after"]),
-        )
+        stream, hw = f"certificate:{identifier}:{self.seed}", (int(before.shape[1]), int(before.shape[2]))
+
+        def seen(changed: bool, number: int, asked: Sequence[int]) -> list[Drawn]:
+            draw = self.nuisances.of_picture(stream, number, hw)
+            told = look(draw.picture(after if changed else before))
+            return [(told.right != changed, told.margin)]
+
+        return count_draws(1, seen, self.rule)[0]
 
     @torch.no_grad()
     def agreement(
@@ -58,7 +45,3 @@ class PictureGrader:
         draws = [self.nuisances.of_picture(stream, number, hw) for number in range(SECOND[1])]
         right, wrong = ([look(draw.picture(p)).right for draw in draws] for p in (before, after))
         return Agreement(by, sum(right), wrong.count(False), len(draws))
-
-
-def _mean(values: list[float]) -> float | None:
-    return round(sum(values) / len(values), 4) if values else None

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.classify.attack import Attacker
@@ -80,22 +81,15 @@ class HoleWorker(FailureWorker[PoseHole]):
 
     def answer(self, name: str, source: str, folder: Path) -> PoseHole:
         """See `FailureWorker`."""
-        config = self.config
-        objective, theta = self.run.rebuilt(self.attacker, name)
-        change = objective.space.change(theta)
-        rng = np.random.default_rng([config.seed, zlib.crc32(name.encode())])
-        bounds = bounds_of(change, config.reach)
-        poses = Poses(objective, change, self.attacker, f"holes:{name}:{config.seed}")
-        asked = rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
-        called = [objective.look(poses.picture(one, number)).predicted for number, one in enumerate(asked)]
-        fails = np.array([one != objective.scene.model.label for one in called])
-        rule = fit(_columns(asked), fails)
+        poses, config = Poses.of(self, name), self.config
+        label, bounds = poses.objective.scene.model.label, poses.bounds(config.reach)
+        asked = poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
+        fails = poses.called(asked) != label
+        rule = fit({axis: asked[:, i] for i, axis in enumerate(AXES)}, fails)
         for axis, interval in rule.where.items():
             bounds[AXES.index(axis)] = interval
-        fresh = rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3))
-        numbered = enumerate(fresh, start=config.samples)
-        inside = [objective.look(poses.picture(one, number)).predicted for number, one in numbered]
-        wrong = [one for one in inside if one != objective.scene.model.label]
+        inside = poses.called(poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3)), config.samples)
+        wrong = inside[inside != label].tolist()
         frame, classes = self.run.frames[name], self.attacker.network.classes
         return PoseHole(
             identifier=name,
@@ -109,18 +103,33 @@ class HoleWorker(FailureWorker[PoseHole]):
             count_outside=rule.count_outside,
             fails_all=int(fails.sum()),
             count_all=len(fails),
-            passes=objective.passes,
+            passes=poses.objective.passes,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """An object as it was found, in other poses. stream: of the draws of what a camera does."""
+    """An object as it was found, in other poses. stream: of the draws of what a camera does; rng: of poses."""
 
     objective: ClassifierObjective
     change: Change
     attacker: Attacker
     stream: str
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, worker: FailureWorker[Any], name: str) -> Poses:
+        """Around a failure that a question is about. Raises SceneError."""
+        objective, theta = worker.run.rebuilt(worker.attacker, name)
+        seed, change = worker.config.seed, objective.space.change(theta)
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        return cls(objective, change, worker.attacker, f"{worker.question}:{name}:{seed}", rng)
+
+    def bounds(self, reach: float) -> Floats:
+        """Lowest and highest angles (3, 2), degrees, within `reach` rad of the pose that was found."""
+        angles = self.change.angles
+        found = np.zeros(3) if angles is None else np.degrees(angles.numpy().astype(float))
+        return np.stack([found - math.degrees(reach), found + math.degrees(reach)], axis=1)
 
     @torch.no_grad()
     def picture(self, degrees: Floats, number: int) -> Tensor:
@@ -130,15 +139,10 @@ class Poses:
         draw = self.attacker.grader.nuisances.of_picture(self.stream, number, (SEEN_PX, SEEN_PX))
         return draw.picture(picture)
 
-
-def bounds_of(change: Change, reach: float) -> Floats:
-    """Lowest and highest angles (3, 2), degrees, within `reach` rad of a change's pose."""
-    found = np.zeros(3) if change.angles is None else np.degrees(change.angles.numpy().astype(float))
-    return np.stack([found - math.degrees(reach), found + math.degrees(reach)], axis=1)
-
-
-def _columns(degrees: Floats) -> dict[str, Floats]:
-    return {axis: degrees[:, i] for i, axis in enumerate(AXES)}
+    def called(self, degrees: Floats, first: int = 0) -> NDArray[np.int64]:
+        """The classes (N,) that poses (N, 3) are called, in draws from the first on."""
+        pictures = (self.picture(one, number) for number, one in enumerate(degrees, first))
+        return np.array([self.objective.look(picture).predicted for picture in pictures], np.int64)
 
 
 def _as_seen(where: Where, view: str) -> dict[str, tuple[float, float]]:

@@ -8,15 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.theta import ThetaSpace
+from drivesem.attack.methods.base import GRADIENT_PASSES, Group, Problem, Score
 from drivesem.classify.networks.base import Scorer
 from drivesem.classify.scenes import ObjectScene
-from drivesem.classify.space import Moved, ObjectSpace
+from drivesem.classify.space import ObjectSpace
 from scene_ir.errors import RangeError
-
-GRADIENT_PASSES = 3
-"""What a gradient counts, where a forward pass of the network counts 1."""
 
 Aimed = Literal["logit", "hinge", "softmax"]
 """What an attack raises. logit: the true class's score falls, as in the paper; hinge: so does what it is ahead of
@@ -132,11 +128,5 @@ class ClassifierObjective:
             step=self.space.step,
             lower=self.space.lower,
             upper=self.space.upper,
-            groups=groups_of(self.space),
+            groups=tuple(Group(str(p), where, self.space.owners(p)) for p, where in self.space.blocks.items()),
         )
-
-
-def groups_of(space: ThetaSpace[Moved]) -> tuple[Group, ...]:
-    """The blocks of theta as attacks see them."""
-    owners = {p: space.count if space.specs[p].per_object else 0 for p in space.params}
-    return tuple(Group(str(p), where, owners[p]) for p, where in space.blocks.items())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 
-from drivesem.classify.results import ClassifiedFrame, ClassifiedRun
+from drivesem.classify.results import ClassifiedFrame, ClassifiedRun, ClassTally
 from drivesem.report import web
 from drivesem.report.tables import percent
 from drivesem.truth.grades import Grade
@@ -22,38 +22,31 @@ _QUALITY = 90
 _ORDER = {Grade.CONFIRMED: 0, Grade.CERTAIN: 1, Grade.THRESHOLD: 2, None: 3}
 
 
-@dataclass(frozen=True, slots=True)
-class _Card:
-    frame: ClassifiedFrame
-    shots: tuple[tuple[str, str], ...]
-    moved: str
-
-
 def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]) -> None:
     """Write the page beside the run's folder of frames. Raises FormatError where a picture is missing."""
     worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
     cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
-    rows = [
-        (one, percent(share(one.benign, one.pictures)), percent(share(one.attacked, one.pictures)))
-        for one in run.classes
-    ]
-    shown = {"title": run.network, "run": run, "cards": cards, "percent": percent, "rows": rows}
+    rows = [(one, *shares(one)) for one in run.classes]
+    before, after = shares(run.whole)
+    shown = {"title": run.network, "run": run, "cards": cards, "before": before, "after": after, "rows": rows}
     files.write_text(path, web.render("drivesem.classify:page.html", **shown))
 
 
-def share(part: int, whole: int) -> float | None:
-    """A share; None of nothing."""
-    return part / whole if whole else None
+def shares(tally: ClassTally) -> list[str]:
+    """Accuracy before and after the change, as percentages."""
+    return [percent(one) for one in tally.accuracy.values()]
 
 
-def _card(frame: ClassifiedFrame, folder: Path) -> _Card:
+def _card(frame: ClassifiedFrame, folder: Path) -> dict[str, Any]:
+    """A picture's frame, its pictures by what they are, and what was moved."""
     told = [f"{name.rpartition('.')[2]} {value}" for name, value in frame.moved.items()]
-    told += (
-        [f"vertices by up to {100 * frame.sizes['vertex']:.1f} % of the size"] if "vertex" in frame.sizes else []
-    )
-    shots = [("before", "benign.png"), ("after", "counterexample.png")]
-    shots += [(frame.second.agreement.by, SECOND_PICTURE)] if frame.second is not None else []
-    return _Card(frame, tuple((name, _embedded(folder / file)) for name, file in shots), ", ".join(told))
+    if "vertex" in frame.sizes:
+        told.append(f"vertices by up to {100 * frame.sizes['vertex']:.1f} % of the size")
+    shots = {"before": "benign.png", "after": "counterexample.png"}
+    if frame.second is not None:
+        shots[frame.second.agreement.by] = SECOND_PICTURE
+    pictures = [(name, _embedded(folder / file)) for name, file in shots.items()]
+    return {"frame": frame, "shots": pictures, "moved": ", ".join(told)}
 
 
 def _embedded(path: Path) -> str:

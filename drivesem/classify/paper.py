@@ -36,8 +36,3 @@ REMARKS: dict[str, tuple[str, ...]] = {
 def figures() -> dict[str, Any]:
     """The tables by name, as `paper.yaml` says."""
     return yaml.safe_load(resources.files("drivesem.classify").joinpath("paper.yaml").read_text(encoding="utf-8"))
-
-
-def theirs(architecture: str) -> str:
-    """The network of the paper that a network stands beside: VGG-16, unless it is a ResNet-50."""
-    return "resnet50" if architecture.startswith("resnet") else "vgg16"

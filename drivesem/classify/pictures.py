@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
-from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds, scene_name
+from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds
 from drivesem.run.ask import Bar, JobResults, ask
 from drivesem.settings.commands import Classify
 from drivesem.settings.errors import UsageError
@@ -32,7 +32,8 @@ class Shown:
 
     @property
     def identifier(self) -> str:
-        return scene_name(self.name, self.view)
+        """As folders are named."""
+        return f"{self.name.replace('/', '-')}-{self.view}"
 
 
 @dataclass(frozen=True)

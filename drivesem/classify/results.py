@@ -99,6 +99,12 @@ class ClassTally:
     certain: int
     confirmed: int = 0
 
+    @property
+    def accuracy(self) -> dict[str, float | None]:
+        """Before and after the change; None without pictures."""
+        counts = {"benign": self.benign, "attacked": self.attacked}
+        return {name: count / self.pictures if self.pictures else None for name, count in counts.items()}
+
 
 @dataclass(frozen=True, slots=True)
 class ClassifiedRun:
@@ -154,30 +160,14 @@ class ClassifiedRun:
         return self.whole.pictures
 
     @property
-    def benign(self) -> float | None:
-        """Accuracy before the change; None without pictures."""
-        return round(self.whole.benign / self.pictures, 4) if self.pictures else None
-
-    @property
-    def attacked(self) -> float | None:
-        """Accuracy after it."""
-        return round(self.whole.attacked / self.pictures, 4) if self.pictures else None
-
-    @property
     def grades(self) -> dict[str, int]:
         """How many failures are at least so sure."""
         whole = self.whole
-        failures = whole.benign - whole.attacked
-        return {
-            str(Grade.THRESHOLD): failures,
-            str(Grade.CERTAIN): whole.certain,
-            str(Grade.CONFIRMED): whole.confirmed,
-        }
+        counts = (whole.benign - whole.attacked, whole.certain, whole.confirmed)
+        return dict(zip(map(str, (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)), counts, strict=True))
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
-        accuracy = {"benign": self.benign, "attacked": self.attacked}
-        return {"schema": SCHEMA, **asdict(self), "pictures": self.pictures} | {
-            "accuracy": accuracy,
-            "grades": self.grades,
-        }
+        accuracy = {name: None if one is None else round(one, 4) for name, one in self.whole.accuracy.items()}
+        data = {"schema": SCHEMA, **asdict(self), "pictures": self.pictures}
+        return data | {"accuracy": accuracy, "grades": self.grades}

@@ -163,10 +163,5 @@ def in_turn(names: Sequence[str]) -> list[str]:
     return [name for _, _, name in sorted(ranked)]
 
 
-def scene_name(name: str, view: str) -> str:
-    """Of an object's name and a view, as folders are named."""
-    return f"{name.replace('/', '-')}-{view}"
-
-
 def _seed(name: str) -> int:
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:6], "big")

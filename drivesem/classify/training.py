@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar, training_bar
@@ -32,16 +32,10 @@ _EMBEDDED_AT_A_TIME = 4
 _TINY = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class Pictures:
-    """images (N, 3, H, W) uint8, labels (N,)."""
-
-    images: Tensor
-    labels: Tensor
-
-    def batch(self, rows: Tensor, device: str) -> tuple[Tensor, Tensor]:
-        """Some of them, RGB in [0, 1]."""
-        return self.images[rows].to(device).float() / 255, self.labels[rows].to(device)
+_Splits = dict[str, tuple[Tensor, Tensor]]
+"""By split: pictures (N, 3, H, W) uint8, and their labels (N,)."""
+_Fitted = tuple[list[dict[str, float]], dict[str, float]]
+"""What each epoch came to, and the accuracy by split."""
 
 
 def train_run(config: Classify) -> dict[str, Any]:
@@ -55,13 +49,13 @@ def train_run(config: Classify) -> dict[str, Any]:
     claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES))
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]
-    splits = {name: Pictures(*read_pictures(folder, name, classes)) for name in ("train", "val", "test")}
+    splits = {name: read_pictures(folder, name, classes) for name in ("train", "val", "test")}
     fit = _fit_last if config.layers == "last" else _fit_all
     curve, accuracy = fit(network, splits, config, generator)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
-    counts = {name: len(split.labels) for name, split in splits.items()}
+    counts = {name: len(labels) for name, (_, labels) in splits.items()}
     data = {
         "out": str(out),
         "weights": str(path),
@@ -78,16 +72,14 @@ def train_run(config: Classify) -> dict[str, Any]:
     return data
 
 
-def _fit_last(
-    network: Classifier, splits: dict[str, Pictures], config: Classify, generator: torch.Generator
-) -> tuple[list[dict[str, float]], dict[str, float]]:
+def _fit_last(network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator) -> _Fitted:
     network.eval()
-    known = {
-        name: embedded(network, split.images, config.device, f"looking at {name}")
-        for name, split in splits.items()
+    looked = {
+        name: embedded(network, images, config.device, f"looking at {name}")
+        for name, (images, _) in splits.items()
     }
-    labels = {name: split.labels.to(config.device) for name, split in splits.items()}
-    return fit_last(network, known, labels, config, generator)
+    labels = {name: labels.to(config.device) for name, (_, labels) in splits.items()}
+    return fit_last(network, looked, labels, config, generator)
 
 
 def fit_last(
@@ -97,9 +89,9 @@ def fit_last(
     config: Classify,
     generator: torch.Generator,
     onward: bool = False,
-) -> tuple[list[dict[str, float]], dict[str, float]]:
+) -> _Fitted:
     """Fit the last layer to features (N, K) and labels (N,) by split, of which `train` is learnt and `val`
-    watched: what each epoch came to, and the accuracy by split. onward: go on from what the layer is.
+    watched. onward: go on from what the layer is.
     """
     # Fitted to features of mean 0 and deviation 1, whatever the network, and then told in its own.
     deviation, mean = torch.std_mean(known["train"], dim=0)
@@ -114,48 +106,46 @@ def fit_last(
     def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
         return last(known["train"][rows]), labels["train"][rows]
 
-    @torch.no_grad()
-    def accuracy(name: str) -> float:
-        return round(float((last(known[name]).argmax(1) == labels[name]).float().mean()), 4)
-
-    curve = _fit(last, batch, accuracy, len(labels["train"]), config, generator)
-    figures = {name: accuracy(name) for name in known}
+    found = _fit(last, batch, lambda name: _accuracy(last(known[name]), labels[name]), labels, config, generator)
     with torch.no_grad():
         last.weight.div_(deviation)
         last.bias.sub_(last.weight @ mean)
-    return curve, figures
+    return found
 
 
-def _fit_all(
-    network: Classifier, splits: dict[str, Pictures], config: Classify, generator: torch.Generator
-) -> tuple[list[dict[str, float]], dict[str, float]]:
+def _fit_all(network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator) -> _Fitted:
+    labels = {name: labels.to(config.device) for name, (_, labels) in splits.items()}
+
     def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
         network.train()
-        images, labels = splits["train"].batch(rows, config.device)
-        return network(images), labels
+        return network(splits["train"][0][rows].to(config.device).float() / 255), labels["train"][rows]
 
-    @torch.no_grad()
     def accuracy(name: str) -> float:
         network.eval()
-        features = embedded(network, splits[name].images, config.device, f"looking at {name}")
-        said = network.last(features).argmax(1)
-        return round(float((said == splits[name].labels.to(said)).float().mean()), 4)
+        features = embedded(network, splits[name][0], config.device, f"looking at {name}")
+        return _accuracy(network.last(features), labels[name])
 
-    curve = _fit(network, batch, accuracy, len(splits["train"].labels), config, generator)
-    return curve, {name: accuracy(name) for name in splits}
+    return _fit(network, batch, accuracy, labels, config, generator)
+
+
+@torch.no_grad()
+def _accuracy(scores: Tensor, labels: Tensor) -> float:
+    return round(float((scores.argmax(1) == labels).float().mean()), 4)
 
 
 def _fit(
     module: nn.Module,
-    batch: Any,
-    accuracy: Any,
-    count: int,
+    batch: Callable[[Tensor], tuple[Tensor, Tensor]],
+    accuracy: Callable[[str], float],
+    labels: Mapping[str, Tensor],
     config: Classify,
     generator: torch.Generator,
-) -> list[dict[str, float]]:
-    """Adam, with a rate that falls in a half cosine, over `count` pictures; what each epoch came to."""
-    rate = config.rate or _RATES[config.layers]
-    optimiser = torch.optim.Adam(module.parameters(), lr=rate)
+) -> _Fitted:
+    """Adam, with a rate that falls in a half cosine. batch: scores and labels of some of the pictures of `train`;
+    accuracy: of a split; labels: by split.
+    """
+    count = len(labels["train"])
+    optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
     steps = config.epochs * -(-count // config.batch)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     curve = []
@@ -164,8 +154,8 @@ def _fit(
         for epoch in range(1, config.epochs + 1):
             total = 0.0
             for rows in torch.randperm(count, generator=generator).split(config.batch):
-                scores, labels = batch(rows)
-                loss = F.cross_entropy(scores, labels)
+                scores, truth = batch(rows)
+                loss = F.cross_entropy(scores, truth)
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
@@ -173,7 +163,7 @@ def _fit(
                 total += float(loss.detach()) * len(rows)
                 progress.advance(task)
             curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val")})
-    return curve
+    return curve, {name: accuracy(name) for name in labels}
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from drivesem.classify.confirm import confirm_run
 from drivesem.classify.gate import gate_run
 from drivesem.classify.holes import holes_run
 from drivesem.classify.least import explain_run
-from drivesem.classify.page import share
+from drivesem.classify.page import shares
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun, ClassTally
 from drivesem.classify.training import train_run
@@ -109,8 +109,7 @@ def _end(
 
 def _table(run: ClassifiedRun) -> Sheet:
     def row(name: str, tally: ClassTally) -> tuple[str, ...]:
-        shares = (percent(share(count, tally.pictures)) for count in (tally.benign, tally.attacked))
-        return name, str(tally.pictures), *shares, str(tally.certain), str(tally.confirmed)
+        return name, str(tally.pictures), *shares(tally), str(tally.certain), str(tally.confirmed)
 
     rows = [*(row(one.name, one) for one in run.classes if one.pictures), row("all", run.whole)]
     title = f"{run.network} on {run.objects} objects: {run.method}, {' + '.join(run.params)}"

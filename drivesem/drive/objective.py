@@ -12,7 +12,7 @@ from detectors.base import Predictor
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.base import Group, Problem, Score
 from drivesem.attack.objective import Objective, Rendered
-from drivesem.attack.space import SPECS, Budget, Parameter, ParameterSpace
+from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.drive.space import ClipSpace, project
 from drivesem.drive.taking import TakenClip
 from drivesem.evaluation.failures import judge
@@ -159,7 +159,7 @@ class ClipObjective:
         )
 
     def _group(self, parameter: Parameter, where: slice) -> Group:
-        owners = self.space.count if SPECS[parameter].per_object else 0
+        owners = self.space.owners(parameter)
         return Group(parameter.value, where, owners, ffd.low_modes() if parameter is Parameter.MESH else None)
 
 

@@ -19,7 +19,7 @@ from drivesem.attack.budgets import budget_of, written
 from drivesem.attack.changes import Changes, parse_changes, vehicle_mesh
 from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
 from drivesem.attack.methods.apgd import APGD
-from drivesem.attack.methods.base import LOOKED_AT
+from drivesem.attack.methods.base import GRADIENT_PASSES, LOOKED_AT
 from drivesem.attack.methods.base import Attack as AttackMethod
 from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.cma_es import CMAES
@@ -33,7 +33,7 @@ from drivesem.attack.methods.scw import SCW
 from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
-from drivesem.attack.objective import GRADIENT_PASSES, OF_DETECTIONS
+from drivesem.attack.objective import OF_DETECTIONS
 from drivesem.attack.space import SIX, Parameter, combo, parse_params
 from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, ask

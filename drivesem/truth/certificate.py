@@ -134,25 +134,42 @@ def certify(
     places_xyxy: (F, 4) px of each fault, in the picture without a draw; it matters for background. before, after:
     the number-th look at either state. Looks are shared by all faults: at most 2 * rule.draws of them.
     """
-    wrong: list[list[bool]] = [[] for _ in faults]
-    right: list[list[bool]] = [[] for _ in faults]
-    beyond: list[tuple[list[float | None], list[float | None]]] = [([], []) for _ in faults]
-    for outcomes, side, needed, state in ((wrong, 1, rule.after, after), (right, 0, rule.before, before)):
+
+    def seen(changed: bool, number: int, asked: Sequence[int]) -> list[Drawn]:
+        look, says = (after(number), has) if changed else (before(number), is_right)
+        told = [(faults[f], places_xyxy[f], look) for f in asked]
+        return [(says(*one), margin_of(*one)) for one in told]
+
+    return count_draws(len(faults), seen, rule)
+
+
+Drawn = tuple[bool, float | None]
+"""Of a fault in a draw: whether it is wrong after the change, or right before it; and its margin."""
+
+
+def count_draws(
+    faults: int, seen: Callable[[bool, int, Sequence[int]], Sequence[Drawn]], rule: Rule
+) -> tuple[Count, ...]:
+    """The same for so many faults of whatever kind. seen: whether it is after the change, number of the draw, and
+    places of the faults that are asked -> each of these.
+    """
+    wrong: list[list[Drawn]] = [[] for _ in range(faults)]
+    right: list[list[Drawn]] = [[] for _ in range(faults)]
+    for drawn, changed, needed in ((wrong, True, rule.after), (right, False, rule.before)):
         # What has failed the first half is not asked again.
-        candidates = [f for f in range(len(faults)) if side == 1 or sum(wrong[f]) >= rule.after]
+        asked = [f for f in range(faults) if changed or _held(wrong[f]) >= rule.after]
         for number in range(rule.draws):
-            if all(outcomes[f].count(False) > rule.draws - needed for f in candidates):
+            if all(len(drawn[f]) - _held(drawn[f]) > rule.draws - needed for f in asked):
                 break
-            look = state(number)
-            for f in candidates:
-                fails = has(faults[f], places_xyxy[f], look)
-                holds = fails if side == 1 else is_right(faults[f], places_xyxy[f], look)
-                outcomes[f].append(holds)
-                beyond[f][side].append(margin_of(faults[f], places_xyxy[f], look))
+            for f, one in zip(asked, seen(changed, number, asked), strict=True):
+                drawn[f].append(one)
     return tuple(
-        Count(sum(right[f]), len(right[f]), sum(wrong[f]), len(wrong[f]), _mean(beyond[f][0]), _mean(beyond[f][1]))
-        for f in range(len(faults))
+        Count(_held(r), len(r), _held(w), len(w), _mean(r), _mean(w)) for r, w in zip(right, wrong, strict=True)
     )
+
+
+def _held(draws: Sequence[Drawn]) -> int:
+    return sum(holds for holds, _ in draws)
 
 
 def has(fault: Fault, place_xyxy: Tensor, look: Look) -> bool:
@@ -190,6 +207,6 @@ def _overlap(place_xyxy: Tensor, look: Look, at_xyxy: Tensor) -> Tensor:
     return boxes.iou_matrix(look.draw.boxes(place_xyxy[None]).to(at_xyxy), at_xyxy)[0]
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
+def _mean(draws: Sequence[Drawn]) -> float | None:
+    known = [margin for _, margin in draws if margin is not None]
     return round(sum(known) / len(known), 4) if known else None

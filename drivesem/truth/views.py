@@ -13,7 +13,8 @@ from detectors.base import Candidates, Detector, predict
 from detectors.incremental.reference import Reference
 from drivesem.attack import goals
 from drivesem.attack.labels import shown_boxes
-from drivesem.attack.objective import GRADIENT_PASSES, Objective
+from drivesem.attack.methods.base import GRADIENT_PASSES
+from drivesem.attack.objective import Objective
 from drivesem.truth import margin
 from drivesem.truth.certificate import with_regions
 from drivesem.truth.kinds import View, judge

@@ -50,6 +50,7 @@ def test_every_kept_study_is_told_and_small() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("folder", KEPT, ids=lambda folder: folder.name)
 def test_pages_say_what_follows_from_it(folder: Path, tmp_path: Path) -> None:
     kept = json.loads((folder / "study.json").read_text(encoding="utf-8"))

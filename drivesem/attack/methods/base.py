@@ -18,6 +18,8 @@ from torch import Tensor
 from drivesem.attack.theta import Projected
 from scene_ir.errors import RangeError
 
+GRADIENT_PASSES = 3
+"""What a gradient counts, where a forward pass of the network counts 1."""
 LOOKED_AT = 5
 """Of the iterates that a gradient pass saw, so many of the most promising are rendered and judged."""
 _TINY = 1e-30

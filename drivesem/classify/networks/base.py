@@ -40,10 +40,7 @@ class Classifier(nn.Module, ABC):
     std: Tensor
 
     def __init__(
-        self,
-        classes: Sequence[str],
-        mean: Sequence[float] = IMAGENET_MEAN,
-        std: Sequence[float] = IMAGENET_STD,
+        self, classes: Sequence[str], mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
     ) -> None:
         super().__init__()
         self.classes = tuple(classes)

@@ -14,9 +14,7 @@ from detectors.reading import read_state
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
-from drivesem.classify.networks.resnet import ResNet50
-from drivesem.classify.networks.squeezenet import SqueezeNet
-from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.weights import load_into, read_weights
@@ -51,11 +49,7 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
 
 
 def to_train(
-    architecture: str,
-    weights: str | None,
-    classes: Sequence[str],
-    generator: torch.Generator,
-    anew: bool = False,
+    architecture: str, weights: str | None, classes: Sequence[str], generator: torch.Generator, anew: bool = False
 ) -> Classifier:
     """A network with a new last layer for `classes`, and all else from a file: torchvision's (.pth), or a
     safetensors file by the same names. squeezenet needs none: it begins with the shipped one's convolutions. anew:
@@ -90,12 +84,8 @@ def to_train(
 
 def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -> None:
     """Write weights as float16, what was counted in training as float32."""
-    learned = {key for key, _ in network.named_parameters()}
-    tensors = {
-        key: value.detach().cpu().contiguous().to(torch.float16 if key in learned else torch.float32)
-        for key, value in network.state_dict().items()
-        if value.is_floating_point()
-    }
+    halved = detectors.registry.halved(network)
+    tensors = {key: value for key, value in halved.items() if value.is_floating_point()}
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
     detectors.registry.write_weights(path, metadata, tensors)
 

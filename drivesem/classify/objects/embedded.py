@@ -1,4 +1,4 @@
-"""The embedded objects: a hundred of each class, made by code."""
+"""Where objects come from, and the embedded ones: a hundred of each class, made by code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivesem.classify.objects.made.street import BENCHES, MAILBOXES, TRASHCANS
 from drivesem.classify.objects.made.towers import TOWERS
 from drivesem.classify.objects.made.vehicles import BUSES, CARS, TRAINS
 from drivesem.classify.objects.surfaces import Kit
-from drivesem.classify.objects.types import CLASSES, ObjectModel, Split
+from drivesem.classify.objects.types import CLASSES, ObjectModel, ObjectSet, Split
 from scene_ir.errors import RangeError
 
 KINDS: Mapping[str, tuple[Callable[[Kit], None], ...]] = {
@@ -66,3 +66,14 @@ class EmbeddedObjects:
         kit = Kit(np.random.default_rng([crc32(kind.encode()), int(number)]))
         make(kit)
         return kit.model(name, self.classes.index(kind))
+
+
+def open_objects(source: str | None, *, seed: int = 0, most_triangles: int | None = 20_000) -> ObjectSet:
+    """The embedded objects (None), or those of a folder: see `FolderObjects`, which seed and most_triangles are
+    for. Raises FormatError for a folder without objects.
+    """
+    if source is None:
+        return EmbeddedObjects()
+    from drivesem.classify.objects.folders import FolderObjects
+
+    return FolderObjects(source, seed=seed, most_triangles=most_triangles)

@@ -67,11 +67,6 @@ class Redraw(Protocol):
         ...
 
 
-def line_of(error: BaseException) -> str:
-    """An error on one line."""
-    return " ".join(f"{type(error).__name__} {error}".split())
-
-
 def likeness(scene: ObjectScene, one: Tensor, other: Tensor) -> Likeness:
     """Of what two renderers drew (4, H, W) of a scene."""
     first, second = one[3] >= 0.5, other[3] >= 0.5

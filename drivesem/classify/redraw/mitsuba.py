@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drivesem.classify.redraw.base import Solid, line_of
+from drivesem.classify.redraw.base import Solid
 from drivesem.truth.redraw.base import NoSecondRendererError
 from scene_ir.render.lit import GAMMA, UP
 
@@ -139,5 +139,5 @@ def _mitsuba() -> Any:
         library.set_variant(_VARIANT)
         importlib.import_module("drjit").set_thread_count(torch.get_num_threads())
     except Exception as error:  # also what a library raises whose own libraries are missing
-        raise NoSecondRendererError(NAME, _EXPECTED, line_of(error)) from error
+        raise NoSecondRendererError.of(NAME, _EXPECTED, error) from error
     return library

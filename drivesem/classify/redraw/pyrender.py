@@ -17,7 +17,6 @@ from drivesem.classify.redraw.base import Array, Solid
 from drivesem.truth.redraw.screen import Coat, Window, shared_screen
 from scene_ir.render.lit import AROUND, GAMMA, UP
 
-NAME = "pyrender"
 _MATT = 0.96**2
 """Of a colour glTF's shading lets so much show of what is neither metal nor glossy, in pyrender's version."""
 
@@ -25,7 +24,7 @@ _MATT = 0.96**2
 class PyrenderRenderer:
     """`Redraw` by pyrender. Raises NoSecondRendererError where there is neither EGL nor OSMesa."""
 
-    name = NAME
+    name = "pyrender"
 
     def __init__(self) -> None:
         self._screen = shared_screen()

@@ -12,14 +12,12 @@ from drivesem.classify.attack import WRITTEN, Attacker, frames_of
 from drivesem.classify.pictures import Shown
 from drivesem.classify.results import ClassifiedFrame
 from drivesem.run.ask import Bar, ask
-from drivesem.run.folder import FRAMES, claim
+from drivesem.run.folder import ARMS, FRAMES, SHARING, claim
 from drivesem.run.frame import RESULT
 from drivesem.settings.commands import Classify, Study
 from drivesem.settings.presets import presets
 from scene_ir import files
 
-ARMS = "arms"
-"""Folder of the attacks, each a run of `drivesem classify attack`."""
 GRADIENT = ("si-fgsm", "sgd", "scw")
 _SAMPLES: dict[str, dict[str, Any]] = {
     f"{method}-{name}": {"method": method, "params": "pose", "within_pose": within}
@@ -66,27 +64,9 @@ def preset(network: str, strategy: str) -> Mapping[str, Any]:
 
 def attack_of(study: Study, out: Path, name: str, network: str, **settings: Any) -> Classify:
     """The settings of an arm. network: the shipped one's name, or a file."""
-    config = Classify(
-        what="attack",
-        out=str(out / ARMS / name),
-        network=network,
-        objects=study.objects,
-        backgrounds=study.backgrounds,
-        seed=study.seed,
-        device=study.device,
-        workers=study.workers,
-        keep_going=study.keep_going,
-        engine=study.engine,
-        address=study.address,
-        grade=False,
-    )
+    shared = {one: getattr(study, one) for one in ("objects", "backgrounds", "seed", "device", *SHARING)}
+    config = Classify(what="attack", out=str(out / ARMS / name), network=network, grade=False, **shared)
     return replace(config, **settings)
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    arm: int
-    shown: Shown
 
 
 class _Attackers:
@@ -96,13 +76,14 @@ class _Attackers:
         self._arms = arms
         self._kept: dict[int, Attacker] = {}
 
-    def __call__(self, job: _Job) -> None:
-        arm = self._arms[job.arm]
-        if job.arm not in self._kept:
+    def __call__(self, job: tuple[int, Shown]) -> None:
+        place, shown = job
+        arm = self._arms[place]
+        if place not in self._kept:
             like = [one for one in self._kept.values() if one.config.network == arm.config.network]
             any_other = next(iter(self._kept.values()), None)
-            self._kept[job.arm] = Attacker.of(arm.config, like[0] if like else any_other)
-        self._kept[job.arm].attack(job.shown, arm.out)
+            self._kept[place] = Attacker.of(arm.config, like[0] if like else any_other)
+        self._kept[place].attack(shown, arm.out)
 
 
 def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
@@ -113,10 +94,10 @@ def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
     for arm in arms:
         claim(arm.out, arm.config, WRITTEN)
     jobs = [
-        _Job(i, one)
+        (i, one)
         for i, arm in enumerate(arms)
         for one in arm.shown
         if not (arm.out / FRAMES / one.identifier / RESULT).is_file()
     ]
     build = partial(_Attackers, tuple(arms))
-    return ask(jobs, build(), build, study, Bar(title, remaining=True), lambda job: job.shown.identifier).failed
+    return ask(jobs, build(), build, study, Bar(title, remaining=True), lambda job: job[1].identifier).failed

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from drivesem.classify.study.arms import ARMS
 from drivesem.classify.study.kept import keep_results, load_results
 from drivesem.classify.study.lab import PICTURES, TABLES, Lab
 from drivesem.classify.study.looking import LOOKED
 from drivesem.classify.study.results import Facts, Results
-from drivesem.classify.study.retraining import RETRAINED
 from drivesem.classify.study.tables import ORDERS, flat, remarks, tables_of
-from drivesem.questions.study.kept_rows import KEPT
+from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
 from drivesem.report.answer import Answer
-from drivesem.run.folder import PRESENTATION, claim, folder_of
+from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from drivesem.settings.commands import Study
 from drivesem.settings.text import command_line
 
@@ -69,7 +67,7 @@ def _again(study: Study, folder: Path) -> Answer:
 
 def _answer(study: Study, results: Results, out: Path) -> Answer:
     found, facts = tables_of(results), results.facts
-    command = command_line("study", study, ("out", "json", "resume", "workers", "name"))
+    command = command_line("study", study, (*NOT_TOLD, "name"))
     return Answer(
         out=out,
         name="study",

@@ -48,19 +48,16 @@ class Answers:
         """The mean of the classes' accuracies weighed by their sizes; sizes: by default those of these pictures,
         which is the share of all pictures. Classes without pictures count for nothing.
         """
-        weights = self.weights(sizes)
+        weights = np.ones(len(self.label))
+        if sizes is not None:
+            weights = (np.asarray(sizes) / np.maximum(np.bincount(self.label, minlength=len(sizes)), 1))[
+                self.label
+            ]
         return drawing.ratio(self.right * weights, weights, self.unit)
 
     def below(self, other: Answers, drawing: Drawing) -> Interval:
         """By how much the overall accuracy is below the other's on the same pictures, paired."""
         return drawing.ratio(other.right.astype(np.float64) - self.right, np.ones(len(self.right)), self.unit)
-
-    def weights(self, sizes: Sequence[int] | None) -> Floats:
-        """What each picture (M,) counts where classes have such sizes."""
-        if sizes is None:
-            return np.ones(len(self.label))
-        counts = np.bincount(self.label, minlength=len(sizes))
-        return (np.asarray(sizes) / np.maximum(counts, 1))[self.label]
 
 
 def keeping_shares(labels: Sequence[int], size: int, generator: np.random.Generator) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,29 +16,29 @@ from torch import Tensor
 
 from drivesem.classify.attack import report_run
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.loading import load_classifier
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.networks.loading import load_classifier, ready, save_classifier
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
 from drivesem.classify.paper import NETWORKS
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
-from drivesem.classify.study.figures import Answers, Drawing, keeping_shares
+from drivesem.classify.study.figures import keeping_shares
 from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
-from drivesem.classify.study.retraining import RETRAINED, half, retrained, right
-from drivesem.classify.training import embedded
-from drivesem.evaluation.resampling import DRAWS
+from drivesem.classify.training import embedded, fit_last
 from drivesem.questions.realism.asking import AVAILABLE, chosen
 from drivesem.questions.realism.measures import load
 from drivesem.questions.transfer.asking import words
-from drivesem.run.folder import FRAMES, folder_of
-from drivesem.settings.commands import Study
+from drivesem.questions.worth.measures import Floats
+from drivesem.run.folder import FRAMES, RETRAINED, folder_of
+from drivesem.settings.commands import Classify, Study
 from drivesem.settings.errors import UsageError
 from scene_ir import files
 
 PICTURES = "pictures"
 """Folder of the pictures that are trained on."""
+EPOCHS = 20
 BENIGN, ONWARD = "benign", "benign-on"
 """A network as it was, and trained on with benign pictures alone."""
 SINGLE = ("vertex", "pose", "lighting", "vertex,pose,lighting")
@@ -67,7 +68,6 @@ class Lab:
     objects: ObjectSet
     eyes: tuple[Eyes, ...]
     tables: tuple[str, ...]
-    drawing: Drawing
     test: tuple[Shown, ...]
     train: tuple[Shown, ...]
     arms: dict[_Key, Arm] = field(default_factory=dict[_Key, Arm])
@@ -85,10 +85,9 @@ class Lab:
         objects = open_objects(study.objects)
         open_backgrounds(study.backgrounds)
         eyes = _eyes_of(study, objects.classes, out)
-        drawing = Drawing(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
         test = _some(objects, "test", sizes["limit"], study.seed)
         train = _some(objects, "train", sizes["train_pictures"], study.seed)
-        return cls(replace(study, **sizes), out, objects, eyes, wanted, drawing, test, train)
+        return cls(replace(study, **sizes), out, objects, eyes, wanted, test, train)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -118,6 +117,11 @@ class Lab:
         rng = np.random.default_rng(self.study.seed)
         places = keeping_shares(self.labels(self.done), self.study.fresh or len(self.done), rng)
         return tuple(self.done[place] for place in places)
+
+    @property
+    def fresh(self) -> tuple[int, ...]:
+        """Places among `done` of those of `few` that could be used."""
+        return tuple(i for i, one in enumerate(self.done) if one in self.few and one.identifier not in self.failed)
 
     @cached_property
     def replaced(self) -> list[int]:
@@ -206,35 +210,56 @@ class Lab:
     def weights(self, eyes: Eyes, trained: str) -> Path:
         return self.out / RETRAINED / f"{eyes.name}-{trained}.safetensors"
 
-    def answers(
-        self, kind: str, eyes: Eyes, strategy: str, shown: Sequence[Shown], before: bool = False
-    ) -> Answers:
-        """What an attacked network made of pictures, after the attack or before it."""
-        frames = self.arms[kind, eyes.name, strategy].frames(shown)
-        return self.judged([f.right_before if before else f.right_after for f in frames], shown)
+    def right(self, what: str, network: str, strategy: str, other: str) -> np.ndarray:
+        """Which pictures (M,) bool a network classifies rightly, as `Results.answers` says."""
+        eyes = self.eyes_of(network)
+        if what == "pixels":
+            return self.pixels(eyes)[strategy]
+        if what in ("known", "crossed"):
+            target = eyes if what == "known" else self.eyes_of(other)
+            judge = self.taught[network, other] if what == "known" else target.network
+            return right(judge, self.features(eyes, strategy, target), self.labels(self.done))
+        shown, kind = self.done, other
+        if what == "fresh":
+            shown = tuple(self.done[place] for place in self.fresh)
+            kind = "test" if other == BENIGN else f"against {other}"
+        frames = self.arms[kind, network, GRADIENT[0] if strategy == BENIGN else strategy].frames(shown)
+        return np.array([one.right_before if strategy == BENIGN else one.right_after for one in frames])
 
-    def judged(self, right: Sequence[bool], shown: Sequence[Shown]) -> Answers:
-        """Pictures with what was made of them."""
-        objects = {name: place for place, name in enumerate(sorted({one.name for one in shown}))}
-        unit = np.array([objects[one.name] for one in shown], np.int64)
-        return Answers(np.asarray(right, bool), np.array(self.labels(shown), np.int64), unit)
+    def distances(self, what: str, network: str, strategy: str, metric: str) -> Floats:
+        """Distances (N,) from the pictures before, as `Results.far` says."""
+        if what == "pixels":
+            return self.pixels(self.eyes_of(network))[f"{strategy} apart"].astype(np.float64)
+        return self.apart(network, strategy).pairs[metric]
 
-    def certain(self, eyes: Eyes, strategy: str) -> int | None:
+    def chances(self, network: str, strategy: str, trained: str) -> Floats:
+        """Softmax (N, C) of a network, as it was or trained so, for the pictures against it as it was."""
+        eyes = self.eyes_of(network)
+        judge = self.taught[network, trained] if trained else eyes.network
+        with torch.no_grad():
+            return judge.last(self.features(eyes, strategy, eyes)).softmax(1).double().cpu().numpy()
+
+    def certain(self, network: str, strategy: str) -> int | None:
         """How many failures are certain, where that was asked."""
-        frames = self.arms["test", eyes.name, strategy].frames(self.done)
+        frames = self.arms["test", network, strategy].frames(self.done)
         return None if self.study.quick else sum(frame.grade == "certain" for frame in frames)
+
+    def eyes_of(self, network: str) -> Eyes:
+        """The network of that name."""
+        return next(eyes for eyes in self.eyes if eyes.name == network)
 
     def features(self, source: Eyes, strategy: str, target: Eyes) -> Tensor:
         """What a network's last layer reads of counterexamples against a network; of benign pictures too."""
-        attacked = self.strategies[0] if strategy == BENIGN else strategy
-        before, after = pictures(self.arms["test", source.name, attacked], self.done)
-        name = BENIGN if strategy == BENIGN else f"{strategy} against {source.name}"
-        return target.features(name, before if strategy == BENIGN else after)
+        benign = strategy == BENIGN
+        before, after = pictures(self.arms["test", source.name, GRADIENT[0] if benign else strategy], self.done)
+        if benign:
+            return target.features(BENIGN, before)
+        return target.features(f"{strategy} against {source.name}", after)
 
-    def apart(self, eyes: Eyes, strategy: str) -> Apart:
+    def apart(self, network: str, strategy: str) -> Apart:
         """How far counterexamples are from the pictures before."""
-        before, after = pictures(self.arms["test", eyes.name, strategy], self.done)
-        path = self.out / LOOKED / f"{eyes.name}-{strategy}-distances.npz"
+        before, after = pictures(self.arms["test", network, strategy], self.done)
+        path = self.out / LOOKED / f"{network}-{strategy}-distances.npz"
         return apart(path, list(zip(before, after, strict=True)), self.measures)
 
     def pixels(self, eyes: Eyes) -> Mapping[str, np.ndarray]:
@@ -247,7 +272,7 @@ class Lab:
             found: dict[str, np.ndarray] = {}
             for name, after in pixels.attacked(eyes.network, images / np.float32(255), np.array(labels)).items():
                 features = embedded(eyes.network, torch.from_numpy(after), self.study.device, name)
-                found[name] = np.array(right(eyes.network, features, labels))
+                found[name] = right(eyes.network, features, labels)
                 pairs = zip(before, after.transpose(0, 2, 3, 1), strict=True)
                 found[f"{name} apart"] = np.array([self.measures["perceptual"](a, b) for a, b in pairs])
             return found
@@ -281,3 +306,30 @@ def _eyes_of(study: Study, classes: tuple[str, ...], out: Path) -> tuple[Eyes, .
     loaded = [load_classifier(spec, classes, study.device) for spec in specs]
     found = zip(names, specs, loaded, strict=True)
     return tuple(Eyes(name, spec, network, out, study.device) for name, spec, network in found)
+
+
+def half(count: int, seed: int) -> list[int]:
+    """Places of half of so many pictures, at random, in order."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    return sorted(order[: count // 2].tolist())
+
+
+def retrained(
+    network: Classifier, path: Path, features: Tensor, labels: Tensor, seed: int, device: str
+) -> Classifier:
+    """The network with its last layer trained on for EPOCHS, from what it is, as in the paper; kept in a file."""
+    if not path.is_file():
+        learner = copy.deepcopy(network)
+        learner.last.requires_grad_(True)
+        config = Classify(what="train", epochs=EPOCHS, layers="last")
+        truth = labels.to(device)
+        known, labelled = {"train": features, "val": features}, {"train": truth, "val": truth}
+        fit_last(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
+        save_classifier(ready(learner, device), path, {"trained_on": str(len(labels))})
+    return load_classifier(str(path), network.classes, device)
+
+
+@torch.no_grad()
+def right(network: Classifier, features: Tensor, labels: Sequence[int]) -> np.ndarray:
+    """Which pictures (N,) bool a network's last layer classifies rightly by their features (N, K)."""
+    return network.last(features).argmax(1).cpu().numpy() == np.asarray(labels)

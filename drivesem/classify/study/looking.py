@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.paper import theirs
 from drivesem.classify.training import embedded
 from drivesem.questions.realism.frechet import Gaussian, frechet
-from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures, psnr_db
+from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures
 from drivesem.questions.worth.measures import Floats
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
@@ -48,8 +47,8 @@ class Eyes:
 
     @property
     def theirs(self) -> str:
-        """The network of the paper that it stands beside."""
-        return theirs(self.network.architecture)
+        """The network of the paper that it stands beside: VGG-16, unless it is a ResNet-50."""
+        return "resnet50" if self.network.architecture.startswith("resnet") else "vgg16"
 
     def features(self, name: str, paths: Sequence[Path]) -> Tensor:
         """Features (N, K) of pictures, which are known by a name of their own."""
@@ -76,15 +75,10 @@ class Apart:
     pairs: Mapping[str, Floats]
     sets: Mapping[str, tuple[Floats, Floats]]
 
-    def mean(self, metric: str, kept: np.ndarray) -> float | None:
-        """Of some pictures, kept (M,) bool: the mean distance, or the sets' one; None where there are too few."""
-        if metric in self.sets:
-            first, second = (side[kept] for side in self.sets[metric])
-            return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
-        if not kept.any():
-            return None
-        mean = float(self.pairs[metric][kept].mean())
-        return psnr_db(mean) if METRICS[metric].squared else mean
+    def between(self, metric: str, kept: np.ndarray) -> float | None:
+        """The distance of the sets of some pictures, kept (M,) bool; None where there are too few."""
+        first, second = (side[kept] for side in self.sets[metric])
+        return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
 
 
 def apart(

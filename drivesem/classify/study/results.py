@@ -16,8 +16,6 @@ from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT
 from drivesem.classify.study.figures import Answers, Drawing
 from drivesem.classify.study.lab import BENIGN, Lab
-from drivesem.classify.study.looking import Eyes
-from drivesem.classify.study.retraining import chances, right
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.realism.measures import METRICS, missing, psnr_db
 from drivesem.questions.worth.measures import Floats, Points, classified
@@ -82,7 +80,7 @@ class Facts:
             distance=next(name for name in PREFERRED if missing(name, None) is None),
             toolbox=pixels.available(),
             pictures=tuple(one.name for one in lab.done),
-            few=tuple(i for i, one in enumerate(lab.done) if one in lab.few and one.identifier not in lab.failed),
+            few=lab.fresh,
             counts={"test": len(lab.done), "train": len(lab.train), "retrained": len(lab.few)},
             objects={split: by_class(list(lab.objects.names(split))) for split in SPLITS},
             used={split: by_class([one.name for one in getattr(lab, split)]) for split in ("test", "train")},
@@ -106,14 +104,6 @@ class Results:
     certain: dict[Key, int | None] = field(default_factory=dict[Key, "int | None"])
 
     @property
-    def classes(self) -> tuple[str, ...]:
-        return self.facts.classes
-
-    @property
-    def networks(self) -> tuple[Network, ...]:
-        return self.facts.networks
-
-    @property
     def deep(self) -> tuple[Network, ...]:
         return tuple(one for one in self.facts.networks if one.deep)
 
@@ -126,7 +116,7 @@ class Results:
     def labels(self) -> np.ndarray:
         """Of all pictures (N,)."""
         kinds = [name.partition("/")[0] for name in self.facts.pictures]
-        return np.array([self.classes.index(kind) for kind in kinds], np.int64)
+        return np.array([self.facts.classes.index(kind) for kind in kinds], np.int64)
 
     @cached_property
     def units(self) -> np.ndarray:
@@ -134,55 +124,17 @@ class Results:
         places = {name: place for place, name in enumerate(sorted({*self.facts.pictures}))}
         return np.array([places[name] for name in self.facts.pictures], np.int64)
 
-    def attacked(self, network: Network, strategy: str, kind: str = "test") -> Answers:
-        """What a network makes of the pictures, under a strategy or as they are. kind: of the lab's arms."""
-        benign = strategy == BENIGN
+    def answers(self, what: str, network: Network, strategy: str, other: str = "test") -> Answers:
+        """What a network makes of pictures, under a strategy or, for BENIGN, as they are.
 
-        def compute(lab: Lab) -> np.ndarray:
-            by = lab.strategies[0] if benign else strategy
-            return lab.answers(kind, _eyes(lab, network), by, lab.done, before=benign).right
-
-        return self._answers(("attacked", network.name, strategy, kind), compute)
-
-    def known(self, network: Network, trained: str, test: str) -> Answers:
-        """A network, as it was or retrained, on the pictures that were made against it as it was."""
-
-        def compute(lab: Lab) -> np.ndarray:
-            eyes = _eyes(lab, network)
-            features = lab.features(eyes, test, eyes)
-            return np.array(right(lab.taught[network.name, trained], features, self.labels.tolist()))
-
-        return self._answers(("known", network.name, test, trained), compute)
-
-    def fresh(self, network: Network, trained: str, test: str) -> Answers:
-        """A network on few pictures that are made against itself."""
-
-        def compute(lab: Lab) -> np.ndarray:
-            kind = "test" if trained == BENIGN else f"against {trained}"
-            few = [lab.done[place] for place in self.facts.few]
-            by = GRADIENT[0] if test == BENIGN else test
-            return lab.answers(kind, _eyes(lab, network), by, few, before=test == BENIGN).right
-
-        return self._answers(("fresh", network.name, test, trained), compute, np.array(self.facts.few, np.int64))
-
-    def crossed(self, source: Network, strategy: str, target: Network) -> Answers:
-        """Another network on the pictures that were made against one."""
-
-        def compute(lab: Lab) -> np.ndarray:
-            eyes = _eyes(lab, target)
-            features = lab.features(_eyes(lab, source), strategy, eyes)
-            return np.array(right(eyes.network, features, self.labels.tolist()))
-
-        return self._answers(("crossed", source.name, strategy, target.name), compute)
-
-    def on_pixels(self, network: Network, attack: str) -> tuple[Answers, Floats]:
-        """After an attack on pixels, and how far (N,) it went."""
-        key = ("pixels", network.name, attack, "")
-        answers = self._answers(key, lambda lab: lab.pixels(_eyes(lab, network))[attack])
-        found = self._noted(
-            self.distances, key, lambda lab: lab.pixels(_eyes(lab, network))[f"{attack} apart"].astype(np.float64)
-        )
-        return answers, found
+        what: "attacked", all, by a kind of the lab's arms (other); "known", of the network as it was or retrained
+        (other), those made against it as it was; "fresh", of the same, few made against itself; "crossed", of
+        another network (other), those made against this one; "pixels", after an attack on pixels.
+        """
+        key = (what, network.name, strategy, other)
+        found = self._noted(self.right, key, lambda lab: lab.right(*key)).astype(np.bool_)
+        places = list(self.facts.few) if what == "fresh" else slice(None)
+        return Answers(found, self.labels[places], self.units[places])
 
     def taught(self, network: Network, trained: str) -> bool:
         """Whether it was retrained so."""
@@ -191,30 +143,25 @@ class Results:
 
     def points(self, network: Network, strategy: str, rho: Floats, trained: str = "") -> Points:
         """Pictures before a network, as it was or retrained; what is drawn together are an object's."""
-
-        def compute(lab: Lab) -> Floats:
-            eyes = _eyes(lab, network)
-            judge = lab.taught[network.name, trained] if trained else eyes.network
-            return chances(judge, lab.features(eyes, strategy, eyes)).numpy()
-
-        found = self._noted(self.chances, (network.name, strategy, trained), compute)
+        key = (network.name, strategy, trained)
+        found = self._noted(self.chances, key, lambda lab: lab.chances(*key))
         return replace(classified(found, self.labels, rho), unit=self.units)
 
-    def far(self, network: Network, strategy: str, metric: str) -> Floats:
-        """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors."""
-        key = ("counterexamples", network.name, strategy, metric)
-        return self._noted(self.distances, key, lambda lab: lab.apart(_eyes(lab, network), strategy).pairs[metric])
+    def far(self, network: Network, strategy: str, metric: str, what: str = "counterexamples") -> Floats:
+        """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors. what: or "pixels",
+        after an attack on these.
+        """
+        key = (what, network.name, strategy, metric)
+        return self._noted(self.distances, key, lambda lab: lab.distances(*key))
 
     def mean(self, network: Network, strategy: str, metric: str, kind: str) -> float | None:
         """The mean distance, or the sets' one, of what was right before. kind: a class, or OVERALL."""
-        kept = self.attacked(network, BENIGN).right
+        kept = self.answers("attacked", network, BENIGN).right
         if kind != OVERALL:
-            kept = kept & (self.labels == self.classes.index(kind))
+            kept = kept & (self.labels == self.facts.classes.index(kind))
         if not METRICS[metric].pairwise:
             key = (network.name, strategy, metric, kind)
-            return self._noted(
-                self.sets, key, lambda lab: lab.apart(_eyes(lab, network), strategy).mean(metric, kept)
-            )
+            return self._noted(self.sets, key, lambda lab: lab.apart(*key[:2]).between(metric, kept))
         if not kept.any():
             return None
         mean = float(self.far(network, strategy, metric)[kept].mean())
@@ -222,17 +169,8 @@ class Results:
 
     def certain_of(self, network: Network, strategy: str) -> int | None:
         """How many failures are certain, where that was asked."""
-        return self._noted(
-            self.certain, (network.name, strategy), lambda lab: lab.certain(_eyes(lab, network), strategy)
-        )
-
-    def _answers(
-        self, key: Key, compute: Callable[[Lab], np.ndarray], places: np.ndarray | None = None
-    ) -> Answers:
-        found = self._noted(self.right, key, compute).astype(np.bool_)
-        if places is None:
-            return Answers(found, self.labels, self.units)
-        return Answers(found, self.labels[places], self.units[places])
+        key = (network.name, strategy)
+        return self._noted(self.certain, key, lambda lab: lab.certain(*key))
 
     def _noted(self, store: dict[Key, _T], key: Key, compute: Callable[[Lab], _T]) -> _T:
         if key not in store:
@@ -240,7 +178,3 @@ class Results:
                 raise FormatError("what was kept", f"figures of {', '.join(filter(None, key))}", "none")
             store[key] = compute(self.lab)
         return store[key]
-
-
-def _eyes(lab: Lab, network: Network) -> Eyes:
-    return next(eyes for eyes in lab.eyes if eyes.name == network.name)

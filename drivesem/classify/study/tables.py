@@ -18,13 +18,7 @@ from drivesem.classify.study.lab import BENIGN, ONWARD, SINGLE
 from drivesem.classify.study.results import OVERALL, Network, Results
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism.measures import METRICS
-from drivesem.questions.worth.measures import (
-    MEMBERSHIPS,
-    Setting,
-    gain_of,
-    realism,
-    worth_of,
-)
+from drivesem.questions.worth.measures import MEMBERSHIPS, Setting, gain_of, realism, worth_of
 from drivesem.report.tables import Sheet
 
 Row = dict[str, Any]
@@ -121,14 +115,14 @@ def _rounded(value: float | None) -> float | None:
 
 def _overall(lab: Results, answers: Answers) -> Row:
     found = {"pictures": len(answers.right), **_bounded("overall", answers.overall(lab.drawing))}
-    if lab.classes == CLASSES:
+    if lab.facts.classes == CLASSES:
         sizes = [counts[0] for counts in figures()["sizes"].values()]
         found |= _bounded("at_paper_sizes", answers.overall(lab.drawing, sizes))
     return found
 
 
 def _with_classes(lab: Results, answers: Answers) -> Row:
-    own = zip(lab.classes, answers.by_class(len(lab.classes)), strict=True)
+    own = zip(lab.facts.classes, answers.by_class(len(lab.facts.classes)), strict=True)
     return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
 
 
@@ -151,16 +145,17 @@ def _by_class(values: Sequence[float]) -> Row:
 
 def _degradation(lab: Results) -> Table:
     rows = []
-    for eyes, strategy in product(lab.networks, (BENIGN, *STRATEGIES)):
-        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, lab.attacked(eyes, strategy))}
+    for eyes, strategy in product(lab.facts.networks, (BENIGN, *STRATEGIES)):
+        answers = lab.answers("attacked", eyes, strategy)
+        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, answers)}
         rows.append(row | {"certain": None if strategy == BENIGN else lab.certain_of(eyes, strategy)})
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
-    columns = ("network", "strategy", *lab.classes, "overall", "at_paper_sizes", "certain")
+    columns = ("network", "strategy", *lab.facts.classes, "overall", "at_paper_sizes", "certain")
     return Table("degradation", "Accuracy by class and strategy, %", columns, rows, reference)
 
 
 def _moved(lab: Results, eyes: Network, strategy: str, params: str) -> Answers:
-    return lab.attacked(eyes, strategy, "test" if params == _BOTH else params)
+    return lab.answers("attacked", eyes, strategy, "test" if params == _BOTH else params)
 
 
 def _parameters(lab: Results) -> Table:
@@ -185,7 +180,7 @@ def _hyperparameters(lab: Results) -> Table:
         settings = {"strategy": strategy, "settings": NETWORKS[network]}
         settings |= {key: preset(network, strategy).get(key) for key in _SETTINGS}
         for eyes in lab.deep:
-            answers = lab.attacked(eyes, strategy, "test" if network == eyes.theirs else network)
+            answers = lab.answers("attacked", eyes, strategy, "test" if network == eyes.theirs else network)
             rows.append({"network": eyes.name, **settings, **_overall(lab, answers)})
         value = figures()["degradation"][network][strategy][-1]
         reference.append({"network": NETWORKS[network], **settings, "overall": value})
@@ -193,54 +188,32 @@ def _hyperparameters(lab: Results) -> Table:
     return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference)
 
 
-_Tried = Callable[[Results, Network, str], Mapping[str, Answers]]
-"""A network that was trained so, on each of TESTS."""
-
-
-def _on_tests(lab: Results, network: str, train: str, found: Mapping[str, Answers]) -> Row:
-    row: Row = {"network": network, "trained_on": train}
-    for test, answers in found.items():
-        row |= _bounded(test, answers.overall(lab.drawing))
-    return row | {"pictures": len(found[BENIGN].right)}
-
-
-def _paper_on_tests(table: str) -> list[Row]:
-    return [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
-
-
-def _known(lab: Results, eyes: Network, trained: str) -> dict[str, Answers]:
-    """A network, as it was or retrained, on the pictures that were made against it as it was."""
-    return {test: lab.known(eyes, trained, test) for test in TESTS}
-
-
-def _fresh(lab: Results, eyes: Network, trained: str) -> dict[str, Answers]:
-    """A network on few pictures that are made against itself."""
-    return {test: lab.fresh(eyes, trained, test) for test in TESTS}
-
-
-def _learners(lab: Results, table: str, title: str, trained: Sequence[str], tried: _Tried) -> Table:
-    rows = [
-        _on_tests(lab, eyes.name, one, tried(lab, eyes, one))
-        for eyes, one in product(lab.deep, (BENIGN, *trained))
-    ]
-    return Table(table, title, ("network", "trained_on", *TESTS, "pictures"), rows, _paper_on_tests(table))
+def _learners(lab: Results, table: str, title: str, trained: Sequence[str], what: str) -> Table:
+    """Networks that were trained so, on each of TESTS. what: as of `Results.answers`."""
+    rows: list[Row] = []
+    for eyes, one in product(lab.deep, (BENIGN, *trained)):
+        row: Row = {"network": eyes.name, "trained_on": one}
+        for test in TESTS:
+            row |= _bounded(test, lab.answers(what, eyes, test, one).overall(lab.drawing))
+        rows.append(row | {"pictures": len(lab.answers(what, eyes, BENIGN, one).right)})
+    reference = [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
+    return Table(table, title, ("network", "trained_on", *TESTS, "pictures"), rows, reference)
 
 
 def _retraining(lab: Results) -> Table:
     title = "Retrained networks on pictures made against the benign one, %"
-    return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), _known)
+    return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), "known")
 
 
 def _robustness(lab: Results) -> Table:
-    return _learners(
-        lab, "robustness", "Retrained networks on pictures made against themselves, %", GRADIENT, _fresh
-    )
+    title = "Retrained networks on pictures made against themselves, %"
+    return _learners(lab, "robustness", title, GRADIENT, "fresh")
 
 
 def _worth(lab: Results) -> Table:
     rows: list[Row] = []
     distance = lab.facts.distance
-    for eyes in lab.networks:
+    for eyes in lab.facts.networks:
         far = {one: lab.far(eyes, one, distance) for one in STRATEGIES}
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
@@ -266,10 +239,10 @@ def _worth(lab: Results) -> Table:
 
 def _realism(lab: Results) -> Table:
     rows = []
-    for eyes, strategy, metric in product(lab.networks, STRATEGIES, lab.facts.measures):
+    for eyes, strategy, metric in product(lab.facts.networks, STRATEGIES, lab.facts.measures):
         name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
         row: Row = {"network": eyes.name, "strategy": strategy, "metric": name}
-        kinds = (*lab.classes, OVERALL)
+        kinds = (*lab.facts.classes, OVERALL)
         rows.append(row | {kind: _rounded(lab.mean(eyes, strategy, metric, kind)) for kind in kinds})
     reference = [
         row | {"metric": row["metric"].upper(), **_by_class(values)}
@@ -281,32 +254,32 @@ def _realism(lab: Results) -> Table:
         "does not compare with the paper's. "
         + (f"Without weights on disk: {', '.join(absent)}." if absent else "")
     )
-    columns = ("network", "strategy", "metric", *lab.classes, "overall")
+    columns = ("network", "strategy", "metric", *lab.facts.classes, "overall")
     return Table("realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True)
 
 
 def _transfer(lab: Results) -> Table:
     rows = []
-    for source, target in product(lab.networks, lab.networks):
+    for source, target in product(lab.facts.networks, lab.facts.networks):
         for strategy in (BENIGN, *GRADIENT) if source is not target else ():
             row = {"source": source.name, "target": target.name, "strategy": strategy}
-            rows.append(row | _with_classes(lab, lab.crossed(source, strategy, target)))
+            rows.append(row | _with_classes(lab, lab.answers("crossed", source, strategy, target.name)))
     other = dict(zip(NETWORKS.values(), reversed(NETWORKS.values()), strict=True))
     reference = [
         row | {"source": row["network"], "target": other[row["network"]], **_by_class(values)}
         for row, values in _paper("transfer", "strategy")
     ]
     note = () if rows else ("Two networks are needed: --networks squeezenet,FILE.",)
-    columns = ("source", "target", "strategy", *lab.classes, "overall", "at_paper_sizes")
+    columns = ("source", "target", "strategy", *lab.facts.classes, "overall", "at_paper_sizes")
     return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
 
 
 def _pixels(lab: Results) -> Table:
     rows: list[Row] = []
     for eyes, attack in product(lab.deep if lab.facts.toolbox else (), pixels.ATTACKS):
-        answers, apart = lab.on_pixels(eyes, attack)
-        far = {"distance": round(float(apart.mean()), 5)}
-        rows.append({"network": eyes.name, "strategy": attack, **_overall(lab, answers), **far})
+        row: Row = {"network": eyes.name, "strategy": attack}
+        row |= _overall(lab, lab.answers("pixels", eyes, attack, ""))
+        rows.append(row | {"distance": round(float(lab.far(eyes, attack, "", "pixels").mean()), 5)})
     note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
     notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
@@ -318,7 +291,7 @@ def _sizes(lab: Results) -> Table:
     rows = [
         {"class": one, **{f"{split} objects": objects[split][one] for split in SPLITS}}
         | {f"{split} pictures": used[split][one] for split in used}
-        for one in lab.classes
+        for one in lab.facts.classes
     ]
     reference = [
         {"class": f"{one} (paper)"}
@@ -343,9 +316,10 @@ def _order(
 
 def _strategies_in_order(lab: Results) -> list[Row]:
     rows: list[Row] = []
-    for eyes in lab.networks:
+    for eyes in lab.facts.networks:
         theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
-        rows += _order(lab, "degradation", eyes, theirs, {one: lab.attacked(eyes, one) for one in STRATEGIES})
+        ours = {one: lab.answers("attacked", eyes, one) for one in STRATEGIES}
+        rows += _order(lab, "degradation", eyes, theirs, ours)
     return rows
 
 
@@ -358,16 +332,14 @@ def _parameters_in_order(lab: Results) -> list[Row]:
     return rows
 
 
-def _learners_in_order(lab: Results, table: str, tried: _Tried) -> list[Row]:
+def _learners_in_order(lab: Results, table: str, what: str) -> list[Row]:
     """For each test: is a retrained network better than the benign one?"""
     rows: list[Row] = []
-    for eyes in lab.deep:
-        found = {trained: tried(lab, eyes, trained) for trained in (BENIGN, *GRADIENT)}
-        for i, test in enumerate(TESTS):
-            theirs = {trained: figures()[table][eyes.theirs][trained][i] for trained in found}
-            ours = {trained: one[test] for trained, one in found.items()}
-            pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
-            rows += [row for row in pairs if row["first"] == BENIGN]
+    for eyes, (i, test) in product(lab.deep, enumerate(TESTS)):
+        theirs = {trained: figures()[table][eyes.theirs][trained][i] for trained in (BENIGN, *GRADIENT)}
+        ours = {trained: lab.answers(what, eyes, test, trained) for trained in theirs}
+        pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
+        rows += [row for row in pairs if row["first"] == BENIGN]
     return rows
 
 
@@ -386,8 +358,8 @@ _BUILDERS: dict[str, Callable[[Results], Table]] = {
 _ORDERS: dict[str, Callable[[Results], list[Row]]] = {
     "degradation": _strategies_in_order,
     "parameters": _parameters_in_order,
-    "retraining": lambda lab: _learners_in_order(lab, "retraining", _known),
-    "robustness": lambda lab: _learners_in_order(lab, "robustness", _fresh),
+    "retraining": lambda lab: _learners_in_order(lab, "retraining", "known"),
+    "robustness": lambda lab: _learners_in_order(lab, "robustness", "fresh"),
 }
 
 

@@ -55,7 +55,7 @@ def vgg16() -> Trunk:
         if layers:
             layers.append(nn.MaxPool2d(2, 2))
         for _ in range(count):
-            layers += [nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU()]
+            layers += [nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU(inplace=True)]
             inputs = width
         taps.append(len(layers) - 1)
     return Trunk(layers, taps, widths)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from drivesem.attack.objective import GRADIENT_PASSES
+from drivesem.attack.methods.base import GRADIENT_PASSES
 from drivesem.attack.space import SIX, Parameter
 from drivesem.questions.transfer.asking import detector_names, short_names
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE

@@ -69,9 +69,17 @@ def detector_names(text: str, setting: str = "--detectors") -> list[str]:
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Detectors without the folders of their files, as long as that tells them apart."""
-    short = [re.sub(r"[^,:]*/", "", name) for name in names]
-    return short if len(set(short)) == len(short) else list(names)
+    """Detectors without the folders of their files, but for as many as tell each from all others."""
+
+    def end(name: str, folders: int) -> str:
+        return re.sub(r"[^,:]+", lambda part: "/".join(part[0].split("/")[-folders - 1 :]), name)
+
+    short = []
+    for name in names:
+        depths = range(name.count("/") + 1)
+        alone = (d for d in depths if [end(other, d) for other in names].count(end(name, d)) == 1)
+        short.append(end(name, next(alone, depths[-1])))
+    return short
 
 
 def detectors_of(specs: Sequence[str], config: Asking, out: Path, t_star: float | None = None) -> list[Asked]:

@@ -43,3 +43,8 @@ class SecondRenderer(Protocol):
 
 class NoSecondRendererError(SceneError):
     """Nothing on this machine can draw the scene a second time; the message says what to install."""
+
+    @classmethod
+    def of(cls, renderer: str, expected: str, error: BaseException) -> NoSecondRendererError:
+        """What a library raised, on one line."""
+        return cls(renderer, expected, " ".join(f"{type(error).__name__} {error}".split()))

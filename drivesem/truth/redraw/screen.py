@@ -187,7 +187,7 @@ class Screen:
             GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._buffer)
             GL.glBufferData(GL.GL_ARRAY_BUFFER, len(self._mark), self._mark, GL.GL_STATIC_DRAW)
         except Exception as error:  # a driver's errors have no common kind
-            raise NoSecondRendererError("pyrender", _EXPECTED, _line(error)) from error
+            raise NoSecondRendererError.of("pyrender", _EXPECTED, error) from error
 
     def _reopen(self) -> None:
         """Before a scene is made: open another context if this one is gone. All pyrender renderers of a process
@@ -236,7 +236,7 @@ def _pyrender() -> Any:
             warnings.simplefilter("ignore")  # of pyrender's own dependencies, while they are imported
             import pyrender
     except Exception as error:  # OpenGL's bindings raise what they like where a driver is missing
-        raise NoSecondRendererError("pyrender", _EXPECTED, _line(error)) from error
+        raise NoSecondRendererError.of("pyrender", _EXPECTED, error) from error
     return pyrender
 
 
@@ -246,7 +246,3 @@ def _is_there(platform: str) -> bool:
     except OSError:
         return False
     return True
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__} {error}".split())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.scenes import (
     DRAWN_PX,
     SEEN_PX,

@@ -8,7 +8,7 @@ import torch
 
 from drivesem.classify.networks import loading
 from drivesem.classify.networks.loading import load_classifier
-from drivesem.classify.objects.sources import open_objects
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import CLASSES
 from drivesem.classify.scenes import ObjectScene, generated_background, in_turn
 from scene_ir.errors import FormatError

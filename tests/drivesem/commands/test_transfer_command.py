@@ -158,7 +158,11 @@ def test_detectors_are_told_apart(text: str, names: list[str]) -> None:
 
 def test_names_lose_their_folders_where_that_is_clear() -> None:
     assert asking.short_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
-    assert asking.short_names(["onnx:a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
+    assert asking.short_names(["onnx:c/a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
+    assert asking.short_names(["a/n.onnx", "c/a/n.onnx"]) == ["a/n.onnx", "c/a/n.onnx"]
+    runs = ["squeezedet", "onnx:d/n.onnx", "out/benign/r.safetensors", "out/worst/r.safetensors"]
+    assert asking.short_names(runs) == ["squeezedet", "onnx:n.onnx", "benign/r.safetensors", "worst/r.safetensors"]
+    assert asking.short_names(["darknet:x/c.cfg,x/c.weights"]) == ["darknet:c.cfg,c.weights"]
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,17 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivesem.classify.objects.shapes import beams, body, box, boxes, lathe, patch, torus, tube, wing
-from drivesem.classify.objects.surfaces import (
-    BLACK,
-    GLASS,
-    RUBBER,
-    STEEL,
-    WHITE,
-    Kit,
-    Surface,
-    metal,
-    paint,
-)
+from drivesem.classify.objects.surfaces import BLACK, GLASS, RUBBER, STEEL, WHITE, Kit, Surface, metal, paint
 
 
 def _engine(kit: Kit, cowl: Surface, x: float, y: float, z: float, radius: float) -> None:

@@ -16,9 +16,7 @@ from drivesem.classify.networks import libraries as libraries_module
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
 from drivesem.classify.networks.onnx import OnnxClassifier
-from drivesem.classify.networks.resnet import ResNet50
-from drivesem.classify.networks.squeezenet import SqueezeNet
-from drivesem.classify.networks.vgg import VGG16, PooledVGG16
+from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir.errors import FormatError
 from tools.onnx_graph import constant_graph
 

@@ -10,8 +10,8 @@ import torch
 import trimesh
 from PIL import Image
 
+from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.folders import FolderObjects
-from drivesem.classify.objects.sources import open_objects
 from drivesem.classify.objects.types import CLASSES
 from drivesem.classify.paper import figures
 from scene_ir.errors import FormatError, RangeError

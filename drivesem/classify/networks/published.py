@@ -1,0 +1,137 @@
+"""The published networks, by torchvision's names of weights: SqueezeNet 1.1 (Iandola et al. 2016,
+arXiv:1602.07360), VGG-16 (Simonyan and Zisserman 2015, arXiv:1409.1556, configuration D), ResNet-50 (He et al.
+2015, arXiv:1512.03385).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
+from drivesem.classify.networks.base import Classifier
+from drivesem.questions.realism import networks
+
+_FIRES = dict(list(SqueezeDet.layout.fires.items())[:8])
+"""Up to fire9: what SqueezeDet has after that is its own."""
+
+
+class SqueezeNet(Classifier):
+    """Up to its last Fire module, and one layer on mean and maximum of what that finds anywhere. The names of its
+    convolutions are those of SqueezeDet, which begins with the same ones.
+    """
+
+    architecture = "squeezenet"
+    head = "classifier"
+    published_head = "conv10"
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        mean = [value / 255 for value in reversed(BGR_MEAN)]
+        super().__init__(classes, mean, [1 / 255] * 3)
+        channels = SqueezeDet.layout.channels
+        self.conv1 = nn.Conv2d(3, channels, SqueezeDet.layout.kernel, 2)
+        self.fires = nn.ModuleDict()
+        for name, (squeeze, expand) in _FIRES.items():
+            self.fires[name] = Fire(channels, squeeze, expand)
+            channels = 2 * expand
+        self.classifier = nn.Linear(2 * channels, len(self.classes))
+
+    def encode(self, prepared: Tensor) -> Tensor:
+        x = F.max_pool2d(F.relu(self.conv1(prepared.flip(1))), 3, 2, ceil_mode=True)  # its weights read BGR
+        for name, fire in self.fires.items():
+            x = fire(x)
+            if name in SqueezeDet.layout.pooled:
+                x = F.max_pool2d(x, 3, 2, ceil_mode=True)
+        return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)
+
+
+class VGG16(Classifier):
+    """The published network."""
+
+    architecture = "vgg16"
+    head = "classifier.6"
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        super().__init__(classes)
+        self.features = nn.Sequential(*networks.vgg16().features, nn.MaxPool2d(2, 2))
+        wide = [nn.Linear(512 * 7 * 7, 4096), nn.ReLU(inplace=True), nn.Dropout()]
+        deep = [nn.Linear(4096, 4096), nn.ReLU(inplace=True), nn.Dropout()]
+        self.classifier = nn.Sequential(*wide, *deep, nn.Linear(4096, len(self.classes)))
+
+    def encode(self, prepared: Tensor) -> Tensor:
+        pooled = F.adaptive_avg_pool2d(self.features(prepared), 7)
+        return self.classifier[:6](torch.flatten(pooled, 1))
+
+
+class PooledVGG16(Classifier):
+    """Its convolutions, and one layer on mean and maximum of what the last of them find: where the three large
+    layers of the published network are not at hand, which hold nine tenths of its weights.
+    """
+
+    architecture = "vgg16-pooled"
+    head = "classifier"
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        super().__init__(classes)
+        self.features = nn.Sequential(*networks.vgg16().features, nn.MaxPool2d(2, 2))
+        self.classifier = nn.Linear(2 * 512, len(self.classes))
+
+    def encode(self, prepared: Tensor) -> Tensor:
+        x = self.features(prepared)
+        return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)
+
+
+_BLOCKS = (3, 4, 6, 3)
+_EXPANSION = 4
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1, and what went in; as in torchvision, one that halves the picture does so in its 3x3."""
+
+    def __init__(self, channels: int, width: int, stride: int) -> None:
+        super().__init__()
+        out = _EXPANSION * width
+        self.conv1 = nn.Conv2d(channels, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, out, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(out)
+        self.downsample: nn.Module = nn.Identity()
+        if stride != 1 or channels != out:
+            self.downsample = nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out))
+
+    def forward(self, x: Tensor) -> Tensor:
+        inner = F.relu(self.bn1(self.conv1(x)))
+        inner = F.relu(self.bn2(self.conv2(inner)))
+        return F.relu(self.bn3(self.conv3(inner)) + self.downsample(x))
+
+
+class ResNet50(Classifier):
+    """The published network."""
+
+    architecture = "resnet50"
+    head = "fc"
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        super().__init__(classes)
+        self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.maxpool = nn.MaxPool2d(3, 2, padding=1)
+        channels = 64
+        for i, count in enumerate(_BLOCKS):
+            width, blocks = 64 << i, []
+            for k in range(count):
+                blocks.append(Bottleneck(channels, width, 2 if i > 0 and k == 0 else 1))
+                channels = _EXPANSION * width
+            self.add_module(f"layer{i + 1}", nn.Sequential(*blocks))
+        self.fc = nn.Linear(channels, len(self.classes))
+
+    def encode(self, prepared: Tensor) -> Tensor:
+        x = self.maxpool(F.relu(self.bn1(self.conv1(prepared))))
+        for i in range(len(_BLOCKS)):
+            x = self.get_submodule(f"layer{i + 1}")(x)
+        return torch.flatten(F.adaptive_avg_pool2d(x, 1), 1)
