@@ -10,7 +10,7 @@ from drivesem.report.terminal import Console
 
 def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
     """Cars, by track and kind, that come nearer by a metre a frame and are missed from the second one on."""
-    states = dict.fromkeys(STATES, "f" + "l" * (frames - 1))
+    states: dict[str, str] = dict.fromkeys(map(str, STATES), "f" + "l" * (frames - 1))
     distance_m = tuple(float(frames - i) for i in range(frames))
     told = (CarResult.of(track, kind, states, distance_m, (None,) * frames, (True, False)) for track, kind in cars)
     return DriveResult(
@@ -23,7 +23,7 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
         frames=frames,
         names=tuple(map(str, range(frames))),
         cars=tuple(told),
-        phantoms=dict.fromkeys(STATES, 1),
+        phantoms=dict.fromkeys(map(str, STATES), 1),
         feasible=frames,
         violations={},
         held_back=(),
