@@ -148,8 +148,8 @@ class _Beside:
 
 
 class Consistency(_Beside):
-    """What a detector says of an object, and of all that is none, is to be the same in the photograph and in a
-    state around a failure: a term of the loss, by margins, on a pair of pictures a step.
+    """What a detector says of an object is to be the same in the photograph and in a state around a failure, and
+    nothing is to be nearer to a phantom there: a term of the loss, by margins, on a pair of pictures a step.
     """
 
     name = "consistency"
@@ -163,8 +163,8 @@ class Consistency(_Beside):
         )
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the objects that are judged in both pictures, and lie in the part that is seen; and of what is
-        surest of all that is reported on nothing there, lest scores rise everywhere.
+        """Of the objects that are judged in both pictures, and lie in the part that is seen; and of what is surest
+        of all that is reported on nothing there, lest scores rise everywhere.
         """
         index, (sample, state) = self._pair(step)
         window = self._window(index, sample, state)
@@ -181,7 +181,9 @@ class Consistency(_Beside):
             of_background(seen, _shifted(there.boxes_xyxy, window), self._t_star, SHARPNESS)
             for seen, there in ((before, as_targets(frame.result.targets_benign, CLASSES)), (after, state))
         ]
-        return self._weight * (objects + F.smooth_l1_loss(nothing[1], nothing[0].detach()))
+        # one-sided: what the photograph makes suspect of nothing is no aim
+        nearer = (nothing[0].detach() - nothing[1]).clamp_min(0)
+        return self._weight * (objects + F.smooth_l1_loss(nearer, torch.zeros_like(nearer)))
 
     def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
         index, generator = self._drawn(step)

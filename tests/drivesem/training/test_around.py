@@ -169,15 +169,14 @@ def test_consistency_on_real_pictures(around: AroundFailures, monkeypatch: pytes
     raw = detector(images)
     value = once.term(detector, raw, 0)
     assert float(value.detach()) > 0
-    margins = iter([torch.tensor(1.0), torch.tensor(-2.0)])
-    with monkeypatch.context() as patch:
-        patch.setattr("drivesem.training.around.of_background", lambda *_: torch.tensor(1.0))
-        objects = once.term(detector, raw, 0)
-        patch.setattr("drivesem.training.around.of_background", lambda *_: next(margins))
-        rises = once.term(detector, raw, 0)
-    assert float(rises.detach()) == pytest.approx(float(objects.detach()) + 2.5), (
-        "background is nearer to a phantom"
-    )
     assert float(twice.term(detector, raw, 0).detach()) == pytest.approx(2 * float(value.detach()))
+    said = {}
+    for name, pair in {"alike": (1.0, 1.0), "nearer": (1.0, -2.0), "farther": (-2.0, 1.0)}.items():
+        margins = iter(map(torch.tensor, pair))
+        with monkeypatch.context() as patch:
+            patch.setattr("drivesem.training.around.of_background", lambda *_, margins=margins: next(margins))
+            said[name] = float(once.term(detector, raw, 0).detach())
+    assert said["nearer"] == pytest.approx(said["alike"] + 2.5), "background is nearer to a phantom than it was"
+    assert said["farther"] == pytest.approx(said["alike"]), "which is no harm the other way round"
     value.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())
