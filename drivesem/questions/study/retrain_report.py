@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drivesem.attack.judging import HEADLINE
 from drivesem.evaluation.resampling import Interval
@@ -21,6 +22,9 @@ from drivesem.report.plots import COLOURS, STYLE
 from drivesem.report.tables import Sheet, percent
 from scene_ir import files
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _DETECTOR, _LABELS, _PICTURES, _MIX, _WINDOW = "detector", "labels", "pictures", "mix", "window"
 _GOAL = "short of the goal"
 _WORDS = (_DETECTOR, _LABELS, _PICTURES, _MIX, _WINDOW, _GOAL)
@@ -33,6 +37,11 @@ _SHOWN = {
     "around": "certain failures, drawn anew",
 }
 _SIZE_IN = (9.6, 4.8)
+_STATES = {
+    ANYWHERE: "states anywhere",
+    REDRAWN: "some of them,\nsecond renderer",
+    AROUND: "states around\ncertain failures",
+}
 _GROUPS = {
     "benign": "benign frames",
     "known": "counterexamples\nof the benign detector",
@@ -216,37 +225,52 @@ _MOST_IN_THREE = 6
 
 
 def write_plot(path: Path, found: Taught) -> None:
-    """AP50 of each detector on benign frames, known and fresh counterexamples; the paper's as marks."""
+    """How likely each arm fails a car, where states were shown; else AP50 of each detector by pictures."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    series: dict[str, list[Interval | None]] = {
-        row.name: [row.spread.get(group) for group in _GROUPS] for row in found.rows
-    }
     with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         axes = figure.add_subplot()
-        bars(axes, series)
-        label: str | None = "the paper, mAP"
-        for i, row in enumerate(found.rows):
-            if row.reference is None:
-                continue
-            known, benign = row.reference
-            places = [place_of(group, i, len(series)) for group in (0, 1)]
-            axes.plot(
-                places, [100 * benign, 100 * known], "D", color=COLOURS[-1], markersize=5, zorder=4, label=label
-            )
-            label = None
-        axes.set_xticks(range(len(_GROUPS)), list(_GROUPS.values()))
-        axes.set(ylabel=f"{HEADLINE} AP50, %", ylim=(0, 104))
-        axes.set_title("Moved labels; lines: 95 % of draws of frames", loc="left", fontsize=11)
+        count = _failures(axes, found) if found.chances else _ap50(axes, found.rows)
         axes.legend(
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.14),
-            ncols=3 if len(series) <= _MOST_IN_THREE else 2,
-            fontsize=9,
+            loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3 if count <= _MOST_IN_THREE else 2, fontsize=9
         )
     buffer = io.BytesIO()
     # no date and no version in the file: equal figures give equal bytes
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     files.write_bytes(path, buffer.getvalue())
+
+
+def _failures(axes: Axes, found: Taught) -> int:
+    """Bars of cars that are not found and pictures with phantoms, by arm; how many arms there are."""
+    series: dict[str, list[Interval | None]] = {
+        row.title: [*(row.failures[kind] for kind in _STATES), row.phantoms] for row in found.chances
+    }
+    bars(axes, series)
+    axes.set_xticks(range(len(_STATES) + 1), [*_STATES.values(), "phantoms"])
+    axes.set(ylabel="cars not found; pictures with phantoms, %", ylim=(0, None))
+    title = f"{len(found.counts.states)} held-out frames, {found.study.states} states each"
+    axes.set_title(f"{title}; lines: 95 % of draws of frames", loc="left", fontsize=11)
+    return len(series)
+
+
+def _ap50(axes: Axes, rows: Sequence[Judged]) -> int:
+    """Bars of AP50 on benign frames, known and fresh counterexamples, the paper's as marks; how many detectors."""
+    groups = {name: told for name, told in _GROUPS.items() if name != "fresh" or _attacked_again(rows)}
+    series: dict[str, list[Interval | None]] = {
+        row.name: [row.spread.get(group) for group in groups] for row in rows
+    }
+    bars(axes, series)
+    label: str | None = "the paper, mAP"
+    for i, row in enumerate(rows):
+        if row.reference is None:
+            continue
+        known, benign = row.reference
+        places = [place_of(group, i, len(series)) for group in (0, 1)]
+        axes.plot(places, [100 * benign, 100 * known], "D", color=COLOURS[-1], markersize=5, zorder=4, label=label)
+        label = None
+    axes.set_xticks(range(len(groups)), list(groups.values()))
+    axes.set(ylabel=f"{HEADLINE} AP50, %", ylim=(0, 104))
+    axes.set_title("Moved labels; lines: 95 % of draws of frames", loc="left", fontsize=11)
+    return len(series)

@@ -22,10 +22,12 @@ from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.methods.base import Attack
 from drivesem.cli import main
 from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.resampling import Interval
 from drivesem.questions.study import lessons, retrain, retrain_report
 from drivesem.questions.study.counts import ArmCounts
 from drivesem.questions.study.lessons import BENIGN, lessons_of, reference_of
 from drivesem.questions.study.report import OWN_PROTOCOL, answer_of
+from drivesem.questions.study.robust import KINDS, RobustRow
 from drivesem.questions.study.running import AttackFacts
 from drivesem.questions.study.taught import RetrainCounts, SeenBenign, Taught, taught
 from drivesem.questions.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, PairCounts, ShownRun, Target, row_of
@@ -178,6 +180,24 @@ def test_what_is_told(found: Taught, tmp_path: Path) -> None:
     assert "retrained, ours" in stream.getvalue()
     retrain_report.write_plot(tmp_path / "study.png", found)
     assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
+
+
+def test_the_picture_is_of_failures_where_states_were_shown(
+    found: Taught, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Groups without any bar are left out; AP50 has no groups of states."""
+    drawn: list[dict[str, list[Interval | None]]] = []
+    draw = retrain_report.bars
+    monkeypatch.setattr(retrain_report, "bars", lambda axes, series: (drawn.append(series), draw(axes, series)))
+    monkeypatch.setattr(retrain_report.files, "write_bytes", lambda *_: None)
+    told = Interval("", 0.2, 0.1, 0.3)
+    row = RobustRow("certain", "ours", dict.fromkeys(KINDS, told), {}, replace(told, value=0.5), None, None)
+    retrain_report.write_plot(Path("a.png"), replace(found, chances=[row]))
+    assert [one.value for one in drawn[0]["ours"] if one] == [0.2, 0.2, 0.2, 0.5]
+    retrain_report.write_plot(Path("a.png"), found)
+    once = replace(found, rows=[found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])])
+    retrain_report.write_plot(Path("a.png"), once)
+    assert [len(series[BENIGN]) for series in drawn[1:]] == [3, 2]
 
 
 def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
