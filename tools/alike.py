@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+from drivesem.report.tables import number_of
 from drivesem.run.finished import load_runs
 from drivesem.run.results import Failure, FrameResult
 from drivesem.settings.errors import UsageError
@@ -76,7 +77,10 @@ def main(words: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"python -m tools.alike: {' '.join(str(error).split())}\n")
         return 2
     first, second = found["failures"]
-    print(f"{found['frames']} frames, {first} and {second} failures, theta equal in {found['same_theta']}")
+    print(
+        f"{number_of(found['frames'], 'frame')}, {first} and {number_of(second, 'failure')}, "
+        f"theta equal in {found['same_theta']}"
+    )
     for row in found["differing"]:
         print(f"{row['frame']}: success {row['success'][0]} and {row['success'][1]}")
         for side in ("first", "second"):

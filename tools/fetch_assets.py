@@ -33,6 +33,7 @@ import yaml
 from trimesh.remesh import subdivide_to_size
 from trimesh.visual.material import SimpleMaterial
 
+from drivesem.report.tables import number_of
 from drivesem.synth.render import rasterise
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -554,7 +555,7 @@ def fetch(out: Path, deb: Path | None, tarball: Path | None) -> Iterator[str]:
                 yield from add_skies(package, out)
     skies = sorted(path.name for path in (out / "skies").glob("*.npz"))
     files.write_text(out / "LICENCES.md", licences(pack, skies))
-    yield f"{out}: {len(pack.vehicles)} vehicles, {len(skies)} skies"
+    yield f"{out}: {number_of(len(pack.vehicles), 'vehicle')}, {number_of(len(skies), 'sky', 'skies')}"
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ from functools import partial
 from pathlib import Path
 
 from drivesem.report.progress import progress_bar
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from scene_ir import files
 from tools.same import Hasher, differences, environment
@@ -179,8 +180,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if given.out is not None:
                 files.write_json(given.out, [asdict(one) for one in trials])
             console.print(
-                f"{name}: {trial.kills} kills ({trial.begun} after the folder was made) in {trial.runs} runs of"
-                f" {trial.unbroken_s:g} s and {trial.files} files: {len(trial.differing)} differences",
+                f"{name}: {number_of(trial.kills, 'kill')} ({trial.begun} after the folder was made) in"
+                f" {number_of(trial.runs, 'run')} of {trial.unbroken_s:g} s and {number_of(trial.files, 'file')}:"
+                f" {number_of(len(trial.differing), 'difference')}",
                 *trial.differing[:20],
                 sep="\n",
                 soft_wrap=True,

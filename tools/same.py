@@ -35,6 +35,8 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
+from drivesem.report.tables import number_of
+
 VARYING = {"seconds", "seconds_now", "versions", "images_a_second", "processor_seconds_an_image", "stamp"}
 """Keys of JSON and columns of CSV that differ from run to run."""
 TIMES = re.compile(r"\b\d+(\.\d+)?(e-?\d+)? ?(s|ms|min|minutes|seconds|images a second|processor seconds each)\b")
@@ -203,6 +205,7 @@ retrain: --run nowhere | --run @inputs/run | --run @inputs/other | --run @inputs
 """Command lines that cannot be: of each command, options parted by `|`. They share one process."""
 
 SHARED = """
+from drivesem.report.tables import number_of
 import contextlib, io, json, runpy, sys, traceback
 with open(sys.argv[1]) as asked, open(sys.argv[2], "w") as said:
     for words in map(json.loads, asked):
@@ -532,7 +535,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("one of --out and --compare")
     if given.compare:
         lines = differences(*(read_table(path, given.only) for path in given.compare))
-        print("\n".join([*lines, f"{len(lines)} lines differ"]))
+        print("\n".join([*lines, number_of(len(lines), "line differs", "lines differ")]))
         return 1 if lines else 0
     with tempfile.TemporaryDirectory() as temporary:
         work = (given.work or Path(temporary)).resolve()

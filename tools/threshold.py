@@ -18,6 +18,7 @@ import numpy as np
 from detectors.registry import load_detector
 from drivesem.attack.labels import Difficulty
 from drivesem.data.registry import open_dataset
+from drivesem.report.tables import number_of
 from drivesem.training.frames import FrameStore
 from drivesem.training.judging import detect, judge
 
@@ -37,8 +38,8 @@ def told(name: str, folder: Path) -> str:
     low, high = np.quantile(drawn, [0.025, 0.975])
     objects = sum(int((~targets.ignore).sum()) for targets in wanted)
     return (
-        f"{name}, {len(store)} frames, {objects} objects: best F1 {best.f1:.3f} at {best.t_star:.3f} "
-        f"[{low:.3f}, {high:.3f}]; its own t* is {detector.t_star:.3f}"
+        f"{name}, {number_of(len(store), 'frame')}, {number_of(objects, 'object')}: best F1 "
+        f"{best.f1:.3f} at {best.t_star:.3f} [{low:.3f}, {high:.3f}]; its own t* is {detector.t_star:.3f}"
     )
 
 

@@ -28,6 +28,7 @@ from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.data.classes import VEHICLES
 from drivesem.data.kitti import KittiDataset
+from drivesem.report.tables import number_of
 from drivesem.scenes.label_free import DETECTOR_LOOKS
 from scene_ir import files
 from scene_ir.derender import pose
@@ -483,7 +484,7 @@ def main() -> None:
     torch.set_num_threads(1)
     settings = Settings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
     store = CropStore(arguments.data, arguments.run / "train")
-    print(f"{len(store)} vehicles in {store.frames} frames", flush=True)
+    print(f"{number_of(len(store), 'vehicle')} in {number_of(store.frames, 'frame')}", flush=True)
     run = Run(settings)
     checkpoint = arguments.run / "checkpoint.safetensors"
     if checkpoint.is_file():

@@ -10,6 +10,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
+from drivesem.report.tables import number_of
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -51,8 +52,9 @@ def markdown(result: dict[str, Any], sections: Sequence[Section]) -> str:
     lines += [
         f"Method. {result['method']}",
         "",
-        f"Machine: {machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, "
-        f"{machine['ram']} GB{gpu}. " + ", ".join(f"{name} {version}" for name, version in versions.items()) + ". "
+        f"Machine: {machine['cpu']}, {number_of(machine['cores'], 'core')}, "
+        f"{number_of(machine['threads'], 'thread')} used, {machine['ram']} GB{gpu}. "
+        f"{', '.join(f'{name} {version}' for name, version in versions.items())}. "
         f"Made by `{result['command']}` in {result['seconds']:.0f} s.",
         "",
     ]

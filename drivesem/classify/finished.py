@@ -17,6 +17,7 @@ from drivesem.classify.objective import ClassifierObjective
 from drivesem.classify.pictures import Shown
 from drivesem.classify.protocol import aimed_by
 from drivesem.classify.results import SCHEMA, ClassifiedFrame
+from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, Kept, KeptFrames
 from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, claim
 from drivesem.run.frame import RESULT
@@ -123,7 +124,7 @@ def ask_of_failures(config: Classify, worker: type[FailureWorker[K]], title: str
     run = ClassifyRun.of(config)
     names = run.failures(config.limit, worker.grades)
     if worker.needs_some and not names:
-        raise UsageError("RUN", "a run with failures", f"none in {len(run.frames)} pictures")
+        raise UsageError("RUN", "a run with failures", f"none in {number_of(len(run.frames), 'picture')}")
     out = Path(config.out) if config.out else run.folder / worker.question
     build = partial(worker, config, run, out)
     work = build()

@@ -14,7 +14,7 @@ from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
 from drivesem.classify.space import Moved, ObjectSpace
 from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
 from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import Sheet, number_of
 from drivesem.settings.commands import Classify
 from scene_ir import files
 from scene_ir.errors import RangeError
@@ -136,7 +136,7 @@ def explain_run(config: Classify) -> Answer:
 def _answer(asked: Asked[LeastChange]) -> Answer:
     found = asked.answers
     columns = ("picture", "called", "enough, %", "pitch, rad", "yaw, rad", "roll, rad", "vertices", "left out")
-    title = f"How little is enough: {len(found)} failures of {asked.run.config.network}"
+    title = f"How little is enough: {number_of(len(found), 'failure')} of {asked.run.config.network}"
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [

@@ -7,6 +7,7 @@ from typing import Any
 from rich.table import Table
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.settings.commands import Anchors
 from drivesem.training.anchors import fitted_anchors
@@ -22,7 +23,7 @@ def run(config: Anchors) -> int:
 
 
 def _print(data: dict[str, Any], console: Console) -> None:
-    title = f"Anchors for {data['boxes']} boxes of {data['frames']} frames, px"
+    title = f"Anchors for {number_of(data['boxes'], 'box', 'boxes')} of {number_of(data['frames'], 'frame')}, px"
     table = Table(title=title, title_justify="left", min_width=min(len(title) + 4, console.width))
     for heading in ("", "mean best IoU", "width x height"):
         table.add_column(heading, justify="left")

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_run
 from drivesem.run.report.grading import KINDS, NO_KIND
@@ -45,15 +46,16 @@ def _print(summary: RunSummary, console: Console) -> None:
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(
-        f"{summary.frames} frames, {summary.objects} vehicles: {sum(summary.lost_objects.values())} lost, "
-        f"{sum(summary.phantoms.values())} phantoms by threshold, {summary.successes_moved} frames broken; "
-        f"feasible {feasible}; {summary.queries} queries in {summary.seconds:.0f} s"
+        f"{number_of(summary.frames, 'frame')}, {number_of(summary.objects, 'vehicle')}: "
+        f"{sum(summary.lost_objects.values())} lost, {number_of(sum(summary.phantoms.values()), 'phantom')} by "
+        f"threshold, {number_of(summary.successes_moved, 'frame')} broken; "
+        f"feasible {feasible}; {number_of(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s"
     )
     console.print(told_grades(summary), soft_wrap=True)
     for note, frames in summary.grade_notes.items():
-        console.print(f"{frames} frames: {note}", soft_wrap=True)
+        console.print(f"{number_of(frames, 'frame')}: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
-        console.print(f"{summary.frames_without_vehicles} frames without vehicles passed over")
+        console.print(f"{number_of(summary.frames_without_vehicles, 'frame')} without vehicles passed over")
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)
@@ -67,7 +69,9 @@ def told_grades(summary: RunSummary) -> str:
         return "no failure"
     kinds = {KINDS[Kind(name)]: count for name, count in summary.kinds.items() if count}
     without = failures - sum(kinds.values())
-    unknown = f"; {summary.frames_ungraded} frames of unknown grade" if summary.frames_ungraded else ""
+    unknown = (
+        f"; {number_of(summary.frames_ungraded, 'frame')} of unknown grade" if summary.frames_ungraded else ""
+    )
     kinds |= {NO_KIND: without} if without and not unknown else {}
     told = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""
     if not certain:

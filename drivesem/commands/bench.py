@@ -17,6 +17,7 @@ from drivesem.bench.planted import across, across_names, summary, yardstick
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
@@ -180,7 +181,10 @@ def _planted_in_frames(config: Bench, console: Console) -> Measured:
     methods = yardstick.methods_of(config)
     sought = min(config.faults or len(judge.kinds), len(judge.kinds))
     count = len(names) * (sought * len(methods) + len(judge.named))  # named ones once more without a fault
-    console.print(f"{count} attacks of {config.passes} passes: about {_minutes(count * config.passes)}")
+    console.print(
+        f"{number_of(count, 'attack')} of {number_of(config.passes, 'pass', 'passes')}: "
+        f"about {_minutes(count * config.passes)}"
+    )
     asked = ask(names, judge.judge, partial(yardstick.judge_of, config), config, Bar("frames", remaining=True))
     judged = [asked.results[name] for name in names if name in asked.results]
     rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
@@ -205,7 +209,9 @@ def _night(config: Bench, console: Console) -> Measured:
     names, without, failed = select_frames(open_source(settings), settings)
     count = config.count or len(names)
     chosen = night.spread(names, config.limit or night.FRAMES)
-    console.print(f"{len(chosen)} of {len(names)} frames with vehicles tell; {without} without are passed over")
+    console.print(
+        f"told by {len(chosen)} of {number_of(len(names), 'frame')} with vehicles; {without} without passed over"
+    )
     build = partial(night.timer_of, settings)
     asked = ask(chosen, time_frame, build, config, Bar("frames", remaining=True))
     spent = [one for one in asked.results.values() if one is not None]

@@ -16,7 +16,7 @@ from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun, ClassTally
 from drivesem.classify.training import train_run
 from drivesem.report.answer import print_json
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, number_of, percent
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say, say_end
 from drivesem.run.folder import claim, folder_of
@@ -69,7 +69,8 @@ def _attack(config: Classify, console: Console) -> None:
     console.print(_table(found).table(("class",)))
     grades = found.grades
     console.print(
-        f"{found.pictures} pictures, {found.queries} queries, {found.passes} passes in {found.seconds:.0f} s: "
+        f"{number_of(found.pictures, 'picture')}, {number_of(found.queries, 'query', 'queries')}, "
+        f"{number_of(found.passes, 'pass', 'passes')} in {found.seconds:.0f} s: "
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} for certain",
         soft_wrap=True,
     )
@@ -80,7 +81,7 @@ def _confirm(config: Classify, console: Console) -> None:
     found, facts = confirm_run(config)
     console.print(_table(found).table(("class",)))
     lines = [
-        f"{facts['renderer']} agrees on {facts['agree']} of {facts['failures']} failures; "
+        f"{facts['renderer']} agrees on {facts['agree']} of {number_of(facts['failures'], 'failure')}; "
         f"{found.grades['certain']} are certain, {found.grades['confirmed']} confirmed"
     ]
     if facts["iou"]:

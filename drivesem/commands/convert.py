@@ -10,6 +10,7 @@ from pathlib import Path
 
 from drivesem.data.label_table import Written
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.run.conversion import Conversion, convert
 from drivesem.run.labels import layout_of
 from drivesem.settings.commands import Convert
@@ -64,4 +65,4 @@ def sentence(written: Written) -> str:
 
     parts = [f"lost: {listed(written.lost)}" if written.lost else "nothing lost"]
     parts += [f"assumed: {listed(written.assumed)}"] if written.assumed else []
-    return f"{written.files} files; {'; '.join(parts)}"
+    return f"{number_of(written.files, 'file')}; {'; '.join(parts)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_run
 from drivesem.scenes.sources import Photographs, SceneSource
@@ -22,10 +23,10 @@ def run(config: Derender) -> int:
     lines = Console()
     for name, taken in found.frames.items():
         spent = "there before" if taken.seconds is None else f"{taken.seconds:.1f} s"
-        lines.print(f"{name}: {taken.objects} vehicles, {spent}", soft_wrap=True, highlight=False)
+        lines.print(f"{name}: {number_of(taken.objects, 'vehicle')}, {spent}", soft_wrap=True, highlight=False)
     for name, reason in found.failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
-    lines.print(f"{len(found.frames)} scenes in {found.out} ({found.seconds:.0f} s)", soft_wrap=True)
+    lines.print(f"{number_of(len(found.frames), 'scene')} in {found.out} ({found.seconds:.0f} s)", soft_wrap=True)
     return 0
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from drivesem.attack.scene_edits import edited
 from drivesem.commands.render import picture_path
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import Scene, free_folder
 from drivesem.settings.commands import Edit
@@ -42,7 +43,9 @@ def run(config: Edit) -> int:
         found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": result.notes}
         print_json({**found, "seconds": seconds})
     else:
-        what = f"{len(result.scene.objects)} vehicles, {len(result.removed)} removed ({seconds:.1f} s)"
+        what = (
+            f"{number_of(len(result.scene.objects), 'vehicle')}, {len(result.removed)} removed ({seconds:.1f} s)"
+        )
         Console().print(f"{' and '.join(written.values())}: {what}", soft_wrap=True)
     return 0
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from drivesem.commands.convert import sentence
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.run.export import Tables, chosen, export_dataset
 from drivesem.run.finished import load_runs
 from drivesem.settings.commands import Export
@@ -42,5 +43,5 @@ def _gltf(config: Export, out: Path) -> int:
     written = export_scenes(Path(config.run or ""), out)
     if config.json:
         print_json({"out": str(out), "files": written})
-    sys.stderr.write(f"{len(written)} scenes in {out}\n")
+    sys.stderr.write(f"{number_of(len(written), 'scene')} in {out}\n")
     return 0

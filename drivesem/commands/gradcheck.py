@@ -35,6 +35,7 @@ from drivesem.bench.reach.agreement import rows_of as rows_of_reach
 from drivesem.bench.reach.frames import ReachWorker, measure_of
 from drivesem.bench.reach.report import answer_of as reach_answer
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask, say_end
 from drivesem.run.attack import select_frames
@@ -231,7 +232,9 @@ def _print(rows: Sequence[GradcheckRow], config: Gradcheck, console: Console, sc
     console.print(table)
     outside = sum(not row.passes(config.min_cosine, config.max_error) for row in rows)
     silent = sum(row.cosine is None for row in rows)
-    counts = f"{len(rows) - outside - silent} of {len(rows)} rows inside the tolerance, {outside} outside"
+    counts = (
+        f"{len(rows) - outside - silent} of {number_of(len(rows), 'row')} inside the tolerance, {outside} outside"
+    )
     counts += f", {silent} without effect" if silent else ""
     tolerance = f"cosine at least {config.min_cosine:g}, error at most {config.max_error:g}"
     console.print(f"{counts} ({tolerance})", soft_wrap=True)

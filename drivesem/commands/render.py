@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import load_scene
 from drivesem.settings.commands import Render
@@ -24,7 +25,7 @@ def run(config: Render) -> int:
         found = {"scene": config.scene, "out": str(out), "objects": len(scene), "seconds": seconds}
         print_json(found)
     else:
-        Console().print(f"{out}: {len(scene)} vehicles ({seconds:.1f} s)", soft_wrap=True)
+        Console().print(f"{out}: {number_of(len(scene), 'vehicle')} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.page import report_runs
 from drivesem.settings.commands import Report
@@ -15,6 +16,6 @@ def run(config: Report) -> int:
         print_json(data)
         return 0
     runs, frames = len(data["runs"]), len(data["frames"])
-    said = f"{runs} run{'' if runs == 1 else 's'}, {frames} frames, {data['bytes'] / 1e6:.1f} MB: {data['out']}"
+    said = f"{number_of(runs, 'run')}, {number_of(frames, 'frame')}, {data['bytes'] / 1e6:.1f} MB: {data['out']}"
     Console().print(said, soft_wrap=True)
     return 0

@@ -11,6 +11,7 @@ from typing import Any
 
 from drivesem.commands.attack import told_grades
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
@@ -51,13 +52,13 @@ def _list(config: Runs, console: Console) -> dict[str, Any]:
 
 def _line(row: Mapping[str, Any]) -> str:
     """A run in words."""
-    grades, frames = row["grades"], f"{row['frames']} frame{'' if row['frames'] == 1 else 's'}"
+    grades, frames = row["grades"], number_of(row["frames"], "frame")
     what = f"{row['params']} by {row['method']} on {row['detector']}, {row['mb']:.0f} MB"
     if grades is None:
         stands = "being made now" if row["running"] else "not finished (the same command goes on)"
         return f"{row['run']}: {frames}, {stands}; {what}"
     held = [f"{grades[grade]} {grade}" for grade in (Grade.CERTAIN, Grade.CONFIRMED) if grade in grades]
-    found = f"{', '.join(held)} of {grades.get(Grade.THRESHOLD, 0)} failures by threshold"
+    found = f"{', '.join(held)} of {number_of(grades.get(Grade.THRESHOLD, 0), 'failure')} by threshold"
     return f"{row['run']}: {frames}, {found}; {what}"
 
 
@@ -100,7 +101,9 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
         asked = {key: value for key, value in settings_of(attack_of(folder)).items() if value != usual[key]}
         told.append({**_row(folder), "settings": asked, "left": len(files.leftovers(folder))})
         console.print(
-            f"{folder}: {told[-1]['frames']} frames, {told[-1]['mb']:.0f} MB", soft_wrap=True, markup=False
+            f"{folder}: {number_of(told[-1]['frames'], 'frame')}, {told[-1]['mb']:.0f} MB",
+            soft_wrap=True,
+            markup=False,
         )
         for key, value in asked.items():
             console.print(f"  {key}: {value}", soft_wrap=True, markup=False)
@@ -110,7 +113,10 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
 def _merge(config: Runs, console: Console) -> dict[str, Any]:
     summary = merge([str(_place(folder)) for folder in config.folders], Path(config.out or ""), config.trust)
     console.print(told_grades(summary), soft_wrap=True)
-    console.print(f"{summary.frames} frames of {len(config.folders)} runs in {summary.out}", soft_wrap=True)
+    console.print(
+        f"{number_of(summary.frames, 'frame')} of {number_of(len(config.folders), 'run')} in {summary.out}",
+        soft_wrap=True,
+    )
     return summary.to_json()
 
 

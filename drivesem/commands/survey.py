@@ -13,6 +13,7 @@ from drivesem.questions.survey.page import (
     write_key,
 )
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import folder_of
@@ -36,6 +37,9 @@ def run(config: Survey) -> int:
     if config.json:
         print_json(data)
     if counts[CHANGED] < config.items:
-        console.print(f"only {counts[CHANGED]} of {config.items} pictures: the runs have no more", soft_wrap=True)
+        console.print(
+            f"only {counts[CHANGED]} of {number_of(config.items, 'picture')}: the runs have no more",
+            soft_wrap=True,
+        )
     console.print(f"give people {out / PAGE}, keep {out / KEY}", soft_wrap=True, highlight=False)
     return 0

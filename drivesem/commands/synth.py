@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
@@ -66,7 +67,7 @@ def run(config: Synth) -> int:
     if config.json:
         print_json(found)
     else:
-        Console().print(f"{total} frames in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True)
+        Console().print(f"{number_of(total, 'frame')} in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True)
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.settings.commands import Train
 from drivesem.training.train import train_run
@@ -19,6 +20,6 @@ def run(config: Train) -> int:
     speed = (
         f"{pace.images_a_second:.1f} images a second, {pace.processor_seconds_an_image:.3f} processor seconds each"
     )
-    told = f"{data['steps']} steps, {pace.steps} of them now: {speed}; weights: {data['weights']}"
+    told = f"{number_of(data['steps'], 'step')}, {pace.steps} of them now: {speed}; weights: {data['weights']}"
     Console(stderr=True).print(told, soft_wrap=True)
     return 0

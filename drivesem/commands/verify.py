@@ -7,7 +7,7 @@ from typing import Any
 
 from drivesem.questions.verify.asking import WHOLE_RUN, verify_run
 from drivesem.report.answer import print_json
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import Sheet, number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say_end
 from drivesem.run.report.grading import UNKNOWN
@@ -53,7 +53,9 @@ def _print(data: dict[str, Any], console: Console) -> None:
         for row in data["checks"]
     )
     columns = ("check", "what holds where nothing differs", "compared", "differ", "in frames")
-    console.print(Sheet(f"{data['frames']} frames of {data['run']}", columns, rows).table(columns[:2]))
+    console.print(
+        Sheet(f"{number_of(data['frames'], 'frame')} of {data['run']}", columns, rows).table(columns[:2])
+    )
     told = _told_first(data["differences"])[:_MOST_SHOWN]
     for wrong in told:
         line = f"{wrong['frame']}: {wrong['check']}: {wrong['field']}"
@@ -62,7 +64,7 @@ def _print(data: dict[str, Any], console: Console) -> None:
     if left := len(data["differences"]) - len(told):
         console.print(f"and {left} more")
     if ungraded := data["frames_ungraded"]:
-        console.print(f"{ungraded} frame{'' if ungraded == 1 else 's'}: {UNKNOWN}")
+        console.print(f"{number_of(ungraded, 'frame')}: {UNKNOWN}")
     for name, reason in data["frames_failed"].items():
         console.print(f"frame {name} could not be checked: {reason}", soft_wrap=True, markup=False)
     if not data["sealed"]:

@@ -6,6 +6,7 @@ import sys
 import webbrowser
 
 from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.settings.commands import View
 from drivesem.settings.errors import UsageError
@@ -59,7 +60,7 @@ def _tell(server: Server, config: View) -> None:
         print_json({"url": server.url, "frames": frames, "detector": server.viewer.detector.name})
         sys.stdout.flush()
     else:
-        what = f"{frames} frame{'' if frames == 1 else 's'}, {server.viewer.detector.name}"
+        what = f"{number_of(frames, 'frame')}, {server.viewer.detector.name}"
         Console(stderr=True).print(f"{server.url} ({what}); Ctrl-C ends it", soft_wrap=True, markup=False)
     if config.browser:
         webbrowser.open(server.url)

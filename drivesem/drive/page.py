@@ -13,6 +13,7 @@ from markupsafe import Markup
 from drivesem.drive.report import NOTES, row_of, summary, unfeasible
 from drivesem.drive.results import ABSENT, FOUND, LOST, UNCOUNTED, DriveResult
 from drivesem.report import web
+from drivesem.report.tables import number_of
 from drivesem.run.folder import FRAMES
 from scene_ir import files
 
@@ -59,15 +60,15 @@ def _headline(result: DriveResult) -> str:
     if worst.newly <= 0:
         return f"{result.detector} misses no car of {result.clip} for longer than before"
     return (
-        f"{result.detector} misses car {worst.track} in {worst.lost_after} of {worst.frames} frames, "
+        f"{result.detector} misses car {worst.track} in {worst.lost_after} of {number_of(worst.frames, 'frame')}, "
         f"{worst.lost_before} before"
     )
 
 
 def _lead(result: DriveResult) -> str:
     return (
-        f"{' + '.join(result.params)} changed by {result.method}: each of {len(result.cars)} cars by the same "
-        f"over all of {result.frames} frames. Beside it, a random change as large."
+        f"{' + '.join(result.params)} changed by {result.method}: each of {number_of(len(result.cars), 'car')} "
+        f"by the same over all of {number_of(result.frames, 'frame')}. Beside it, a random change as large."
     )
 
 

@@ -10,18 +10,24 @@ from rich import box
 
 from drivesem.drive.results import CarResult, DriveResult
 from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import Sheet, number_of
 
 WORDS = ("car",)
 NOTES = (
-    "counts: frames in which the car is judged; lost: of these, frames in which the detector misses it; before: "
-    "in the clip as it was, after: with the change, random: with a random change as large.",
-    "longest: frames of the longest unbroken stretch of misses. unseen: metres by which the camera comes nearer "
-    "to the car while it is missed, of the metres while it counts.",
+    "lost: frames in which the detector misses the car, of those in which it is judged; before: in the clip as it "
+    "was, after: with the change, random: with a random change as large.",
+    "longest: frames of the longest unbroken stretch of misses after it. unseen: metres by which the camera comes "
+    "nearer to the car while it is missed, of the metres while it is judged.",
     "certain: of the frames in which it is newly missed and that were looked at again in draws, those in which "
     "it is missed for certain (docs/grades.md).",
 )
-_LOOKS: dict[str, Any] = {"unbroken": WORDS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+_LOOKS: dict[str, Any] = {
+    "unbroken": (*WORDS, "longest", "certain"),
+    "box": box.SIMPLE_HEAD,
+    "padding": 0,
+    "show_edge": False,
+}
+"""Narrow enough for 80 columns."""
 
 
 def answer_of(result: DriveResult) -> Answer:
@@ -32,7 +38,7 @@ def answer_of(result: DriveResult) -> Answer:
     return Answer(
         out=Path(result.out),
         name="drive",
-        heading=f"{result.frames} frames of {result.clip}",
+        heading=f"{number_of(result.frames, 'frame')} of {result.clip}",
         data=asdict(result),
         tables={"drive": [figures(car) for car in result.cars]},
         sheets=[sheet],
@@ -46,15 +52,15 @@ def row_of(car: CarResult) -> dict[str, str]:
     """A car's line of the table."""
     return {
         "car": f"{car.track} {car.kind}",
-        "counts": f"{car.frames}",
         "lost before": f"{car.lost_before}",
         "lost after": f"{car.lost_after}",
         "lost random": f"{car.lost_control}",
-        "longest after": f"{car.longest_after}",
+        "of": f"{car.frames}",
+        "longest": f"{car.longest_after}",
         "unseen before": f"{car.metres_lost_before:.1f}",
         "unseen after": f"{car.metres_lost_after:.1f}",
         "unseen random": f"{car.metres_lost_control:.1f}",
-        "of metres": f"{car.metres:.1f}",
+        "of m": f"{car.metres:.1f}",
         "certain": f"{car.certain}/{car.graded}" if car.graded else "-",
     }
 
@@ -64,12 +70,13 @@ def summary(result: DriveResult) -> str:
     before, after, control = (
         sum(getattr(car, f"lost_{state}") for car in result.cars) for state in ("before", "after", "control")
     )
-    counted = sum(car.frames for car in result.cars)
+    sights = number_of(sum(car.frames for car in result.cars), "sight")
+    phantoms, frames = number_of(result.phantoms["after"], "phantom"), number_of(result.frames, "frame")
+    queries, passes = number_of(result.queries, "query", "queries"), number_of(result.passes, "pass", "passes")
     return (
-        f"{after} of {counted} sights of {len(result.cars)} cars missed ({before} before, {control} by a random "
-        f"change), {result.phantoms['after']} phantoms ({result.phantoms['control']} random); feasible in "
-        f"{result.feasible} of {result.frames} frames; {result.queries} queries, {result.passes} passes, "
-        f"{result.seconds:.0f} s"
+        f"{after} of {sights} of {number_of(len(result.cars), 'car')} missed ({before} before, {control} by a "
+        f"random change), {phantoms} ({result.phantoms['control']} random); "
+        f"feasible in {result.feasible} of {frames}; {queries}, {passes}, {result.seconds:.0f} s"
     )
 
 

@@ -33,6 +33,7 @@ from drivesem.drive.video import write_video
 from drivesem.report.answer import Answer
 from drivesem.report.drawing import write_picture
 from drivesem.report.progress import progress_bar
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run import attack as attacks
 from drivesem.run.folder import FRAMES, PRESENTATION, claim
@@ -76,7 +77,8 @@ def drive_run(config: Drive) -> Answer:
     seen, control = _Seen(clip, objective, out), theta0
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task(
-            f"looking at {len(clip.names)} frames with {objective.space.count} cars", total=None
+            f"looking at {number_of(len(clip.names), 'frame')} with {number_of(objective.space.count, 'car')}",
+            total=None,
         )
         objective.looked = lambda: progress.advance(task)
         search = method(problem, theta0, config.seed)

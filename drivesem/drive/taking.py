@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from drivesem.data.clips import Clip, clip_of, clips_in
+from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, ask
 from drivesem.run.derender import RECORD
 from drivesem.scenes.sources import derender_settings, make_ready
@@ -125,7 +126,9 @@ def _labels_of(clip: Clip, name: str) -> Labels:
     labels = clip.dataset.labels(name)
     if labels is None or len(labels.kind) != len(clip.tracks(name)):
         found = "none" if labels is None else f"{len(labels.kind)}"
-        raise FormatError(f"frame {name}: labels", f"one for each of {len(clip.tracks(name))} tracks", found)
+        raise FormatError(
+            f"frame {name}: labels", f"one for each of {number_of(len(clip.tracks(name)), 'track')}", found
+        )
     return labels
 
 
@@ -173,7 +176,7 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
     kept = tuple(name for name in names if name not in failed)
     scenes = tuple(load_scene(out / name) for name in kept)
     if not any(len(scene.objects) for scene in scenes):
-        found = next(iter(failed.values()), f"none in {len(kept)} frames")
+        found = next(iter(failed.values()), f"none in {number_of(len(kept), 'frame')}")
         raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
     return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes), failed)
 
@@ -183,7 +186,7 @@ def _check_memory(source: _Demo | _Labelled) -> None:
     camera = source.camera()
     there, needed = memory_gb(), _BYTES_A_PIXEL * camera.width * camera.height / 2**30
     if there is not None and len(source.names) * needed > there:
-        expected = f"at most {int(there / needed)} frames, as memory of {there:g} GB holds"
+        expected = f"at most {number_of(int(there / needed), 'frame')}, as memory of {there:g} GB holds"
         raise UsageError("CLIP: frames", f"{expected} (--limit takes the first)", f"{len(source.names)}")
 
 

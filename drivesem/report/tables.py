@@ -53,6 +53,11 @@ def csv_table(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: s
     return buffer.getvalue()
 
 
+def number_of(number: int, word: str, words: str | None = None) -> str:
+    """How many there are of something: 1 frame, 2 frames. words: the plural, if it isn't the word with an s."""
+    return f"{number} {word if number == 1 else words or word + 's'}"
+
+
 def percent(value: float | None) -> str:
     """A fraction as a percentage; a dash where there is none (COCO's -1 too)."""
     return "-" if value is None or value < 0 else f"{100 * value:.2f}"

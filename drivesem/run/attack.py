@@ -35,6 +35,7 @@ from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
 from drivesem.attack.objective import OF_DETECTIONS
 from drivesem.attack.space import SIX, Parameter, combo, parse_params
+from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS
 from drivesem.run.folder import FRAMES, claim
@@ -138,7 +139,7 @@ def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mappi
     """UsageError where no frame can be attacked: figures of none would say nothing."""
     if names:
         return
-    found = [f"{without} frames without"] if without else []
+    found = [f"{number_of(without, 'frame')} without"] if without else []
     if failed:
         found.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
     expected = "frames with cars, vans or trucks to attack (drivesem derender --sheet draws what it makes of one)"

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Predictor
+from drivesem.report.tables import number_of
 from drivesem.run.attack import Worker
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.report import grading, pictures
@@ -158,7 +159,7 @@ class Counterexample:
         lines = lines or "<li>nothing fails</li>"
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
         grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count) or "no failure"
-        head = f"{self.scene.name}: {grades}; {feasible}, {result.queries} queries"
+        head = f"{self.scene.name}: {grades}; {feasible}, {number_of(result.queries, 'query', 'queries')}"
         return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{shown}</div><ul>{lines}</ul></div>'
 
 

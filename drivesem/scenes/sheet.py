@@ -23,6 +23,7 @@ from drivesem.report.drawing import (
     write_picture,
     write_text,
 )
+from drivesem.report.tables import number_of
 from scene_ir.io import to_uint8
 from scene_ir.raster import verbs
 from scene_ir.render.compositor import Compositor
@@ -56,7 +57,7 @@ def scene_sheet(scene: SceneIR, title: str) -> np.ndarray:
     count = len(scene.objects)
     kinds = ", ".join(name.removesuffix("_map") for name in MAPS)
     panels = (
-        (f"photograph, {count} vehicles: outlines of their meshes", _outlined(meshes, photograph)),
+        (f"photograph, {number_of(count, 'vehicle')}: outlines of their meshes", _outlined(meshes, photograph)),
         ("mattes", _numbered(still, _mattes(still, photograph))),
         ("normals of the meshes", _normals(meshes, photograph)),
         ("depth behind the vehicles (log, near is bright)", depth_colours(still.depth.cpu().numpy())),

@@ -127,7 +127,8 @@ class Limit(Options):
     """How many frames."""
 
     limit: Count | None = None
-    """Take the first N frames (those with vehicles, where a command needs vehicles)."""
+    """Take the first N frames (those with vehicles, where a command needs vehicles). They follow one another:
+    of Virtual KITTI, --split too, they are of one drive."""
 
 
 @dataclass(frozen=True, kw_only=True)

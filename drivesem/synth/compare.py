@@ -19,6 +19,7 @@ import numpy as np
 from scipy.stats import wasserstein_distance
 
 from drivesem.data.registry import Dataset
+from drivesem.report.tables import number_of
 from scene_ir.errors import FormatError
 from scene_ir.files import write_bytes
 from scene_ir.types import Labels
@@ -260,8 +261,8 @@ class Comparison:
 
     def table(self) -> str:
         """A Markdown table: mean here and in KITTI, Wasserstein-1 distance, total variation."""
-        head = f"{self.own.frames} frames with {self.own.vehicles} vehicles against KITTI's {self.kitti.frames} "
-        head += f"with {self.kitti.vehicles}.\n\n"
+        head = f"{number_of(self.own.frames, 'frame')} with {number_of(self.own.vehicles, 'vehicle')} against "
+        head += f"KITTI's {self.kitti.frames} with {self.kitti.vehicles}.\n\n"
         rows = ["| quantity | unit | mean | KITTI's mean | Wasserstein-1 | total variation |"]
         rows.append("|---|---|---:|---:|---:|---:|")
         for name, d in self.distances.items():
@@ -284,7 +285,7 @@ class Comparison:
         panels = figure.subplots(2, 3)
         for axes, name in zip(panels.flat, _PANELS, strict=True):
             self._panel(axes, name)
-        names = (f"KITTI ({self.kitti.frames} frames)", f"generated ({self.own.frames} frames)")
+        names = (f"KITTI ({self.kitti.frames} frames)", f"generated ({number_of(self.own.frames, 'frame')})")
         figure.legend(panels.flat[0].get_legend_handles_labels()[0], names, loc="outside upper center", ncols=2)
         data = io.BytesIO()
         figure.savefig(data, format="png", dpi=110)

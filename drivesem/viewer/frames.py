@@ -11,6 +11,7 @@ from detectors.registry import load_predictor
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import Budget
+from drivesem.report.tables import number_of
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import CONFIG, detector_of, trusted_attack
 from drivesem.run.results import FrameResult
@@ -86,5 +87,5 @@ def _told(result: FrameResult) -> str:
     kinds = [failure.kind for failure in result.failures]
     lost, phantoms = kinds.count("lost"), kinds.count("phantom")
     parts = [f"{lost} lost"] if lost else []
-    parts += [f"{phantoms} phantom{'' if phantoms == 1 else 's'}"] if phantoms else []
+    parts += [number_of(phantoms, "phantom")] if phantoms else []
     return ", ".join(parts) or "withstood"

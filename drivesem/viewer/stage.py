@@ -23,6 +23,7 @@ from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget
 from drivesem.evaluation import failures
+from drivesem.report.tables import number_of
 from drivesem.viewer.knobs import Knobs, State
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.render.compositor import Compositor
@@ -90,8 +91,8 @@ class Stage:
         rendered = self._look(state, drawn)
         failed = self.objective.failures(rendered, "moved")
         cars = self._cars(rendered)
-        said = [_count(len(failed.lost), "object lost", "objects lost") if failed.lost else ""]
-        said += [_count(len(failed.phantoms), "phantom", "phantoms") if failed.phantoms else ""]
+        said = [number_of(len(failed.lost), "object lost", "objects lost") if failed.lost else ""]
+        said += [number_of(len(failed.phantoms), "phantom", "phantoms") if failed.phantoms else ""]
         return {
             "boxes": self._boxes(rendered, cars, failed.phantoms),
             "cars": cars,
@@ -269,10 +270,6 @@ def best_score(targets: Targets, detections: Detections, row: int) -> float:
     overlap = boxes.iou_matrix(detections.boxes_xyxy, targets.boxes_xyxy[row : row + 1])[:, 0]
     meets = (overlap >= failures.IOU) & (detections.labels == targets.labels[row])
     return float(detections.scores[meets].max()) if bool(meets.any()) else 0.0
-
-
-def _count(number: int, word: str, words: str) -> str:
-    return f"{number} {word if number == 1 else words}"
 
 
 def _jpeg(picture: NDArray[np.uint8]) -> bytes:

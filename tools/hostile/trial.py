@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivesem.report.tables import number_of
 from tools.beside import ROOT
 from tools.hostile.inputs import MARK, Ground
 from tools.same import environment
@@ -33,6 +34,7 @@ _TROUBLE = ("Traceback (most recent call last)", "Warning:", "leaked", "Exceptio
 _PROGRESS = "━"
 
 _LAUNCHER = """
+from drivesem.report.tables import number_of
 import json, os, resource, signal, subprocess, sys
 answer, seconds, megabytes, *words = sys.argv[1:]
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # what a shell starts in the background ignores it
@@ -135,7 +137,7 @@ def judge(case: Case, done: Done) -> list[str]:
     if case.signals is not None and done.ended_s > END_SECONDS:
         wrong.append(f"ended {done.ended_s:.1f} s after the last signal, more than {END_SECONDS:g}")
     if done.left:
-        wrong.append(f"{done.left} processes outlived it")
+        wrong.append(f"{number_of(done.left, 'process', 'processes')} outlived it")
     return wrong
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from drivesem.questions.confirm.judge import RendererFailure
 from drivesem.questions.confirm.results import Confirmed
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, text_extent, write_text
+from drivesem.report.tables import number_of
 from drivesem.run.finished import Frame
 from drivesem.run.report.pictures import overlay
 from drivesem.run.results import BoxRecord, Failure
@@ -65,7 +66,8 @@ def _told(found: Sequence[RendererFailure]) -> str:
     if not found:
         return "no failure"
     lost = sum(f.kind == "lost" for f in found)
-    return f"{lost} lost, {len(found) - lost} phantoms; {sum(f.survives for f in found)} in both pictures"
+    phantoms = number_of(len(found) - lost, "phantom")
+    return f"{lost} lost, {phantoms}; {sum(f.survives for f in found)} in both pictures"
 
 
 def _places(confirmed: Confirmed, moved: Sequence[BoxRecord]) -> list[tuple[float, ...]]:

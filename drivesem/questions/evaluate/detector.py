@@ -21,7 +21,7 @@ from drivesem.evaluation import coco
 from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.questions.evaluate.mistakes import marked
-from drivesem.report.tables import percent
+from drivesem.report.tables import number_of, percent
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.looking import detections_in
@@ -163,7 +163,7 @@ def print_figures(figures: DetectorFigures, console: Console) -> None:
             bounds = f"{percent(one.low)} to {percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
             console.print(f"{HEADLINE} {one.name} {percent(one.value)}, {bounds}", soft_wrap=True)
     console.print(
-        f"{data['frames']} frames; judged: at least {data['min_height']:g} px high, occlusion at most "
-        f"{data['max_occlusion']}, truncation at most {data['max_truncation']:g}; t* {data['t_star']:.3f}",
+        f"{number_of(data['frames'], 'frame')}; judged: at least {data['min_height']:g} px high, occlusion "
+        f"at most {data['max_occlusion']}, truncation at most {data['max_truncation']:g}; t* {data['t_star']:.3f}",
         soft_wrap=True,
     )

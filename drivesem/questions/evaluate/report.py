@@ -9,7 +9,7 @@ from pathlib import Path
 from drivesem.evaluation.coco import STATS
 from drivesem.evaluation.results import Result
 from drivesem.report.plots import write_bars, write_curves
-from drivesem.report.tables import Sheet, csv_table, percent
+from drivesem.report.tables import Sheet, csv_table, number_of, percent
 from drivesem.report.terminal import Console
 from scene_ir import files
 
@@ -76,7 +76,7 @@ def sheets(result: Result, wide: bool = False) -> list[Sheet]:
         draws, frames = result.facts["bootstrap"], result.facts["frames"]
         found.append(
             Sheet(
-                f"95 % intervals, %; {draws} bootstrap draws of {frames} frames",
+                f"95 % intervals, %; {number_of(draws, 'bootstrap draw')} of {number_of(frames, 'frame')}",
                 ("figure", "value", "low", "high"),
                 tuple((i.name, percent(i.value), percent(i.low), percent(i.high)) for i in result.intervals),
             )
@@ -119,7 +119,8 @@ def print_result(result: Result, console: Console) -> None:
     facts = result.facts
     counted = f", counted by {facts['engine']}" if "engine" in facts else ""
     console.print(
-        f"{facts['frames']} frames, {facts['objects']} objects, {facts['detections']} detections{counted}"
+        f"{number_of(facts['frames'], 'frame')}, {number_of(facts['objects'], 'object')}, "
+        f"{number_of(facts['detections'], 'detection')}{counted}"
     )
     for note in result.notes:
         console.print(note, soft_wrap=True)

@@ -12,6 +12,7 @@ from drivesem.data.kitti_labels import TYPES
 from drivesem.data.label_table import REGION, LabelTable
 from drivesem.evaluation import kitti
 from drivesem.evaluation.instances import Found, Truths, from_xywh, from_xyxy
+from drivesem.report.tables import number_of
 from drivesem.run.labels import layout_of, read
 from drivesem.settings.commands import Eval
 from drivesem.settings.errors import UsageError
@@ -178,7 +179,9 @@ def _renamed(
             else:
                 expected = f"one of {', '.join(classes) or 'none'}, or {option} {kind}=CLASS (or {kind}=-)"
                 raise UsageError(
-                    f"{path}: class {kind!r}", expected, f"{int((table.kind == i).sum())} boxes of it"
+                    f"{path}: class {kind!r}",
+                    expected,
+                    f"{number_of(int((table.kind == i).sum()), 'box', 'boxes')} of it",
                 )
         places[i] = place
     kind = places[table.kind]  # REGION, -1, is the last place
@@ -230,10 +233,22 @@ def _notes(config: Eval, truths: Truths) -> tuple[str, ...]:
     if config.protocol == "kitti":
         unknown = int(((truths.occlusion < 0) & ~truths.ignore & (truths.label >= 0)).sum())
         if unknown:
-            notes.append(f"{unknown} objects without occlusion count as visible")
+            notes.append(
+                number_of(
+                    unknown,
+                    "object without occlusion counts as visible",
+                    "objects without occlusion count as visible",
+                )
+            )
         unknown = int(((truths.truncation < 0) & ~truths.ignore & (truths.label >= 0)).sum())
         if unknown:
-            notes.append(f"{unknown} objects without truncation count as whole")
+            notes.append(
+                number_of(
+                    unknown,
+                    "object without truncation counts as whole",
+                    "objects without truncation count as whole",
+                )
+            )
         judged = ", ".join(kitti.CLASSES)
         notes.append(f"judged are {judged}; detections below the minimum height: {config.small_detections}")
     return tuple(notes)

@@ -12,6 +12,7 @@ from drivesem.questions.explain.frame import Effort, explain_frame
 from drivesem.questions.explain.report import answer_of, means
 from drivesem.questions.explain.results import EXPLANATION, read_explanation
 from drivesem.report.answer import Answer
+from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim, detector_of, trusted_attack
@@ -81,5 +82,7 @@ def _chosen(run: Run, config: Explain) -> list[str]:
             raise UsageError("--frame", "frames that fail, by moved labels", f"{name}, which does not")
     names = [name for name in fails if fails[name] and (not asked or name in asked)]
     if not names:
-        raise UsageError("--run", "a run with counterexamples, by moved labels", f"none in {len(fails)} frames")
+        raise UsageError(
+            "--run", "a run with counterexamples, by moved labels", f"none in {number_of(len(fails), 'frame')}"
+        )
     return names[: config.limit]

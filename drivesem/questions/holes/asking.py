@@ -23,6 +23,7 @@ from drivesem.questions.holes.results import (
     load_inside,
 )
 from drivesem.report.answer import Answer
+from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
@@ -168,5 +169,6 @@ def _tell_effort(runs: list[Run], config: Holes) -> None:
     wanted += config.contrast * sum(len(run.frames) for run in runs) if count else 0
     minutes = wanted * seconds / passes / 60 if passes else None
     pace = "" if minutes is None or not count else f", at most {max(minutes, 0.1):.1f} min in one process"
-    told = f"{count} certain failures, about {wanted} passes{pace}; more where losses are rare or rules narrow"
+    told = f"{number_of(count, 'certain failure')}, about {number_of(wanted, 'pass', 'passes')}{pace}; "
+    told += "more where losses are rare or rules narrow"
     Console(stderr=True).print(told, soft_wrap=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from drivesem.questions.holes.merged import Hole
 from drivesem.report.plots import COLOURS, STYLE
+from drivesem.report.tables import number_of
 from scene_ir import files
 
 _MOST = 12
@@ -16,7 +17,7 @@ _DPI = 150
 
 
 def _count(hole: Hole) -> str:
-    return "1 failure" if len(hole.failures) == 1 else f"{len(hole.failures)} failures"
+    return number_of(len(hole.failures), "failure")
 
 
 def write_holes(path: Path, holes: Sequence[Hole]) -> None:

@@ -14,7 +14,7 @@ from drivesem.data.kitti import read_labels
 from drivesem.questions.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
 from drivesem.questions.plausibility.weather import CODES, Weather, weather_of
 from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import Sheet, number_of
 from drivesem.run.finished import Frame, Run, load_runs
 from drivesem.run.folder import folder_of
 from drivesem.settings.commands import Plausibility as Config
@@ -176,7 +176,7 @@ def _weather_sheet(pairs: Sequence[FramePair]) -> list[Sheet]:
 
 
 def _sheet(data: dict[str, Any]) -> Sheet:
-    title = f"{data['frames']} frames: percentiles by KITTI's labels"
+    title = f"{number_of(data['frames'], 'frame')}: percentiles by KITTI's labels"
     columns = ("figure", "vehicles", "median before", "after", "unusual before, %", "after, %", "largest fall")
     rows = tuple(
         (

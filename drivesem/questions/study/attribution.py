@@ -27,7 +27,7 @@ from drivesem.questions.study.rows import Figures, feasible_fraction
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.report.plots import COLOURS, STYLE
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, number_of, percent
 from drivesem.run.protocol import PROTOCOL
 from drivesem.settings.commands import DEFAULT_COMBO, Attack, Study
 from scene_ir import files
@@ -281,7 +281,7 @@ def notes(found: Attribution) -> list[str]:
         "Virtual KITTI.",
     ]
     if found.counts.without_vehicles:
-        lines.append(f"{found.counts.without_vehicles} frames without vehicles passed over.")
+        lines.append(f"{number_of(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
     return lines + [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
 
 

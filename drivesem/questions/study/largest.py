@@ -12,6 +12,7 @@ import numpy as np
 from drivesem.questions.study.counts import size_of
 from drivesem.questions.study.running import ArmRun
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, write_picture, write_text
+from drivesem.report.tables import number_of
 from drivesem.run.folder import ARMS
 from drivesem.run.results import FrameResult
 from scene_ir import files
@@ -68,7 +69,7 @@ def _row(change: Change) -> np.ndarray:
     row[:] = PAPER
     result = change.result
     lost = sum(failure.kind == "lost" for failure in result.failures)
-    told = f"{lost} lost, {len(result.failures) - lost} phantoms"
+    told = f"{lost} lost, {number_of(len(result.failures) - lost, 'phantom')}"
     write_text(row, (MARGIN_PX, 0), f"{result.identifier}, {change.arm}: size {change.size:.2f}, {told}")
     for column, picture in enumerate(pictures):
         paste(row, (MARGIN_PX + column * (WIDTH_PX + MARGIN_PX), _LINE_PX), picture)

@@ -20,7 +20,7 @@ from drivesem.questions.study.success import Curve
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.answer import Answer
 from drivesem.report.paper import PAPER_BENIGN
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, number_of, percent
 from drivesem.settings.commands import Study
 from drivesem.truth.certificate import Rule
 from drivesem.truth.grades import Grade, Kind
@@ -384,7 +384,7 @@ def notes(found: Findings) -> list[str]:
     share = feasible_fraction(found.counts.frames)
     told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
     if found.counts.without_vehicles:
-        told.append(f"{found.counts.without_vehicles} frames without vehicles passed over.")
+        told.append(f"{number_of(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
     told += [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
     return told
 

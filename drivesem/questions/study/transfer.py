@@ -30,7 +30,7 @@ from drivesem.questions.transfer.matrix import (
 from drivesem.questions.transfer.report import bounded
 from drivesem.questions.transfer.report import sheets as matrix_sheets
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, number_of, percent
 from drivesem.run.attack import Worker
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS
@@ -290,6 +290,6 @@ def notes(found: Matrix) -> list[str]:
     attacks = found.counts.attacks
     lines.append(f"Feasible by the independent check: {percent(feasible_of(attacks))} % of all attacked frames.")
     if attacks.without_vehicles:
-        lines.append(f"{attacks.without_vehicles} frames without vehicles passed over.")
+        lines.append(f"{number_of(attacks.without_vehicles, 'frame')} without vehicles passed over.")
     lines += [f"{name} could not be used: {reason}" for name, reason in found.failed.items()]
     return lines

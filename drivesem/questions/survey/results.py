@@ -15,7 +15,7 @@ from drivesem.questions.survey.page import (
     summary,
 )
 from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import Sheet, number_of
 from drivesem.run.folder import folder_of
 from drivesem.settings.commands import SurveyResults
 from drivesem.settings.errors import UsageError
@@ -85,7 +85,7 @@ def _figures(data: Mapping[str, Any]) -> Sheet:
     rows = tuple(
         (what, *(_cell(kinds[kind], key, factor, digits) for kind in kinds)) for what, key, factor, digits in lines
     )
-    return Sheet(f"what {data['people']} people say", ("what", *kinds), rows)
+    return Sheet(f"what {number_of(data['people'], 'person says', 'people say')}", ("what", *kinds), rows)
 
 
 def _cell(figures: Mapping[str, Any], key: str, factor: float, digits: int) -> str:

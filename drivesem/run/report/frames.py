@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from drivesem.report.tables import number_of
 from drivesem.run.report import grading
 from drivesem.run.report.page import ShownRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
@@ -410,7 +411,7 @@ def told(one: Outcome) -> str:
     """`1 certain of 1 lost, 2 phantoms`."""
     parts = [f"{one.lost} lost"] if one.lost else []
     if one.phantoms:
-        parts.append(f"{one.phantoms} phantom{'s' if one.phantoms > 1 else ''}")
+        parts.append(number_of(one.phantoms, "phantom"))
     if not parts:
         return "withstood"
     sure = f"{one.surest} {one.grade} of " if one.sure else ""
@@ -418,7 +419,7 @@ def told(one: Outcome) -> str:
 
 
 def _told_before(one: Outcome) -> str:
-    return f"{one.result.objects} vehicle{'' if one.result.objects == 1 else 's'}"
+    return number_of(one.result.objects, "vehicle")
 
 
 def _shared(sets: Sequence[tuple[Mark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[Mark, ...]], ...]:

@@ -13,6 +13,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from drivesem.report import web
+from drivesem.report.tables import number_of
 from drivesem.run.report import grading
 from drivesem.run.report.charts import Fall, curve_chart, fall_chart, key_of, trace
 from drivesem.run.report.frames import Card, CloseUp, cards_of, in_units, told
@@ -119,10 +120,6 @@ def _points(before: float | None, after: float | None) -> str:
     return _NONE if before is None or after is None else f"{100 * (before - after):.1f}"
 
 
-def _count(number: int, word: str, words: str | None = None) -> str:
-    return f"{number} {word if number == 1 else words or word + 's'}"
-
-
 def _totals(summary: RunSummary) -> tuple[int, int]:
     return sum(summary.lost_objects.values()), sum(summary.phantoms.values())
 
@@ -131,18 +128,18 @@ def _verdict(run: ShownRun) -> str:
     summary = run.summary
     lost, phantoms = _totals(summary)
     if not lost and not phantoms:
-        return f"{summary.detector} withstood in all of {_count(summary.frames, 'frame')}"
+        return f"{summary.detector} withstood in all of {number_of(summary.frames, 'frame')}"
     if grading.is_known(summary, run.frames):
         grade = grading.highest(summary)
         if grade is None:
-            return f"No certain failure: {_count(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
+            return f"No certain failure: {number_of(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
         frames = sum(any(f.grade == grade for f in r.failures) for r in run.frames)
-        failures = _count(summary.grades[str(grade)], f"{grade} failure")
-        return f"{failures} of {summary.detector}, in {frames} of {_count(summary.frames, 'frame')}"
-    parts = [f"loses {_count(lost, 'object')}"] if lost else []
+        failures = number_of(summary.grades[str(grade)], f"{grade} failure")
+        return f"{failures} of {summary.detector}, in {frames} of {number_of(summary.frames, 'frame')}"
+    parts = [f"loses {number_of(lost, 'object')}"] if lost else []
     if phantoms:
-        parts.append(f"makes up {phantoms if lost else _count(phantoms, 'object')}")
-    frames = f"{summary.successes_moved} of {_count(summary.frames, 'frame')}"
+        parts.append(f"makes up {phantoms if lost else number_of(phantoms, 'object')}")
+    frames = f"{summary.successes_moved} of {number_of(summary.frames, 'frame')}"
     return f"{summary.detector} {' and '.join(parts)}, in {frames}"
 
 
@@ -169,7 +166,7 @@ def _how_sure(run: ShownRun) -> str:
 
 
 def _comparison(runs: Sequence[ShownRun]) -> str:
-    frames = _count(runs[0].summary.frames, "frame")
+    frames = number_of(runs[0].summary.frames, "frame")
     head = f"{len(runs)} runs on {frames}"
     if all(grading.is_known(run.summary, run.frames) for run in runs):
         surest = max(runs, key=lambda run: tuple(run.summary.grades[str(g)] for g in _FROM_CERTAIN))
@@ -203,7 +200,7 @@ def _notes(runs: Sequence[ShownRun]) -> list[str]:
     """Why grades could not be reached."""
     several = len(runs) > 1
     return [
-        f"{f'{run.name}: ' if several else ''}{note} ({_count(frames, 'frame')})"
+        f"{f'{run.name}: ' if several else ''}{note} ({number_of(frames, 'frame')})"
         for run in runs
         for note, frames in run.summary.grade_notes.items()
     ]
@@ -211,7 +208,9 @@ def _notes(runs: Sequence[ShownRun]) -> list[str]:
 
 def _lead(runs: Sequence[ShownRun]) -> str:
     summary = runs[0].summary
-    data = f"{_count(summary.frames, 'frame')} of {summary.dataset} with {_count(summary.objects, 'vehicle')}"
+    data = (
+        f"{number_of(summary.frames, 'frame')} of {summary.dataset} with {number_of(summary.objects, 'vehicle')}"
+    )
     if len(runs) > 1:
         return f"The same {data}, each run beside the others."
     changed = " + ".join(summary.params)
@@ -242,7 +241,7 @@ def _tiles(run: ShownRun) -> list[_Tile]:
         _Tile(
             "feasible, %",
             _percent(summary.feasible_fraction),
-            f"by the independent check; {_count(summary.queries, 'query', 'queries')}",
+            f"by the independent check; {number_of(summary.queries, 'query', 'queries')}",
         ),
     ]
 

@@ -62,7 +62,7 @@ function wanted(element) {
 function filter() {
   for (const element of all("[data-frame]")) element.classList.toggle("hidden", !wanted(element));
   const frames = all("#frames [data-frame]"), kept = frames.filter((row) => !row.classList.contains("hidden")).length;
-  one("#count").textContent = `${kept} of ${frames.length} frames`;
+  one("#count").textContent = `${kept} of ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
   one("#size-now").textContent = Number(filters.elements.size.value) >= Number(filters.elements.size.max) ? "any" : `up to ${filters.elements.size.value} %`;
 }
 if (filters) {

@@ -370,7 +370,7 @@ def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.Captu
         assert all(failure.kind == "lost" and failure.index == 0 for failure in result.failures)
         assert result.success_moved == bool(result.failures)
     assert main([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")]) == 2
-    assert "1 frames without" in capsys.readouterr().err
+    assert "1 frame without" in capsys.readouterr().err
 
 
 def test_a_gradient_that_is_no_number_names_frame_and_coordinate(

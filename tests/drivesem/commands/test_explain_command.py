@@ -267,7 +267,7 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     path = run / "frames" / "demo-000" / "result.json"
     result = json.loads(path.read_text())
     path.write_text(json.dumps(result | {"success_moved": False}))
-    assert "--run: expected a run with counterexamples, by moved labels, found none in 1 frames" in refused(
+    assert "--run: expected a run with counterexamples, by moved labels, found none in 1 frame" in refused(
         "--run", run
     )
     assert "found demo-000, which does not" in refused("--run", run, "--frame", "demo-000")

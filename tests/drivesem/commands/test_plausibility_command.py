@@ -97,7 +97,7 @@ def test_before_and_after(run: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_a_table_for_people(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plausibility", "--run", str(run), "--limit", "1", "--out", str(tmp_path / "p")]) == 0
-    assert "1 frames: percentiles by KITTI's labels" in capsys.readouterr().out
+    assert "1 frame: percentiles by KITTI's labels" in capsys.readouterr().out
     assert len((tmp_path / "p" / "plausibility.csv").read_text().splitlines()) == 3
 
 

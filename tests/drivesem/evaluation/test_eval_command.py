@@ -290,7 +290,7 @@ def _broken(folder: Path, name: str) -> list[object]:
         ("nothing there", r"pred: expected a file or folder of labels, found nothing there"),
         (
             "class",
-            r"class 'Tractor': expected one of Car, .* or --map Tractor=CLASS \(or Tractor=-\), found 1 boxes",
+            r"class 'Tractor': expected one of Car, .* or --map Tractor=CLASS \(or Tractor=-\), found 1 box of it",
         ),
         ("NaN", r"000000\.txt:1: score: expected a finite number, found nan"),
         ("no score", r"000000\.txt:1: expected 16 fields \(with a score\), found 15"),
