@@ -19,7 +19,7 @@ from drivesem.questions.study.taught import Judged, Taught
 from drivesem.questions.transfer.matrix import AP50, BROKEN, LOST
 from drivesem.questions.transfer.report import bounded
 from drivesem.report.plots import COLOURS, STYLE
-from drivesem.report.tables import Sheet, percent
+from drivesem.report.tables import Sheet, number_of, percent
 from scene_ir import files
 
 if TYPE_CHECKING:
@@ -172,8 +172,8 @@ def notes(found: Taught) -> list[str]:
     rows = found.rows
     learned, judged = found.attacks
     lines = [
-        f"{learned.frames} frames were attacked by {found.counts.attack} to train on, beside "
-        f"{found.counts.benign} benign frames; "
+        f"{number_of(learned.frames, 'frame')} attacked by {found.counts.attack} to train on, beside "
+        f"{number_of(found.counts.benign, 'benign frame')}; "
         f"{rows[0].known.frames} others, which no detector was trained on, to judge by.",
         f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
         "Gain: over the detector as it was, on the same pictures, and for fresh ones over what the attack on it "
@@ -198,7 +198,7 @@ def notes(found: Taught) -> list[str]:
     lines.append(f"Feasible by the independent check: {share} % of all attacked frames.")
     passed = learned.without_vehicles + judged.without_vehicles
     if passed:
-        lines.append(f"{passed} frames without vehicles passed over.")
+        lines.append(f"{number_of(passed, 'frame')} without vehicles passed over.")
     failed = {**learned.failed, **judged.failed}
     lines += [f"Frame {name} could not be used: {reason}" for name, reason in failed.items()]
     return lines

@@ -171,7 +171,7 @@ def test_what_is_told(found: Taught, tmp_path: Path) -> None:
     answer_of(told, tmp_path, {}, "drivesem study retrain", None).write()
     text = (tmp_path / "study.md").read_text()
     assert all(f"## {sheet.title}" in text for sheet in told.sheets)
-    for part in ("65.90", "99.40", "92.97", "Frame 9 could not be used: no camera", "1 frames without vehicles"):
+    for part in ("65.90", "99.40", "92.97", "Frame 9 could not be used: no camera", "1 frame without vehicles"):
         assert part in text
     lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
     assert [line["name"] for line in lines] == [r.name for r in found.rows]
