@@ -34,7 +34,6 @@ _TROUBLE = ("Traceback (most recent call last)", "Warning:", "leaked", "Exceptio
 _PROGRESS = "━"
 
 _LAUNCHER = """
-from drivesem.report.tables import number_of
 import json, os, resource, signal, subprocess, sys
 answer, seconds, megabytes, *words = sys.argv[1:]
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # what a shell starts in the background ignores it
