@@ -205,7 +205,6 @@ retrain: --run nowhere | --run @inputs/run | --run @inputs/other | --run @inputs
 """Command lines that cannot be: of each command, options parted by `|`. They share one process."""
 
 SHARED = """
-from drivesem.report.tables import number_of
 import contextlib, io, json, runpy, sys, traceback
 with open(sys.argv[1]) as asked, open(sys.argv[2], "w") as said:
     for words in map(json.loads, asked):

@@ -277,4 +277,6 @@ def test_everything_fits(width: int, height: int, opened: Callable[..., Any]) ->
         assert name, "every control has a name"
     if width < 500:
         page.mouse.wheel(0, 2000)
+        page.wait_for_timeout(500)  # scrolling takes its time, and the page's policy forbids to wait for a script
+        assert page.evaluate("scrollY") > 500
         assert page.locator("#view").bounding_box()["y"] < 100, "the picture stays in sight"
