@@ -55,5 +55,5 @@ def _coloured(albedo: np.ndarray, hue: float, lightness: float) -> np.ndarray:
         foliage_map=torch.ones_like(row),
         road=row,
     )
-    changed = apply_foliage(shown, environment, row.new_zeros(3))
+    changed = apply_foliage(shown, environment, row.new_zeros(5, *row.shape))
     return (changed.clamp(0, 1) ** 2.2)[:, 0].T.float().numpy()

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir.derender.background import push_pull
 from scene_ir.derender.silhouette import Placement, extent, grow
+from scene_ir.push_pull import push_pull
 from scene_ir.render.surfaces import shadow_corners, shadow_density, sun_offset
 from scene_ir.types import Camera
 

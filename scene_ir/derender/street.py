@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from scene_ir.derender.background import push_pull
 from scene_ir.derender.colours import grey, largest
+from scene_ir.push_pull import push_pull
 from scene_ir.types import Camera
 
 Image = NDArray[np.float32]

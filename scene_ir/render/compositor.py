@@ -79,7 +79,7 @@ class Compositor(Prepared):
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
-            canvas = torch.cat([apply_foliage(canvas[:3], changed, self.air, backend), canvas[3:]])
+            canvas = torch.cat([apply_foliage(canvas[:3], changed, self.crowns, backend), canvas[3:]])
         if self.standing is not None:
             layers = self.standing.before(layers, canvas[:3] - self.canvas[:3] if foliage else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)

@@ -9,14 +9,16 @@ from __future__ import annotations
 from functools import lru_cache
 
 import kornia
+import numpy as np
 import torch
 from torch import Tensor
 
 from scene_ir.geometry import kept_within
+from scene_ir.push_pull import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.texture import lab, rgb_of, smoothstep
-from scene_ir.types import Environment
+from scene_ir.types import Environment, SceneIR
 
 
 def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
@@ -44,32 +46,60 @@ def time_gain(time: Tensor) -> Tensor:
     return torch.expm1(-darkening * square) + (warmth * time * dusk - model.DIMMING * time * dim)
 
 
-def apply_foliage(image: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference") -> Tensor:
+@torch.no_grad()
+def crowns_of(scene: SceneIR) -> Tensor:
+    """What density does to foliage, (5, H, W) in [0, 1]: how far a pixel opens in a thin crown; how far it darkens
+    in a thick one, neither on level ground, as grass is no crown; RGB of what shows through. Behind leaves is what
+    surrounds them: the sky where they stand before it, a wall where they climb it.
+    """
+    amount, photo = scene.environment.foliage_map, scene.background
+    gaps = _leaf_gaps(*amount.shape).to(photo)
+    standing = _standing(scene).to(photo)
+    known = (1.0 - amount.clamp(0.0, 1.0)).square().float().cpu().numpy()
+    behind = push_pull(np.ascontiguousarray(photo.permute(1, 2, 0).float().cpu().numpy()), known)
+    shows = torch.from_numpy(behind).permute(2, 0, 1).to(photo)
+    return torch.stack([standing * gaps, standing * (1.0 - gaps), *shows])
+
+
+def _standing(scene: SceneIR) -> Tensor:
+    """How far (H, W), 0 to 1, what is seen stands above the ground: 1 from `model.GRASS_M` on."""
+    camera, depth = scene.camera, scene.depth.double()
+    inverse = torch.linalg.inv(camera.matrix[:, :3].double())
+    up = inverse.T @ scene.environment.ground[:3].double().to(inverse)
+    start = float(scene.environment.ground[3]) - float(up @ camera.matrix[:, 3].double())
+    rows, columns = (torch.arange(n, dtype=torch.float64, device=up.device) for n in depth.shape)
+    slope = up[0] * columns + up[1] * rows[:, None] + up[2]
+    height = start + torch.where(torch.isfinite(depth), depth, 0.0) * slope.to(depth)
+    return torch.where(torch.isfinite(depth), (height / model.GRASS_M).clamp(0.0, 1.0), 1.0)
+
+
+def apply_foliage(
+    image: Tensor, environment: Environment, crowns: Tensor, backend: Backend = "reference"
+) -> Tensor:
     """The picture (3, H, W) with its foliage changed by `environment.foliage`, (3,) in [-1, 1].
 
     Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is
-    a curve in CIE L*; density darkens the crowns (1) or lets the air (3,) RGB show through them (-1).
-    Differentiable to all, with backend `warp` (float32, fused) to all but the airlight and the map.
+    a curve in CIE L*; density darkens the crowns (1) or lets what is behind show through them (-1).
+    crowns: of `crowns_of`. Differentiable to all, with backend `warp` (float32, fused) to picture and code.
     """
     if backend == "warp":
-        gaps = _leaf_gaps(*environment.foliage_map.shape).to(image)
         from scene_ir.render.kernels import effects
 
-        return effects.foliage(image, environment, air, gaps)
+        return effects.foliage(image, environment, crowns)
     amount = environment.foliage_map.to(image)
     index = (amount.flatten() > model.FEWEST_LEAVES).nonzero()[:, 0]
     if index.numel() == 0:
         return image
+    maps = crowns.to(image).flatten(1)[:, index].T
     rows = image.flatten(1)[:, index].T
-    gaps = _leaf_gaps(*amount.shape).to(image).flatten()[index]
     code = environment.foliage.to(image)
-    change = _leaves(rows, code, gaps, air) - _leaves(rows, torch.zeros_like(code), gaps, air)
+    change = _leaves(rows, code, maps) - _leaves(rows, torch.zeros_like(code), maps)
     change = change * amount.flatten()[index][:, None]
     return image.flatten(1).index_add(1, index, change.T).reshape(image.shape)
 
 
-def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
-    """The leaf model on rows (R, 3); gaps (R,) in [0, 1] says where a thin crown lets light through."""
+def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
+    """The leaf model on rows (R, 3); maps (R, 5): of `crowns_of`."""
     hue, shift, density = code.unbind(-1)
     lightness, a, b = lab(kept_within(rgb, 0.0, 1.0)).unbind(-1)
     level = kept_within(lightness / 100.0, *model.LEVEL)
@@ -84,8 +114,8 @@ def _leaves(rgb: Tensor, code: Tensor, gaps: Tensor, air: Tensor) -> Tensor:
     out = rgb_of(torch.stack([100.0 * level, red, yellow], dim=-1))
     thick = density * torch.sigmoid(model.CROWN_BEND * density)
     thin = -density * torch.sigmoid(-model.CROWN_BEND * density)
-    out = out + (thick * model.THICK_SHARE * (1.0 - gaps))[:, None] * (model.THICK_DARKNESS * out - out)
-    return out + (thin * model.THIN_SHARE * gaps)[:, None] * (air - out)
+    out = out + (thick * model.THICK_SHARE * maps[:, 1])[:, None] * (model.THICK_DARKNESS * out - out)
+    return out + (thin * model.THIN_SHARE * maps[:, 0])[:, None] * (maps[:, 2:] - out)
 
 
 def apply_weather(

@@ -144,6 +144,9 @@ CROWN_BEND = 6.0
 THICK_SHARE, THICK_DARKNESS, THIN_SHARE = 0.5, 0.25, 0.8
 """Of the thickest crown: how much of it is deep inside, and how bright that is; how far the thinnest one opens."""
 
+GRASS_M = 0.3
+"""Height above the ground from which foliage is a crown, which density changes; below it fades into grass."""
+
 # -------------------------------------------------------------------------------------------------------- weather
 
 LUMA = (0.299, 0.587, 0.114)

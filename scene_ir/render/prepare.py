@@ -23,7 +23,7 @@ from torch import Tensor
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
-from scene_ir.render.environment import sky_colour
+from scene_ir.render.environment import crowns_of, sky_colour
 from scene_ir.render.sun import Sun
 from scene_ir.render.surfaces import Fleet, Rig, Surface
 from scene_ir.render.texture import Regions, Texels, smoothstep
@@ -174,6 +174,7 @@ class Prepared:
         self.centre = surfaces.camera_centre(scene.camera.matrix).to(self.like)
         self.unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self.like)
         self.air = sky_colour(scene.photograph, scene.environment.sky)
+        self._crowns: Tensor | None = None
         inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
         self.canvas = torch.cat([scene.background, inverse.to(self.like)[None]])
         self.standing = Standing.of(scene, self.like) if scene.front else None
@@ -400,6 +401,13 @@ class Prepared:
             *(direction.expand(count, 3).contiguous(), ground.expand(count, 4).contiguous()),
             *(self.scene.camera.matrix.to(self.like).expand(count, 3, 4).contiguous(), casts),
         )
+
+    @property
+    def crowns(self) -> Tensor:
+        """Of `environment.crowns_of`; found on first use."""
+        if self._crowns is None:
+            self._crowns = crowns_of(self.scene)
+        return self._crowns
 
     @property
     def casts(self) -> Tensor:

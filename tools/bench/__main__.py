@@ -30,6 +30,7 @@ from tools.bench import (
     depth,
     derender,
     evaluation,
+    foliage,
     found,
     install,
     label_free,
@@ -72,6 +73,7 @@ def run(config: BenchTool) -> int:
         "moves": _moves,
         "redraw": _redraw,
         "weather": _weather,
+        "foliage": _foliage,
         "synth": _synth,
         "rivals": _rivals,
         "eval": _eval,
@@ -139,6 +141,14 @@ def _weather(config: BenchTool, console: Console) -> Measured:
     except DetectorError as error:
         raise UsageError("--detector", "a detector", error) from error
     return _measured(weather, {"rows": [asdict(row) for row in rows], "summary": weather.summary(rows)})
+
+
+def _foliage(config: BenchTool, console: Console) -> Measured:
+    _on_cpu(config)
+    frames = _frames(config, foliage)
+    measured = foliage.measure(config, frames, _sheets(config))
+    rows = [row for found in watched(measured, frames, console) for row in found]
+    return _measured(foliage, {"rows": [asdict(row) for row in rows], "summary": foliage.summary(rows)})
 
 
 def _label_free(config: BenchTool, console: Console) -> Measured:

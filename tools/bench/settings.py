@@ -28,6 +28,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
             "moves",
             "redraw",
             "weather",
+            "foliage",
             "synth",
             "rivals",
             "eval",
@@ -40,10 +41,10 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     the generator's truth, a laser, and in fog; found: whether a detector finds removed
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
     those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
-    of photographs beside the photograph and ours; weather: the compositor's weather beside the generator's; synth:
-    the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many frames
-    beside pycocotools; viewer: how long drivesem view takes to answer a slider; install:
-    megabytes and seconds from a clone to the first report, and of each start."""
+    of photographs beside the photograph and ours; weather, foliage: the compositor's beside the generator's;
+    synth: the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many
+    frames beside pycocotools; viewer: how long drivesem view takes to answer a slider; install: megabytes and
+    seconds from a clone to the first report, and of each start."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
@@ -53,8 +54,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
     100, with --quick 12; that moves does, by default 80, with --quick 6; that depth does, by default 40, with
-    --quick 6; that weather does, by default 24, with --quick 4; that label-free and parts look at, by default 60,
-    with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
+    --quick 6; that weather and foliage do, by default 24, with --quick 4; that label-free and parts look at, by
+    default 60, with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
     fast: Flag = False

@@ -124,8 +124,8 @@ def rows_of(
 ) -> list[WeatherRow]:
     """The figures of one frame. sheets: folder for its pictures."""
     street = generated.street_of(plan)
-    made = _rendered(plan, street)
-    scene = derender(Frame(f"{number:03d}", _tensor(made.image), made.camera, made.labels))
+    made = rendered(plan, street)
+    scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
     shown = [truth for truth in made.truths if _shown(truth)]
     if not shown:
         return []
@@ -133,7 +133,7 @@ def rows_of(
     rows, strips = [], []
     for name, edit in CODES.items():
         ours = to_uint8(compositor.render(_under(scene, edit)).image)
-        truth = _rendered(apply_edit(plan, edit), street).image
+        truth = rendered(apply_edit(plan, edit), street).image
         rows.append(_row((pool, f"{number:03d}", name), made.image, ours, truth, shown, detector))
         region = np.ones(ours.shape[:2], bool)
         strips.append(Strip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
@@ -192,7 +192,7 @@ def _row(
 def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
     boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
     labels = torch.tensor([int(VEHICLES[car.actor.label]) for car in shown])
-    found = of_detections(predict(detector, _tensor(picture)[None])[0], len(detector.classes))
+    found = of_detections(predict(detector, tensor_of(picture)[None])[0], len(detector.classes))
     return of_objects(found, boxes, labels, boxes, t_star_of(detector))
 
 
@@ -215,11 +215,11 @@ def _under(scene: SceneIR, edit: FrameEdit) -> SceneIR:
     return scene.with_environment(weather=like.new_tensor(edit.weather), light=like.new_tensor(edit.sun))
 
 
-def _rendered(plan: Plan, street: generated.Street) -> SynthFrame:
+def rendered(plan: Plan, street: generated.Street) -> SynthFrame:
     frame = generated.render_frame(plan, surround=street)
     assert frame is not None
     return frame
 
 
-def _tensor(image: Picture) -> Tensor:
+def tensor_of(image: Picture) -> Tensor:
     return torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))

@@ -654,17 +654,16 @@ def _mirror(wet: _Wet, width: int, source: Any, target: Any, forward: bool) -> N
 
 
 ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
-LEAF_AIR, LEAF_SETTINGS = 11, 14
+LEAF_SETTINGS = 11
 """Numbers that are the same for all leaves: where they stand, and their count. Factor of the odds of lightness; of
 chroma; cosine and sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn
-along hue, of thicker and thinner along density; airlight (3)."""
+along hue, of thicker and thinner along density."""
 
 
 @wp.kernel
 def leaf_settings_kernel(
     start: int,
     code: wp.array(dtype=wp.float32),
-    air: wp.array(dtype=wp.float32),
     settings: wp.array(dtype=wp.float32),
 ):
     """Thread 0 for the code, thread 1 for no change."""
@@ -690,8 +689,6 @@ def leaf_settings_kernel(
     settings[first + TURN_SLOPE] = wp.float32(-rate - rate_slope * hue)
     settings[first + THICKER_SLOPE] = wp.float32(thick + steep)
     settings[first + THINNER_SLOPE] = wp.float32(thick - one + steep)
-    for c in range(3):
-        settings[first + LEAF_AIR + c] = air[c]
 
 
 @wp.func
@@ -709,24 +706,42 @@ def leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     return wp.vec3f(100.0 * level, red, yellow)
 
 
+@wp.struct
+class Crown:
+    """One pixel of `environment.crowns_of`."""
+
+    thinned: wp.float32
+    thickened: wp.float32
+    behind: wp.vec3f
+
+
 @wp.func
-def crown(rgb: wp.vec3f, gap: wp.float32, settings: wp.array(dtype=wp.float32), at: int):
+def crown_at(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
+    """crowns: five planes: thinned, thickened, behind."""
+    at = Crown()
+    at.thinned = load(crowns, i)
+    at.thickened = load(crowns, plane + i)
+    at.behind = load3(crowns, 2 * plane + i, plane)
+    return at
+
+
+@wp.func
+def crowned(rgb: wp.vec3f, at: Crown, settings: wp.array(dtype=wp.float32), first: int):
     """Leaves in a thicker or thinner crown."""
-    dense = (1.0 - THICK * load(settings, at + THICKER) * (1.0 - gap)) * rgb
-    air = load3(settings, at + LEAF_AIR, 1)
-    return dense + (model.THIN_SHARE * load(settings, at + THINNER) * gap) * (air - dense)
+    dense = (1.0 - THICK * load(settings, first + THICKER) * at.thickened) * rgb
+    return dense + (model.THIN_SHARE * load(settings, first + THINNER) * at.thinned) * (at.behind - dense)
 
 
 @wp.func
-def leaf_adjoint(lab: wp.vec3f, gap: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+def leaf_adjoint(lab: wp.vec3f, crown: Crown, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     """-> gradients to lab and to hue, lightness and density (3)."""
     changed = leaf_lab(lab, settings, at)
     rgb = rgb_of(changed)
-    keep = 1.0 - THICK * load(settings, at + THICKER) * (1.0 - gap)
-    through = model.THIN_SHARE * load(settings, at + THINNER) * gap
-    g_thin = model.THIN_SHARE * gap * wp.dot(g, load3(settings, at + LEAF_AIR, 1) - keep * rgb)
+    keep = 1.0 - THICK * load(settings, at + THICKER) * crown.thickened
+    through = model.THIN_SHARE * load(settings, at + THINNER) * crown.thinned
+    g_thin = model.THIN_SHARE * crown.thinned * wp.dot(g, crown.behind - keep * rgb)
     g_dense = (1.0 - through) * g
-    g_thick = -THICK * (1.0 - gap) * wp.dot(g_dense, rgb)
+    g_thick = -THICK * crown.thickened * wp.dot(g_dense, rgb)
     g_lab = rgb_adjoint(changed, keep * g_dense)
 
     before = level_of(lab[0])
@@ -770,16 +785,16 @@ def foliage_kernel(
     code: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
     amount: wp.array(dtype=wp.float32),
-    gaps: wp.array(dtype=wp.float32),
+    crowns: wp.array(dtype=wp.float32),
     plane: int,
     out: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
     own = load3(image, i, plane)
-    gap = load(gaps, i)
+    crown = crown_at(crowns, i, plane)
     lab = lab_of(clamped(own))
-    now = crown(rgb_of(leaf_lab(lab, settings, 0)), gap, settings, 0)
-    then = crown(rgb_of(leaf_lab(lab, settings, LEAF_SETTINGS)), gap, settings, LEAF_SETTINGS)
+    now = crowned(rgb_of(leaf_lab(lab, settings, 0)), crown, settings, 0)
+    then = crowned(rgb_of(leaf_lab(lab, settings, LEAF_SETTINGS)), crown, settings, LEAF_SETTINGS)
     size = wp.abs(load(code, 0)) + wp.abs(load(code, 1)) + wp.abs(load(code, 2))
     share = wp.where(size > 0.0, leaf_share(load(amount, i)), 0.0)
     store3(out, i, plane, own + share * (now - then))
@@ -791,7 +806,7 @@ def foliage_code_kernel(
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
     amount: wp.array(dtype=wp.float32),
-    gaps: wp.array(dtype=wp.float32),
+    crowns: wp.array(dtype=wp.float32),
     plane: int,
     grad: wp.array(dtype=wp.float32),
     first: int,
@@ -801,7 +816,7 @@ def foliage_code_kernel(
     """shares: each pixel's part of the gradient to the code, planes of `kept` numbers, from pixel `first` on."""
     i = start + wp.tid()
     g = leaf_share(load(amount, i)) * load3(grad, i, plane)
-    _lab, code = leaf_adjoint(lab_of(clamped(load3(image, i, plane))), load(gaps, i), g, settings, 0)
+    _lab, code = leaf_adjoint(lab_of(clamped(load3(image, i, plane))), crown_at(crowns, i, plane), g, settings, 0)
     store3(shares, i - first, kept, code)
 
 
@@ -811,7 +826,7 @@ def foliage_image_kernel(
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
     amount: wp.array(dtype=wp.float32),
-    gaps: wp.array(dtype=wp.float32),
+    crowns: wp.array(dtype=wp.float32),
     plane: int,
     grad: wp.array(dtype=wp.float32),
     grad_image: wp.array(dtype=wp.float32),
@@ -822,24 +837,25 @@ def foliage_image_kernel(
     rgb = clamped(own)
     lab = lab_of(rgb)
     part = leaf_share(load(amount, i)) * g
-    now, _code = leaf_adjoint(lab, load(gaps, i), part, settings, 0)
-    then, _none = leaf_adjoint(lab, load(gaps, i), part, settings, LEAF_SETTINGS)
+    crown = crown_at(crowns, i, plane)
+    now, _code = leaf_adjoint(lab, crown, part, settings, 0)
+    then, _none = leaf_adjoint(lab, crown, part, settings, LEAF_SETTINGS)
     store3(grad_image, i, plane, g + clamped_adjoint(own, lab_adjoint(rgb, now - then)))
 
 
 class _Foliage(torch.autograd.Function):
-    """Leaves of image (3, H, W); code (3,), air (3,); amount and gaps (H, W)."""
+    """Leaves of image (3, H, W); code (3,); amount (H, W); crowns (5, H, W)."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, code: Tensor, air: Tensor, amount: Tensor, gaps: Tensor) -> Tensor:
+    def forward(ctx: Any, image: Tensor, code: Tensor, amount: Tensor, crowns: Tensor) -> Tensor:
         height, width = image.shape[1:]
         plane = height * width
         top, bottom = (0, height) if image.is_cuda else _rows(amount, model.FEWEST_LEAVES)
-        kept_maps = [t.detach().contiguous() for t in (image, amount, gaps)]
+        kept_maps = [t.detach().contiguous() for t in (image, amount, crowns)]
         settings = image.new_empty(2 * LEAF_SETTINGS)
         out = kept_maps[0].clone()
         given, own_code, maps = array(settings), array(code), [array(t) for t in kept_maps]
-        launch(leaf_settings_kernel, [0, 2], [own_code, array(air)], [given])
+        launch(leaf_settings_kernel, [0, 2], [own_code], [given])
         inputs = [given, own_code, *maps, plane]
         launch(foliage_kernel, _ranges(top * width, bottom * width), inputs, [array(out)])
         ctx.save_for_backward(*kept_maps, settings)
@@ -863,7 +879,7 @@ class _Foliage(torch.autograd.Function):
             (shares,) = _scratch.planes(image, 3 * (last - first))
             launch(foliage_code_kernel, _ranges(first, last), [*inputs, first, last - first], [array(shares)])
             grad_code = _row_by_row(shares.view(3, bottom - top, width))
-        return grad_image, grad_code, None, None, None
+        return grad_image, grad_code, None, None
 
 
 def weather(image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor) -> Tensor:
@@ -872,7 +888,7 @@ def weather(image: Tensor, inverse: Tensor, environment: Environment, air: Tenso
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 
-def foliage(image: Tensor, environment: Environment, air: Tensor, gaps: Tensor) -> Tensor:
-    """See `environment.apply_foliage`; gaps: (H, W). All float32, the airlight constant."""
+def foliage(image: Tensor, environment: Environment, crowns: Tensor) -> Tensor:
+    """See `environment.apply_foliage`; crowns: (5, H, W). All float32."""
     code, amount = environment.foliage.to(image), environment.foliage_map.to(image)
-    return _Foliage.apply(image, code, air.to(image).detach(), amount, gaps)
+    return _Foliage.apply(image, code, amount, crowns.to(image))

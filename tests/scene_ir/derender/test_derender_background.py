@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_ir.derender.background import FillSettings, Ground, fill, mirrored, push_pull
+from scene_ir.derender.background import FillSettings, Ground, fill, mirrored
 
 SHAPE = (72, 120)
 
@@ -100,13 +100,6 @@ def test_mirrored_points_to_known_pixels_and_known_pixels_to_themselves():
     own = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     assert np.array_equal(np.stack([rows, columns])[:, ~hole()], own[:, ~hole()])
     assert (rows[37, 46], columns[37, 46]) == (37, 42)
-
-
-def test_push_pull_keeps_known_pixels_and_continues_a_constant():
-    image = np.full((*SHAPE, 2), 0.4, np.float32)
-    image[hole()] = 9
-    result = push_pull(image, (~hole()).astype(np.float32))
-    assert result == pytest.approx(np.full((*SHAPE, 2), 0.4), abs=1e-5)
 
 
 @pytest.mark.parametrize("side", [1, 4])

@@ -64,7 +64,8 @@ def _run(name: str, code: list[float], frame: tuple[int, int, int], backend: str
     else:
         live.pop()
         changed = replace(scenery, foliage=live[1])
-        out = env.apply_foliage(live[0], changed, air.to(dtype), backend=backend)  # type: ignore[arg-type]
+        crowns = torch.rand(5, *frame[:2], generator=torch.Generator().manual_seed(4)).to(dtype)
+        out = env.apply_foliage(live[0], changed, crowns, backend=backend)  # type: ignore[arg-type]
     weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(3)).to(dtype)
     return [out.detach(), *torch.autograd.grad(out, live, weights, materialize_grads=True)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from scene_ir.render import environment as env
 from scene_ir.render import model
-from scene_ir.types import Environment
+from scene_ir.types import Environment, SceneIR
 
 H, W = 40, 64
 FOG, RAIN, TIME, OVERCAST = range(4)
@@ -38,7 +39,13 @@ def _weather(code: Tensor) -> tuple[Tensor, Tensor]:
 
 def _foliage(code: Tensor) -> tuple[Tensor, Tensor]:
     image, _, scenery, air = _inputs(code.dtype)
-    return image, env.apply_foliage(image, replace(scenery, foliage=code), air)
+    return image, env.apply_foliage(image, replace(scenery, foliage=code), _crowns(air))
+
+
+def _crowns(air: Tensor) -> Tensor:
+    """Leaves that all stand before the air, half open."""
+    half = air.new_full((2, H, W), 0.5)
+    return torch.cat([half, air[:, None, None].expand(3, H, W)])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -134,6 +141,33 @@ def test_autumn_is_redder_and_thin_crowns_show_the_air() -> None:
     assert float((autumn[0] - autumn[1]).mean()) > float((spring[0] - spring[1]).mean()) + 0.05
     thin, thick = (_foliage(torch.tensor([0, 0, d], dtype=torch.float64))[1][:, inside] for d in (-1.0, 1.0))
     assert float(thin.mean()) > float(thick.mean()) + 0.1
+
+
+def test_grass_is_no_crown_and_leaves_show_what_surrounds_them(
+    street: Callable[[torch.dtype], SceneIR],
+) -> None:
+    """Four patches of leaves: before a blue sky, on a red wall, one on level ground, one a hand above it."""
+    scene = street(torch.float64)
+    blue, red, grey = (
+        torch.tensor(c).double()[:, None, None] for c in ((0.3, 0.5, 0.9), (0.8, 0.2, 0.2), (0.4,) * 3)
+    )
+    picture, depth, leaves = scene.background.clone(), scene.depth.clone(), torch.zeros_like(scene.depth)
+    picture[:, :34], picture[:, 34:] = blue, grey
+    picture[:, 10:34, 100:], depth[10:34, 100:] = red, 30.0
+    patches = {"sky": (12, 20), "wall": (18, 115), "level": (60, 40), "low": (60, 100)}
+    for top, left in patches.values():
+        leaves[top : top + 8, left : left + 8] = 1.0
+    picture = torch.where(leaves > 0, torch.tensor([0.1, 0.4, 0.1]).double()[:, None, None], picture)
+    low = (slice(60, 68), slice(100, 108))
+    depth[low] *= 1 - 0.5 * model.GRASS_M / scene.environment.ground[3]
+    environment = replace(scene.environment, foliage_map=leaves)
+    crowns = env.crowns_of(replace(scene, background=picture, depth=depth, environment=environment))
+    at = {name: crowns[:, top + 2 : top + 6, left + 2 : left + 6] for name, (top, left) in patches.items()}
+    assert float(at["level"][:2].max()) < 1e-3
+    torch.testing.assert_close(at["low"][:2].sum(0), torch.full((4, 4), 0.5).double(), atol=0.02, rtol=0)
+    for name, colour in (("sky", blue), ("wall", red)):
+        torch.testing.assert_close(at[name][:2].sum(0), torch.ones(4, 4).double())
+        torch.testing.assert_close(at[name][2:], colour.expand(3, 4, 4), atol=0.02, rtol=0)
 
 
 def test_sky_colour_is_the_photographs_and_has_a_default() -> None:
