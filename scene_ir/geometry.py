@@ -35,6 +35,20 @@ def project(points: Tensor, matrix: Tensor) -> Tensor:
     return clip[..., :2] / clip[..., 2:]
 
 
+def height_above(depth: Tensor, ground: Tensor, matrix: Tensor) -> Tensor:
+    """Height (H, W) m, float64, above the ground plane of what is seen at `depth` (H, W) m; inf where that is inf.
+
+    ground (4,): plane n.x + d = 0; matrix (3, 4).
+    """
+    depth, ground, matrix = (t.double() for t in (depth, ground.to(depth.device), matrix.to(depth.device)))
+    up = torch.linalg.inv(matrix[:, :3]).T @ ground[:3]
+    rows, columns = (torch.arange(n, dtype=torch.float64, device=depth.device) for n in depth.shape)
+    slope = up[0] * columns + up[1] * rows[:, None] + up[2]
+    seen = torch.isfinite(depth)
+    height = ground[3] - up @ matrix[:, 3] + torch.where(seen, depth, 0.0) * slope
+    return torch.where(seen, height, torch.inf)
+
+
 _BOX_CORNERS = (
     (0.5, 0.5, -0.5, -0.5, 0.5, 0.5, -0.5, -0.5),
     (0, 0, 0, 0, -1, -1, -1, -1),

@@ -20,7 +20,7 @@ from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.matte import opacity_of
 from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import project_boxes, to_clip
+from scene_ir.geometry import height_above, project_boxes, to_clip
 from scene_ir.raster import verbs
 from scene_ir.render.sources import SolveSettings, solve_sources
 from scene_ir.types import (
@@ -315,8 +315,8 @@ def _unlabelled(
     if frame.masks is not None:
         known = known | (frame.masks > 0.5).any(dim=0).numpy()
     nearest = [(cut.outline, front.nearest_corner(cut.placement, frame.camera)) for cut in cuts]
-    depth = frame.depth.float().numpy()
-    return front.measured(depth, maps.height_above(depth, ground, frame.camera), known, nearest)
+    height = height_above(frame.depth, ground, frame.camera.matrix).float().numpy()
+    return front.measured(frame.depth.float().numpy(), height, known, nearest)
 
 
 def _behind(cuts: list[_Cut], things: list[front.Thing], camera: Camera) -> list[_Cut]:

@@ -69,19 +69,6 @@ def plane_depth(ground: torch.Tensor, camera: Camera) -> Array:
     return np.where(depth > 0, depth, np.inf).astype(np.float32)
 
 
-def height_above(depth: Array, ground: torch.Tensor, camera: Camera) -> Array:
-    """Height (H, W) m above the ground plane of what is seen at `depth` (H, W) m; inf where that is inf."""
-    matrix = camera.matrix.double().numpy()
-    inverse = np.linalg.inv(matrix[:, :3])
-    normal = ground.double().numpy()
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    slope = (inverse.T @ normal[:3]) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1).astype(np.float64)
-    start = normal[3] - normal[:3] @ (inverse @ matrix[:, 3])
-    z = depth.astype(np.float64)
-    height = start + np.where(np.isfinite(z), z, 0) * slope.reshape(z.shape)
-    return np.where(np.isfinite(z), height, np.inf).astype(np.float32)
-
-
 def horizon_row(ground: torch.Tensor, camera: Camera) -> float:
     """Row, px, of the horizon in the image's middle column: where rays run parallel to the ground."""
     inverse = np.linalg.inv(camera.intrinsics.double().numpy())

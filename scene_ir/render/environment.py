@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import kept_within
+from scene_ir.geometry import height_above, kept_within
 from scene_ir.push_pull import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
@@ -54,23 +54,12 @@ def crowns_of(scene: SceneIR) -> Tensor:
     """
     amount, photo = scene.environment.foliage_map, scene.background
     gaps = _leaf_gaps(*amount.shape).to(photo)
-    standing = _standing(scene).to(photo)
+    height = height_above(scene.depth, scene.environment.ground, scene.camera.matrix)
+    standing = (height / model.GRASS_M).clamp(0.0, 1.0).to(photo)
     known = (1.0 - amount.clamp(0.0, 1.0)).square().float().cpu().numpy()
     behind = push_pull(np.ascontiguousarray(photo.permute(1, 2, 0).float().cpu().numpy()), known)
     shows = torch.from_numpy(behind).permute(2, 0, 1).to(photo)
     return torch.stack([standing * gaps, standing * (1.0 - gaps), *shows])
-
-
-def _standing(scene: SceneIR) -> Tensor:
-    """How far (H, W), 0 to 1, what is seen stands above the ground: 1 from `model.GRASS_M` on."""
-    camera, depth = scene.camera, scene.depth.double()
-    inverse = torch.linalg.inv(camera.matrix[:, :3].double())
-    up = inverse.T @ scene.environment.ground[:3].double().to(inverse)
-    start = float(scene.environment.ground[3]) - float(up @ camera.matrix[:, 3].double())
-    rows, columns = (torch.arange(n, dtype=torch.float64, device=up.device) for n in depth.shape)
-    slope = up[0] * columns + up[1] * rows[:, None] + up[2]
-    height = start + torch.where(torch.isfinite(depth), depth, 0.0) * slope.to(depth)
-    return torch.where(torch.isfinite(depth), (height / model.GRASS_M).clamp(0.0, 1.0), 1.0)
 
 
 def apply_foliage(

@@ -146,7 +146,7 @@ def _weather(config: BenchTool, console: Console) -> Measured:
 def _foliage(config: BenchTool, console: Console) -> Measured:
     _on_cpu(config)
     frames = _frames(config, foliage)
-    measured = foliage.measure(config, frames, _sheets(config))
+    measured = foliage.measure(frames, _sheets(config))
     rows = [row for found in watched(measured, frames, console) for row in found]
     return _measured(foliage, {"rows": [asdict(row) for row in rows], "summary": foliage.summary(rows)})
 

@@ -20,7 +20,6 @@ from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame
 from tools.bench.pictures import Strip, psnr, sheet
-from tools.bench.settings import BenchTool
 from tools.bench.weather import rendered, tensor_of
 
 TITLE = "Foliage, ours beside the generator's"
@@ -59,7 +58,7 @@ class FoliageRow:
     grass_unchanged_db: float | None
 
 
-def measure(_config: BenchTool, frames: int, sheets: Path | None) -> Iterator[list[FoliageRow]]:
+def measure(frames: int, sheets: Path | None) -> Iterator[list[FoliageRow]]:
     """Rows of a frame at a time, pools in turn."""
     for number in range(frames):
         pool = SPLITS[number % len(SPLITS)]

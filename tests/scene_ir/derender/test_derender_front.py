@@ -8,7 +8,7 @@ import torch
 
 from scene_ir.derender import front, maps, silhouette
 from scene_ir.derender.derender import DerenderSettings, derender
-from scene_ir.geometry import project_boxes
+from scene_ir.geometry import height_above, project_boxes
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Camera, Frame, Labels
 
@@ -77,7 +77,7 @@ def test_depth_tells_a_pole_from_the_ground_and_from_what_is_behind():
     outline = silhouette.silhouettes([car], CAMERA)[0]
     shown = outline & ~pole
     depth[shown] = 11.5
-    height = maps.height_above(depth.astype(np.float32), LEVEL, CAMERA)
+    height = height_above(torch.from_numpy(depth), LEVEL, CAMERA.matrix).float().numpy()
     ground = np.isfinite(maps.plane_depth(LEVEL, CAMERA)) & ~pole & ~outline & (depth < 60)
     assert np.abs(height[ground]).max() < 0.01
     things = front.measured(
