@@ -6,8 +6,10 @@ import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
+from rich import box
 from torch import Tensor
 
 from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
@@ -23,9 +25,12 @@ from scene_ir.io import to_uint8
 _POINTS = 16
 """Of the grid of scales, as for detectors."""
 _AXES = ("pose.pitch", "pose.yaw", "pose.roll")
+_LOOKS: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False}
+_LONGEST = 24
+"""Letters of a name that stays on one line: all fits into 80 columns then. ShapeNet's hashes are longer."""
 _NOTES = (
     "Enough: the share of the change, in steps of the attack, of the least that is still misclassified. Angles in "
-    "rad, beyond the view; a dash where the angle is not needed. Vertices: the farthest goes so far, in object "
+    "rad, beyond the view; a dash where the angle is not needed. Vertex: the farthest goes so far, in object "
     "sizes. Left out: what went without a loss. What fails only between two of 16 shares is not seen.",
 )
 
@@ -135,8 +140,10 @@ def explain_run(config: Classify) -> Answer:
 
 def _answer(asked: Asked[LeastChange]) -> Answer:
     found = asked.answers
-    columns = ("picture", "called", "enough, %", "pitch, rad", "yaw, rad", "roll, rad", "vertices", "left out")
+    columns = ("picture", "called", "enough\n%", "pitch\nrad", "yaw\nrad", "roll\nrad", "vertex", "left out")
     title = f"How little is enough: {number_of(len(found), 'failure')} of {asked.run.config.network}"
+    short = all(len(one.identifier) <= _LONGEST for one in found)
+    looks = _LOOKS | {"unbroken": columns[0 if short else 1 : -1]}
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [
@@ -152,7 +159,7 @@ def _answer(asked: Asked[LeastChange]) -> Answer:
         heading="How little is enough",
         data={**asked.facts, "share_median": round(middle, 4) if found else None, "least": rows},
         tables={"explain": flat} if found else {},
-        sheets=[Sheet(title, columns, tuple(one.row() for one in found), {"unbroken": columns[:2]})],
+        sheets=[Sheet(title, columns, tuple(one.row() for one in found), looks)],
         notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
         words=("picture", "called", "left out"),
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},

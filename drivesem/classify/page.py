@@ -29,7 +29,8 @@ def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]
     rows = [(one, *shares(one)) for one in run.classes]
     before, after = shares(run.whole)
     shown = {"title": run.network, "run": run, "cards": cards, "before": before, "after": after, "rows": rows}
-    files.write_text(path, web.render("drivesem.classify:page.html", **shown))
+    redrawn = any(frame.second is not None for frame in frames)
+    files.write_text(path, web.render("drivesem.classify:page.html", **shown, redrawn=redrawn))
 
 
 def shares(tally: ClassTally) -> list[str]:

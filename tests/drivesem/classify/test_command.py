@@ -57,6 +57,8 @@ def test_attack(standins, tmp_path, capsys):
     page = (out / "report.html").read_text()
     assert page.count("data:image/jpeg") == 24
     assert "box-0008-forward" in page
+    assert page.count("wrong from the start and so not attacked") == 12 - sum(right)
+    assert page.count("yaw ") == sum(right)
     assert len((out / "classified.csv").read_text().splitlines()) == 13
 
     # what is written is what was judged, and the page's figures are those of the pictures

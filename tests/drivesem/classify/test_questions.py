@@ -134,6 +134,13 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
     assert f"{NAME} is called ball with" in found["sentence"]
     assert (tmp_path / "why" / "explain.csv").is_file()
     assert files.read_image(tmp_path / "why" / "frames" / NAME / "least.png").shape == (224, 224, 3)
+    # its table breaks no number and no short name at 80 columns
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["classify", "explain", str(run), "--out", str(tmp_path / "why"), "--workers", "1"]) == 0
+    told = capsys.readouterr().out.split()
+    turns = [f"{angle:+.3f}" for angle in angles.tolist() if angle]
+    assert turns
+    assert {NAME, *turns} <= set(told)
 
 
 def test_holes_tell_poses(run, tmp_path, capsys):
