@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -25,6 +26,8 @@ from scene_ir.io import to_uint8
 _POINTS = 16
 """Of the grid of scales, as for detectors."""
 _AXES = ("pose.pitch", "pose.yaw", "pose.roll")
+WORDS = ("picture", "called", "left out")
+"""Columns of words; the others hold numbers."""
 _LOOKS: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False}
 _LONGEST = 24
 """Letters of a name that stays on one line: all fits into 80 columns then. ShapeNet's hashes are longer."""
@@ -138,12 +141,17 @@ def explain_run(config: Classify) -> Answer:
     return answer
 
 
-def _answer(asked: Asked[LeastChange]) -> Answer:
-    found = asked.answers
+def sheet_of(found: Sequence[LeastChange], network: str) -> Sheet:
+    """The table of a network's failures."""
     columns = ("picture", "called", "enough\n%", "pitch\nrad", "yaw\nrad", "roll\nrad", "vertex", "left out")
-    title = f"How little is enough: {number_of(len(found), 'failure')} of {asked.run.config.network}"
+    title = f"How little is enough: {number_of(len(found), 'failure')} of {network}"
     short = all(len(one.identifier) <= _LONGEST for one in found)
     looks = _LOOKS | {"unbroken": columns[0 if short else 1 : -1]}
+    return Sheet(title, columns, tuple(one.row() for one in found), looks)
+
+
+def _answer(asked: Asked[LeastChange]) -> Answer:
+    found = asked.answers
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [
@@ -159,8 +167,8 @@ def _answer(asked: Asked[LeastChange]) -> Answer:
         heading="How little is enough",
         data={**asked.facts, "share_median": round(middle, 4) if found else None, "least": rows},
         tables={"explain": flat} if found else {},
-        sheets=[Sheet(title, columns, tuple(one.row() for one in found), looks)],
+        sheets=[sheet_of(found, asked.run.config.network)],
         notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
-        words=("picture", "called", "left out"),
+        words=WORDS,
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )

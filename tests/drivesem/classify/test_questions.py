@@ -1,5 +1,6 @@
 """What is asked of a run of `drivesem classify attack`: confirm, explain, holes, gate, as they are typed."""
 
+import io
 import json
 import shutil
 import xml.etree.ElementTree as ET
@@ -7,11 +8,13 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from drivesem.classify import attack as attacking
 from drivesem.classify import confirm as confirming
 from drivesem.classify import least, pictures
 from drivesem.classify.holes import PoseHole
+from drivesem.classify.least import LeastChange
 from drivesem.classify.networks import loading
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
 from drivesem.classify.space import Change
@@ -134,13 +137,21 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
     assert f"{NAME} is called ball with" in found["sentence"]
     assert (tmp_path / "why" / "explain.csv").is_file()
     assert files.read_image(tmp_path / "why" / "frames" / NAME / "least.png").shape == (224, 224, 3)
-    # its table breaks no number and no short name at 80 columns
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["classify", "explain", str(run), "--out", str(tmp_path / "why"), "--workers", "1"]) == 0
-    told = capsys.readouterr().out.split()
-    turns = [f"{angle:+.3f}" for angle in angles.tolist() if angle]
-    assert turns
-    assert {NAME, *turns} <= set(told)
+
+
+@pytest.mark.parametrize("name", ["skateboard-0080-forward", f"motorcycle-{32 * 'a'}-forward"])
+def test_the_table_of_least_changes_breaks_no_number_at_80_columns(name):
+    angles = {"pose.pitch": -0.276, "pose.yaw": 0.238, "pose.roll": -0.476}
+    dropped = ("vertex", "lighting")
+    change = LeastChange(name, "", "bus", "motorcycle", 1.0, angles, angles, 0.0074, 0.0, dropped, 1, 1)
+    shown = io.StringIO()
+    sheet = least.sheet_of([change], "squeezenet")
+    Console(width=80, file=shown).print(sheet.table(least.WORDS, **sheet.looks))
+    told = shown.getvalue()
+    assert {"-0.276", "+0.238", "-0.476", "0.0074", "motorcycle", "vertex,", "lighting"} <= set(told.split())
+    first = "".join(line.split(" ")[0] for line in told.splitlines()[4:])
+    assert first == name  # on one line where it is short, else it goes on below itself
+    assert (name in told) == (len(name) <= 24)
 
 
 def test_holes_tell_poses(run, tmp_path, capsys):
