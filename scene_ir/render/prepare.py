@@ -236,7 +236,7 @@ class Prepared:
                 continue  # a shadow that the border cuts goes on beyond it
             if int(x.max()) >= width - margin or int(y.max()) >= height - margin:
                 continue
-            steps = torch.tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
+            steps = x.new_tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
             pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self.like)
             found = surfaces.on_ground(
                 pixels,

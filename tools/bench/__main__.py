@@ -29,6 +29,7 @@ from scene_ir.errors import SceneError
 from tools.bench import (
     depth,
     derender,
+    devices,
     evaluation,
     foliage,
     found,
@@ -76,6 +77,7 @@ def run(config: BenchTool) -> int:
         "foliage": _foliage,
         "synth": _synth,
         "rivals": _rivals,
+        "devices": _devices,
         "eval": _eval,
         "viewer": _viewer,
         "install": _install,
@@ -149,6 +151,13 @@ def _foliage(config: BenchTool, console: Console) -> Measured:
     measured = foliage.measure(frames, _sheets(config))
     rows = [row for found in watched(measured, frames, console) for row in found]
     return _measured(foliage, {"rows": [asdict(row) for row in rows], "summary": foliage.summary(rows)})
+
+
+def _devices(config: BenchTool, console: Console) -> Measured:
+    frames = _frames(config, devices)
+    measured = devices.measure(frames, config.detector, config.device)
+    rows = [row for found in watched(measured, frames, console) for row in found]
+    return _measured(devices, {"rows": [asdict(row) for row in rows], "summary": devices.summary(rows)})
 
 
 def _label_free(config: BenchTool, console: Console) -> Measured:

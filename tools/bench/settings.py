@@ -31,6 +31,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
             "foliage",
             "synth",
             "rivals",
+            "devices",
             "eval",
             "viewer",
             "install",
@@ -42,7 +43,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
     those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
     of photographs beside the photograph and ours; weather, foliage: the compositor's beside the generator's;
-    synth: the scene generator; rivals: other renderers beside the project's verbs; eval: drivesem eval of many
+    synth: the scene generator; rivals: other renderers beside the project's verbs; devices: a GPU (--device)
+    beside the processor; eval: drivesem eval of many
     frames beside pycocotools; viewer: how long drivesem view takes to answer a slider; install: megabytes and
     seconds from a clone to the first report, and of each start."""
     quick: Flag = False

@@ -1,0 +1,206 @@
+"""A GPU that is pretended: tensors that are made for "cuda" lie on the processor and say that they do not.
+
+What a real one refuses is refused here: operations whose tensors lie on both, a kernel's array that lies elsewhere,
+NumPy's view of one. So whoever has no GPU finds what was forgotten where one is meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from scene_ir.raster import launch
+
+GPU, CPU = torch.device("cuda:0"), torch.device("cpu")
+_EITHER = torch.device("meta")
+"""Of zeros that torch itself makes on the way back, where a gradient is missing: they lie where they are needed."""
+_WARPS_GPU = SimpleNamespace(is_cuda=True)
+_MADE = ("zeros", "ones", "empty", "full", "arange", "linspace", "eye", "rand", "randn", "tensor")
+_ANY_INDEX = ("aten::index.Tensor", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
+_COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
+_NO_SCALARS = ("aten::cat", "aten::stack")
+
+
+def place(tensor: Tensor) -> torch.device:
+    """Where a tensor is said to lie."""
+    return getattr(_storage(tensor), "pretended", CPU)
+
+
+def _put(tensor: Tensor, where: torch.device) -> None:
+    storage = _storage(tensor)
+    if storage is not None:
+        storage.pretended = where
+
+
+def _storage(tensor: Tensor) -> Any:
+    """None of oneDNN's weights, which only the processor has."""
+    with torch._C.DisableTorchFunction():
+        return None if tensor.is_mkldnn else tensor.untyped_storage()
+
+
+class _Move(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, where: torch.device) -> Tensor:
+        ctx.back = place(tensor)
+        moved = tensor.clone()
+        _put(moved, where)
+        return moved
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        return _moved(grads[0], ctx.back), None
+
+
+def _moved(tensor: Tensor, where: torch.device) -> Tensor:
+    return tensor if place(tensor) == where else _Move.apply(tensor, where)  # pyright: ignore
+
+
+class _Operations(TorchDispatchMode):
+    """Every operation, those of gradients too: which of its tensors lie where."""
+
+    on_the_way_back = False
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        name = func._schema.name
+        there = [t for t in given if place(t) == GPU]
+        if there and name not in _COPIES:
+            self._check(name, func, args, given)
+        outcome = func(*args, **(kwargs or {}))
+        own = [t for t in given if t.ndim] or given
+        first = own[0] if name in _ANY_INDEX or name in _COPIES else None
+        none = _EITHER if not given and self.on_the_way_back else CPU
+        where = place(first) if first is not None else GPU if there else none
+        known = {id(_storage(t)) for t in given}
+        for leaf in tree_leaves(outcome):
+            if isinstance(leaf, Tensor) and id(_storage(leaf)) not in known:
+                _put(leaf, where)
+        return outcome
+
+    def _check(self, name: str, func: Any, args: Any, given: list[Tensor]) -> None:
+        if name in _ANY_INDEX or str(func).startswith("aten.index."):
+            given = [given[0]] if place(given[0]) == GPU else given
+        for tensor in given:
+            if place(tensor) == CPU and (tensor.ndim or name in _NO_SCALARS):
+                raise RuntimeError(f"{func}: expected all tensors on the same device, found cuda:0 and cpu")
+
+
+class _Calls(TorchFunctionMode):
+    """What is asked for by name: devices of new tensors, moves, and where a tensor lies."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        name, of = getattr(func, "__name__", ""), getattr(func, "__self__", None)
+        if name == "__get__" and of is torch.Tensor.device:
+            return place(args[0])
+        if name == "__get__" and of is torch.Tensor.is_cuda:
+            return place(args[0]) == GPU
+        if name in ("numpy", "__array__") and place(args[0]) == GPU:
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+        if name == "cpu":
+            return _moved(args[0], CPU)
+        if name == "cuda":
+            return _moved(args[0], GPU)
+        if name == "to":
+            return self._to(func, args, kwargs)
+        asked = place(args[0]) if name == "new_tensor" and "device" not in kwargs else kwargs.get("device")
+        if asked is None and name in _MADE:
+            asked = CPU
+        if asked is None or name == "_parse_to":
+            return func(*args, **kwargs)
+        kwargs["device"] = CPU
+        outcome = func(*args, **kwargs)
+        where = _device(asked)
+        if name == "as_tensor" and isinstance(args[0], Tensor):
+            return _moved(outcome, where)
+        if isinstance(outcome, Tensor):
+            _put(outcome, where)
+        return outcome
+
+    def _to(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Tensor:
+        tensor, where, rest = args[0], place(args[0]), []
+        asked = kwargs.pop("device", None)
+        other = kwargs.pop("other", None)
+        for value in args[1:]:
+            if isinstance(value, Tensor):
+                other = value
+            elif isinstance(value, str | torch.device):
+                asked = value
+            elif not isinstance(value, bool):  # whether to wait for it, or to copy
+                rest.append(value)
+        if other is not None:
+            where, rest = place(other), [other.dtype, *rest]
+        if asked is not None:
+            where = _device(asked)
+        rest = [value for value in rest if value is not None]
+        changed = func(tensor, *rest, **kwargs) if rest or kwargs else tensor
+        return _moved(changed, where)
+
+
+def _device(asked: Any) -> torch.device:
+    return GPU if torch.device(asked).type == "cuda" else CPU
+
+
+class _Kernels:
+    """Warp's arrays and launches: of tensors that are said to lie on the GPU, run by the processor."""
+
+    def __init__(self) -> None:
+        self._array, self._run = launch.wp.from_torch, launch._run
+
+    def array(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
+        where = place(tensor)
+        with torch._C.DisableTorchFunction():
+            made = self._array(tensor, *args, **kwargs)
+        if where == GPU and isinstance(made, launch.wp.array):
+            made.device = _WARPS_GPU
+        return made
+
+    def run(self, kernel: Any, start: int, count: int, inputs: Any, device: Any, stream: Any) -> None:
+        where, arrays = GPU if device == GPU else CPU, []
+        for value in inputs:
+            if isinstance(value, launch.wp.array) and value.device is _WARPS_GPU:
+                arrays.append(value)
+            held = getattr(value, "_held", None)
+            for tensor in held.values() if held is not None else [getattr(value, "_tensor", getattr(value, "_ref", None))]:
+                if isinstance(tensor, Tensor) and tensor.numel() and place(tensor) != where:
+                    raise RuntimeError(f"{kernel.key}: an array lies on {place(tensor)}, the kernel on {where}")
+        for value in arrays:
+            value.device = launch.wp.get_device("cpu")
+        self._run(kernel, start, count, inputs, "cpu", None)
+        for value in arrays:
+            value.device = _WARPS_GPU
+
+
+@contextmanager
+def pretended() -> Iterator[None]:
+    """While it lasts, there is a GPU."""
+    operations = _Operations()
+    kernels, to_torch, engine = _Kernels(), launch.wp.device_to_torch, torch.autograd._engine_run_backward
+
+    def backward(*args: Any, **kwargs: Any) -> Any:
+        operations.on_the_way_back = True
+        try:
+            with _Calls():  # which torch switches off while it looks for gradients
+                return engine(*args, **kwargs)
+        finally:
+            operations.on_the_way_back = False
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "_run", kernels.run)
+        patch.setattr(launch.wp, "from_torch", kernels.array)
+        patch.setattr(launch.wp, "device_from_torch", lambda device: device)
+        patch.setattr(launch.wp, "device_to_torch", lambda device: "cuda:0" if device is _WARPS_GPU else to_torch(device))
+        patch.setattr(launch.wp, "stream_from_torch", lambda device: None)
+        patch.setattr(torch.cuda, "synchronize", lambda *_: None)
+        patch.setattr(torch.autograd, "_engine_run_backward", backward)
+        with _Calls(), operations:
+            yield
