@@ -466,8 +466,10 @@ class Render:
     drawn: Tensor | None = None
 
 
-def scene_to(value: T, dtype: torch.dtype, device: torch.device | str | None = None) -> T:
-    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`."""
+def scene_to(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
+    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they are
+    where that is None.
+    """
     converted: Any = value
     if isinstance(value, Tensor):
         converted = value.to(device=device, dtype=dtype if value.is_floating_point() else None)

@@ -47,7 +47,7 @@ class DrawnViews:
         shown = with_regions(shown_boxes(benign.render), targets)
         found = judge(View(targets, shown, benign.detections), objective.t_star).found
         count = len(objective.space.scene.objects)
-        return cls(objective, nuisances, stream, (found & ~targets.ignore)[:count])
+        return cls(objective, nuisances, stream, (found & ~targets.ignore.to(found.device))[:count])
 
     @property
     def differentiable(self) -> bool:
@@ -75,7 +75,7 @@ class DrawnViews:
         soft = self.soft(leaf, number)
         self.objective.passes += GRADIENT_PASSES
         counts = torch.isfinite(soft)
-        total = (weights[counts].to(soft) * soft[counts]).sum()
+        total = (weights.to(soft)[counts] * soft[counts]).sum()
         if not total.requires_grad:  # nothing counts there
             return soft.detach(), torch.zeros_like(theta)
         (gradient,) = torch.autograd.grad(total, leaf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torch import Tensor
 
 from drivesem.settings.blocks import DEMO
@@ -13,7 +15,7 @@ from drivesem.truth.redraw.photograph import PhotographRedraw
 from drivesem.truth.redraw.plans import DemoPlans, FolderPlans, Plans
 from drivesem.truth.redraw.screen import shared_screen
 from scene_ir.errors import FormatError
-from scene_ir.types import SceneIR
+from scene_ir.types import SceneIR, scene_to
 
 
 class Exchanged:
@@ -37,6 +39,26 @@ class Exchanged:
     def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
         """See `PhotographRedraw`."""
         return self._after.not_carried(changed)
+
+
+class OnProcessor:
+    """Of a scene on a GPU: second renderers draw on the processor; their pictures go where the scene lies."""
+
+    def __init__(self, renderer: SecondRenderer) -> None:
+        self._renderer = renderer
+
+    @property
+    def name(self) -> str:
+        return self._renderer.name
+
+    def redraw(self, changed: SceneIR) -> Redrawn:
+        """A state of the scene."""
+        drawn = self._renderer.redraw(scene_to(changed, None, "cpu"))
+        return replace(drawn, image=drawn.image.to(changed.photograph.device))
+
+    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+        """What of a change `redraw` leaves out."""
+        return self._renderer.not_carried(scene_to(changed, None, "cpu"))
 
 
 class SecondRenderers:
@@ -70,6 +92,8 @@ class SecondRenderers:
             shared_screen()
 
     def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+        if scene.photograph.is_cuda:
+            return OnProcessor(self._made(identifier, scene_to(scene, None, "cpu")))
         if scene.before is not None:
             return Exchanged(identifier, scene)
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
