@@ -79,7 +79,7 @@ class _Descent:
         steps = max((search.left - FINAL_PASSES) // cost, 0)
         slope = torch.zeros_like(place)
         track: list[Tensor] = []
-        margins = torch.full((len(search.views.judged),), FAR)
+        margins = torch.full((len(search.views.judged),), FAR, device=place.device)
         for step in range(steps):
             number, part = search.number(), torch.zeros_like(place)
             if bool((~wide).any()):

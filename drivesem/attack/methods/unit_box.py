@@ -36,10 +36,10 @@ class UnitBox:
             first[:, group.where] = block
             blocks.append(first)
             start.append(at)
-            own = torch.arange(count) if group.owners else torch.tensor([-1])
+            own = (torch.arange(count) if group.owners else torch.tensor([-1])).to(block.device)
             owners.append(own.repeat_interleave(len(block) // count))
             holders.append(own.repeat_interleave(size // count))
-            wide.append(torch.full((len(block),), not group.smooth))
+            wide.append(torch.full((len(block),), not group.smooth, device=block.device))
         self._matrix = torch.cat(blocks)
         self.start = torch.cat(start)
         self._offset = theta0 - self.start @ self._matrix
