@@ -206,6 +206,12 @@ class Predictor(Protocol):
 
 
 @torch.no_grad()
+def device_of(predictor: Predictor) -> torch.device:
+    """Where a detector's weights lie, and its images must; the processor, where it has none that are known."""
+    known = [*predictor.parameters(), *predictor.buffers()] if isinstance(predictor, nn.Module) else []
+    return known[0].device if known else torch.device("cpu")
+
+
 def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
     """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each. Images that are too many
     for the device's memory are looked at in halves.

@@ -468,18 +468,20 @@ class Render:
 
 def scene_to(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
     """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they are
-    where that is None.
+    where that is None. What does not change is not copied.
     """
     converted: Any = value
     if isinstance(value, Tensor):
         converted = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
     elif isinstance(value, tuple):
-        converted = tuple(scene_to(v, dtype, device) for v in value)
+        parts = tuple(scene_to(part, dtype, device) for part in value)
+        converted = value if all(a is b for a, b in zip(parts, value, strict=True)) else parts
     elif is_dataclass(value) and not isinstance(value, type):
-        changes = {
+        parts = {
             f.name: scene_to(getattr(value, f.name), dtype, device)
             for f in fields(value)
             if not isinstance(getattr(value, f.name), (int, float, str, Mapping, type(None)))
         }
-        converted = replace(value, **changes)
+        changes = {name: part for name, part in parts.items() if part is not getattr(value, name)}
+        converted = replace(value, **changes) if changes else value
     return converted

@@ -22,9 +22,10 @@ from scene_ir.raster import launch
 
 GPU, CPU = torch.device("cuda:0"), torch.device("cpu")
 _EITHER = torch.device("meta")
-"""Of zeros that torch itself makes on the way back, where a gradient is missing: they lie where they are needed."""
+"""Of what torch itself makes within an operation, such as zeros for a gradient that is missing: it lies where it is
+needed."""
 _WARPS_GPU = SimpleNamespace(is_cuda=True)
-_MADE = ("zeros", "ones", "empty", "full", "arange", "linspace", "eye", "rand", "randn", "tensor")
+_MADE = ("zeros", "ones", "empty", "full", "arange", "linspace", "eye", "rand", "randn", "randint", "randperm", "tensor")
 _ANY_INDEX = ("aten::index.Tensor", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 _COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
 _NO_SCALARS = ("aten::cat", "aten::stack")
@@ -67,8 +68,6 @@ def _moved(tensor: Tensor, where: torch.device) -> Tensor:
 class _Operations(TorchDispatchMode):
     """Every operation, those of gradients too: which of its tensors lie where."""
 
-    on_the_way_back = False
-
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         name = func._schema.name
@@ -78,8 +77,7 @@ class _Operations(TorchDispatchMode):
         outcome = func(*args, **(kwargs or {}))
         own = [t for t in given if t.ndim] or given
         first = own[0] if name in _ANY_INDEX or name in _COPIES else None
-        none = _EITHER if not given and self.on_the_way_back else CPU
-        where = place(first) if first is not None else GPU if there else none
+        where = place(first) if first is not None else GPU if there else CPU if given else _EITHER
         known = {id(_storage(t)) for t in given}
         for leaf in tree_leaves(outcome):
             if isinstance(leaf, Tensor) and id(_storage(leaf)) not in known:
@@ -101,7 +99,7 @@ class _Calls(TorchFunctionMode):
         kwargs = dict(kwargs or {})
         name, of = getattr(func, "__name__", ""), getattr(func, "__self__", None)
         if name == "__get__" and of is torch.Tensor.device:
-            return place(args[0])
+            return CPU if place(args[0]) == _EITHER else place(args[0])
         if name == "__get__" and of is torch.Tensor.is_cuda:
             return place(args[0]) == GPU
         if name in ("numpy", "__array__") and place(args[0]) == GPU:
@@ -183,16 +181,11 @@ class _Kernels:
 @contextmanager
 def pretended() -> Iterator[None]:
     """While it lasts, there is a GPU."""
-    operations = _Operations()
     kernels, to_torch, engine = _Kernels(), launch.wp.device_to_torch, torch.autograd._engine_run_backward
 
     def backward(*args: Any, **kwargs: Any) -> Any:
-        operations.on_the_way_back = True
-        try:
-            with _Calls():  # which torch switches off while it looks for gradients
-                return engine(*args, **kwargs)
-        finally:
-            operations.on_the_way_back = False
+        with _Calls():  # which torch switches off while it looks for gradients
+            return engine(*args, **kwargs)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(launch, "_run", kernels.run)
@@ -201,6 +194,7 @@ def pretended() -> Iterator[None]:
         patch.setattr(launch.wp, "device_to_torch", lambda device: "cuda:0" if device is _WARPS_GPU else to_torch(device))
         patch.setattr(launch.wp, "stream_from_torch", lambda device: None)
         patch.setattr(torch.cuda, "synchronize", lambda *_: None)
+        patch.setattr(torch.cuda, "get_device_name", lambda *_: "pretended")
         patch.setattr(torch.autograd, "_engine_run_backward", backward)
-        with _Calls(), operations:
+        with _Calls(), _Operations():
             yield

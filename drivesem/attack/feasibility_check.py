@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_ir.types import SceneIR
+from scene_ir.types import SceneIR, scene_to
 
 Array = NDArray[np.float64]
 JudgeName = Literal["open3d", "outlines"]
@@ -140,6 +140,7 @@ def check_scene(
     `base`. Empty where the change is feasible.
     """
     judge = _Outlines() if by == "outlines" else _judge()
+    base, perturbed = (scene_to(scene, None, "cpu") for scene in (base, perturbed))
     if len(base.objects) != len(perturbed.objects):
         return [f"objects: {len(base.objects)} before, {len(perturbed.objects)} after"]
     found = _unchanged(base, perturbed) + check_reach(base, perturbed, reach)
@@ -163,7 +164,7 @@ def check_exchange(scene: SceneIR, by: JudgeName | None = None) -> list[str]:
     if scene.before is None:
         return []
     judge = _Outlines() if by == "outlines" else _judge()
-    base, rest = scene.before.at_rest(), scene.at_rest()
+    base, rest = (scene_to(state.at_rest(), None, "cpu") for state in (scene.before, scene))
     rows = range(len(rest.objects))
     before, after = ([_Car(state, i) for i in rows] for state in (base, rest))
     road = base.environment.road.numpy().astype(np.float64)
@@ -187,6 +188,7 @@ def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list
     What only an attack is bound to, how far a car may go and turn, is not looked at. Outlines judge, on every
     machine: an edit waits for no library, and a scene drawn at random is the same everywhere.
     """
+    base, perturbed = (scene_to(scene, None, "cpu") for scene in (base, perturbed))
     before = {i: _Car(base, i) for i in rows}
     after = {i: _Car(perturbed, i) for i in before}
     road = base.environment.road.numpy().astype(np.float64)

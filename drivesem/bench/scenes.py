@@ -91,7 +91,7 @@ class Placed:
             faces.append(mesh.faces + corners)
             corners += mesh.vertices.shape[0]
             ends.append((corners, ends[-1][1] + mesh.faces.shape[0]))
-        edges = torch.tensor(ends, dtype=torch.int64)
+        edges = torch.tensor(ends, dtype=torch.int64, device=scene.photograph.device)
         all_points = torch.cat(points)
         ranges = torch.stack([edges[:-1], edges[1:]], dim=1)
         return cls(

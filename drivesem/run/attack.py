@@ -57,7 +57,7 @@ from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import SceneIR, scene_to
+from scene_ir.types import SceneIR
 
 PEERS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures: what is confirmed of one is shown to another."""
@@ -261,7 +261,6 @@ class Worker:
             keep_mb=config.keep_mb,
             changes=self.changes,
         )
-        scene = scene_to(scene, None, config.device)
         try:
             return attack_scene(identifier, scene, self.detector, settings)
         except (RangeError, ShapeError) as error:

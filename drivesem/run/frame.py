@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from detectors.base import Predictor
+from detectors.base import Predictor, device_of
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
 from drivesem.attack.budgets import reach_of
@@ -46,7 +46,7 @@ from scene_ir.exchange import CHANGE
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Render, SceneIR
+from scene_ir.types import Render, SceneIR, scene_to
 
 RESULT = "result.json"
 """The file that marks a frame as done."""
@@ -101,12 +101,13 @@ class AttackedScene:
 
 
 def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> AttackedScene:
-    """Attack one scene. Nothing is written.
+    """Attack one scene, where the detector is. Nothing is written.
 
     Raises SceneError where the scene cannot be used, or a loss or gradient is not finite; DetectorError where the
     detector knows no cars.
     """
     start = time.perf_counter()
+    scene = scene_to(scene, None, device_of(detector))
     posed, attack = _Posed.of(identifier, scene, detector, settings), settings.attack
     aside = 0
     if settings.changes is not None and isinstance(attack, OfMargins):

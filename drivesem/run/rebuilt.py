@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from detectors.base import Predictor
+from detectors.base import Predictor, device_of
 from drivesem.attack.aims import Aim
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.labels import Difficulty
@@ -21,6 +21,7 @@ from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import scene_to
 
 
 def rebuilt(
@@ -35,7 +36,7 @@ def rebuilt(
     The saved scene carries the one it was made from, so that neither the data set nor its de-rendering is needed.
     Raises FormatError.
     """
-    scene = load_scene(folder / "scene").at_rest()
+    scene = scene_to(load_scene(folder / "scene").at_rest(), None, device_of(detector))
     space = ParameterSpace(scene, params, budget_of(attack.budget), parametrisation=attack.parametrisation)
     if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")

@@ -63,8 +63,8 @@ class Classifier(nn.Module, ABC):
         return self.encode((images - self.mean) / self.std)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]."""
-        return self.last(self.embed(images))
+        """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1], wherever they lie."""
+        return self.last(self.embed(images.to(self.mean))).to(images)
 
     def own_name(self, published: str) -> str:
         """What a tensor of the published weights is called here."""
