@@ -15,7 +15,7 @@ from torch import nn
 
 from detectors import ensemble, planted
 from detectors.adapters import choose
-from detectors.base import Detector, DetectorError, Predictor
+from detectors.base import Detector, DetectorError, Predictor, compute_exactly
 from detectors.reading import read_file, read_text
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
@@ -86,6 +86,7 @@ def load_detector(
     Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
     to another architecture; the message names the file, what was expected and what was found.
     """
+    compute_exactly(device)
     if str(name_or_path).startswith(planted.PREFIX):
         fault, inner = planted.parts_of(str(name_or_path))
         return planted.PlantedDetector(load_detector(inner, device, gradient_precision), fault).requires_grad_(

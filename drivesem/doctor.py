@@ -88,7 +88,7 @@ PARTS = (
     Part("presets", "--config NAME", "pip install --force-reinstall drivesem", _PRESETS),
     Part(
         "GPU",
-        "--device cuda: faster detectors and training",
+        "--device cuda: faster searches, detectors and training",
         "a build of torch for your GPU (pytorch.org/get-started)",
         _GPU,
     ),

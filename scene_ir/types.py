@@ -467,8 +467,8 @@ class Render:
 
 
 def scene_to(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
-    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they are
-    where that is None. What does not change is not copied.
+    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they
+    are where that is None. What does not change is not copied.
     """
     converted: Any = value
     if isinstance(value, Tensor):

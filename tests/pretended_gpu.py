@@ -1,7 +1,7 @@
 """A GPU that is pretended: tensors that are made for "cuda" lie on the processor and say that they do not.
 
-What a real one refuses is refused here: operations whose tensors lie on both, a kernel's array that lies elsewhere,
-NumPy's view of one. So whoever has no GPU finds what was forgotten where one is meant.
+What a real one refuses is refused here: operations whose tensors lie on both, a kernel's array that lies
+elsewhere, NumPy's view of one. So whoever has no GPU finds what was forgotten where one is meant.
 """
 
 from __future__ import annotations
@@ -22,10 +22,23 @@ from scene_ir.raster import launch
 
 GPU, CPU = torch.device("cuda:0"), torch.device("cpu")
 _EITHER = torch.device("meta")
-"""Of what torch itself makes within an operation, such as zeros for a gradient that is missing: it lies where it is
-needed."""
+"""Of what torch itself makes within an operation, such as zeros for a gradient that is missing: it lies where it
+is needed."""
 _WARPS_GPU = SimpleNamespace(is_cuda=True)
-_MADE = ("zeros", "ones", "empty", "full", "arange", "linspace", "eye", "rand", "randn", "randint", "randperm", "tensor")
+_MADE = (
+    "zeros",
+    "ones",
+    "empty",
+    "full",
+    "arange",
+    "linspace",
+    "eye",
+    "rand",
+    "randn",
+    "randint",
+    "randperm",
+    "tensor",
+)
 _ANY_INDEX = ("aten::index.Tensor", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 _COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
 _NO_SCALARS = ("aten::cat", "aten::stack")
@@ -168,7 +181,9 @@ class _Kernels:
             if isinstance(value, launch.wp.array) and value.device is _WARPS_GPU:
                 arrays.append(value)
             held = getattr(value, "_held", None)
-            for tensor in held.values() if held is not None else [getattr(value, "_tensor", getattr(value, "_ref", None))]:
+            for tensor in (
+                held.values() if held is not None else [getattr(value, "_tensor", getattr(value, "_ref", None))]
+            ):
                 if isinstance(tensor, Tensor) and tensor.numel() and place(tensor) != where:
                     raise RuntimeError(f"{kernel.key}: an array lies on {place(tensor)}, the kernel on {where}")
         for value in arrays:
@@ -191,7 +206,9 @@ def pretended() -> Iterator[None]:
         patch.setattr(launch, "_run", kernels.run)
         patch.setattr(launch.wp, "from_torch", kernels.array)
         patch.setattr(launch.wp, "device_from_torch", lambda device: device)
-        patch.setattr(launch.wp, "device_to_torch", lambda device: "cuda:0" if device is _WARPS_GPU else to_torch(device))
+        patch.setattr(
+            launch.wp, "device_to_torch", lambda device: "cuda:0" if device is _WARPS_GPU else to_torch(device)
+        )
         patch.setattr(launch.wp, "stream_from_torch", lambda device: None)
         patch.setattr(torch.cuda, "synchronize", lambda *_: None)
         patch.setattr(torch.cuda, "get_device_name", lambda *_: "pretended")

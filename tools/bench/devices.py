@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from detectors import boxes
 from detectors.base import Detector
 from detectors.registry import load_detector
 from detectors.types import Detections
@@ -44,8 +45,8 @@ METHOD = (
     "by the detector and differentiated on --device and on the processor. PSNR of one picture to the other, the "
     "least of the frames; pixels off by more than 1 of 255; loss (objectness) and its gradient by parameter, the "
     "least cosine; device beside itself: the least cosine of two gradients at the same theta, whose sums run in "
-    "another order; detections over t*, matched in order of scores. Milliseconds of loss and gradient: medians of "
-    "10 after 2, the two in turn."
+    "another order; detections over t*, each beside the one that it meets best. Milliseconds of loss and "
+    "gradient: medians of 10 after 2, the two in turn."
 )
 QUICK_FRAMES, FULL_FRAMES = 2, 12
 STATES = {
@@ -138,10 +139,12 @@ def _random(space: ParameterSpace, seed: int) -> Tensor:
 
 @torch.no_grad()
 def _looked(objective: Objective, theta: Tensor) -> tuple[Tensor, Detections]:
-    """The picture (3, H, W) at theta, on the processor, and what is found in it."""
+    """The picture (3, H, W) at theta, on the processor, and what is found in it, from t* on."""
     scene = objective.space.apply(objective.space.scene, theta)
     render = objective.compositor.render(scene)
-    return render.image.cpu(), objective.look(scene, render).detections
+    found = objective.look(scene, render).detections
+    counts = found.scores >= objective.t_star
+    return render.image.cpu(), Detections(found.boxes_xyxy[counts], found.labels[counts], found.scores[counts])
 
 
 def _cosine(first: Tensor, second: Tensor) -> float:
@@ -152,13 +155,13 @@ def _cosine(first: Tensor, second: Tensor) -> float:
 
 
 def _apart(first: Detections, second: Detections) -> tuple[float, float]:
-    """How far scores and boxes, px, of detections are apart, matched in order of their scores."""
-    both = min(len(first), len(second))
-    if not both:
+    """How far scores and boxes, px, of detections are apart from those that they meet best."""
+    if not len(first) or not len(second):
         return 0.0, 0.0
-    scores = first.scores[:both] - second.scores[:both].cpu()
-    boxes = first.boxes_xyxy[:both] - second.boxes_xyxy[:both].cpu()
-    return float(scores.abs().max()), float(boxes.abs().max())
+    best = boxes.iou_matrix(first.boxes_xyxy, second.boxes_xyxy.cpu()).argmax(dim=1)
+    scores = first.scores - second.scores.cpu()[best]
+    corners = first.boxes_xyxy - second.boxes_xyxy.cpu()[best]
+    return float(scores.abs().max()), float(corners.abs().max())
 
 
 def summary(rows: Sequence[DeviceRow]) -> list[dict[str, Any]]:

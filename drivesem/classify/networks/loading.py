@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import detectors.registry
+from detectors.base import compute_exactly
 from detectors.reading import read_state
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
@@ -99,6 +100,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 def ready(network: Classifier, device: str = "cpu") -> Classifier:
     """Frozen, in eval mode, channels-last."""
+    compute_exactly(device)
     network.requires_grad_(False)
     return network.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 

@@ -1,0 +1,135 @@
+"""Commands with --device cuda, on a GPU that is pretended: nothing is forgotten on the processor, and what they
+find is what the processor finds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from detectors.registry import load_detector
+from drivesem.cli import main
+from scene_ir.raster import launch
+from scene_ir.raster.kernels import unpack_kernel
+from tests.pretended_gpu import CPU, GPU, place, pretended
+
+ALL = "color,weather,foliage,translate,rotate,mesh"
+ATTACKS = {
+    "si-fgsm": ["--params", ALL, "--steps", "2"],
+    "corners": ["--combo", "2", "--method", "corners", "--passes", "30"],
+    "yolov3-slim": ["--combo", "2", "--steps", "1", "--detector", "yolov3-slim"],
+    "ensemble": ["--combo", "2", "--steps", "1", "--detector", "ensemble:squeezedet+yolov3-slim"],
+    "planted": ["--combo", "2", "--steps", "1", "--detector", "planted:height_px=20:60@squeezedet"],
+}
+
+
+@pytest.fixture(autouse=True)
+def exact() -> Iterator[None]:
+    before = torch.backends.cudnn.allow_tf32
+    yield
+    torch.backends.cudnn.allow_tf32 = before
+
+
+def run(words: Sequence[str], out: Path, device: str) -> None:
+    assert main([*words, "--workers", "1", "--device", device, "--out", str(out)]) == 0
+
+
+def on_both(words: Sequence[str], folder: Path) -> tuple[Path, Path]:
+    run(words, folder / "cpu", "cpu")
+    with pretended():
+        run(words, folder / "gpu", "cuda")
+    return folder / "cpu", folder / "gpu"
+
+
+def results(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(path.read_text()) for path in sorted(out.glob("frames/*/result.json"))]
+
+
+def test_the_pretended_one_refuses_what_a_real_one_does() -> None:
+    with pretended():
+        there, here = torch.ones(3, device="cuda"), torch.ones(3)
+        assert (there * 2).device == GPU
+        assert (there + here[0]).is_cuda  # a number may lie anywhere
+        assert there.new_tensor([1.0]).is_cuda
+        assert there[here > 0].is_cuda
+        assert there.cpu().device == CPU
+        for mixed in (lambda: there + here, lambda: here[there > 0], lambda: torch.cat([there, here])):
+            with pytest.raises(RuntimeError, match="cuda"):
+                mixed()
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+        with pytest.raises(RuntimeError, match="array lies on"):
+            launch.launch(unpack_kernel, [0, 3], [launch.array(here)] * 3, (), GPU)
+
+
+def test_gradients_come_back_to_where_their_tensors_lie() -> None:
+    leaf = torch.ones(3, requires_grad=True)
+    with pretended():
+        first, second = (leaf.to("cuda") * 2).split([1, 2])
+        assert first.is_cuda
+        (gradient,) = torch.autograd.grad(second.sum(), leaf)
+        assert gradient.device == CPU
+        assert place(second) == GPU
+    assert gradient.tolist() == [0, 2, 2]
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack_finds_what_it_finds_on_the_processor(name: str, tmp_path: Path) -> None:
+    here, there = (results(out)[0] for out in on_both(["attack", *ATTACKS[name], "--limit", "1"], tmp_path))
+    first, second = ([c["value"] for c in one["theta"]] for one in (here, there))
+    np.testing.assert_allclose(second, first, atol=1e-4)
+    np.testing.assert_allclose(there["loss_trace"], here["loss_trace"], rtol=1e-3)
+    for told in ("queries", "success_moved", "success_paper", "violations"):
+        assert here[told] == there[told]
+    scores = [[found["score"] for found in one["detections_attacked"]] for one in (here, there)]
+    np.testing.assert_allclose(scores[1], scores[0], atol=1e-3)
+
+
+def test_a_classifier_is_attacked_as_on_the_processor(tmp_path: Path) -> None:
+    here, there = on_both(["classify", "attack", "--limit", "2"], tmp_path)
+    for mine, other in zip(results(here), results(there), strict=True):
+        assert (mine["label"], mine["grade"], mine["queries"]) == (
+            other["label"],
+            other["grade"],
+            other["queries"],
+        )
+        np.testing.assert_allclose(other["loss_trace"], mine["loss_trace"], rtol=1e-3)
+
+
+def test_a_gpu_convolves_in_float32() -> None:
+    torch.backends.cudnn.allow_tf32 = True
+    with pretended():
+        load_detector("squeezedet", "cuda")
+    assert not torch.backends.cudnn.allow_tf32
+
+
+@pytest.mark.slow
+def test_questions_on_a_run(tmp_path: Path) -> None:
+    """A certain failure looked around, explained, drawn again and shown to another detector."""
+    found = tmp_path / "found"
+    words = [
+        "attack",
+        "--params",
+        ALL,
+        "--method",
+        "climb",
+        "--passes",
+        "40",
+        "--budget",
+        "street",
+        "--limit",
+        "1",
+    ]
+    with pretended():
+        run(words, found, "cuda")
+        assert results(found)[0]["failures"]
+        for question in ("explain", "confirm", "holes"):
+            run([question, str(found)], tmp_path / question, "cuda")
+        run(["gate", str(found), "--before", "squeezedet", "--after", "squeezedet"], tmp_path / "gate", "cuda")
+        run(["transfer", str(found), "--detectors", "squeezedet"], tmp_path / "transfer", "cuda")
