@@ -22,7 +22,7 @@ from tests.pretended_gpu import CPU, GPU, place, pretended
 ALL = "color,weather,foliage,translate,rotate,mesh"
 ATTACKS = {
     "si-fgsm": ["--params", ALL, "--steps", "2"],
-    "corners": ["--combo", "2", "--method", "corners", "--passes", "30"],
+    "climb": ["--combo", "2", "--method", "climb", "--passes", "60"],
     "yolov3-slim": ["--combo", "2", "--steps", "1", "--detector", "yolov3-slim"],
     "ensemble": ["--combo", "2", "--steps", "1", "--detector", "ensemble:squeezedet+yolov3-slim"],
     "planted": ["--combo", "2", "--steps", "1", "--detector", "planted:height_px=20:60@squeezedet"],
