@@ -79,7 +79,9 @@ def test_gradients_come_back_to_where_their_tensors_lie() -> None:
     assert gradient.tolist() == [0, 2, 2]
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "climb" else []) for name in ATTACKS]
+)
 def test_an_attack_finds_what_it_finds_on_the_processor(name: str, tmp_path: Path) -> None:
     here, there = (results(out)[0] for out in on_both(["attack", *ATTACKS[name], "--limit", "1"], tmp_path))
     first, second = ([c["value"] for c in one["theta"]] for one in (here, there))

@@ -56,8 +56,9 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
     100, with --quick 12; that moves does, by default 80, with --quick 6; that depth does, by default 40, with
-    --quick 6; that weather and foliage do, by default 24, with --quick 4; that label-free and parts look at, by
-    default 60, with --quick 12; or that eval counts, by default 20,000, with --quick 1,000."""
+    --quick 6; that weather and foliage do, by default 24, with --quick 4; that devices draws, by default 12, with
+    --quick 2; that label-free and parts look at, by default 60, with --quick 12; or that eval counts, by default
+    20,000, with --quick 1,000."""
     ablate: Flag = False
     """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
     fast: Flag = False
@@ -65,7 +66,7 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of one, or
+    """Of devices, found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of one, or
     onnx:FILE, a detector that was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """Of found, label-free, parts, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1,
