@@ -66,8 +66,8 @@ class BenchTool(Tiles, DataSource, FrameCommand):
     threads: Count | None = None
     """Threads of torch and of the kernels; by default as many as torch chooses."""
     detector: str = "squeezedet"
-    """Of devices, found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of one, or
-    onnx:FILE, a detector that was trained elsewhere."""
+    """Of devices, found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of
+    one, or onnx:FILE, a detector that was trained elsewhere."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """Of found, label-free, parts, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1,
     vkitti2, coco or yolo."""
