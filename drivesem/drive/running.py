@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from torch import Tensor
 
+from detectors.base import device_of
 from detectors.types import CLASSES
 from drivesem.attack.budgets import budget_of, reach_of
 from drivesem.attack.feasibility_check import Reach, check_scene
@@ -48,6 +49,7 @@ from drivesem.truth.grades import Grade
 from drivesem.truth.redraw.compositor import CompositorDraw
 from scene_ir import files
 from scene_ir.io import to_uint8
+from scene_ir.types import scene_to
 
 RESULT, PAGE, VIDEO, SCENES = "drive.json", "report.html", "clip.webm", "scenes"
 _WRITTEN = (RESULT, PAGE, VIDEO, SCENES, FRAMES, "drive.csv", "drive.md")
@@ -70,8 +72,9 @@ def drive_run(config: Drive) -> Answer:
     claim(out, config, _WRITTEN, _FREE)
     if config.resume and (out / RESULT).is_file():
         return answer_of(from_json(DriveResult, files.read_json(out / RESULT), str(out / RESULT)))
-    clip = take_clip(taker, config)
     detector, budget = worker.detector, budget_of(asked.budget)
+    clip = take_clip(taker, config)
+    clip = replace(clip, scenes=scene_to(clip.scenes, None, device_of(detector)))
     objective = ClipObjective(clip, detector, params, budget, config)
     problem, theta0 = objective.problem(config.keep == "last"), objective.space.theta0
     seen, control = _Seen(clip, objective, out), theta0

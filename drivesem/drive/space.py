@@ -43,7 +43,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         like = spaces[0].scene.objects.translation
         super().__init__(spaces[0].params, _specs(self.points), len(self.tracks), like)
         places = ([self.tracks.index(track) for track in of_frame] for of_frame in tracks)
-        self.rows = [torch.tensor(of_frame, dtype=torch.int64) for of_frame in places]
+        self.rows = [torch.tensor(of_frame, dtype=torch.int64, device=like.device) for of_frame in places]
         self._weights = _path_weights(self.tracks, tracks, self.points, like)
         self.lower.fill_(-torch.inf)
         self.upper.fill_(torch.inf)
@@ -149,7 +149,7 @@ def project(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> Pro
     theta = torch.minimum(torch.maximum(theta.detach(), space.lower), space.upper)
     active: list[str] = []
     for attempt in range(_ROUNDS + space.count + 1):
-        offenders = torch.zeros(space.count, dtype=torch.bool)
+        offenders = torch.zeros(space.count, dtype=torch.bool, device=theta.device)
         held = False
         for frame, feasible in enumerate(sets):
             asked = space.of_frame(theta, frame)
@@ -169,7 +169,7 @@ def project(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> Pro
 
 def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:
     """(n,) bool: objects of a frame of which two thetas (D',) differ."""
-    found = torch.zeros(space.count, dtype=torch.bool)
+    found = torch.zeros(space.count, dtype=torch.bool, device=one.device)
     for parameter in space.params:
         if SPECS[parameter].per_object:
             a, b = space.block(one, parameter), space.block(other, parameter)

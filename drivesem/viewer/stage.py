@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from detectors import boxes
-from detectors.base import Predictor
+from detectors.base import Predictor, device_of
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.objective import Objective, Rendered
@@ -27,7 +27,7 @@ from drivesem.report.tables import number_of
 from drivesem.viewer.knobs import Knobs, State
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.render.compositor import Compositor
-from scene_ir.types import Category, Render, SceneIR
+from scene_ir.types import Category, Render, SceneIR, scene_to
 
 QUALITY = 92
 """Of JPEG files."""
@@ -59,7 +59,7 @@ class Stage:
     @torch.no_grad()
     def __init__(self, folder: Path, detector: Predictor, budget: Budget, t_star: float | None) -> None:
         self.folder = folder
-        self.knobs = Knobs(load_scene(folder), budget)
+        self.knobs = Knobs(scene_to(load_scene(folder), None, device_of(detector)), budget)
         space = self.knobs.space
         self.objective = Objective(Compositor(self.knobs.rest), space, detector, t_star=t_star)
         benign = self.objective.benign
@@ -178,7 +178,7 @@ class Stage:
         transparent, and pale where there is no road: what stands there is smeared over the ground.
         """
         x0, x1, z0, z1 = self.street_m()
-        rest = self.knobs.rest
+        rest = scene_to(self.knobs.rest, None, "cpu")
         columns, rows = (max(round((b - a) * _PIXELS_PER_M), 1) for a, b in ((x0, x1), (z0, z1)))
         x, z = np.meshgrid(
             x0 + (np.arange(columns) + 0.5) / _PIXELS_PER_M, z1 - (np.arange(rows) + 0.5) / _PIXELS_PER_M

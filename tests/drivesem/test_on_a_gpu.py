@@ -14,7 +14,9 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
+from drivesem.attack.budgets import budget_of
 from drivesem.cli import main
+from drivesem.viewer.stage import Stage
 from scene_ir.raster import launch
 from scene_ir.raster.kernels import unpack_kernel
 from tests.pretended_gpu import CPU, GPU, place, pretended
@@ -109,6 +111,25 @@ def test_a_gpu_convolves_in_float32() -> None:
     with pretended():
         load_detector("squeezedet", "cuda")
     assert not torch.backends.cudnn.allow_tf32
+
+
+def test_a_scene_is_shown(tmp_path: Path) -> None:
+    run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
+    (scene,) = (tmp_path / "run").glob("frames/*/scene")
+    with pretended():
+        stage = Stage(scene, load_detector("squeezedet", "cuda"), budget_of("street"), None)
+        drawn = stage.drawn({})
+        assert all((stage.picture(drawn), stage.photograph(), stage.street()))
+        assert stage.seen({}, drawn)["cars"]
+        assert 0 < stage.score({}, 0, drawn)["score"] <= 1
+
+
+@pytest.mark.slow
+def test_a_clip(tmp_path: Path) -> None:
+    here, there = on_both(["drive", "--limit", "3", "--steps", "2"], tmp_path)
+    first, second = (json.loads((out / "drive.json").read_text()) for out in (here, there))
+    assert first["cars"] == second["cars"]
+    np.testing.assert_allclose(second["loss_trace"], first["loss_trace"], rtol=1e-3)
 
 
 @pytest.mark.slow
