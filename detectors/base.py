@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -205,11 +206,11 @@ class Predictor(Protocol):
         ...
 
 
-@torch.no_grad()
 def device_of(predictor: Predictor) -> torch.device:
     """Where a detector's weights lie, and its images must; the processor, where it has none that are known."""
-    known = [*predictor.parameters(), *predictor.buffers()] if isinstance(predictor, nn.Module) else []
-    return known[0].device if known else torch.device("cpu")
+    known = chain(predictor.parameters(), predictor.buffers()) if isinstance(predictor, nn.Module) else ()
+    first = next(iter(known), None)
+    return torch.device("cpu") if first is None else first.device
 
 
 def compute_exactly(device: str | torch.device) -> None:
@@ -218,6 +219,7 @@ def compute_exactly(device: str | torch.device) -> None:
         torch.backends.cudnn.allow_tf32 = False
 
 
+@torch.no_grad()
 def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
     """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each. Images that are too many
     for the device's memory are looked at in halves.

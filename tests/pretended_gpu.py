@@ -39,7 +39,7 @@ _MADE = (
     "randperm",
     "tensor",
 )
-_ANY_INDEX = ("aten::index.Tensor", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
+_ANY_INDEX = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 _COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
 _NO_SCALARS = ("aten::cat", "aten::stack")
 
@@ -86,7 +86,7 @@ class _Operations(TorchDispatchMode):
         name = func._schema.name
         there = [t for t in given if place(t) == GPU]
         if there and name not in _COPIES:
-            self._check(name, func, args, given)
+            self._check(name, given)
         outcome = func(*args, **(kwargs or {}))
         own = [t for t in given if t.ndim] or given
         first = own[0] if name in _ANY_INDEX or name in _COPIES else None
@@ -97,12 +97,12 @@ class _Operations(TorchDispatchMode):
                 _put(leaf, where)
         return outcome
 
-    def _check(self, name: str, func: Any, args: Any, given: list[Tensor]) -> None:
-        if name in _ANY_INDEX or str(func).startswith("aten.index."):
+    def _check(self, name: str, given: list[Tensor]) -> None:
+        if name in _ANY_INDEX:
             given = [given[0]] if place(given[0]) == GPU else given
         for tensor in given:
             if place(tensor) == CPU and (tensor.ndim or name in _NO_SCALARS):
-                raise RuntimeError(f"{func}: expected all tensors on the same device, found cuda:0 and cpu")
+                raise RuntimeError(f"{name}: expected all tensors on the same device, found cuda:0 and cpu")
 
 
 class _Calls(TorchFunctionMode):

@@ -78,3 +78,8 @@ def test_weights_that_cannot_be_written_are_named(tmp_path: Path, monkeypatch: p
         write_whole(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_predicted_carries_no_gradient() -> None:
+    images = torch.rand(2, 3, 4, 5, requires_grad=True)
+    assert not any(found.scores.requires_grad for found in predict(Few(2), images))

@@ -51,7 +51,7 @@ METHOD = (
 QUICK_FRAMES, FULL_FRAMES = 2, 12
 STATES = {
     "photograph": "color",
-    "combination 2": "color,weather,translate,rotate",
+    "combination 2": "translate,rotate,mesh",
     "all six": "color,weather,foliage,translate,rotate,mesh",
 }
 _SEED = 97
