@@ -378,8 +378,7 @@ class _Run:
     def save(self, path: Path, step: int) -> None:
         tensors = {f"weights.{n}": v.detach().contiguous() for n, v in self.detector.state_dict().items()}
         tensors |= {f"average.{n}": v.contiguous() for n, v in self.average.items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{key}": value.contiguous() for key, value in state.items()}
+        tensors |= {f"optimiser.{n}": v for n, v in state_of(self.optimiser).items()}
         facts = {
             "step": str(step),
             "seconds": repr(self.seconds),
@@ -410,11 +409,7 @@ class _Run:
         # Copied, so that the averages keep the layout of the weights.
         for name, value in self.average.items():
             value.copy_(sections["average"][name])
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in sections["optimiser"].items():
-            index, key = name.split(".", 1)
-            state.setdefault(int(index), {})[key] = tensor
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        restore(self.optimiser, sections["optimiser"])
         if self.scaler.is_enabled():
             self.scaler.load_state_dict(json.loads(facts["scaler"]))
         self.seconds = float(facts["seconds"])
@@ -485,6 +480,21 @@ def _settings_of(facts: Mapping[str, str]) -> dict[str, Any]:
 
 
 @torch.no_grad()
+def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """What an optimiser keeps of each parameter, by "INDEX.NAME"."""
+    state = optimiser.state_dict()["state"]
+    return {f"{index}.{key}": value.contiguous() for index, kept in state.items() for key, value in kept.items()}
+
+
+def restore(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Give an optimiser of the same parameters what `state_of` told."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        index, key = name.split(".", 1)
+        state.setdefault(int(index), {})[key] = tensor
+    optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
+
+
 def _copy_into(detector: Detector, values: Mapping[str, Tensor]) -> None:
     for name, own in detector.state_dict().items():
         own.copy_(values[name])

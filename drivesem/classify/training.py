@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from detectors.base import DetectorError
+from detectors.registry import read_weights, write_weights
+from detectors.training import CHECKPOINT, PRECISIONS, restore, state_of
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.embedded import open_objects
@@ -19,13 +23,15 @@ from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar, training_bar
 from drivesem.report.terminal import Console
-from drivesem.run.folder import claim, folder_of
+from drivesem.run.folder import PRESENTATION, claim, folder_of
 from drivesem.settings.commands import Classify
 from scene_ir import files
 
 PICTURES = "pictures"
 """Folder in --out where pictures are drawn, unless --data has them."""
 RECORD = "training.json"
+_FREE = tuple(name for name in PRESENTATION if name != "limit")
+"""Settings that a run may be gone on with; --limit says what is learnt."""
 _RATES = {"last": 3e-3, "all": 1e-4}
 _EMBEDDED_AT_A_TIME = 4
 """More is no faster on a CPU, and VGG-16's maps are so large that the system clears them anew each time."""
@@ -46,12 +52,14 @@ def train_run(config: Classify) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(config.seed)
     anew = config.layers == "all"
     network = to_train(config.network, config.weights, classes, generator, anew).to(config.device)
-    claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES))
+    claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]
     splits = {name: read_pictures(folder, name, classes) for name in ("train", "val", "test")}
-    fit = _fit_last if config.layers == "last" else _fit_all
-    curve, accuracy = fit(network, splits, config, generator)
+    if config.layers == "last":
+        curve, accuracy = _fit_last(network, splits, config, generator)
+    else:
+        curve, accuracy = _fit_all(network, splits, config, generator, out / CHECKPOINT)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
@@ -103,7 +111,7 @@ def fit_last(
             last.bias.add_(last.weight @ mean)
             last.weight.mul_(deviation)
 
-    def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
+    def batch(rows: Tensor, _: int) -> tuple[Tensor, Tensor]:
         return last(known["train"][rows]), labels["train"][rows]
 
     found = _fit(last, batch, lambda name: _accuracy(last(known[name]), labels[name]), labels, config, generator)
@@ -113,19 +121,31 @@ def fit_last(
     return found
 
 
-def _fit_all(network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator) -> _Fitted:
+def _fit_all(
+    network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator, checkpoint: Path
+) -> _Fitted:
+    """Fit all layers, each picture mirrored in half of all epochs."""
     labels = {name: labels.to(config.device) for name, (_, labels) in splits.items()}
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images, dtype = splits["train"][0], PRECISIONS[config.precision]
 
-    def batch(rows: Tensor) -> tuple[Tensor, Tensor]:
+    def batch(rows: Tensor, epoch: int) -> tuple[Tensor, Tensor]:
         network.train()
-        return network(splits["train"][0][rows].to(config.device).float() / 255), labels["train"][rows]
+        shown = images[rows].to(config.device).float() / 255
+        mirrored = torch.rand(len(rows), generator=generator) < 0.5
+        shown = torch.where(mirrored.to(shown.device).view(-1, 1, 1, 1), shown.flip(-1), shown)
+        if epoch <= config.half:
+            shown = F.avg_pool2d(shown, 2)
+        with torch.autocast(config.device.partition(":")[0], dtype, enabled=dtype != torch.float32):
+            scores = network(shown.contiguous(memory_format=torch.channels_last))
+        return scores.float(), labels["train"][rows]
 
     def accuracy(name: str) -> float:
         network.eval()
         features = embedded(network, splits[name][0], config.device, f"looking at {name}")
         return _accuracy(network.last(features), labels[name])
 
-    return _fit(network, batch, accuracy, labels, config, generator)
+    return _fit(network, batch, accuracy, labels, config, generator, checkpoint)
 
 
 @torch.no_grad()
@@ -135,26 +155,29 @@ def _accuracy(scores: Tensor, labels: Tensor) -> float:
 
 def _fit(
     module: nn.Module,
-    batch: Callable[[Tensor], tuple[Tensor, Tensor]],
+    batch: Callable[[Tensor, int], tuple[Tensor, Tensor]],
     accuracy: Callable[[str], float],
     labels: Mapping[str, Tensor],
     config: Classify,
     generator: torch.Generator,
+    checkpoint: Path | None = None,
 ) -> _Fitted:
-    """Adam, with a rate that falls in a half cosine. batch: scores and labels of some of the pictures of `train`;
-    accuracy: of a split; labels: by split.
+    """Adam, with a rate that falls in a half cosine. batch: scores and labels of some of the pictures of `train`,
+    in an epoch, of which the first is 1; accuracy: of a split; labels: by split; checkpoint: written after each
+    epoch, and gone on from.
     """
     count = len(labels["train"])
     optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
     steps = config.epochs * -(-count // config.batch)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    curve = []
+    state = _State(module, optimiser, schedule, generator)
+    curve = state.load(checkpoint) if checkpoint is not None and checkpoint.is_file() else []
     with progress_bar(Console(stderr=True)) as progress:
-        task = progress.add_task("training", total=steps)
-        for epoch in range(1, config.epochs + 1):
+        task = progress.add_task("training", total=steps, completed=steps * len(curve) // config.epochs)
+        for epoch in range(len(curve) + 1, config.epochs + 1):
             total = 0.0
             for rows in torch.randperm(count, generator=generator).split(config.batch):
-                scores, truth = batch(rows)
+                scores, truth = batch(rows, epoch)
                 loss = F.cross_entropy(scores, truth)
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
@@ -163,7 +186,48 @@ def _fit(
                 total += float(loss.detach()) * len(rows)
                 progress.advance(task)
             curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val")})
+            if checkpoint is not None:
+                state.save(checkpoint, curve)
     return curve, {name: accuracy(name) for name in labels}
+
+
+@dataclass(frozen=True)
+class _State:
+    """All that the next epoch depends on."""
+
+    module: nn.Module
+    optimiser: torch.optim.Optimizer
+    schedule: torch.optim.lr_scheduler.LRScheduler
+    generator: torch.Generator
+
+    def save(self, path: Path, curve: list[dict[str, float]]) -> None:
+        """curve: what each epoch came to so far."""
+        tensors = {f"weights.{name}": value.contiguous() for name, value in self.module.state_dict().items()}
+        tensors |= {f"optimiser.{name}": value for name, value in state_of(self.optimiser).items()}
+        # Dropout draws from torch's own generator, the order of pictures from this one.
+        tensors |= {"random.own": self.generator.get_state(), "random.torch": torch.get_rng_state()}
+        rates = json.dumps(self.schedule.state_dict())
+        write_weights(path, {"curve": json.dumps(curve), "schedule": rates}, tensors)
+
+    def load(self, path: Path) -> list[dict[str, float]]:
+        """What each epoch came to before the file was written. Raises DetectorError for what is no such file."""
+        facts, tensors = read_weights(path)
+        parts: dict[str, dict[str, Tensor]] = {"weights": {}, "optimiser": {}, "random": {}}
+        try:
+            for key, tensor in tensors.items():
+                part, _, name = key.partition(".")
+                parts[part][name] = tensor
+            self.module.load_state_dict(parts["weights"])
+            restore(self.optimiser, parts["optimiser"])
+            self.schedule.load_state_dict(json.loads(facts["schedule"]))
+            self.generator.set_state(parts["random"]["own"])
+            torch.set_rng_state(parts["random"]["torch"])
+            curve: list[dict[str, float]] = json.loads(facts["curve"])
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise DetectorError(f"{path}: expected a checkpoint of this network, found {error!r:.120}") from error
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.schedule.get_last_lr()[0]
+        return curve
 
 
 @torch.no_grad()

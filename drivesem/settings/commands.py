@@ -1141,6 +1141,10 @@ class Classify(FrameCommand):
     """Train: pictures a step."""
     rate: Annotated[float, POSITIVE] | None = None
     """Train: learning rate of Adam; by default 0.003 for the last layer, 0.0001 for all."""
+    half: NotNegative = 0
+    """Train, --layers all: in the first N epochs pictures have half their size, a quarter of the work."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Train, --layers all: what the network computes in; bfloat16 is faster where the processor has it."""
     params: str | None = None
     """Attack: what is changed, with commas: vertex, pose, lighting; by default pose,vertex, and pose alone for
     random and halton."""
@@ -1179,6 +1183,12 @@ class Classify(FrameCommand):
 
     def check(self) -> None:
         super().check()
+        whole = self.what == "train" and self.layers == "all"
+        refuse(self.half > 0 and not whole, "--half", "classify train --layers all", self.half)
+        refuse(self.half > self.epochs, "--half", f"at most --epochs, {self.epochs}", self.half)
+        refuse(
+            self.precision != "float32" and not whole, "--precision", "classify train --layers all", self.precision
+        )
         needless = self.weights is not None and self.what != "train"
         refuse(needless, "--weights", "classify train (an attack takes --network FILE)", f"classify {self.what}")
         refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
