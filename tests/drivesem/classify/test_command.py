@@ -132,6 +132,67 @@ def test_the_whole_network_can_be_trained(standins, tmp_path, capsys):
     assert not torch.equal(network.get_parameter("conv1.weight"), start.get_parameter("conv1.weight"))
 
 
+def test_training_goes_on_to_the_bit(standins, tmp_path, capsys, monkeypatch):
+    words = ("train", "--views", "left", "--limit", "3", "--layers", "all", "--epochs", "3", "--batch", "2")
+
+    def train(name, *more):
+        code, data, said = answer(capsys, *words, "--out", str(tmp_path / name), *more, "--json")
+        return code, data, said
+
+    _, whole, _ = train("whole")
+    saved = training._State.save
+
+    def dies(self, path, curve):
+        saved(self, path, curve)
+        if len(curve) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training._State, "save", dies)
+    code, _, _ = train("cut")
+    assert code != 0
+    assert not (tmp_path / "cut" / "squeezenet.safetensors").exists()
+    asked = []
+    monkeypatch.setattr(training._State, "save", lambda self, path, curve: asked.append(len(curve)))
+    _, cut, _ = train("cut")
+    assert asked == [3]
+    assert (cut["epochs"], cut["accuracy"]) == (whole["epochs"], whole["accuracy"])
+    weights = [(tmp_path / name / "squeezenet.safetensors").read_bytes() for name in ("whole", "cut")]
+    assert weights[0] == weights[1]
+    code, _, said = answer(capsys, *words[:3], "--limit", "2", *words[5:], "--out", str(tmp_path / "cut"))
+    assert code == 2
+    assert "limit" in said
+    files.write_bytes(
+        tmp_path / "cut" / "checkpoint.safetensors", (tmp_path / "cut" / "squeezenet.safetensors").read_bytes()
+    )
+    code, _, said = train("cut")
+    assert code == 2
+    assert "checkpoint.safetensors: expected a checkpoint of this network" in said
+
+
+def test_epochs_show_pictures_mirrored_and_at_half_the_size(standins, tmp_path, capsys, monkeypatch):
+    seen = []
+    embed = loading.SqueezeNet.embed
+
+    def watched(self, images):
+        if self.training:
+            seen.append(images)
+        return embed(self, images)
+
+    monkeypatch.setattr(loading.SqueezeNet, "embed", watched)
+    words = ("train", "--out", str(tmp_path / "net"), "--views", "left", "--limit", "3", "--layers", "all")
+    more = ("--epochs", "6", "--half", "2", "--batch", "3", "--precision", "bfloat16")
+    code, trained, _ = answer(capsys, *words, *more, "--json")
+    assert (code, trained["pictures"]["train"]) == (0, 3)
+    assert [tuple(images.shape) for images in seen] == [(3, 3, 112, 112)] * 2 + [(3, 3, 224, 224)] * 4
+    images, _ = pictures.read_pictures(tmp_path / "net" / training.PICTURES, "train", standins.classes)
+    known = [image.float() / 255 for image in images]
+    shown = [image for images in seen[2:] for image in images]
+    as_they_are = sum(any(torch.equal(image, one) for one in known) for image in shown)
+    mirrored = sum(any(torch.equal(image, one.flip(-1)) for one in known) for image in shown)
+    assert as_they_are + mirrored == len(shown) == 12
+    assert min(as_they_are, mirrored) > 2
+
+
 def test_bad_input_is_one_line_and_exit_code_2(standins, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
     (tmp_path / "torn").mkdir()
@@ -143,6 +204,8 @@ def test_bad_input_is_one_line_and_exit_code_2(standins, tmp_path, capsys, monke
         ("--backgrounds", str(tmp_path / "empty")): "expected a folder with photographs",
         ("--backgrounds", str(tmp_path / "torn")): "sky.png",
         ("--weights", "x.pth"): "--weights: expected classify train",
+        ("--half", "2"): "--half: expected classify train --layers all, found 2",
+        ("--precision", "bfloat16"): "--precision: expected classify train --layers all, found bfloat16",
         ("--queries", "7"): "--queries: expected --method random, halton beside it, found si-fgsm",
         ("--step-pose", "0"): "--step-pose: expected a number above 0",
         ("--nuisances", "fog=1"): "--nuisances",
