@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -81,13 +82,63 @@ class ObjectScene:
 
     def picture(self, change: Change | None = None) -> Tensor:
         """(3, SEEN_PX, SEEN_PX) RGB in [0, 1]; differentiable to the change."""
-        drawn = self.mesh.render(self.placed(change), camera(), self.lights(change), self.backend)
-        return self.shown(drawn)
+        placed, lights = self.placed(change), self.lights(change)
+        return self.shown(*self.mesh.render_part(placed, camera(), lights, self.backend))
 
-    def shown(self, drawn: Tensor) -> Tensor:
-        """What a renderer drew (4, DRAWN_PX, DRAWN_PX), before the background, as a network sees it."""
-        whole = over(drawn, self.background.to(drawn))
-        return F.interpolate(whole[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True)[0]
+    def shown(self, drawn: Tensor, x: int = 0, y: int = 0) -> Tensor:
+        """What a renderer drew (4, h, w) from column x and row y on, before the background, as a network sees it.
+        Only what is around it is put together and made smaller.
+        """
+        if not drawn.numel():
+            return self._behind.to(drawn)
+        rows, columns = _Cut.around(y, drawn.shape[1]), _Cut.around(x, drawn.shape[2])
+        around = (*columns.beside(x, drawn.shape[2]), *rows.beside(y, drawn.shape[1]))
+        whole = over(F.pad(drawn, around), self.background[:, rows.drawn, columns.drawn].to(drawn))
+        size = (rows.small, columns.small)
+        small = _smaller(whole, size)
+        picture = self._behind.to(drawn, copy=True)
+        picture[:, rows.seen, columns.seen] = small[:, rows.kept, columns.kept]
+        return picture
+
+    @cached_property
+    def _behind(self) -> Tensor:
+        """The background as a network sees it."""
+        return _smaller(self.background, (SEEN_PX, SEEN_PX))
+
+
+def _smaller(picture: Tensor, size: tuple[int, int]) -> Tensor:
+    """(3, *size) of (3, H, W): each pixel is a mean of what lies within a pixel's width around its middle."""
+    return F.interpolate(picture[None], size, mode="bilinear", antialias=True)[0]
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """The rows, or columns, of a picture that change where something is drawn. drawn: as they are drawn, from a
+    line to a line at which a drawn and a seen pixel begin together; small: how many seen ones these are; kept:
+    those of them that see nothing beyond, and seen: where they belong.
+    """
+
+    drawn: slice
+    small: int
+    kept: slice
+    seen: slice
+
+    @classmethod
+    def around(cls, begin: int, count: int) -> _Cut:
+        """Of `count` drawn pixels from `begin` on, and so far beyond as a seen pixel reaches that sees any."""
+        steps = math.gcd(DRAWN_PX, SEEN_PX)
+        drawn, seen = DRAWN_PX // steps, SEEN_PX // steps
+        margin = -(-2 // seen)  # of steps: a seen pixel reaches its own width either way from its middle
+        first = max(begin // drawn - margin, 0)
+        last = min(-(-(begin + count) // drawn) + margin, steps)
+        low, high = int(first > 0), int(last < steps)
+        small = (last - first) * seen
+        kept = slice(low, small - high)
+        return cls(slice(first * drawn, last * drawn), small, kept, slice(first * seen + low, last * seen - high))
+
+    def beside(self, begin: int, count: int) -> tuple[int, int]:
+        """How much of `drawn` lies before those pixels, and after them."""
+        return begin - self.drawn.start, self.drawn.stop - begin - count
 
 
 def camera(size: int = DRAWN_PX) -> Camera:

@@ -41,6 +41,17 @@ class Layout:
         object.__setattr__(layout, "offsets", _offsets(rects))
         return layout
 
+    @classmethod
+    def of_pixels(cls, pixels: Tensor) -> Layout:
+        """That of draws of a pixel each, (T, 2) (x, y), whole numbers."""
+        rects = torch.empty(len(pixels), 4, dtype=torch.int64, device=pixels.device)
+        rects[:, :2] = pixels
+        torch.add(rects[:, :2], 1, out=rects[:, 2:])
+        layout = object.__new__(cls)
+        object.__setattr__(layout, "rects", rects)
+        object.__setattr__(layout, "offsets", torch.arange(len(pixels) + 1, device=pixels.device))
+        return layout
+
     @property
     def size(self) -> int:
         """The number T of packed pixels."""

@@ -38,11 +38,12 @@ class Looks:
         face = fragments.face.reshape(rows, count, columns, count)
         low, high = (reduce(of, reduce(of, face.unbind(1)).unbind(2)) for of in (torch.minimum, torch.maximum))
         low, same = low.reshape(-1), (low == high).reshape(-1)
-        whole = (same & (low >= 0)).nonzero()[:, 0]
+        row, column = (same & (low >= 0)).reshape(rows, columns).nonzero().unbind(1)
+        whole = row * columns + column
         numbers = torch.zeros_like(low, dtype=torch.int64).index_put((whole,), torch.arange(len(whole)))
         sight = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
         corner = torch.tensor([x0, y0])
-        middle = torch.stack([whole % columns, whole // columns], dim=1) * count + corner + (count - 1) / 2
+        middle = torch.stack([column, row], dim=1) * count + corner + (count - 1) / 2
         # Of pixels that see several faces, or none in part, looks in the order of their faces.
         mixed = (~same).nonzero()[:, 0]
         step = torch.arange(count)

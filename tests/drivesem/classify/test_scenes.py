@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from drivesem.classify import scenes
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.scenes import (
     DRAWN_PX,
     SEEN_PX,
     VIEWS,
     ObjectScene,
+    camera,
     generated_background,
     in_turn,
     open_backgrounds,
@@ -18,6 +20,7 @@ from drivesem.classify.scenes import (
 from drivesem.classify.space import Amounts, Change, ObjectSpace, moved_of
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.render.lit import over
 from tests.drivesem.classify.standins import model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
@@ -56,6 +59,31 @@ def test_a_picture_has_its_background_around_the_object():
     torch.testing.assert_close(picture[:, 0, 0], torch.full((3,), 0.4))
     middle = picture[:, SEEN_PX // 2, SEEN_PX // 2]
     assert float(middle[1]) > float(middle[0]) > 0.2
+
+
+@pytest.mark.parametrize("drawn_px", [512, 96, 448])
+@pytest.mark.parametrize("along", [(0.0, 0.0), (0.9, -0.4), (30.0, 0.0)])
+def test_only_what_is_around_an_object_is_drawn_smaller(drawn_px, along, monkeypatch):
+    """As if all of the picture were; the object in the middle, over two borders, or out of it."""
+    monkeypatch.setattr(scenes, "DRAWN_PX", drawn_px)
+    behind = torch.rand(3, drawn_px, drawn_px, generator=torch.Generator().manual_seed(0))
+    scene, view = ObjectScene("ball", model("ball"), "forward", behind), camera(drawn_px)
+    vertices = (scene.placed() + torch.tensor([*along, 0.0])).requires_grad_(True)
+    weight = torch.randn(3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(1))
+    drawn = scene.mesh.render(vertices, view, scene.lights())
+    whole = torch.nn.functional.interpolate(
+        over(drawn, behind)[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True
+    )[0]
+    part, x, y = scene.mesh.render_part(vertices, view, scene.lights())
+    found = scene.shown(part, x, y)
+    torch.testing.assert_close(found, whole, atol=2e-5, rtol=0)
+    assert part.numel() < drawn.numel()
+    if not part.numel():
+        return
+    expected, gradient = (
+        torch.autograd.grad(seen, vertices, weight, retain_graph=True)[0] for seen in (whole, found)
+    )
+    torch.testing.assert_close(gradient, expected, atol=1e-4 * float(expected.abs().max()), rtol=0)
 
 
 def smooth_noise():

@@ -16,6 +16,15 @@ def test_pixels_are_packed_row_major_draw_after_draw():
     assert layout.spans() == [(slice(0, 4), (2, 2)), (slice(4, 4), (9, 0)), (slice(4, 6), (2, 1))]
 
 
+def test_draws_of_a_pixel_each():
+    pixels = torch.tensor([[3.0, 5.0], [-2.0, 9.0], [3.0, 5.0]], dtype=torch.float64)
+    layout, places = Layout.of_pixels(pixels), pixels.to(torch.int64)
+    expected = Layout.of(torch.cat([places, places + 1], dim=1))
+    assert torch.equal(layout.rects, expected.rects)
+    assert torch.equal(layout.offsets, expected.offsets)
+    assert Layout.of_pixels(torch.zeros(0, 2)).size == 0
+
+
 def test_no_draws():
     layout = Layout.of(torch.zeros(0, 4, dtype=torch.int64))
     assert (layout.size, layout.spans()) == (0, [])
