@@ -549,6 +549,8 @@ class Worth(Draws, Command):
     its pictures are, as drivesem realism tells it, and their worth; of retrain also what its detectors gained."""
     metrics: str = "available"
     """With --study, as of drivesem realism."""
+    bootstrap: NotNegative | None = None
+    """With --study: draws of frames for intervals of its distances, by default 200; 0 leaves them out."""
     distance: str | None = None
     """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
     lpips-alex where its weights are on disk, else perceptual (docs/realism.md)."""
@@ -575,6 +577,8 @@ class Worth(Draws, Command):
         refuse(twice, "--second", "runs (--after is a second table)", f"--table {self.table}")
         other = self.metrics != "available" and self.study is None
         refuse(other, "--metrics", "--study beside it (drivesem realism measures runs)", "none")
+        drawn = self.bootstrap is not None and self.study is None
+        refuse(drawn, "--bootstrap", "--study beside it (worth itself has the jackknife's intervals)", "none")
 
 
 @dataclass(frozen=True, kw_only=True)

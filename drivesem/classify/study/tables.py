@@ -218,7 +218,7 @@ def _worth(lab: Results) -> Table:
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
             rho = np.ones(len(lab.labels)) if strategy == BENIGN else realism(far[strategy], largest)
-            setting = Setting(kind, weighted, draws=lab.drawing.draws, seed=lab.drawing.seed)
+            setting = Setting(kind, weighted)
             row: Row = {"network": eyes.name, "strategy": strategy, "membership": kind, "weighted": weighted}
             before = lab.points(eyes, strategy, rho)
             row |= _bounded("worth", worth_of(before, setting))

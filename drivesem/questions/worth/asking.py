@@ -51,7 +51,7 @@ _WORDS = ("set", "detector", "membership", "realism weight")
 _NOTE = (
     "Information worth: entropy of the true label that is left once the answer is known; 0: the answer tells all. "
     "Gain: the worth before the first detector less that before the second, on the same pictures. In brackets "
-    "95 % of the bootstrap over frames."
+    "95 % of the jackknife over frames, less what few of them make too small: a figure may lie below it."
 )
 
 
@@ -67,14 +67,15 @@ class Entry:
 def worth_run(config: Worth) -> Answer:
     """Count, and write what is said of it. Raises UsageError or SceneError for bad input."""
     base = math.e if config.base == "e" else _number(config.base)
-    draws = DRAWS if config.bootstrap is None else config.bootstrap
     first = Path(config.table).parent if config.table is not None else Path(config.study or config.runs[0])
     out = folder_of(config.out, first / "worth")
     if config.study is not None:
-        answer = by_arm(config, base, draws, distance_of(config), out)
+        answer = by_arm(
+            config, base, DRAWS if config.bootstrap is None else config.bootstrap, distance_of(config), out
+        )
         answer.write()
         return answer
-    facts: dict[str, Any] = {"base": config.base, "bootstrap": draws}
+    facts: dict[str, Any] = {"base": config.base}
     if config.table is not None:
         entries, names = _tables(Path(config.table), None if config.after is None else Path(config.after))
         weighted = [False, True] if any((e.first.realism != 1).any() for e in entries) else [False]
@@ -85,7 +86,7 @@ def worth_run(config: Worth) -> Answer:
         entries, names = _runs(runs, config, distance, out)
         weighted = [False] if distance is None else [False, True]
     facts |= {"distance": distance, "detectors": names}
-    settings = [Setting(kind, w, base, draws, config.seed) for w in weighted for kind in MEMBERSHIPS]
+    settings = [Setting(kind, w, base) for w in weighted for kind in MEMBERSHIPS]
     rows = [row for entry in entries for setting in settings for row in _rows(entry, setting, names)]
     answer = Answer(
         out=out,

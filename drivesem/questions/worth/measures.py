@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from detectors import boxes
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.evaluation.failures import IOU
-from drivesem.evaluation.resampling import Figure, Interval, intervals
+from drivesem.evaluation.resampling import Figure, Interval, jackknife
 from scene_ir.errors import RangeError, ShapeError
 
 Floats = NDArray[np.float64]
@@ -198,18 +198,21 @@ class _Value:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How worth is counted and how often frames are drawn. weighted: whether realism counts."""
+    """How worth is counted. weighted: whether realism counts."""
 
     kind: str
     weighted: bool
     base: float = float(np.e)
-    draws: int = 200
-    seed: int = 0
 
 
 def worth_of(points: Points, setting: Setting) -> Interval:
-    """Information worth, with its interval; None where nothing counts."""
-    return _interval(_Value(points, None, setting.kind, setting.weighted, setting.base), points, setting)
+    """Information worth, with its interval, within what an entropy can be; None where nothing counts."""
+    one = _interval(_Value(points, None, setting.kind, setting.weighted, setting.base), points, setting)
+    if one.low is None or one.high is None:
+        return one
+    most = np.log(len(np.unique(points.label))) / np.log(setting.base)
+    low, high = np.clip((one.low, one.high), 0, most).tolist()
+    return replace(one, low=low, high=high)
 
 
 def gain_of(before: Points, after: Points, setting: Setting) -> Interval:
@@ -223,5 +226,4 @@ def gain_of(before: Points, after: Points, setting: Setting) -> Interval:
 def _interval(value: _Value, points: Points, setting: Setting) -> Interval:
     units = int(points.unit.max(initial=-1)) + 1
     figure = Figure(setting.kind, (value,))  # pyright: ignore[reportArgumentType]
-    (one,) = intervals([figure], units, setting.draws, np.random.default_rng(setting.seed))
-    return one
+    return jackknife(figure, units)

@@ -42,7 +42,7 @@ class Sees:
 def worth(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
     def call(*words: object) -> dict[str, Any]:
         capsys.readouterr()
-        assert main(["worth", "--bootstrap", "20", "--json", *map(str, words)]) == 0
+        assert main(["worth", "--json", *map(str, words)]) == 0
         return json.loads(capsys.readouterr().out)
 
     return call
@@ -236,7 +236,7 @@ def test_what_is_no_finished_study(
 def test_a_table_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "answers.csv"
     path.write_text(TABLE)
-    assert main(["worth", "--table", str(path), "--bootstrap", "0"]) == 0
+    assert main(["worth", "--table", str(path)]) == 0
     assert "information worth" in capsys.readouterr().out
 
 
@@ -275,6 +275,7 @@ def test_bad_input(write_run: Callable[..., Path], tmp_path: Path, refused: Call
     assert "--second: expected runs" in says("--table", "x.csv", "--second", "squeezedet")
     assert "--base: expected e, or a number above 1, found '1'" in says(run, "--base", "1")
     assert "--base" in says(run, "--base", "two")
+    assert "--bootstrap: expected --study beside it" in says(run, "--bootstrap", "20")
     assert "--distance: expected none, perceptual" in says(run, "--distance", "psnr")
     assert "--second: expected a detector" in says(run, "--distance", "none", "--second", "nobody")
     assert "RUN: expected a folder of drivesem attack" in says(tmp_path)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binomtest, t
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.kitti import evaluate
@@ -14,7 +14,9 @@ from drivesem.evaluation.resampling import (
     differences,
     holm,
     intervals,
+    jackknife,
     newcombe,
+    rate,
     wilson,
 )
 
@@ -158,3 +160,26 @@ def test_a_difference_without_its_test_is_the_same() -> None:
     )
     assert without.interval == with_p.interval
     assert (without.p, with_p.p is None) == (None, False)
+
+
+def test_the_jackknife_of_a_mean_is_students_interval() -> None:
+    hits = np.array([3.0, 1, 4, 1, 5, 9])
+    found = jackknife(rate("mean", hits, np.ones(6)), 6)
+    expected = t.interval(0.95, 5, hits.mean(), hits.std(ddof=1) / np.sqrt(6))
+    assert (found.value, found.low, found.high) == pytest.approx((hits.mean(), *expected))
+
+
+def test_the_jackknife_takes_off_what_goes_with_one_over_the_number() -> None:
+    """By hand: the ratio of all units, and what is left without each."""
+    hits, of = np.array([2.0, 0, 1]), np.array([2.0, 1, 1])
+    without = np.array([1 / 2, 3 / 3, 2 / 3])
+    found = jackknife(rate("ratio", hits, of), 3)
+    middle = 3 * 3 / 4 - 2 * without.mean()
+    half = t.ppf(0.975, 2) * np.sqrt(2 / 3 * ((without - without.mean()) ** 2).sum())
+    assert (found.value, found.low, found.high) == pytest.approx((3 / 4, middle - half, middle + half))
+
+
+def test_the_jackknife_needs_two_units_that_count() -> None:
+    assert jackknife(rate("one", np.ones(1), np.ones(1)), 1).low is None
+    assert jackknife(rate("one of two", np.ones(2), np.array([1.0, 0])), 2).low is None
+    assert jackknife(rate("none", np.zeros(2), np.zeros(2)), 2).value is None

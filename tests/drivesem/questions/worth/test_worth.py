@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,7 +119,7 @@ def test_gain() -> None:
     worse = classified(np.array([[0.9, 0.1], [0.2, 0.8], [0.3, 0.7], [0.6, 0.4]]), label)
     right = classified(one_hot(label, 2), label)
     for kind in ("binary", "fractional"):
-        setting = Setting(kind, weighted=False, draws=50)
+        setting = Setting(kind, weighted=False)
         same = gain_of(worse, worse, setting)
         assert (same.value, same.low, same.high) == (0, 0, 0)
         gain, worth = gain_of(worse, right, setting), worth_of(worse, setting)
@@ -127,9 +128,40 @@ def test_gain() -> None:
         assert worth.value > 0
         back = gain_of(right, worse, setting)
         assert back.value == pytest.approx(-worth.value)
-    assert worth_of(worse, Setting("binary", weighted=False, draws=0)).low is None
+    one = classified(np.array([[0.9, 0.1]]), label[:1])
+    assert worth_of(one, Setting("binary", weighted=False)).low is None
     with pytest.raises(ShapeError, match="the same 4 labels"):
         gain_of(worse, classified(one_hot(label, 2), label[::-1].copy()), Setting("binary", weighted=False))
+
+
+def test_intervals_hold_what_all_pictures_are_worth() -> None:
+    """Of few pictures less is unknown than of all; of the bootstrap's intervals few would hold that."""
+    classes, units, views, rng = 6, 36, 3, np.random.default_rng(0)
+    answers = 0.6 * np.eye(classes) + 0.4 * rng.dirichlet(np.full(classes, 0.5), classes)
+    setting = Setting("binary", weighted=False)
+    true = information_worth(answers, np.arange(classes)).value
+    label, unit = np.repeat(np.arange(units) % classes, views), np.repeat(np.arange(units), views)
+    held, below, drawn = 0, 0, 0
+    for _ in range(100):
+        answer = np.array([rng.choice(classes, p=answers[one]) for one in label])
+        shown = classified(one_hot(answer, classes), label)
+        found = worth_of(replace(shown, unit=unit), setting)
+        assert found.value is not None
+        assert found.low is not None
+        assert found.high is not None
+        held += found.low <= true <= found.high
+        resampled = [
+            information_worth(
+                shown.binary, label, np.bincount(rng.integers(0, units, units), minlength=units)[unit]
+            ).value
+            for _ in range(60)
+        ]
+        low, high = np.quantile(resampled, [0.025, 0.975])
+        drawn += low <= true <= high
+        below += found.value < true
+    assert below >= 80
+    assert drawn < held - 30
+    assert held >= 85
 
 
 CARS = [[0.0, 0, 40, 40], [100.0, 0, 140, 40], [200.0, 0, 240, 40]]
@@ -175,7 +207,7 @@ def test_what_detection_is_worth() -> None:
     blind = detected(targets(), found(), 0.5)
     half = detected(targets(), found((0, "Car", 1.0)), 0.5)
     for kind in ("binary", "fractional"):
-        setting = Setting(kind, weighted=True, draws=0)
+        setting = Setting(kind, weighted=True)
         assert worth_of(perfect, setting).value == 0
         assert worth_of(blind, setting).value == pytest.approx(math.log(2))
         # one subset of 1 car, one of 2 cars and 3 empty places
@@ -193,7 +225,7 @@ def test_false_detections_beyond_the_empty_places_are_left_out() -> None:
     seen = found(*((x, "Car", 0.9) for x in range(300, 1000, 100)))
     points = detected(targets(), seen, 0.5)
     assert len(points.label) == 6
-    assert worth_of(points, Setting("binary", weighted=False, draws=0)).value == 0  # tidy, and all wrong
+    assert worth_of(points, Setting("binary", weighted=False)).value == 0  # tidy, and all wrong
 
 
 def test_frames_without_objects_and_realism_of_empty_places() -> None:
@@ -208,4 +240,4 @@ def test_frames_without_objects_and_realism_of_empty_places() -> None:
     both = joined([none, three])
     assert both.unit.tolist() == [1] * 6
     assert isinstance(both, Points)
-    assert worth_of(joined([none]), Setting("binary", weighted=False, draws=5)).value is None
+    assert worth_of(joined([none]), Setting("binary", weighted=False)).value is None
