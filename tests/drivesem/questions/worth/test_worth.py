@@ -152,7 +152,9 @@ def test_intervals_hold_what_all_pictures_are_worth() -> None:
         held += found.low <= true <= found.high
         resampled = [
             information_worth(
-                shown.binary, label, np.bincount(rng.integers(0, units, units), minlength=units)[unit]
+                shown.binary,
+                label,
+                np.bincount(rng.integers(0, units, units), minlength=units)[unit].astype(np.float64),
             ).value
             for _ in range(60)
         ]
