@@ -63,7 +63,7 @@ class Answer:
         """The tables, and what they mean."""
         for sheet in self.sheets if self.printed is None else self.printed:
             words = self.printed_words or self.words or sheet.columns[:1]
-            console.print(sheet.table(words, **sheet.looks))
+            console.print(*sheet.tables(console, words, **sheet.looks), sep="\n")
         for note in self.notes:
             console.print(note, soft_wrap=True)
 

@@ -115,7 +115,7 @@ def _wide_parts(result: Result) -> Sheet:
 def print_result(result: Result, console: Console) -> None:
     """The tables, and what a reader must know."""
     for sheet in sheets(result, wide=True):
-        console.print(sheet.table(_WORDS, min_width=min(len(sheet.title) + 4, console.width)))
+        console.print(*sheet.tables(console, _WORDS, min_width=min(len(sheet.title) + 4, console.width)), sep="\n")
     facts = result.facts
     counted = f", counted by {facts['engine']}" if "engine" in facts else ""
     console.print(

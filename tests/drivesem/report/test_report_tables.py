@@ -1,8 +1,76 @@
-"""Numbers and their nouns."""
+"""Numbers and their nouns, and tables on terminals of any width."""
 
-from drivesem.report.tables import number_of
+import io
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivesem.report.tables import Sheet, number_of
+from drivesem.report.terminal import Console
+
+COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
+ROWS = (
+    ("combo-2-paper-s-protocol", "frame", "24.0 (21.7 to 27.1)", "0.0893 (0.0542 to 0.137)", "-"),
+    ("photograph", "vehicles", "16.2", "0.577", "0.1"),
+)
+SHEET = Sheet("Far", COLUMNS, ROWS)
+
+
+def shown(sheet: Sheet, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str:
+    """What a terminal shows of it."""
+    console = Console(file=io.StringIO(), width=width)
+    console.print(*sheet.tables(console, words), sep="\n")
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
 
 
 def test_one_is_one_and_no_more() -> None:
     assert [number_of(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
     assert [number_of(count, "query", "queries") for count in (1, 40)] == ["1 query", "40 queries"]
+
+
+def test_a_table_that_fits_is_one() -> None:
+    text = shown(SHEET, 110)
+    assert text.count("Far") == 1
+    assert "further" not in text
+
+
+def test_a_table_that_does_not_fit_goes_on_below_with_its_first_columns() -> None:
+    text = shown(SHEET, 80)
+    for row in ROWS:
+        assert all(cell in text for cell in row)
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.count("Far") == 2
+    assert text.count("Far, further columns") == 1
+    assert text.count("combo-2-paper-s-protocol") == 2
+
+
+def test_where_not_even_one_column_has_room_it_stays_one() -> None:
+    for sheet in (SHEET, Sheet("Far words", ("a", "b"), (("x" * 50, "y" * 50),)), Sheet("Far", ("a", "b"), ())):
+        text = shown(sheet, 40, (*COLUMNS[:2], "a", "b"))
+        assert "further" not in text
+        assert max(map(len, text.splitlines())) <= 40
+
+
+_WORD = st.text("abcdefg", min_size=1, max_size=9)
+_NUMBER = st.from_regex(r"\A\d{1,4}\.\d{1,3}( \[\d\.\d, \d\.\d\])?\Z")
+
+
+@given(
+    names=st.lists(_WORD, min_size=1, max_size=3),
+    numbers=st.lists(st.tuples(st.lists(_WORD, min_size=1, max_size=4).map(" ".join), _NUMBER), max_size=8),
+    sentence=st.lists(_WORD, min_size=1, max_size=12).map(" ".join),
+    width=st.integers(60, 200),
+)
+def test_no_word_and_no_number_is_broken(
+    names: list[str], numbers: list[tuple[str, str]], sentence: str, width: int
+) -> None:
+    columns = (
+        *(f"{name}{i}" for i, name in enumerate(names)),
+        *(f"{head}{i}" for i, (head, _) in enumerate(numbers)),
+    )
+    sheet = Sheet("t", columns, ((*[sentence] * len(names), *(number for _, number in numbers)),))
+    text = shown(sheet, width, columns[: len(names)])
+    assert max(map(len, text.splitlines())) <= width
+    assert all(number in text for _, number in numbers)
+    assert all(word in text for word in " ".join([*columns, sentence]).split())
