@@ -479,7 +479,6 @@ def _settings_of(facts: Mapping[str, str]) -> dict[str, Any]:
     return found
 
 
-@torch.no_grad()
 def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
     """What an optimiser keeps of each parameter, by "INDEX.NAME"."""
     state = optimiser.state_dict()["state"]
@@ -495,6 +494,7 @@ def restore(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> 
     optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
 
 
+@torch.no_grad()
 def _copy_into(detector: Detector, values: Mapping[str, Tensor]) -> None:
     for name, own in detector.state_dict().items():
         own.copy_(values[name])
