@@ -114,7 +114,9 @@ def fit_last(
     def batch(rows: Tensor, _: int) -> tuple[Tensor, Tensor]:
         return last(known["train"][rows]), labels["train"][rows]
 
-    found = _fit(last, batch, lambda name: _accuracy(last(known[name]), labels[name]), labels, config, generator)
+    found = _fit(
+        last, batch, lambda name, _: _accuracy(last(known[name]), labels[name]), labels, config, generator
+    )
     with torch.no_grad():
         last.weight.div_(deviation)
         last.bias.sub_(last.weight @ mean)
@@ -131,18 +133,17 @@ def _fit_all(
 
     def batch(rows: Tensor, epoch: int) -> tuple[Tensor, Tensor]:
         network.train()
-        shown = images[rows].to(config.device).float() / 255
+        shown = _shown(images[rows], config.device, epoch <= config.half)
         mirrored = torch.rand(len(rows), generator=generator) < 0.5
         shown = torch.where(mirrored.to(shown.device).view(-1, 1, 1, 1), shown.flip(-1), shown)
-        if epoch <= config.half:
-            shown = F.avg_pool2d(shown, 2)
         with torch.autocast(config.device.partition(":")[0], dtype, enabled=dtype != torch.float32):
             scores = network(shown.contiguous(memory_format=torch.channels_last))
         return scores.float(), labels["train"][rows]
 
-    def accuracy(name: str) -> float:
+    def accuracy(name: str, epoch: int) -> float:
         network.eval()
-        features = embedded(network, splits[name][0], config.device, f"looking at {name}")
+        half = epoch <= config.half
+        features = embedded(network, splits[name][0], config.device, f"looking at {name}", half)
         return _accuracy(network.last(features), labels[name])
 
     return _fit(network, batch, accuracy, labels, config, generator, checkpoint)
@@ -156,15 +157,15 @@ def _accuracy(scores: Tensor, labels: Tensor) -> float:
 def _fit(
     module: nn.Module,
     batch: Callable[[Tensor, int], tuple[Tensor, Tensor]],
-    accuracy: Callable[[str], float],
+    accuracy: Callable[[str, int], float],
     labels: Mapping[str, Tensor],
     config: Classify,
     generator: torch.Generator,
     checkpoint: Path | None = None,
 ) -> _Fitted:
     """Adam, with a rate that falls in a half cosine. batch: scores and labels of some of the pictures of `train`,
-    in an epoch, of which the first is 1; accuracy: of a split; labels: by split; checkpoint: written after each
-    epoch, and gone on from.
+    in an epoch, of which the first is 1; accuracy: of a split, after an epoch; labels: by split; checkpoint:
+    written after each epoch, and gone on from.
     """
     count = len(labels["train"])
     optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
@@ -185,10 +186,10 @@ def _fit(
                 schedule.step()
                 total += float(loss.detach()) * len(rows)
                 progress.advance(task)
-            curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val")})
+            curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val", epoch)})
             if checkpoint is not None:
                 state.save(checkpoint, curve)
-    return curve, {name: accuracy(name) for name in labels}
+    return curve, {name: accuracy(name, config.epochs + 1) for name in labels}
 
 
 @dataclass(frozen=True)
@@ -231,8 +232,16 @@ class _State:
 
 
 @torch.no_grad()
-def embedded(network: Classifier, images: Tensor, device: str, title: str) -> Tensor:
-    """Features (N, K) of pictures (N, 3, H, W) uint8, computed once. title: of the bar."""
+def embedded(network: Classifier, images: Tensor, device: str, title: str, half: bool = False) -> Tensor:
+    """Features (N, K) of pictures (N, 3, H, W) uint8, computed once. title: of the bar; half: shown at half their
+    size.
+    """
     with training_bar(Console(stderr=True)) as progress:
         parts = progress.track(images.split(_EMBEDDED_AT_A_TIME), description=title)
-        return torch.cat([network.embed(part.to(device).float() / 255) for part in parts])
+        return torch.cat([network.embed(_shown(part, device, half)) for part in parts])
+
+
+def _shown(images: Tensor, device: str, half: bool) -> Tensor:
+    """Pictures (N, 3, H, W) uint8 as networks see them, or at half their size."""
+    pictures = images.to(device).float() / 255
+    return F.avg_pool2d(pictures, 2) if half else pictures
