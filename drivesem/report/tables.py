@@ -38,19 +38,17 @@ class Sheet:
         self, words: Collection[str], unbroken: Collection[str] = (), least: bool = False, **looks: Any
     ) -> Table:
         """The same for a terminal: columns of words are wrapped, those of numbers are not. unbroken: further ones
-        that are not; least: whether a column of numbers keeps their width where there is no room for it; looks: of
-        rich's Table.
+        that are not; least: whether these keep their width where there is no room for it; looks: of rich's Table.
         """
         table = Table(title=self.title, title_justify="left", **looks)
         for place, name in enumerate(self.columns):
-            if name in words:
-                table.add_column(name, no_wrap=name in unbroken, overflow="fold")
-                continue
-            # A heading takes lines that are no wider than the numbers below it, where its words allow.
+            wrapped = name in words and name not in unbroken
+            # A heading takes lines that are no wider than what is below it, where its words allow.
             widest = max(_longest(row[place] for row in self.rows), _longest(name.split()), 1)
-            heading = textwrap.fill(name, widest, break_on_hyphens=False)
-            kept = widest if least else None
-            table.add_column(heading, justify="right", no_wrap=True, overflow="fold", min_width=kept)
+            heading = name if wrapped else textwrap.fill(name, widest, break_on_hyphens=False)
+            kept = widest if least and not wrapped else None
+            side = "left" if name in words else "right"
+            table.add_column(heading, justify=side, no_wrap=not wrapped, overflow="fold", min_width=kept)
         for row in self.rows:
             table.add_row(*row)
         return table

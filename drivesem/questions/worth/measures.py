@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from detectors import boxes
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.evaluation.failures import IOU
-from drivesem.evaluation.resampling import Figure, Interval, jackknife
+from drivesem.evaluation.resampling import Interval, jackknife
 from scene_ir.errors import RangeError, ShapeError
 
 Floats = NDArray[np.float64]
@@ -82,12 +82,22 @@ def information_worth(
     for name, values in (("memberships", membership), ("weights", weights)):
         if not (np.isfinite(values).all() and (values >= 0).all()):
             raise RangeError(name, "finite numbers of at least 0", "others")
-    truth = np.zeros((len(label), int(label.max(initial=0)) + 1))
-    truth[np.arange(len(label)), label] = 1
-    mass = (membership * weights[:, None]).T @ truth
+    found = _of_mass(_mass(membership * weights[:, None], label, int(label.max(initial=0)) + 1), base)
+    if found is None:
+        raise RangeError("weights", "a point that counts", "none")
+    return found
+
+
+def _mass(membership: Floats, label: Integers, labels: int) -> Floats:
+    """(I, labels): what there is of each label in each subset."""
+    return membership.T @ one_hot(label, labels)
+
+
+def _of_mass(mass: Floats, base: float) -> Worth | None:
+    """Worth of masses (I, L); None where there is nothing."""
     inside = mass.sum(axis=1)
     if not inside.sum() > 0:
-        raise RangeError("weights", "a point that counts", "none")
+        return None
     p = np.divide(mass, inside[:, None], out=np.zeros_like(mass), where=inside[:, None] > 0)
     logs = np.log(p, out=np.zeros_like(p), where=p > 0) / np.log(base)
     entropies = np.abs(-(p * logs).sum(axis=1))
@@ -171,32 +181,6 @@ def joined(parts: Sequence[Points]) -> Points:
 
 
 @dataclass(frozen=True, slots=True)
-class _Value:
-    """Worth of some points, or of a successor's less; at weights of units."""
-
-    before: Points
-    after: Points | None
-    kind: str
-    weighted: bool
-    base: float
-
-    def value(self, weights: Floats | None) -> float | None:
-        first = self._of(self.before, weights)
-        if self.after is None or first is None:
-            return first
-        second = self._of(self.after, weights)
-        return None if second is None else first - second
-
-    def _of(self, points: Points, weights: Floats | None) -> float | None:
-        counts = points.realism if self.weighted else np.ones(len(points.label))
-        if weights is not None:
-            counts = counts * weights[points.unit]
-        if not counts.sum() > 0:
-            return None
-        return information_worth(points.membership(self.kind), points.label, counts, self.base).value
-
-
-@dataclass(frozen=True, slots=True)
 class Setting:
     """How worth is counted. weighted: whether realism counts."""
 
@@ -207,7 +191,8 @@ class Setting:
 
 def worth_of(points: Points, setting: Setting) -> Interval:
     """Information worth, with its interval, within what an entropy can be; None where nothing counts."""
-    one = _interval(_Value(points, None, setting.kind, setting.weighted, setting.base), points, setting)
+    value, without = _worths(points, setting)
+    one = jackknife(setting.kind, value, without)
     if one.low is None or one.high is None:
         return one
     most = np.log(len(np.unique(points.label))) / np.log(setting.base)
@@ -219,11 +204,29 @@ def gain_of(before: Points, after: Points, setting: Setting) -> Interval:
     """Information gain of a classifier's successor on the same points. Raises ShapeError where they differ."""
     if not (np.array_equal(before.label, after.label) and np.array_equal(before.unit, after.unit)):
         raise ShapeError("points of the successor", f"the same {len(before.label)} labels", len(after.label))
-    after = replace(after, realism=before.realism)
-    return _interval(_Value(before, after, setting.kind, setting.weighted, setting.base), before, setting)
+    (first, one_out), (second, other_out) = (
+        _worths(points, setting) for points in (before, replace(after, realism=before.realism))
+    )
+    value, *without = (
+        None if a is None or b is None else a - b
+        for a, b in zip((first, *one_out), (second, *other_out), strict=True)
+    )
+    return jackknife(setting.kind, value, without)
 
 
-def _interval(value: _Value, points: Points, setting: Setting) -> Interval:
-    units = int(points.unit.max(initial=-1)) + 1
-    figure = Figure(setting.kind, (value,))  # pyright: ignore[reportArgumentType]
-    return jackknife(figure, units)
+def _worths(points: Points, setting: Setting) -> tuple[float | None, list[float | None]]:
+    """Worth of all points, and of those without each unit in turn."""
+    counts = points.realism if setting.weighted else np.ones(len(points.label))
+    weighed = points.membership(setting.kind) * counts[:, None]
+    labels = int(points.label.max(initial=0)) + 1
+    whole = _mass(weighed, points.label, labels)
+
+    def value(mass: Floats) -> float | None:
+        found = _of_mass(mass, setting.base)
+        return None if found is None else found.value
+
+    order = np.argsort(points.unit, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(points.unit[order])) + 1)
+    # What is left may be short of 0 by rounding.
+    left = (np.maximum(whole - _mass(weighed[one], points.label[one], labels), 0) for one in rows if len(one))
+    return value(whole), [value(mass) for mass in left]

@@ -16,7 +16,6 @@ from drivesem.evaluation.resampling import (
     intervals,
     jackknife,
     newcombe,
-    rate,
     wilson,
 )
 
@@ -163,23 +162,25 @@ def test_a_difference_without_its_test_is_the_same() -> None:
 
 
 def test_the_jackknife_of_a_mean_is_students_interval() -> None:
-    hits = np.array([3.0, 1, 4, 1, 5, 9])
-    found = jackknife(rate("mean", hits, np.ones(6)), 6)
-    expected = t.interval(0.95, 5, hits.mean(), hits.std(ddof=1) / np.sqrt(6))
-    assert (found.value, found.low, found.high) == pytest.approx((hits.mean(), *expected))
+    values = np.array([3.0, 1, 4, 1, 5, 9])
+    without = [float(np.delete(values, i).mean()) for i in range(6)]
+    found = jackknife("mean", float(values.mean()), without)
+    expected = t.interval(0.95, 5, values.mean(), values.std(ddof=1) / np.sqrt(6))
+    assert (found.value, found.low, found.high) == pytest.approx((values.mean(), *expected))
 
 
 def test_the_jackknife_takes_off_what_goes_with_one_over_the_number() -> None:
-    """By hand: the ratio of all units, and what is left without each."""
-    hits, of = np.array([2.0, 0, 1]), np.array([2.0, 1, 1])
-    without = np.array([1 / 2, 3 / 3, 2 / 3])
-    found = jackknife(rate("ratio", hits, of), 3)
-    middle = 3 * 3 / 4 - 2 * without.mean()
-    half = t.ppf(0.975, 2) * np.sqrt(2 / 3 * ((without - without.mean()) ** 2).sum())
-    assert (found.value, found.low, found.high) == pytest.approx((3 / 4, middle - half, middle + half))
+    """The variance over n has a bias of just that kind: without it is that over n - 1."""
+    values = np.array([3.0, 1, 4, 1, 5, 9])
+    without = [float(np.delete(values, i).var()) for i in range(6)]
+    found = jackknife("variance", float(values.var()), without)
+    assert found.value == pytest.approx(values.var())
+    assert found.low is not None
+    assert found.high is not None
+    assert (found.low + found.high) / 2 == pytest.approx(values.var(ddof=1))
 
 
 def test_the_jackknife_needs_two_units_that_count() -> None:
-    assert jackknife(rate("one", np.ones(1), np.ones(1)), 1).low is None
-    assert jackknife(rate("one of two", np.ones(2), np.array([1.0, 0])), 2).low is None
-    assert jackknife(rate("none", np.zeros(2), np.zeros(2)), 2).value is None
+    for value, without in ((1.0, []), (1.0, [None]), (1.0, [1.0, None]), (None, [1.0, 1.0])):
+        found = jackknife("a", value, without)
+        assert (found.value, found.low, found.high) == (value, None, None)
