@@ -106,6 +106,16 @@ def test_a_classifier_is_attacked_as_on_the_processor(tmp_path: Path) -> None:
         np.testing.assert_allclose(other["loss_trace"], mine["loss_trace"], rtol=1e-3)
 
 
+@pytest.mark.parametrize("layers", ["last", "all"])
+def test_a_classifier_learns_what_it_learns_on_the_processor(layers: str, tmp_path: Path) -> None:
+    words = ["classify", "train", "--layers", layers, "--limit", "12", "--views", "forward", "--batch", "6"]
+    here, there = on_both([*words, "--epochs", "2", "--json"], tmp_path)
+    told = [json.loads((out / "training.json").read_text()) for out in (here, there)]
+    for one, other in zip(told[0]["epochs"], told[1]["epochs"], strict=True):
+        assert other == pytest.approx(one, abs=2e-3)
+    assert told[0]["accuracy"] == pytest.approx(told[1]["accuracy"], abs=0.1)
+
+
 def test_a_gpu_convolves_in_float32() -> None:
     torch.backends.cudnn.allow_tf32 = True
     with pretended():
