@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from contextlib import contextmanager
@@ -114,6 +115,8 @@ def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Itera
     """
     from loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
+    # A process that has grown by 300 MB, which layers that it keeps may take, is replaced between jobs: no news.
+    warnings.filterwarnings("ignore", "A worker was restarted", UserWarning)
     pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(), start))
     waiting, pending = iter(jobs), {}
     try:

@@ -69,6 +69,27 @@ def test_processes_begin_once_for_all_jobs() -> None:
     assert len(processes) <= 2, "a start takes seconds; on a busy machine one is done before the other has begun"
 
 
+_KEPT: list[bytes] = []
+
+
+def grow(job: int) -> int:
+    """Keeps 400 MB, and takes so long that it is noticed. The process's number."""
+    _KEPT.append(bytes(bytearray(b"x") * 400_000_000))
+    time.sleep(1.1)
+    return os.getpid()
+
+
+def growing() -> Callable[[int], int]:
+    return grow
+
+
+def test_a_process_that_grows_is_replaced_without_a_word(recwarn: pytest.WarningsRecorder) -> None:
+    found = [outcome() for _, outcome in outcomes(grow, growing, list(range(6)), Sharing(workers=2))]
+    assert len(found) == 6
+    assert len(set(found)) > 2
+    assert [str(one.message) for one in recwarn if "worker" in str(one.message)] == []
+
+
 @pytest.mark.parametrize("kind", [ShapeError, RangeError, FormatError, UsageError])
 def test_errors_survive_the_way_between_processes(kind: type[SceneError]) -> None:
     error = kind("file:3", "a number", [1, 2])
