@@ -162,25 +162,6 @@ def intervals(
     return found
 
 
-def jackknife(name: str, value: float | None, without: Sequence[float | None]) -> Interval:
-    """A figure and its 95 % interval by what it is without each of the units in turn (Quenouille 1956, Tukey
-    1958): of one that few units make too small, as they do an entropy, or too large. No bounds where one of these
-    is None, or they are fewer than two.
-
-    That bias, as far as it goes with one over their number, is taken from the interval and not from the value,
-    which may thus lie outside. The bootstrap, whose draws have fewer different units still, would have it twice.
-    """
-    from scipy.special import stdtrit  # Student's quantiles; `scipy.stats` takes a third of a second to load
-
-    known, units = np.array([v for v in without if v is not None]), len(without)
-    if value is None or len(known) < max(units, 2):
-        return Interval(name, value, None, None)
-    apart = known - known.mean()
-    middle = units * value - (units - 1) * float(known.mean())
-    half = float(stdtrit(units - 1, (1 + LEVEL) / 2)) * math.sqrt((units - 1) / units * float(apart @ apart))
-    return Interval(name, value, middle - half, middle + half)
-
-
 def differences(
     first: Sequence[Figure],
     second: Sequence[Figure],

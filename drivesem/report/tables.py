@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import textwrap
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -35,45 +34,73 @@ class Sheet:
         return [f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in cells)]
 
     def table(
-        self, words: Collection[str], unbroken: Collection[str] = (), least: bool = False, **looks: Any
+        self,
+        words: Collection[str],
+        unbroken: Collection[str] = (),
+        widths: Sequence[int] | None = None,
+        **looks: Any,
     ) -> Table:
-        """The same for a terminal: columns of words are wrapped, those of numbers are not. unbroken: further ones
-        that are not; least: whether these keep their width where there is no room for it; looks: of rich's Table.
+        """The same for a terminal. unbroken: columns that are never wrapped; widths: of the columns, characters,
+        by default as rich finds; looks: of its Table.
         """
         table = Table(title=self.title, title_justify="left", **looks)
         for place, name in enumerate(self.columns):
-            wrapped = name in words and name not in unbroken
-            # A heading takes lines that are no wider than what is below it, where its words allow.
-            widest = max(_longest(row[place] for row in self.rows), _longest(name.split()), 1)
-            heading = name if wrapped else textwrap.fill(name, widest, break_on_hyphens=False)
-            kept = widest if least and not wrapped else None
-            side = "left" if name in words else "right"
-            table.add_column(heading, justify=side, no_wrap=not wrapped, overflow="fold", min_width=kept)
+            side, width = "left" if name in words else "right", None if widths is None else widths[place]
+            table.add_column(name, justify=side, no_wrap=name in unbroken, overflow="fold", width=width)
         for row in self.rows:
             table.add_row(*row)
         return table
 
-    def tables(self, console: Console, words: Collection[str], **looks: Any) -> list[Table]:
-        """`table`, or, where words and numbers would break for want of room, several of some columns each, all of
-        which begin with the columns of words that this one begins with.
+    def tables(
+        self, console: Console, words: Collection[str], unbroken: Collection[str] = (), **looks: Any
+    ) -> list[Table]:
+        """`table`, or, where that does not fit the terminal, one in which no word and no number is broken; or,
+        where there is no room for that, several of some columns each, all of which begin with the columns of words
+        that this one begins with.
         """
-        first = next((i for i, name in enumerate(self.columns) if name not in words), len(self.columns))
-        whole, parts = [*range(len(self.columns))], [[*range(first)]]
 
-        def fits(places: Sequence[int]) -> bool:
-            table = self._of(places).table(words, least=True, **looks)
-            roomy = console.options.update(width=_ROOMY)
-            return Measurement.get(console, roomy, table).minimum <= console.width
+        def size(table: Table) -> Measurement:
+            return Measurement.get(console, console.options.update(width=_ROOMY), table)
 
-        if not fits(whole):
-            for place in whole[first:]:
-                if len(parts[-1]) > first and not fits([*parts[-1], place]):
+        def laid(places: Sequence[int], more: str = "") -> Table | None:
+            """Of some columns; None where there is no room."""
+            part = self._of(places, more)
+            least, most = zip(*(part._room(i, words, unbroken) for i in range(len(places))), strict=True)
+            spare = console.width - size(part.table(words, unbroken, least, **looks)).maximum
+            if spare < 0:
+                return None
+            wanted = max(sum(most) - sum(least), 1)
+            widths = [a + min(b - a, spare * (b - a) // wanted) for a, b in zip(least, most, strict=True)]
+            return part.table(words, unbroken, widths, **looks)
+
+        whole = self.table(words, unbroken, **looks)
+        if size(whole).maximum <= console.width or not self.columns:
+            return [whole]
+        everything = [*range(len(self.columns))]
+        first = next((i for i in everything if self.columns[i] not in words), len(everything))
+        parts = [everything]
+        if laid(everything) is None:
+            parts = [[*range(first)]]
+            for place in everything[first:]:
+                if len(parts[-1]) > first and laid([*parts[-1], place]) is None:
                     parts.append([*range(first)])
                 parts[-1].append(place)
-        if len(parts) == 1 or not all(map(fits, parts)):
-            parts = [whole]
-        found = (self._of(part, ", further columns" if i else "") for i, part in enumerate(parts))
-        return [part.table(words, **looks) for part in found]
+        found = [laid(part, ", further columns" if i else "") for i, part in enumerate(parts)]
+        known = [table for table in found if table is not None]
+        return known if len(known) == len(parts) else [whole]
+
+    def _room(self, place: int, words: Collection[str], unbroken: Collection[str]) -> tuple[int, int]:
+        """Characters that a column takes at least, and in which none of its lines is wrapped. Columns of numbers
+        have them in one line, below a heading that may be wrapped.
+        """
+        name, cells = self.columns[place], [row[place] for row in self.rows]
+        longest, lines = _longest(name.split()), _longest(cells)
+        if name in words and name not in unbroken:
+            least = max(longest, _longest(word for cell in cells for word in cell.split()), 1)
+            return least, max(least, lines, _longest([name]))
+        if name in unbroken:
+            longest = _longest([name])
+        return max(longest, lines, 1), max(longest, lines, 1)
 
     def _of(self, places: Sequence[int], more: str = "") -> Sheet:
         columns = tuple(self.columns[i] for i in places)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest, t
+from scipy.stats import binomtest
 
 from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.kitti import evaluate
@@ -14,7 +14,6 @@ from drivesem.evaluation.resampling import (
     differences,
     holm,
     intervals,
-    jackknife,
     newcombe,
     wilson,
 )
@@ -159,28 +158,3 @@ def test_a_difference_without_its_test_is_the_same() -> None:
     )
     assert without.interval == with_p.interval
     assert (without.p, with_p.p is None) == (None, False)
-
-
-def test_the_jackknife_of_a_mean_is_students_interval() -> None:
-    values = np.array([3.0, 1, 4, 1, 5, 9])
-    without = [float(np.delete(values, i).mean()) for i in range(6)]
-    found = jackknife("mean", float(values.mean()), without)
-    expected = t.interval(0.95, 5, values.mean(), values.std(ddof=1) / np.sqrt(6))
-    assert (found.value, found.low, found.high) == pytest.approx((values.mean(), *expected))
-
-
-def test_the_jackknife_takes_off_what_goes_with_one_over_the_number() -> None:
-    """The variance over n has a bias of just that kind: without it is that over n - 1."""
-    values = np.array([3.0, 1, 4, 1, 5, 9])
-    without = [float(np.delete(values, i).var()) for i in range(6)]
-    found = jackknife("variance", float(values.var()), without)
-    assert found.value == pytest.approx(values.var())
-    assert found.low is not None
-    assert found.high is not None
-    assert (found.low + found.high) / 2 == pytest.approx(values.var(ddof=1))
-
-
-def test_the_jackknife_needs_two_units_that_count() -> None:
-    for value, without in ((1.0, []), (1.0, [None]), (1.0, [1.0, None]), (None, [1.0, 1.0])):
-        found = jackknife("a", value, without)
-        assert (found.value, found.low, found.high) == (value, None, None)

@@ -60,7 +60,7 @@ _NUMBER = st.from_regex(r"\A\d{1,4}\.\d{1,3}( \[\d\.\d, \d\.\d\])?\Z")
     names=st.lists(_WORD, min_size=1, max_size=3),
     numbers=st.lists(st.tuples(st.lists(_WORD, min_size=1, max_size=4).map(" ".join), _NUMBER), max_size=8),
     sentence=st.lists(_WORD, min_size=1, max_size=12).map(" ".join),
-    width=st.integers(60, 200),
+    width=st.integers(70, 200),
 )
 def test_no_word_and_no_number_is_broken(
     names: list[str], numbers: list[tuple[str, str]], sentence: str, width: int

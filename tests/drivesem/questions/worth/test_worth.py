@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import t
 
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.questions.worth.measures import (
@@ -20,6 +21,7 @@ from drivesem.questions.worth.measures import (
     detected,
     gain_of,
     information_worth,
+    jackknife,
     joined,
     one_hot,
     realism,
@@ -164,6 +166,31 @@ def test_intervals_hold_what_all_pictures_are_worth() -> None:
     assert below >= 80
     assert drawn < held - 30
     assert held >= 85
+
+
+def test_the_jackknife_of_a_mean_is_students_interval() -> None:
+    values = np.array([3.0, 1, 4, 1, 5, 9])
+    without = [float(np.delete(values, i).mean()) for i in range(6)]
+    found = jackknife("mean", float(values.mean()), without)
+    expected = t.interval(0.95, 5, values.mean(), values.std(ddof=1) / np.sqrt(6))
+    assert (found.value, found.low, found.high) == pytest.approx((values.mean(), *expected))
+
+
+def test_the_jackknife_takes_off_what_goes_with_one_over_the_number() -> None:
+    """The variance over n has a bias of just that kind: without it is that over n - 1."""
+    values = np.array([3.0, 1, 4, 1, 5, 9])
+    without = [float(np.delete(values, i).var()) for i in range(6)]
+    found = jackknife("variance", float(values.var()), without)
+    assert found.value == pytest.approx(values.var())
+    assert found.low is not None
+    assert found.high is not None
+    assert (found.low + found.high) / 2 == pytest.approx(values.var(ddof=1))
+
+
+def test_the_jackknife_needs_two_units_that_count() -> None:
+    for value, without in ((1.0, []), (1.0, [None]), (1.0, [1.0, None]), (None, [1.0, 1.0])):
+        found = jackknife("a", value, without)
+        assert (found.value, found.low, found.high) == (value, None, None)
 
 
 CARS = [[0.0, 0, 40, 40], [100.0, 0, 140, 40], [200.0, 0, 240, 40]]
