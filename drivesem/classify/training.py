@@ -224,10 +224,12 @@ class _State:
             self.generator.set_state(parts["random"]["own"])
             torch.set_rng_state(parts["random"]["torch"])
             curve: list[dict[str, float]] = json.loads(facts["curve"])
-        except (KeyError, ValueError, RuntimeError) as error:
+            if not isinstance(curve, list):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(f"curve: {curve}")
+            for group in self.optimiser.param_groups:
+                group["lr"] = float(self.schedule.get_last_lr()[0])
+        except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
             raise DetectorError(f"{path}: expected a checkpoint of this network, found {error!r:.120}") from error
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.schedule.get_last_lr()[0]
         return curve
 
 

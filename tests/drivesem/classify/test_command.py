@@ -161,12 +161,14 @@ def test_training_goes_on_to_the_bit(standins, tmp_path, capsys, monkeypatch):
     code, _, said = answer(capsys, *words[:3], "--limit", "2", *words[5:], "--out", str(tmp_path / "cut"))
     assert code == 2
     assert "limit" in said
-    files.write_bytes(
-        tmp_path / "cut" / "checkpoint.safetensors", (tmp_path / "cut" / "squeezenet.safetensors").read_bytes()
-    )
-    code, _, said = train("cut")
-    assert code == 2
-    assert "checkpoint.safetensors: expected a checkpoint of this network" in said
+    path = tmp_path / "cut" / "checkpoint.safetensors"
+    facts, tensors = training.read_weights(path)
+    others = training.read_weights(tmp_path / "cut" / "squeezenet.safetensors")
+    for bad in (others, (facts | {"curve": "3"}, tensors), (facts | {"schedule": "3"}, tensors)):
+        training.write_weights(path, *bad)
+        code, _, said = train("cut")
+        assert code == 2
+        assert "checkpoint.safetensors: expected a checkpoint of this network" in said
 
 
 def test_epochs_show_pictures_mirrored_and_at_half_the_size(standins, tmp_path, capsys, monkeypatch):
