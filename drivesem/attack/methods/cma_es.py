@@ -23,6 +23,8 @@ for 1 dimension)."""
 _FULL_COVARIANCE = 64
 """Dimensions up to which the whole covariance is learned: it has D (D + 1) / 2 numbers, which some hundred queries
 tell nothing about. Above, its diagonal (Ros and Hansen 2008)."""
+_FEWEST_DIMENSIONS = 2
+"""The library refuses to scale a single coordinate; a second one, which nothing follows, stands beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,8 @@ class CMAES(Search):
         lower, upper = problem.box(theta0, self.steps)
         size = upper - lower
         start = ((theta0 - lower) / size.clamp_min(torch.finfo(theta0.dtype).tiny)).detach().cpu().double().numpy()
+        coordinates = len(start)
+        start = np.pad(start, (0, max(_FEWEST_DIMENSIONS - coordinates, 0)), constant_values=0.5)
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         trials = Trials(problem, self.queries, self.early_stop)
         strategy = self._strategy(start, rng)
@@ -43,7 +47,7 @@ class CMAES(Search):
             losses: list[float] = []
             for place in places:
                 if trials.left:
-                    theta = lower + torch.from_numpy(np.asarray(place)).to(theta0) * size
+                    theta = lower + torch.from_numpy(np.asarray(place)[:coordinates]).to(theta0) * size
                     losses.append(trials.judge(theta).loss)
             if len(losses) == len(places):
                 strategy.tell(places, [-loss for loss in losses])

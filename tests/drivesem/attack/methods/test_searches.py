@@ -138,6 +138,21 @@ def test_cma_es_goes_on_where_nothing_changes_the_loss(capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize("slope", [0.0, 1e-6, 1.0])
+def test_cma_es_spreads_one_coordinate_alone(slope):
+    """As wide as the library lets it, where the loss grows all the way or not at all."""
+    for seed in range(4):
+        problem = Problem(
+            lambda theta: (0.0, theta),
+            lambda theta: Projected(theta, ()),
+            lambda theta: Score(slope * float(theta.sum()), 0, 0, False, False),
+            torch.full((1,), 0.1),
+            torch.full((1,), -1.0),
+            torch.full((1,), 1.0),
+        )
+        assert CMAES(queries=96)(problem, torch.zeros(1), seed=seed).queries == 96
+
+
 def test_cma_es_moves_one_coordinate_alone_and_a_thousand():
     for size in (1, 1000):
         goal = torch.full((size,), 0.2)
