@@ -114,11 +114,11 @@ class LitMesh:
         seen = Looks.of(fragments, looks)
         blend = _Blend.of(self, seen, clip, coverage, backend)
         colour = self._colours(blend.face, blend.at, clip, vertices, lights, backend)
+        amounts = [(seen.pixel, colour[: len(seen.face)] * seen.share[:, None].to(colour))]
+        amounts += [strip.change(seen, colour) for strip in blend.strips]
         total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
-        own = len(seen.face)
-        total = total.index_add(0, seen.pixel, colour[:own] * seen.share[:, None].to(colour))
-        for strip in blend.strips:
-            total = strip.added(total, seen, colour)
+        # All in one go: a sum out of place copies the whole picture.
+        total.index_add_(0, *(torch.cat(parts) for parts in zip(*amounts, strict=True)))
         cover = coverage.reshape(y1 - y0, looks, x1 - x0, looks)
         cover = reduce(torch.add, reduce(torch.add, cover.unbind(1)).unbind(2)) / looks**2
         rgb = _Turned.apply(total).reshape(3, y1 - y0, x1 - x0) / torch.where(cover > 0, cover, 1.0)
@@ -153,7 +153,7 @@ class LitMesh:
         corners = vertices.index_select(0, self.faces.reshape(-1)).reshape(-1, 3, 3)
         across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         summed = torch.zeros_like(corners).reshape(-1, 3)
-        summed = summed.index_add(0, self._corner, across.index_select(0, self._face))
+        summed.index_add_(0, self._corner, across.index_select(0, self._face))
         away = (across.detach() * corners.detach().mean(dim=1)).sum(dim=1) > 0
         sign = torch.where(away, -1.0, 1.0).to(corners).repeat_interleave(3)
         return corners, _unit(summed) * sign[:, None], away
@@ -273,13 +273,13 @@ class _Strip:
     more: Tensor
     less: Tensor | None
 
-    def added(self, total: Tensor, seen: Looks, colour: Tensor) -> Tensor:
-        """total (pixels, 3) with it; colour (S, 3): of sights."""
+    def change(self, seen: Looks, colour: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (P,), and what each gets more of (P, 3); colour (S, 3): of sights."""
         change = colour.index_select(0, self.more)
         if self.less is not None:
             change = change - colour.index_select(0, self.less)
         amount = self.amount.to(colour) / seen.count**2
-        return total.index_add(0, seen.pixel_of(self.look), amount[:, None] * change)
+        return seen.pixel_of(self.look), amount[:, None] * change
 
 
 @dataclass(frozen=True, slots=True)
