@@ -44,6 +44,9 @@ _AFLOAT = (0.8, 0.02)
 """m, and m a metre of distance: what stands higher above or deeper below the ground than this is no vehicle."""
 _INSIDE = 0.35
 """Share of the smaller footprint from which on two vehicles cannot both be where they are."""
+_NEAR_BORDER = 0.05
+"""A detector's box that ends nearer to the image's border than this share of its side is cut by it. Of 260 such
+ends in 400 generated frames 183 were within BORDER_PX, and 207 within this; of 3,523 others 7."""
 DETECTOR_LOOKS = 2
 """A detector's boxes are not tight: the network looks again at those of what it found."""
 FITTING = FitSettings(max_shift_m=0.4, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
@@ -106,6 +109,8 @@ def label_free(
     """
     names = [_class_name(int(label), classes) for label in detections.labels]
     boxes = detections.boxes_xyxy.float()
+    mine = torch.tensor([name in VEHICLES for name in names], dtype=torch.bool)
+    boxes = torch.where(mine[:, None], _to_border(boxes, frame.camera), boxes)
     placed = _place(frame, boxes, names, detections.scores, ground, DETECTOR_LOOKS)
     vehicles, poses = placed.vehicles, placed.poses
     boxes = boxes.clone()
@@ -202,6 +207,14 @@ def _place(
     seen = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
     seen[vehicles] &= _possible(poses, scores[vehicles])
     return _Placed(vehicles, poses, translation, yaw, size, full, inside, seen)
+
+
+def _to_border(boxes: Tensor, camera: Camera) -> Tensor:
+    """Boxes (N, 4) px whose sides near the image's border lie on it."""
+    near = (_NEAR_BORDER * (boxes[:, 2:] - boxes[:, :2])).clamp_min(BORDER_PX)
+    low, high = boxes[:, :2], boxes[:, 2:]
+    end = boxes.new_tensor([camera.width - 1, camera.height - 1])
+    return torch.cat([torch.where(low <= near, 0.0, low), torch.where(high >= end - near, end, high)], dim=1)
 
 
 def _class_name(label: int, classes: tuple[str, ...]) -> str:

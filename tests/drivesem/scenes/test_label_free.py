@@ -89,6 +89,21 @@ def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: 
     assert float(labels.boxes_xyxy[3, 0]) == 0
 
 
+def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within a twentieth of their sides, or 2 px; people's boxes stay as they are."""
+    asked: list[torch.Tensor] = []
+
+    def estimate(_: torch.Tensor, boxes_xyxy: torch.Tensor, *words: object, **more: object) -> pose.Poses:
+        asked.append(boxes_xyxy)
+        return known(torch.tensor([[4.0 * i, 1.65, 20] for i in range(len(boxes_xyxy))]))()
+
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate", estimate)
+    boxes = [[902.0, 232, 1232, 368], [10, 100, 210, 200], [11, 100, 211, 200], [1.5, 1.5, 30, 30], [3, 9, 60, 180]]
+    label_free(frame_of(), seen([*boxes, [900, 100, 1240, 374]], [CAR, CAR, CAR, TRUCK, CAR, PEDESTRIAN]))
+    cut = [[902.0, 232, 1241, 374], [0, 100, 210, 200], [11, 100, 211, 200], [0, 0, 30, 30], [3, 9, 60, 180]]
+    assert asked[0].tolist() == cut
+
+
 def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cars in one place the surer one stays; one above the ground goes; neighbours stay."""
     places = torch.tensor([[0.0, 1.65, 10], [0.4, 1.65, 11], [3.0, 1.65, 10], [6.0, -1.5, 15], [8.0, 2.2, 25]])
