@@ -38,6 +38,7 @@ METHOD = (
 )
 QUICK_FRAMES, FULL_FRAMES = 12, 60
 _MEETS = 0.5
+NEAR_PX = 120.0
 LEAST_HEIGHT_PX, MOST_OCCLUSION, MOST_TRUNCATION = 25.0, 1, 0.3
 """KITTI's moderate level."""
 _GOALS = {"heading, degrees": "median 5", "depth, relative": "median 0.06"}
@@ -55,11 +56,12 @@ class Error:
 @dataclass(frozen=True, slots=True)
 class VehicleRow:
     """One labelled vehicle that was found: as the network places it, and after the fit, None where the fit left it
-    out."""
+    out. apart: 1 - IoU of its box as placed and the label's."""
 
     frame: str
     label: int
     height_px: float
+    apart: float
     before: Error
     after: Error | None
 
@@ -142,7 +144,8 @@ def judge(frame: Frame, labels: Labels) -> FrameRows:
         end = fitted.get(row)
         after = None if end is None else error(labels, label, end.translation, float(end.yaw), frame.camera)
         height = float(labels.boxes_xyxy[label, 3] - labels.boxes_xyxy[label, 1])
-        rows.append(VehicleRow(frame.identifier, label, round(height, 1), before, after))
+        apart = round(1 - float(overlap[k, best]), 4)
+        rows.append(VehicleRow(frame.identifier, label, round(height, 1), apart, before, after))
     return FrameRows(len(wanted), tuple(rows))
 
 
@@ -178,6 +181,10 @@ def summary(frames: Sequence[FrameRows]) -> list[dict[str, Any]]:
         lines.append(
             {"measure": "vehicles found, share", "median": round(len(rows) / labelled, 4), "count": labelled}
         )
+    for name, least in (("box apart, 1 - IoU, as placed", 0.0), (f"the same from {NEAR_PX:.0f} px high", NEAR_PX)):
+        apart = np.array([row.apart for row in rows if row.height_px >= least])
+        if len(apart):
+            lines.append(_line(name, apart))
     for stage in ("before", "after"):
         errors = [e for row in rows if (e := getattr(row, stage)) is not None]
         if not errors:
@@ -191,16 +198,18 @@ def summary(frames: Sequence[FrameRows]) -> list[dict[str, Any]]:
         }
         when = "as placed" if stage == "before" else "after the fit"
         for name, values in figures.items():
-            lines.append(
-                {
-                    "measure": f"{name}, {when}",
-                    "median": round(float(np.median(values)), 4),
-                    "tail": round(float(np.percentile(values, 90)), 4),
-                    "worst": round(float(values.max()), 4),
-                    "count": len(values),
-                    "goal": _GOALS.get(name) if stage == "after" else None,
-                }
-            )
+            goal = _GOALS.get(name) if stage == "after" else None
+            lines.append(_line(f"{name}, {when}", values) | {"goal": goal})
         share = round(float((yaw > 90).mean()), 4)
         lines.append({"measure": f"turned, share, {when}", "median": share, "count": len(yaw)})
     return lines
+
+
+def _line(measure: str, values: np.ndarray) -> dict[str, Any]:
+    return {
+        "measure": measure,
+        "median": round(float(np.median(values)), 4),
+        "tail": round(float(np.percentile(values, 90)), 4),
+        "worst": round(float(values.max()), 4),
+        "count": len(values),
+    }

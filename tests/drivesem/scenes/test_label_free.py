@@ -89,6 +89,40 @@ def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: 
     assert float(labels.boxes_xyxy[3, 0]) == 0
 
 
+def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is high, and what is seen there of the same class at about the same place; all else stays."""
+    shown: list[tuple[int, int]] = []
+    large = [[100.0, 100, 400, 250], [500, 100, 700, 219], [800, 100, 1000, 260], [1100, 100, 1150, 240]]
+    small = [
+        [80.0, 90, 450, 290],
+        [490, 90, 720, 230],
+        [300, 90, 420, 300],
+        [790, 95, 1010, 280],
+        [1100, 95, 1160, 250],
+    ]
+
+    def predict(_: object, images: torch.Tensor) -> list[Detections]:
+        height, width = images.shape[2:]
+        shown.append((height, width))
+        boxes = torch.tensor(large if width == 1242 else small)
+        labels = torch.tensor([CAR, CAR, CAR, PEDESTRIAN] if width == 1242 else [CAR, CAR, CAR, TRUCK, PEDESTRIAN])
+        ratio = torch.tensor([width / 1242, height / 375]).repeat(2)
+        return [Detections((boxes + 0.5) * ratio - 0.5, labels, torch.full((len(boxes),), 0.9))]
+
+    monkeypatch.setattr("drivesem.scenes.label_free.predict", predict)
+    found = detect(frame_of())
+    assert shown == [(375, 1242), (225, 745)]
+    torch.testing.assert_close(found.boxes_xyxy, torch.tensor([small[0], *large[1:]]), atol=1e-3, rtol=0)
+    shown.clear()
+    large[:] = large[1:2]
+    monkeypatch.setattr(
+        "drivesem.scenes.label_free.predict",
+        lambda _, images: shown.append(images.shape[2:]) or [seen(large, [CAR])],
+    )
+    assert torch.equal(detect(frame_of()).boxes_xyxy, torch.tensor(large))
+    assert len(shown) == 1
+
+
 def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within a twentieth of their sides, or 2 px; people's boxes stay as they are."""
     asked: list[torch.Tensor] = []
@@ -98,7 +132,13 @@ def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.Monkey
         return known(torch.tensor([[4.0 * i, 1.65, 20] for i in range(len(boxes_xyxy))]))()
 
     monkeypatch.setattr("drivesem.scenes.label_free.estimate", estimate)
-    boxes = [[902.0, 232, 1232, 368], [10, 100, 210, 200], [11, 100, 211, 200], [1.5, 1.5, 30, 30], [3, 9, 60, 180]]
+    boxes = [
+        [902.0, 232, 1232, 368],
+        [10, 100, 210, 200],
+        [11, 100, 211, 200],
+        [1.5, 1.5, 30, 30],
+        [3, 9, 60, 180],
+    ]
     label_free(frame_of(), seen([*boxes, [900, 100, 1240, 374]], [CAR, CAR, CAR, TRUCK, CAR, PEDESTRIAN]))
     cut = [[902.0, 232, 1241, 374], [0, 100, 210, 200], [11, 100, 211, 200], [0, 0, 30, 30], [3, 9, 60, 180]]
     assert asked[0].tolist() == cut

@@ -52,11 +52,15 @@ def test_errors_are_of_heading_depth_and_place() -> None:
 def test_summary_keeps_both_stages_apart() -> None:
     before = [Error(4.0 + i, 0.05, 1.0) for i in range(5)]
     rows = tuple(
-        VehicleRow("000", i, 60.0, e, None if i == 4 else replace(e, yaw_deg=1.0)) for i, e in enumerate(before)
+        VehicleRow("000", i, 60.0, 0.2, e, None if i == 4 else replace(e, yaw_deg=1.0))
+        for i, e in enumerate(before)
     )
-    turned = VehicleRow("001", 0, 60.0, Error(178.0, 0.1, 2.0), Error(178.0, 0.1, 2.0))
+    turned = VehicleRow("001", 0, 140.0, 0.4, Error(178.0, 0.1, 2.0), Error(178.0, 0.1, 2.0))
     lines = {s["measure"]: s for s in bench.summary([FrameRows(6, rows), FrameRows(2, (turned,))])}
     assert lines["vehicles found, share"]["median"] == 0.75
+    assert lines["box apart, 1 - IoU, as placed"]["median"] == 0.2
+    assert lines["the same from 120 px high"]["median"] == 0.4
+    assert lines["the same from 120 px high"]["count"] == 1
     assert lines["heading, degrees, as placed"]["median"] == 6.5
     assert lines["heading, degrees, after the fit"]["median"] == 1.0
     assert lines["heading, degrees, after the fit"]["count"] == 5
