@@ -38,7 +38,8 @@ _NEAR_PX, _NEAR_SCALE = 120.0, 0.6
 """Boxes of vehicles that are so high in the detector's picture are taken from one so much smaller: the detector
 knows few that are nearer, and ends their boxes too early (`python -m tools.bench label-free` has its error)."""
 _SAME_IOU = 0.4
-"""Boxes in both pictures that overlap so much are one vehicle."""
+"""Boxes in both pictures that overlap so much are one vehicle. So are two that meet the same one in the smaller
+picture: they then stand in one place, and one is left out."""
 _TWICE_IOU = 0.6
 """Boxes of a car and a truck that overlap more than this are one vehicle."""
 VEHICLE_CLASSES = ("Car", "Truck")
