@@ -34,7 +34,7 @@ _DETECTOR_FOCAL_PX = 721.0
 """Of the pictures that the detector was trained on: others are resized so that cars are as large."""
 _SAME_SCALE = 1.3
 """Up to this ratio of focal lengths they are not."""
-_NEAR_PX, _NEAR_SCALE = 120.0, 0.6
+_NEAR_PX, _NEAR_SCALE = 100.0, 0.6
 """Boxes of vehicles that are so high in the detector's picture are taken from one so much smaller: the detector
 knows few that are nearer, and ends their boxes too early (`python -m tools.bench label-free` has its error)."""
 _SAME_IOU = 0.4

@@ -56,22 +56,24 @@ class Error:
 @dataclass(frozen=True, slots=True)
 class VehicleRow:
     """One labelled vehicle that was found: as the network places it, and after the fit, None where the fit left it
-    out. apart: 1 - IoU of its box as placed and the label's."""
+    out."""
 
     frame: str
     label: int
     height_px: float
-    apart: float
     before: Error
     after: Error | None
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRows:
-    """A frame's vehicles. labelled: how many there were to be found."""
+    """A frame's vehicles. labelled: how many there were to be found. near: of each very near one, cut ones too,
+    1 - IoU of its box and the one placed that it meets best.
+    """
 
     labelled: int
     rows: tuple[VehicleRow, ...]
+    near: tuple[float, ...] = ()
 
 
 def names(config: BenchTool) -> list[str]:
@@ -144,9 +146,11 @@ def judge(frame: Frame, labels: Labels) -> FrameRows:
         end = fitted.get(row)
         after = None if end is None else error(labels, label, end.translation, float(end.yaw), frame.camera)
         height = float(labels.boxes_xyxy[label, 3] - labels.boxes_xyxy[label, 1])
-        apart = round(1 - float(overlap[k, best]), 4)
-        rows.append(VehicleRow(frame.identifier, label, round(height, 1), apart, before, after))
-    return FrameRows(len(wanted), tuple(rows))
+        rows.append(VehicleRow(frame.identifier, label, round(height, 1), before, after))
+    near = labels.boxes_xyxy[nearest(labels)].float()
+    meets = iou_matrix(near, guess.boxes_xyxy[mine])
+    apart = 1 - meets.amax(dim=1) if mine else torch.ones(len(near))
+    return FrameRows(len(wanted), tuple(rows), tuple(round(value, 4) for value in apart.tolist()))
 
 
 def judged(labels: Labels) -> list[int]:
@@ -157,6 +161,13 @@ def judged(labels: Labels) -> list[int]:
     )
     posed = (labels.size_lhw > 0).all(1) & torch.isfinite(labels.yaw)
     return [i for i, kind in enumerate(labels.kind) if kind in VEHICLES and bool(clear[i] & posed[i])]
+
+
+def nearest(labels: Labels) -> list[int]:
+    """Rows of the vehicles that are very near, whole or not."""
+    height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    clear = (height >= NEAR_PX) & (labels.occlusion <= MOST_OCCLUSION)
+    return [i for i, kind in enumerate(labels.kind) if kind in VEHICLES and bool(clear[i])]
 
 
 def error(labels: Labels, row: int, translation: Tensor, yaw: float, camera: Camera) -> Error:
@@ -181,10 +192,9 @@ def summary(frames: Sequence[FrameRows]) -> list[dict[str, Any]]:
         lines.append(
             {"measure": "vehicles found, share", "median": round(len(rows) / labelled, 4), "count": labelled}
         )
-    for name, least in (("box apart, 1 - IoU, as placed", 0.0), (f"the same from {NEAR_PX:.0f} px high", NEAR_PX)):
-        apart = np.array([row.apart for row in rows if row.height_px >= least])
-        if len(apart):
-            lines.append(_line(name, apart))
+    near = np.array([value for frame in frames for value in frame.near])
+    if len(near):
+        lines.append(_line(f"1 - IoU of boxes from {NEAR_PX:.0f} px high, cut ones too", near))
     for stage in ("before", "after"):
         errors = [e for row in rows if (e := getattr(row, stage)) is not None]
         if not errors:

@@ -40,6 +40,13 @@ def test_what_is_judged() -> None:
     assert bench.judged(labels()) == [0]
 
 
+def test_what_is_very_near() -> None:
+    """Cut or not, but not hidden; 60 px is not near."""
+    shown = labels()
+    shown.boxes_xyxy[:, 3] = torch.tensor([160.0, 120, 230, 230, 220, 230])
+    assert bench.nearest(shown) == [3, 4]
+
+
 def test_errors_are_of_heading_depth_and_place() -> None:
     found = bench.error(labels(), 0, torch.tensor([1.3, 1.2, 20.4]), 0.5 - math.radians(3), CAMERA)
     assert found.yaw_deg == pytest.approx(3, abs=0.01)
@@ -52,15 +59,15 @@ def test_errors_are_of_heading_depth_and_place() -> None:
 def test_summary_keeps_both_stages_apart() -> None:
     before = [Error(4.0 + i, 0.05, 1.0) for i in range(5)]
     rows = tuple(
-        VehicleRow("000", i, 60.0, 0.2, e, None if i == 4 else replace(e, yaw_deg=1.0))
-        for i, e in enumerate(before)
+        VehicleRow("000", i, 60.0, e, None if i == 4 else replace(e, yaw_deg=1.0)) for i, e in enumerate(before)
     )
-    turned = VehicleRow("001", 0, 140.0, 0.4, Error(178.0, 0.1, 2.0), Error(178.0, 0.1, 2.0))
-    lines = {s["measure"]: s for s in bench.summary([FrameRows(6, rows), FrameRows(2, (turned,))])}
+    turned = VehicleRow("001", 0, 60.0, Error(178.0, 0.1, 2.0), Error(178.0, 0.1, 2.0))
+    lines = {
+        s["measure"]: s for s in bench.summary([FrameRows(6, rows, (0.2,)), FrameRows(2, (turned,), (0.1, 1.0))])
+    }
     assert lines["vehicles found, share"]["median"] == 0.75
-    assert lines["box apart, 1 - IoU, as placed"]["median"] == 0.2
-    assert lines["the same from 120 px high"]["median"] == 0.4
-    assert lines["the same from 120 px high"]["count"] == 1
+    near = lines["1 - IoU of boxes from 120 px high, cut ones too"]
+    assert (near["median"], near["worst"], near["count"]) == (0.2, 1.0, 3)
     assert lines["heading, degrees, as placed"]["median"] == 6.5
     assert lines["heading, degrees, after the fit"]["median"] == 1.0
     assert lines["heading, degrees, after the fit"]["count"] == 5
