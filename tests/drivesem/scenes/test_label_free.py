@@ -92,10 +92,10 @@ def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: 
 def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is high, and what is seen there of the same class at about the same place; all else stays."""
     shown: list[tuple[int, int]] = []
-    large = [[100.0, 100, 400, 250], [500, 100, 700, 219], [800, 100, 1000, 260], [1100, 100, 1150, 240]]
+    large = [[100.0, 100, 400, 250], [500, 100, 700, 199], [800, 100, 1000, 260], [1100, 100, 1150, 240]]
     small = [
         [80.0, 90, 450, 290],
-        [490, 90, 720, 230],
+        [490, 90, 720, 210],
         [300, 90, 420, 300],
         [790, 95, 1010, 280],
         [1100, 95, 1160, 250],
