@@ -180,15 +180,18 @@ def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
     url = f"file://{tmp_path}/elsewhere/kitti"
     words = ["synth", "--frames", "2", "--seed", "5", "--engine", "ray", "--address", cluster.address]
     assert main([*words, "--out", url]) == 0
-    (tmp_path / "kitti" / ".lock").unlink()
+    for made in (place(url), tmp_path / "kitti"):
+        (made / ".lock").unlink(missing_ok=True)
     assert contents(place(url)) == contents(tmp_path / "kitti")
+    assert not (tmp_path / "elsewhere" / "kitti" / ".lock").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_studies_and_questions_by_a_cluster_are_those_asked_here(tmp_path: Path, alike: Alike) -> None:
     study = ["study", "labels", "--quick", "--limit", "1", "--steps", "1", "--peer", "off", "--bootstrap", "0"]
-    alike(study, "study", "study.", "largest", "label_sets", "arms/combo")
+    place_and_time = ("kept/study.json", "kept/frames.csv", "arms/translate/config.yaml")
+    alike(study, "study", "study.", "largest", "label_sets", "arms/combo", *place_and_time)
     run = str(tmp_path / "study" / "arms" / "translate")
     alike(["confirm", "--run", run], "confirm")
     alike(["holes", run, "--samples", "24", "--fresh", "8"], "holes")
