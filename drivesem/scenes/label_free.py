@@ -90,9 +90,10 @@ def detect(frame: Frame, detector: Predictor | None = None) -> Detections:
     if not near.any():
         return found
     smaller = _seen(frame, detector, _NEAR_SCALE * scale)
-    overlap = iou_matrix(boxes, smaller.boxes_xyxy) * (found.labels[:, None] == smaller.labels)
-    same = near & (overlap >= _SAME_IOU).any(dim=1)
-    boxes[same] = smaller.boxes_xyxy[overlap[same].argmax(dim=1)]
+    if len(smaller):
+        overlap = iou_matrix(boxes, smaller.boxes_xyxy) * (found.labels[:, None] == smaller.labels)
+        same = near & (overlap >= _SAME_IOU).any(dim=1)
+        boxes[same] = smaller.boxes_xyxy[overlap[same].argmax(dim=1)]
     return found
 
 

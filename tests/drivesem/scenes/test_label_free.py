@@ -104,8 +104,9 @@ def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pyt
     def predict(_: object, images: torch.Tensor) -> list[Detections]:
         height, width = images.shape[2:]
         shown.append((height, width))
-        boxes = torch.tensor(large if width == 1242 else small)
+        boxes = torch.tensor(large if width == 1242 else small).reshape(-1, 4)
         labels = torch.tensor([CAR, CAR, CAR, PEDESTRIAN] if width == 1242 else [CAR, CAR, CAR, TRUCK, PEDESTRIAN])
+        labels = labels[: len(boxes)]
         ratio = torch.tensor([width / 1242, height / 375]).repeat(2)
         return [Detections((boxes + 0.5) * ratio - 0.5, labels, torch.full((len(boxes),), 0.9))]
 
@@ -113,6 +114,8 @@ def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pyt
     found = detect(frame_of())
     assert shown == [(375, 1242), (225, 745)]
     torch.testing.assert_close(found.boxes_xyxy, torch.tensor([small[0], *large[1:]]), atol=1e-3, rtol=0)
+    small.clear()  # nothing is seen there
+    torch.testing.assert_close(detect(frame_of()).boxes_xyxy, torch.tensor(large))
     shown.clear()
     large[:] = large[1:2]
     monkeypatch.setattr(
