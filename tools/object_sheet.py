@@ -13,6 +13,7 @@ beside it, and prints how alike they are.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -69,10 +70,10 @@ def beside(objects: ObjectSet, second: str) -> np.ndarray:
     return np.hstack([np.vstack(rows[i * third : (i + 1) * third]) for i in range(3)])
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Write the sheet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path)
+    parser.add_argument("out", type=Path, help="a .jpg or .png file")
     parser.add_argument("--objects", help="a folder of meshes; without it, the embedded objects")
     parser.add_argument("--classes", nargs="+")
     parser.add_argument("--split", default="test", choices=SPLITS)
@@ -81,21 +82,25 @@ def main() -> None:
     parser.add_argument("--start", type=int, default=0, help="the first of them")
     parser.add_argument("--size", type=int, default=112, help="px a picture")
     parser.add_argument("--beside", choices=("mitsuba", "pyrender"), help="a second renderer")
-    told = parser.parse_args()
+    told = parser.parse_args(argv)
+    if told.out.suffix not in (".jpg", ".png"):
+        parser.error(f"out: expected a .jpg or .png file, found {told.out}")
     objects = open_objects(told.objects)
     if told.beside is not None:
-        files.write_png(told.out, beside(objects, told.beside))
-        return
-    rows = []
-    for kind in told.classes or objects.classes:
-        own = [name for name in objects.names(told.split) if name.startswith(f"{kind}/")]
-        chosen = own[told.start : told.start + told.each]
-        rows += [row(objects, chosen, told.views, told.size)] if chosen else []
-    wide = max(one.shape[1] for one in rows)
-    padded = [np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0))) for one in rows]
-    sheet = np.vstack(padded)[..., ::-1]
-    encoded = cv2.imencode(told.out.suffix, sheet, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    files.write_bytes(told.out, encoded.tobytes())
+        sheet = beside(objects, told.beside)
+    else:
+        rows = []
+        for kind in told.classes or objects.classes:
+            own = [name for name in objects.names(told.split) if name.startswith(f"{kind}/")]
+            chosen = own[told.start : told.start + told.each]
+            rows += [row(objects, chosen, told.views, told.size)] if chosen else []
+        wide = max(one.shape[1] for one in rows)
+        sheet = np.vstack([np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0))) for one in rows])
+    if told.out.suffix == ".png":
+        files.write_png(told.out, sheet)
+    else:
+        encoded = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+        files.write_bytes(told.out, encoded.tobytes())
 
 
 if __name__ == "__main__":
