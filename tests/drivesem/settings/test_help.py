@@ -51,6 +51,15 @@ def test_help_imports_nothing_that_takes_long(words: list[str]) -> None:
     assert done.stdout.rstrip().endswith("\nimported:")
 
 
+def test_the_package_is_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    typed = [sys.executable, "-m", "drivesem"]
+    done = subprocess.run([*typed, "attack", "--help"], capture_output=True, text=True, check=True)
+    assert done.stdout == printed(["attack", "--help"], capsys)
+    wrong = subprocess.run([*typed, "atack"], capture_output=True, text=True, check=False)
+    assert wrong.returncode == 2
+    assert wrong.stderr.endswith("did you mean attack?\n")
+
+
 def test_examples_parse(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for words, _ in EXAMPLES:
