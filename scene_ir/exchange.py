@@ -230,6 +230,8 @@ def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, f
     """Gain and lift as of `finish.exposure`: the medians of the others, of the gain as large a multiple of what
     the road shows where each stands, which differs along a street, in the shade of a house.
     """
+    if not len(scene.objects):
+        return 1.0, 0.0
     objects, whole = scene.objects, Compositor(scene.at_rest())
     gains, lifts = [], []
     for i, (surface, samples) in enumerate(zip(whole.fleet.surfaces, whole.samples(), strict=True)):

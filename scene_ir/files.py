@@ -23,7 +23,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,15 +163,38 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     try:
         yield temporary
         with writing(folder):
-            if folder.exists():
-                old = _sibling(folder)
-                os.replace(folder, old)
-                os.replace(temporary, folder)
-                shutil.rmtree(old)
-            else:
-                os.replace(temporary, folder)
+            _put(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _put(temporary: Path, folder: Path) -> None:
+    """`temporary` in the place of what has the name of `folder`, which is there again where that fails. Of two
+    processes that do so at once, the later one's stays.
+    """
+    done = False
+    while not done:
+        old = _sibling(folder)
+        with suppress(FileNotFoundError):
+            os.replace(folder, old)
+        try:
+            os.replace(temporary, folder)
+            done = True
+        except OSError:
+            if not os.path.lexists(folder):  # and no other's that came between
+                if os.path.lexists(old):
+                    os.replace(old, folder)
+                raise
+        if os.path.lexists(old):
+            _remove(old)
+
+
+def _remove(path: Path) -> None:
+    """A folder with all that is in it; a file or a link."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def digest(path: Path) -> str:
@@ -393,17 +416,44 @@ def check_pixels(path: Path, data: bytes) -> tuple[int, int]:
         return image.size
 
 
+def check_text(field: str, text: str) -> None:
+    """FormatError naming the field for text that UTF-8 does not hold, as the names of some old files are."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise FormatError(field, "text that UTF-8 holds", ascii(text)) from error
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether a PNG or JPEG goes on to its end, whatever phones write behind that; of others True. The decoder
+    fills what is missing with grey, without a word.
+    """
+    if data.startswith(b"\x89PNG"):
+        place = 8
+        while place + 12 <= len(data):
+            if data[place + 4 : place + 8] == b"IEND":
+                return True
+            place += 12 + int.from_bytes(data[place : place + 4], "big")
+        return False
+    if data.startswith(b"\xff\xd8"):
+        place = 2
+        while place + 4 <= len(data) and data[place] == 0xFF:
+            if data[place + 1] == 0xDA:  # the picture itself, in which 0xFF stands before no other marker
+                return data.find(b"\xff\xd9", place) >= 0
+            filler = data[place + 1] == 0xFF
+            place += 1 if filler else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        return b"\xff\xd9" in data[-64:]
+    return True
+
+
 def _decode(path: Path) -> np.ndarray:
     """The values of an image file as OpenCV has them, unchanged. FormatError where it is missing or no image."""
     import cv2
 
     data = read_bytes(path)
     check_pixels(path, data)
-    whole = not (data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]) and not (
-        data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-64:]
-    )  # the decoder fills what is missing with grey, without a word
     image = None
-    if data and whole:
+    if data and _is_whole(data):
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:

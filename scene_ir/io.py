@@ -296,6 +296,7 @@ def _provenance(provenance: Mapping[str, str]) -> dict[str, str]:
     for key, value in provenance.items():
         if not isinstance(key, str) or not isinstance(value, str):
             raise FormatError(f"scene.provenance[{key!r}]", "text", repr(value))
+        files.check_text(f"scene.provenance[{key!r}]", key + value)
     return dict(provenance)
 
 
@@ -384,6 +385,10 @@ class _Node:
             raise FormatError(self.where, f"shape {shape}", found)
         if not dtype.is_floating_point and not all(isinstance(v, int) for v in flat):
             raise FormatError(self.where, "integers", "other numbers")
+        if not dtype.is_floating_point and flat:
+            known = torch.iinfo(dtype)
+            if min(flat) < known.min or max(flat) > known.max:
+                raise FormatError(self.where, f"integers of {known.bits} bits", max(flat, key=abs))
         return torch.tensor(flat, dtype=dtype).reshape(shape)
 
     def build(self, make: Callable[[], _T]) -> _T:
@@ -429,7 +434,7 @@ class _Arrays:
         array = self._arrays[name]
         if array.dtype.name not in _DTYPES:
             raise FormatError(where, f"one of {', '.join(_DTYPES)}", array.dtype.name)
-        tensor = torch.from_numpy(array)
+        tensor = torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
         try:
             check_shape(where, tensor, *shape, floating=not integer)
         except SceneError as error:

@@ -98,6 +98,8 @@ class Camera:
         if self.projection is not None:
             check_shape("camera.projection", self.projection, 3, 4)
             check_finite("camera.projection", self.projection)
+            if not float(torch.linalg.det(self.projection[:, :3].double())):
+                raise RangeError("camera.projection", "three columns that can be inverted", "a determinant of 0")
         if self.height < 1 or self.width < 1:
             raise RangeError("camera size", "at least 1x1 px", f"{self.width}x{self.height}")
         focal = self.intrinsics.diagonal()[:2].tolist()

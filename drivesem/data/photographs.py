@@ -35,6 +35,7 @@ def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
 
     FormatError where the file is missing, does not decode, has more bits, or is not of `size_hw`.
     """
+    files.check_text(f"{path.parent}: name of a photograph", path.name)
     with files.opened_image(path, files.read_bytes(path)) as image:
         width, height = image.size
         if image.mode not in _OTHER_CHANNELS:

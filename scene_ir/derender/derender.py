@@ -288,7 +288,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         others=kept,
     )
     if not cuts:
-        return scene
+        return replace(scene, front=())  # it would hide nothing, and its colours are solved with vehicles'
     margins = [_reach_px(cut, opacity, settings) for cut, opacity in zip(cuts, mattes, strict=True)]
     solved = solve_sources(
         scene,

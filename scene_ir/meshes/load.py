@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -47,6 +48,10 @@ _AXES = {
     "-z": (0.0, 0.0, -1.0),
 }
 _UP = {"y": "+y", "z": "+z", "-y": "-y"}
+_PAINTED = "_COLOR0"
+"""glTF's vertex colours, by a name as long as theirs under which trimesh leaves them as they are."""
+_GLB_HEAD = 20
+"""Bytes before the JSON of a GLB."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Node transform of our GLBs: glTF's y points up, ours down, so that viewers show the mesh upright."""
 _NAMES = (
@@ -151,7 +156,8 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     )
     if mesh.colours is not None:
         colours = mesh.colours.detach().cpu().numpy().astype(np.float32)
-        shape.visual = ColorVisuals(shape, vertex_colors=np.round(colours.clip(0, 1) * 255).astype(np.uint8))
+        shown = np.round(_linear(colours.clip(0, 1)) * 255).astype(np.uint8)
+        shape.visual = ColorVisuals(shape, vertex_colors=shown)
         shape.vertex_attributes["_rgb"] = colours
     if mesh.uv is not None:
         shape.vertex_attributes["_uv"] = mesh.uv.detach().cpu().numpy().astype(np.float32)
@@ -172,6 +178,9 @@ def read_scene(file: Path, root: Path | None = None, most: int = _MOST_BYTES) ->
         raise FormatError(str(file), "a mesh file", "no such file")
     data, kind = files.read_bytes(file, most), file.suffix.lower().removeprefix(".")
     _check_claims(file, kind, data)
+    if kind in ("glb", "gltf"):
+        said = len(data) if kind == "gltf" else _GLB_HEAD + _glb_json(data)
+        data = data[:said].replace(b'"COLOR_0"', b'"%b"' % _PAINTED.encode()) + data[said:]
     beside = _Beside(file.parent, root or file.parent, most)
     try:
         return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=beside, process=False)
@@ -193,7 +202,7 @@ class _Beside(Resolver):
     def get(self, key: str) -> bytes:
         """What is in the file. Raises FormatError, and FileNotFoundError where there is none."""
         name = key.strip().replace("\\", "/")
-        for candidate in (name, name.rpartition("/")[2]):
+        for candidate in dict.fromkeys((name, unquote(name), name.rpartition("/")[2])):  # glTF's are quoted
             path = self._folder / candidate
             if path.resolve().is_relative_to(self._root.resolve()) and path.is_file():
                 data = files.read_bytes(path, self._most)
@@ -215,6 +224,11 @@ class _Beside(Resolver):
         raise FormatError(str(self._folder / name), "a mesh that is read", "one that is written")
 
 
+def _glb_json(data: bytes) -> int:
+    """Bytes of a GLB's JSON."""
+    return int.from_bytes(data[12:16], "little")
+
+
 def _check_claims(file: Path, kind: str, data: bytes) -> None:
     """FormatError for a file that says that it holds more than a vehicle has: what it says is believed before what
     it holds is looked at.
@@ -222,8 +236,7 @@ def _check_claims(file: Path, kind: str, data: bytes) -> None:
     claims: list[Any] = []
     if kind in ("glb", "gltf"):
         if kind == "glb":
-            length = int.from_bytes(data[12:16], "little")
-            data = data[20 : 20 + length]
+            data = data[_GLB_HEAD : _GLB_HEAD + _glb_json(data)]
         try:
             told = files.parse_json(data.decode("utf-8"), str(file))
         except (UnicodeDecodeError, FormatError) as error:
@@ -346,15 +359,33 @@ def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
 
 
 def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
-    """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order. FormatError for a texture
-    that does not decode, or is too large.
+    """RGB (V, 3) in [0, 1] from texture, material, or vertex colours, in this order; of glTF from all of them, as
+    they are factors of each other. FormatError for a texture that does not decode, or is too large.
     """
+    base, share = _surface_colours(shape, file), painted(shape)
+    if share is not None:
+        return _srgb(share) * (1.0 if base is None else base)
+    return np.full((len(shape.vertices), 3), _DEFAULT_COLOUR) if base is None else base
+
+
+def painted(shape: trimesh.Trimesh) -> NDArray[np.float64] | None:
+    """What glTF's vertex colours multiply a surface's with: linear RGB (V, 3) in [0, 1]; None without any."""
+    values = shape.vertex_attributes.get(_PAINTED)
+    if values is None or len(values) != len(shape.vertices):
+        return None
+    share = np.asarray(values)[:, :3]
+    most = np.iinfo(share.dtype).max if np.issubdtype(share.dtype, np.integer) else 1.0
+    return np.nan_to_num(share / most, posinf=1.0).clip(0, 1).astype(np.float64)
+
+
+def _surface_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64] | None:
+    """The same of what trimesh makes of a file; None where it says nothing."""
     count = len(shape.vertices)
     visual = shape.visual
     if isinstance(visual, ColorVisuals):
-        return np.asarray(visual.vertex_colors)[:, :3] / 255.0 if visual.defined else _plain(count)
+        return np.asarray(visual.vertex_colors)[:, :3] / 255.0 if visual.defined else None
     if not isinstance(visual, TextureVisuals):
-        return _plain(count)
+        return None
     material, uv, image, tint = visual.material, visual.uv, None, None
     if isinstance(material, PBRMaterial):
         image = material.baseColorTexture
@@ -366,7 +397,7 @@ def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
         if image is None:
             tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0
     if image is None or uv is None or len(uv) != count:
-        return _plain(count) if tint is None else np.tile(tint, (count, 1))
+        return None if tint is None else np.tile(tint, (count, 1))
     return texels(image, uv[:, :2], file) * (1.0 if tint is None else tint)
 
 
@@ -385,19 +416,22 @@ def texels(image: Any, uv: NDArray[np.float64], file: Path, most_px: int | None 
         image.thumbnail((most_px, most_px))
     pixels = np.asarray(image)
     height, width = pixels.shape[:2]
-    places = np.mod(np.nan_to_num(uv, posinf=0.0, neginf=0.0), 1.0)
+    places = np.nan_to_num(uv, posinf=0.0, neginf=0.0)
+    if places.size and (places.min() < 0 or places.max() > 1):
+        places = np.mod(places, 1.0)  # it repeats; else 1 is its end, and not where it begins again
     columns = np.floor(places[..., 0] * width).astype(int).clip(0, width - 1)
-    rows = np.floor(np.mod(1.0 - places[..., 1], 1.0) * height).astype(int).clip(0, height - 1)
+    rows = np.floor((1.0 - places[..., 1]) * height).astype(int).clip(0, height - 1)
     return pixels[rows, columns] / 255.0
-
-
-def _plain(count: int) -> NDArray[np.float64]:
-    return np.full((count, 3), _DEFAULT_COLOUR)
 
 
 def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """Linear light to sRGB, in [0, 1] (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np.float64]:

@@ -175,7 +175,9 @@ def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
     A compositor may occur several times. The pictures are those that `Compositor.render` gives, one by one.
     """
     members = tuple(c for c, _ in pairs)
-    together = len(pairs) > 1 and all(c.fixed is not None for c in members)
+    together = len(pairs) > 1 and all(
+        c.fixed is not None and (scene.before is None) == (c.scene.before is None) for c, scene in pairs
+    )
     if not together:
         return [c.render(scene) for c, scene in pairs]
     objects = [c.moved(scene) for c, scene in pairs]

@@ -165,7 +165,7 @@ class Prepared:
         """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given.
         whole_patches: keep all of the ground that a vehicle may darken, not only what its source's shadow does."""
         self.settings = settings or RenderSettings()
-        if self.settings.backend == "warp" and scene.photograph.dtype != torch.float32:
+        if self.settings.backend == "warp":
             scene = scene_to(scene, torch.float32)
         self.scene = scene
         self._whole_patches = whole_patches

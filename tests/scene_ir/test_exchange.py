@@ -13,7 +13,7 @@ from scene_ir.io import load_scene, save_scene
 from scene_ir.meshes.loads import LOADS, load
 from scene_ir.meshes.templates import template
 from scene_ir.removal import without_objects
-from scene_ir.render.compositor import Compositor
+from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Category, SceneIR, scene_to
 
@@ -51,6 +51,32 @@ def test_the_scene_before_is_drawn_too_and_the_other_way_refused(scene: SceneIR)
     assert not torch.equal(compositor.render(left).image, picture(scene))
     with pytest.raises(RangeError, match="exchanged"):
         Compositor(scene).render(left)
+
+
+def test_states_in_one_go_are_those_drawn_one_by_one(scene: SceneIR) -> None:
+    left = without(scene, 0)
+    compositor = Compositor(left)
+    pairs = [(compositor, left), (compositor, left.as_photographed())]
+    for (one, state), found in zip(pairs, render_batch(pairs), strict=True):
+        assert torch.equal(found.image, one.render(state).image)
+    with pytest.raises(RangeError, match="exchanged"):
+        render_batch([(Compositor(scene), left), (compositor, left)])
+
+
+def test_a_vehicle_comes_where_none_was(scene: SceneIR) -> None:
+    empty = without_objects(scene, range(len(scene.objects)))
+    one = with_vehicle(empty, vehicle(torch.tensor([0.3, 1.65, 12.0])))
+    assert len(one.objects) == 1
+    assert not torch.equal(picture(one), picture(empty))
+
+
+def test_numbers_of_any_precision_draw_the_same(scene: SceneIR) -> None:
+    """Kernels read memory as float32."""
+    for name in ("background", "depth"):
+        mixed = replace(scene, **{name: getattr(scene, name).double()})
+        drawn, wanted = (Compositor(one).render(one) for one in (mixed, scene))
+        assert torch.equal(drawn.image, wanted.image)
+        assert torch.equal(drawn.depth, wanted.depth)
 
 
 def test_at_rest_keeps_the_change_and_as_photographed_does_not(scene: SceneIR) -> None:

@@ -4,6 +4,7 @@ import errno
 import gzip
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NoReturn
@@ -97,6 +98,49 @@ def test_a_folder_in_what_may_only_be_read_is_named(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(Path, "mkdir", _reads_only)
     with pytest.raises(WriteError, match="frame: expected"), files.whole_folder(tmp_path / "frame"):
         raise AssertionError
+
+
+def _written(folder: Path, text: str) -> None:
+    with files.whole_folder(folder) as part:
+        files.write_text(part / "a.txt", text)
+
+
+def test_a_link_to_a_folder_gives_way_and_what_it_leads_to_stays(tmp_path: Path) -> None:
+    _written(tmp_path / "real", "old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    _written(tmp_path / "link", "new")
+    assert (tmp_path / "link" / "a.txt").read_text() == "new"
+    assert (tmp_path / "real" / "a.txt").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "real"]
+
+
+def test_the_old_folder_is_there_again_where_the_new_one_cannot_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _written(tmp_path / "frame", "old")
+    replace = os.replace
+
+    def fails_for_the_new(source: Path, target: Path) -> None:
+        if target == tmp_path / "frame" and (source / "a.txt").read_text() == "new":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", fails_for_the_new)
+    with pytest.raises(WriteError, match="frame: expected"):
+        _written(tmp_path / "frame", "new")
+    assert (tmp_path / "frame" / "a.txt").read_text() == "old"
+    assert list(tmp_path.iterdir()) == [tmp_path / "frame"]
+
+
+def test_of_two_that_write_a_folder_at_once_each_is_whole(tmp_path: Path) -> None:
+    def write(text: str) -> None:
+        for _ in range(200):
+            _written(tmp_path / "frame", text)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(write, ("first", "second")))
+    assert (tmp_path / "frame" / "a.txt").read_text() in ("first", "second")
+    assert list(tmp_path.iterdir()) == [tmp_path / "frame"]
 
 
 def test_errors_of_reading_inside_stay_what_they_are(tmp_path: Path) -> None:

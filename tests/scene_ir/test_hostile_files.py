@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -102,6 +103,25 @@ def test_yaml_that_is_right(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text("a: 0x10\nb: [1, 2.5, true, null, text]\nc: -3\n")
     assert files.read_yaml(path) == {"a": 16, "b": [1, 2.5, True, None, "text"], "c": -3}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_what_a_phone_writes_behind_a_picture_is_passed_over(tmp_path: Path, suffix: str) -> None:
+    colours = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)
+    scans = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1] if suffix == ".jpg" else []
+    whole = cv2.imencode(suffix, colours, scans)[1].tobytes()
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(whole)
+    plain = files.read_image(path)
+    for behind in (b"\0" * 100, b"ftypmp42" * 500, b"\xff\xd8\xff\xda" + b"\0" * 100):
+        path.write_bytes(whole + behind)
+        assert np.array_equal(files.read_image(path), plain)
+    for cut in (len(whole) // 2, len(whole) - 20):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(
+            FormatError, match=rf"a\{suffix}: expected an image, found {cut} bytes that do not decode"
+        ):
+            files.read_image(path)
 
 
 @pytest.mark.parametrize("size", [(100_000, 100_000), (30_000, 30_000), (8_193, 8_192)])

@@ -195,6 +195,20 @@ def test_provenance_is_text(tmp_path: Path) -> None:
         save_scene(rich_scene(provenance={"frame": 8}), tmp_path / "scene")
 
 
+def test_provenance_that_is_no_text_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"provenance\['image'\].*UTF-8.*caf.udce9"):
+        save_scene(rich_scene(provenance={"image": "caf\udce9.png"}), tmp_path / "scene")
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_come_in_any_byte_order(saved: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    shutil.copytree(saved, folder)
+    depth = files.read_npz(folder / "arrays.npz")["depth"]
+    arrays("arrays.npz", depth=depth.astype(depth.dtype.newbyteorder(">")))(folder)
+    assert torch.equal(load_scene(folder).depth, load_scene(saved).depth)
+
+
 def edit(*keys: str | int, value: Any = ...) -> Any:
     """An edit of scene.json: set, or without `value` delete, what `keys` lead to."""
 
@@ -315,6 +329,16 @@ BAD = [
         "crop-missing",
         arrays("arrays.npz", source__1__foreground=None),
         r"source\.1\.foreground: expected an array",
+    ),
+    (
+        "int32",
+        edit("objects", "occlusion", value={"dtype": "int32", "values": [2**40, 0]}),
+        r"objects: occlusion: expected integers of 32 bits, found 1099511627776",
+    ),
+    (
+        "no-way-back",
+        edit("camera", "projection", value=[[0.0] * 4] * 3),
+        r"camera: camera\.projection: expected three columns that can be inverted",
     ),
     ("mesh-cut", cut_mesh, r"meshes/0\.glb: expected a readable mesh"),
     ("mesh-count", edit("meshes", value=3), r"meshes/2\.glb: expected a mesh file, found no such file"),

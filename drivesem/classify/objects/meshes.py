@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from drivesem.classify.objects.types import ObjectModel, used
 from scene_ir.errors import FormatError
-from scene_ir.meshes.load import read_scene, texels
+from scene_ir.meshes.load import painted, read_scene, texels
 from scene_ir.meshes.lod import simplify
 from scene_ir.types import Mesh, Part
 
@@ -91,8 +91,11 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
     rgb = np.full((count, 3), grey)
     material: Any = getattr(visual, "material", None)
     image, uv = None, getattr(visual, "uv", None)
+    factor = painted(part)
     if isinstance(visual, ColorVisuals):
-        if visual.defined:
+        if factor is not None:
+            rgb[:] = 1.0
+        elif visual.defined:
             rgb = _linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
     elif isinstance(material, PBRMaterial):
         image = material.baseColorTexture
@@ -101,7 +104,7 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         shininess = min(2 / max(rough, 0.1) ** 4, _MOST_SHININESS)
         if material.baseColorFactor is not None:
             rgb[:] = np.asarray(material.baseColorFactor, float)[:3] / 255.0
-        elif image is not None:
+        elif image is not None or factor is not None:
             rgb[:] = 1.0
     elif isinstance(material, SimpleMaterial):
         image = material.image
@@ -113,6 +116,8 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         corners = np.nan_to_num(np.asarray(uv, float)[part.faces][..., :2], posinf=0.0, neginf=0.0)
         seen = texels(image, np.einsum("pc,fcd->fpd", _PLACES, corners), path, _TEXTURE_PX)
         rgb = rgb * _linear(seen).mean(axis=1)
+    if factor is not None:
+        rgb = rgb * factor[part.faces].mean(axis=1)
     return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])
 
 

@@ -605,7 +605,7 @@ BAD_SHOTS: dict[str, tuple[dict[str, Any], type[SceneError], str]] = {
     "extrinsic": ({"extrinsic": np.eye(3)}, ShapeError, r"exposure\.extrinsic: expected \(4, 4\)"),
     "extrinsic-row": ({"extrinsic": np.ones((4, 4))}, ShapeError, r"exposure\.extrinsic: .* last row 0 0 0 1"),
     "offset": (
-        {"camera": Camera(torch.eye(3), 40, 80, torch.ones(3, 4))},
+        {"camera": Camera(torch.eye(3), 40, 80, torch.cat([torch.eye(3), torch.ones(3, 1)], dim=1))},
         RangeError,
         r"camera\.projection: expected a fourth column of 0",
     ),

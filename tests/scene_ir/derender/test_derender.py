@@ -160,6 +160,28 @@ def test_a_frame_without_vehicles_is_a_scene_without_objects(street, change):
     assert torch.equal(scene.ignore, street.frame.labels.boxes_xyxy)  # nothing that is found there counts
 
 
+def test_who_hides_all_vehicles_keeps_their_colours(street):
+    """What stands in front is drawn from its own layer, whose colours are solved with the vehicles'."""
+    one = street.frame.labels
+    left, top, right, bottom = one.boxes_xyxy[0].tolist()
+    wall = torch.tensor([[left - 5, top - 5, right + 5, bottom + 5]])
+    both = replace(
+        one,
+        kind=(*one.kind, "Pedestrian"),
+        boxes_xyxy=torch.cat([one.boxes_xyxy, wall]),
+        truncation=torch.zeros(2),
+        occlusion=torch.zeros(2, dtype=torch.int64),
+        translation=torch.cat([one.translation, one.translation / 2 + torch.tensor([0.0, 0.8, 0.0])]),
+        yaw=torch.cat([one.yaw, torch.zeros(1)]),
+        size_lhw=torch.cat([one.size_lhw, torch.tensor([[2.0, 2.0, 2.0]])]),
+    )
+    masks = torch.zeros(2, *street.mask.shape)
+    masks[1, max(int(top) - 5, 0) : int(bottom) + 5, max(int(left) - 5, 0) : int(right) + 5] = 1
+    scene = derender(replace(street.frame, labels=both, masks=masks), DerenderSettings(fit=False))
+    assert len(scene.objects) == 0
+    assert torch.equal(render(scene), street.frame.photograph)
+
+
 def test_what_is_labelled_and_no_vehicle_is_a_region_beside_those_of_the_labels(street):
     one, region = street.frame.labels, torch.tensor([[1.0, 2.0, 30.0, 40.0]])
     walker = torch.tensor([[300.0, 90.0, 320.0, 150.0]])

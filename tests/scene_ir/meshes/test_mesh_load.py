@@ -83,10 +83,9 @@ def test_viewers_get_colours_and_an_upright_mesh(tmp_path: Path) -> None:
     shown = scene.to_mesh()
     assert shown.bounds[:, 1] == pytest.approx([0.0, 1.0], abs=1e-6)
     assert shown.volume > 0
-    expected = (mesh.colours * 255).round().to(torch.uint8).numpy()
-    np.testing.assert_array_equal(
-        np.asarray(next(iter(scene.geometry.values())).visual.vertex_colors)[:, :3], expected
-    )
+    linear = torch.where(mesh.colours <= 0.04045, mesh.colours / 12.92, ((mesh.colours + 0.055) / 1.055) ** 2.4)
+    shown = np.asarray(next(iter(scene.geometry.values())).visual.vertex_colors)[:, :3]
+    np.testing.assert_allclose(shown, 255 * linear.numpy(), atol=0.51)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb"])
@@ -179,6 +178,71 @@ def test_glb_colour_factors_are_linear_light(tmp_path: Path) -> None:
     torch.testing.assert_close(
         load_mesh(tmp_path / "a.glb").colours[0], torch.tensor([0.5017, 1.0, 0.0]), atol=5e-3, rtol=0
     )
+
+
+LINEAR = (0.2, 0.05, 0.6)
+SRGB = torch.tensor([0.4845, 0.2478, 0.7977])
+
+
+def painted_glb(path: Path, colour: tuple[float, ...], dtype: str, factor: tuple[float, ...] | None) -> None:
+    """A box with vertex colours of a type, normalised where it is an integer one, and a material's colour."""
+    box = trimesh.creation.box((4, 1.5, 1.8))
+    most = 1.0 if dtype == "f4" else float(np.iinfo(dtype).max)
+    values = np.tile(np.round(np.array([*colour, 1.0]) * most, 0 if most > 1 else 9), (8, 1)).astype(f"<{dtype}")
+    blobs = [box.vertices.astype("<f4").tobytes(), box.faces.astype("<u4").tobytes(), values.tobytes()]
+    kinds = {"f4": 5126, "u2": 5123, "u1": 5121}
+    starts = np.cumsum([0, *map(len, blobs)]).tolist()
+    low, high = box.bounds.tolist()
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1}
+    if factor is not None:
+        primitive["material"] = 0
+    told = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [*(factor or (1, 1, 1)), 1]}}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3", "min": low, "max": high},
+            {"bufferView": 1, "componentType": 5125, "count": 36, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": kinds[dtype], "count": 8, "type": "VEC4", "normalized": most > 1},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(blob)}
+            for start, blob in zip(starts, blobs, strict=False)
+        ],
+        "buffers": [{"uri": "my%20box%20%C3%A9.bin", "byteLength": starts[-1]}],
+    }
+    (path.parent / "my box é.bin").write_bytes(b"".join(blobs))
+    path.write_text(json.dumps(told))
+
+
+@pytest.mark.parametrize("dtype", ["f4", "u2", "u1"])
+@pytest.mark.parametrize(
+    ("colour", "factor"), [(LINEAR, None), (LINEAR, (1, 1, 1)), ((1, 1, 1), LINEAR)], ids=["alone", "white", "one"]
+)
+def test_vertex_colours_of_gltf_are_linear_factors(tmp_path: Path, dtype: str, colour, factor) -> None:
+    painted_glb(tmp_path / "a.gltf", colour, dtype, factor)
+    colours = load_mesh(tmp_path / "a.gltf").colours
+    torch.testing.assert_close(colours, SRGB.expand_as(colours), atol=4e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("corners", "rows"),
+    [(((0.6, 0.5), (0.8, 0.5), (1.0, 0.9)), "column"), (((0.5, 0.0), (0.8, 0.2), (0.6, 0.3)), "row")],
+)
+def test_a_texture_ends_where_its_coordinates_end(tmp_path: Path, corners, rows: str) -> None:
+    image = np.zeros((4, 4, 3), np.uint8)
+    image[..., 0] = 255
+    image[(slice(None), slice(2, None)) if rows == "column" else (slice(2, None),)] = (0, 0, 255)
+    Image.fromarray(image).save(tmp_path / "t.png")
+    (tmp_path / "m.mtl").write_text("newmtl paint\nmap_Kd t.png\n")
+    box = trimesh.creation.box((4, 1.5, 1.8))
+    lines = ["mtllib m.mtl", "usemtl paint", *(f"v {x} {y} {z}" for x, y, z in box.vertices)]
+    lines += [f"vt {u} {v}" for u, v in corners]
+    lines += [f"f {a + 1}/1 {b + 1}/2 {c + 1}/3" for a, b, c in box.faces]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    assert load_mesh(tmp_path / "a.obj").colours.unique(dim=0).tolist() == [[0.0, 0.0, 1.0]]
 
 
 def test_parts_named_front_decide_over_the_outline(tmp_path: Path) -> None:
