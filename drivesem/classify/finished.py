@@ -19,7 +19,7 @@ from drivesem.classify.protocol import aimed_by
 from drivesem.classify.results import SCHEMA, ClassifiedFrame
 from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, Kept, KeptFrames
-from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, claim
+from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_files, claim
 from drivesem.run.frame import RESULT
 from drivesem.run.records import dump_record, from_json, load_record
 from drivesem.settings.commands import Classify
@@ -49,6 +49,7 @@ class ClassifyRun:
             raise UsageError("RUN", "a folder of drivesem classify attack", folder)
         config: Classify = from_json(Classify, loaded, str(path))
         config.check()
+        check_files(folder, config)
         paths = sorted((folder / FRAMES).glob(f"*/{RESULT}"))
         frames = [load_record(one, ClassifiedFrame, SCHEMA) for one in paths]
         if not frames:
@@ -77,8 +78,8 @@ class ClassifyRun:
 class FailureWorker(ABC, Generic[K]):
     """Answers a question about a run's failures, each in a folder of its own; built once for a process. question:
     its name, that of its folder in the run's and of its files; file, kind: of what is kept of a failure; grades:
-    which failures it is about; needs_some: whether a run may have none; free: further settings that change no
-    answer.
+    which failures it is about; needs_some: whether a run may have none; renews: as of `claim`; free: further
+    settings that change no answer.
     """
 
     question: ClassVar[str]
@@ -86,6 +87,7 @@ class FailureWorker(ABC, Generic[K]):
     kind: ClassVar[type[Any]]
     grades: ClassVar[Collection[str]] = tuple(Grade)
     needs_some: ClassVar[bool] = True
+    renews: ClassVar[bool] = False
     free: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
@@ -129,6 +131,6 @@ def ask_of_failures(config: Classify, worker: type[FailureWorker[K]], title: str
     build = partial(worker, config, run, out)
     work = build()
     written = (*(f"{worker.question}.{kind}" for kind in ("json", "md", "csv", "xml")), FRAMES)
-    claim(out, config, written, (*PRESENTATION, "folder", *worker.free))
+    claim(out, config, written, (*PRESENTATION, "folder", *worker.free), renews=worker.renews)
     kept = KeptFrames(run.folder, out, worker.file, partial(load_record, kind=worker.kind, schema=SCHEMA))
     return Asked(run, out, *kept.ask(names, work, build, config, Bar(title, remaining=True)))

@@ -40,6 +40,7 @@ class GateWorker(FailureWorker[FramePair]):
 
     question, file, kind = "gate", "pair.json", FramePair
     grades, needs_some, free = (Grade.CERTAIN, Grade.CONFIRMED), False, ("tolerance",)
+    renews = True
 
     def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
         super().__init__(config, run, out)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import MISSING, asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from scene_ir import files
 
 CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
+NAMED = "files.json"
+"""Digests of the files that these name."""
 FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
 SHARING = ("workers", "engine", "address", "keep_going")
@@ -43,24 +46,60 @@ PRESENTATION = (
 """Settings that change no frame's result: a run may be continued with others."""
 
 
-def claim(out: Path, config: Output, written: Iterable[str], presentation: Collection[str] = PRESENTATION) -> None:
+def claim(
+    out: Path,
+    config: Output,
+    written: Iterable[str],
+    presentation: Collection[str] = PRESENTATION,
+    renews: bool = False,
+) -> None:
     """Make `out` this run's folder, and hold it. written: names of the files and folders in it that an earlier run
-    wrote, which --no-resume removes, and nothing else.
+    wrote, which --no-resume removes, and nothing else; renews: so does a file that the settings name, such as
+    weights, where it holds something else than before.
 
-    Raises UsageError where `out` is a file, holds other files, a run whose settings were others, or what another
-    process is writing.
+    Raises UsageError where `out` is a file, holds other files, a run whose settings or files were others, or what
+    another process is writing.
     """
     path = out / CONFIG
     folder_of(None, out)
     if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     hold(out)
+    named = _named(config, presentation)
     if path.exists():
         if config.resume:
             _check_settings(path, config, presentation)
-        else:
+        other = _others(out, named) if config.resume else []
+        if other and not renews:
+            expected = "the files of this run (else another --out, or --no-resume)"
+            raise UsageError(str(out / NAMED), expected, f"another content of {', '.join(other)}")
+        if other or not config.resume:
             _remove(out / name for name in written)
     files.write_text(path, to_yaml(config))
+    if named:
+        files.write_json(out / NAMED, named)
+
+
+def _named(config: Output, presentation: Collection[str]) -> dict[str, str]:
+    """Digests of the files that settings name, such as weights, by how they name them."""
+    values = [value for value in settings_of(config, presentation).values() if isinstance(value, str)]
+    words = {word for value in values for word in (value, *re.split("[,:]", value)) if word}
+    return {word: files.digest(Path(word)) for word in sorted(words) if Path(word).is_file()}
+
+
+def _others(folder: Path, named: Mapping[str, str]) -> list[str]:
+    """Which of the files hold something else than when the folder was claimed."""
+    path = folder / NAMED
+    before = files.read_json(path) if path.is_file() else {}
+    known = before if isinstance(before, dict) else {}
+    return [word for word, digest in named.items() if known.get(word, digest) != digest]
+
+
+def check_files(run: Path, config: Output) -> None:
+    """UsageError where a file that a run's settings name is no longer the one that the run was made with."""
+    other = _others(run, _named(config, PRESENTATION))
+    if other:
+        raise UsageError(str(run / NAMED), "the files that this run was made with", f"another {', '.join(other)}")
 
 
 def _remove(paths: Iterable[Path]) -> None:
@@ -111,6 +150,7 @@ def trusted_attack(run: Path, trust: bool) -> Attack:
         if code is not None and not trust:
             expected = f"a detector that is data alone, or --trust, which lets this run the code in {code}"
             raise UsageError(f"{run / CONFIG}: {setting}", expected, getattr(attack, setting))
+    check_files(run, attack)
     return attack
 
 
