@@ -90,7 +90,8 @@ def confirm_run(config: Classify) -> tuple[ClassifiedRun, dict[str, Any]]:
     done = [run.shown(name) for name in run.frames]
     classes = worker.attacker.network.classes
     found = report_run(run.config, run.folder, classes, done, before["frames_failed"], before["seconds"])
-    looks = [ClassifyRun.of(config).frames[name].second for name in names if name not in failed]
+    again = ClassifyRun.of(config).frames
+    looks = [again[name].second for name in names if name not in failed]
     alike = [one for look in looks if look is not None for one in (look.before, look.after)]
     ious, colours = [one.iou for one in alike], [one.colour for one in alike]
     facts: dict[str, Any] = {

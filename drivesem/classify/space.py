@@ -133,8 +133,14 @@ class ObjectSpace(ThetaSpace[Moved]):
         return (100 * value, "%") if parameter is Moved.LIGHTING and k < 2 else None
 
     def sizes(self, theta: Tensor) -> dict[str, float]:
-        """The largest change of each parameter in theta (D,), by name, in theta's units."""
-        return {str(p): round(float(theta[where].abs().amax()), 6) for p, where in self.blocks.items()}
+        """The largest change of each parameter in theta (D,), by name: how far the farthest vertex goes, in object
+        sizes; of the others the largest coordinate, in theta's units.
+        """
+        most = {p: theta[where].abs().amax() for p, where in self.blocks.items()}
+        offsets = self.change(theta).offsets
+        if offsets is not None:
+            most[Moved.VERTEX] = offsets.norm(dim=1).amax()
+        return {str(p): round(float(value), 6) for p, value in most.items()}
 
     def few(self, theta: Tensor) -> dict[str, str]:
         """theta (D,) for people: each coordinate that is not one of many, by name."""

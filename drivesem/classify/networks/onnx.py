@@ -12,7 +12,7 @@ from detectors.adapters import onnx
 from detectors.adapters.spec import Spec, fit, prepare, settings_of
 from detectors.base import DetectorError
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
-from scene_ir.errors import FormatError
+from scene_ir.errors import FormatError, RangeError
 
 _ASKED = ("size", "resize", "channels", "scale", "mean", "std", "classes")
 """Of a YAML file's settings those that a classifier has."""
@@ -40,12 +40,20 @@ class OnnxClassifier:
         outputs = [list(output.shape) for output in session.get_outputs()]
         if len(session.get_inputs()) != 1 or len(shape) != 4 or shape[1] != 3:
             raise FormatError(f"{path}: input", "one batch of pictures (B, 3, H, W)", shape)
+        if isinstance(shape[0], int) and shape[0] != 1:
+            raise FormatError(f"{path}: input", "a batch of any size, or of one picture", shape)
         if len(outputs) != 1 or len(outputs[0]) != 2 or outputs[0][1] not in (len(classes), None):
             raise FormatError(f"{path}: output", f"one score for each of the {len(classes)} classes", outputs)
         own = tuple(settings.pop("classes", classes))
         if sorted(own) != sorted(classes):
             raise FormatError(f"{path}: classes", ", ".join(classes), ", ".join(own))
-        fixed = tuple(shape[2:]) if all(isinstance(side, int) for side in shape[2:]) else None
+        sides = [side if isinstance(side, int) else None for side in shape[2:]]
+        fixed = None if None in sides else tuple(sides)
+        size = settings.get("size")
+        if size is not None and not all(side in (None, given) for side, given in zip(sides, size, strict=True)):
+            raise FormatError(
+                f"{path.with_suffix('.yaml')}: size", f"{shape[2]} x {shape[3]}, as the graph has", size
+            )
         usual = {"resize": "stretch", "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "size": fixed}
         self._spec = Spec(**(usual | settings))
         self._session, self._input = session, session.get_inputs()[0].name
@@ -56,4 +64,7 @@ class OnnxClassifier:
         """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]; without a gradient."""
         fed = prepare(fit(images.detach().float().cpu(), self._spec)[0], self._spec)
         rows = [self._session.run(None, {self._input: one.numpy()})[0] for one in fed.contiguous().split(1)]
-        return torch.cat([torch.from_numpy(row) for row in rows])[:, self._order].to(images.device)
+        scores = torch.cat([torch.from_numpy(row) for row in rows])[:, self._order]
+        if not bool(scores.isfinite().all()):
+            raise RangeError("the network's scores", "finite numbers", "others")
+        return scores.to(images.device)

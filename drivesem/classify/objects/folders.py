@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -62,6 +63,12 @@ class FolderObjects:
             raise FormatError(str(folder), expected, "no object")
         known = {name.partition("/")[0] for name in self._paths}
         self.classes: tuple[str, ...] = CLASSES if known <= set(CLASSES) else tuple(sorted(known))
+        if len(self.classes) < 2:
+            raise FormatError(str(folder), "objects of two classes at least", f"of {min(known)} alone")
+        folders = Counter(name.replace("/", "-") for name in self._paths)
+        twice = next((name for name, count in folders.items() if count > 1), None)
+        if twice is not None:
+            raise FormatError(str(folder), "names that differ with - for /", f"{twice} twice")
         self._splits = self._listed() or self._drawn()
 
     def names(self, split: Split) -> tuple[str, ...]:
@@ -116,7 +123,8 @@ class FolderObjects:
             texts = {split: self._root / f"{split}.txt" for split in SPLITS}
             if not any(text.exists() for text in texts.values()):
                 return None
-            lists = {s: files.read_text(t).split() if t.exists() else [] for s, t in texts.items()}
+            lines = {s: files.read_text(t).splitlines() if t.exists() else [] for s, t in texts.items()}
+            lists = {split: [line.strip() for line in every if line.strip()] for split, every in lines.items()}
         owner: dict[str, Split] = {}
         for split in SPLITS:
             where = str(path) if path.exists() else str(self._root / f"{split}.txt")

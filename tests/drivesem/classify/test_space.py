@@ -39,7 +39,7 @@ def test_what_theta_does():
     assert torch.equal(change.angles, theta[9:])
     # places are counted in the order of their coordinates
     assert torch.equal(change.offsets, theta[:9].reshape(3, 3)[[0, 2, 1]])
-    assert space.sizes(theta) == {"vertex": 8.0, "pose": 11.0}
+    assert space.sizes(theta) == pytest.approx({"vertex": math.hypot(6, 7, 8), "pose": 11.0}, abs=1e-5)
     assert list(space.few(theta)) == ["pose.pitch", "pose.yaw", "pose.roll"]
     with pytest.raises(ShapeError, match="theta"):
         space.change(theta[1:])
@@ -64,6 +64,7 @@ def test_smooth_changes_move_neighbours_alike():
     assert space.name(0) == "lattice[0,0,0].x"
     offsets = space.change(torch.ones(192)).offsets
     torch.testing.assert_close(offsets, torch.ones(50, 3))
+    assert space.sizes(torch.ones(192))["vertex"] == pytest.approx(math.sqrt(3), abs=1e-5)
     rough = space.change(torch.randn(192, generator=torch.Generator().manual_seed(0))).offsets
     assert float(rough.diff(dim=0).abs().max()) < 0.5
 

@@ -17,7 +17,7 @@ from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
 from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
-from scene_ir.errors import FormatError
+from scene_ir.errors import FormatError, RangeError
 from tools.onnx_graph import constant_graph
 
 CLASSES = ("box", "ball", "pole")
@@ -333,6 +333,13 @@ def test_an_onnx_file(tmp_path):
     assert OnnxClassifier(path, CLASSES)(torch.rand(1, 3, 16, 16)).tolist() == [[3.0, 2.0, 1.0]]
 
 
+def test_scores_that_are_no_numbers_are_told(tmp_path):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(constant_graph((1, 3, 8, 8), {"scores": np.full((1, 3), np.nan)}))
+    with pytest.raises(RangeError, match="scores: expected finite numbers"):
+        OnnxClassifier(path, CLASSES)(torch.rand(1, 3, 8, 8))
+
+
 @pytest.mark.parametrize(
     ("graph", "settings", "message"),
     [
@@ -349,6 +356,8 @@ def test_an_onnx_file(tmp_path):
             "net.yaml: expected settings among size",
         ),
         (b"no graph", None, "expected an ONNX classifier"),
+        (constant_graph((8, 3, 8, 8), {"scores": SCORES}), None, "a batch of any size, or of one picture"),
+        (constant_graph((1, 3, 8, 8), {"scores": SCORES}), "size: 9", "net.yaml: size: expected 8 x 8"),
     ],
 )
 def test_an_onnx_file_that_is_no_classifier_of_these(tmp_path, graph, settings, message):

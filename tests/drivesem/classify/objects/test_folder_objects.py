@@ -176,6 +176,30 @@ def test_lists_beside_the_objects(tmp_path: Path, listed: str) -> None:
     assert open_objects(str(tmp_path)).names("test") == ("bus/a", "bus/c")
 
 
+def test_names_with_blanks_have_a_line(tmp_path: Path) -> None:
+    for name in ("my box", "my", "ball"):
+        folder = tmp_path / ("cat" if name == "ball" else "dog")
+        folder.mkdir(exist_ok=True)
+        CUBE.export(folder / f"{name}.ply")
+    (tmp_path / "train.txt").write_text("dog/my box\n\n  cat/ball \n")
+    assert open_objects(str(tmp_path)).names("train") == ("cat/ball", "dog/my box")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("cat/one", "cat/two"), "expected objects of two classes at least, found of cat alone"),
+        (("fire/truck-3", "fire-truck/3"), "names that differ with - for /, found fire-truck-3 twice"),
+    ],
+)
+def test_folders_that_cannot_be_told_apart(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        CUBE.export(tmp_path / f"{name}.ply")
+    with pytest.raises(FormatError, match=message):
+        open_objects(str(tmp_path))
+
+
 @pytest.mark.parametrize(
     ("lists", "message"),
     [
