@@ -173,9 +173,11 @@ def _held(draws: Sequence[Drawn]) -> int:
 
 
 def has(fault: Fault, place_xyxy: Tensor, look: Look) -> bool:
-    """Whether a look shows this fault: an object not found, or reported twice; something on nothing there."""
+    """Whether a look shows this fault: an object that is judged and not found, or reported twice; something on
+    nothing there. Where a draw hides an object, or makes it too small or faint to be judged, nothing is missed.
+    """
     if fault.kind in OF_OBJECTS:
-        return not bool(look.judged.found[fault.target])
+        return not bool(look.judged.found[fault.target] | look.view.targets.ignore[fault.target])
     if fault.kind is Kind.TWICE:
         return fault.target in look.judged.twice
     at = look.view.detections.boxes_xyxy[list(look.judged.background)]

@@ -37,11 +37,11 @@ class Still(Draw):
         return boxes_xyxy
 
 
-def look(found: bool, twice: bool = False, alarm: float | None = None) -> Look:
+def look(found: bool, twice: bool = False, alarm: float | None = None, hidden: bool = False) -> Look:
     boxes = PLACE if alarm is not None else PLACE[:0]
     scores = torch.tensor([] if alarm is None else [alarm])
     detections = Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), scores)
-    targets = Targets(PLACE + 300, torch.tensor([0]), torch.tensor([False]))
+    targets = Targets(PLACE + 300, torch.tensor([0]), torch.tensor([hidden]))
     background = (0,) if alarm is not None and alarm >= 0.5 else ()
     judged = Judged(torch.tensor([found]), {}, {0: 0} if twice else {}, background)
     return Look(View(targets, torch.zeros(1, 4), detections), judged, 0.5, Still(), 1)
@@ -76,6 +76,15 @@ def test_the_rule(right: int, wrong: int, certain: bool) -> None:
 def test_what_the_rule_promises() -> None:
     assert wilson(12, 16)[0] > 0.5
     assert wilson(11, 16)[0] < 0.5
+
+
+def test_what_a_draw_hides_is_not_missed_in_it() -> None:
+    """Nobody could see the car there: neither found nor missed."""
+    unseen = look(False, hidden=True)
+    count, _ = counted(LOST, [FOUND] * 16, [GONE] * 11 + [unseen] * 5)
+    assert (count.after, Rule().holds(count)) == (11, False)
+    assert Rule().holds(counted(LOST, [FOUND] * 16, [GONE] * 12 + [unseen] * 4)[0])
+    assert not Rule().holds(counted(LOST, [FOUND] * 14 + [unseen] * 2, [GONE] * 16)[0])
 
 
 def test_no_more_looks_than_decide() -> None:
