@@ -218,7 +218,8 @@ def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
     colour = texture.finished(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
     values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
     values = values.to(scene.background).contiguous()
-    values[:4] = kornia.filters.gaussian_blur2d(values[None, :4], (5, 5), (_LENS_PX, _LENS_PX), "replicate")[0]
+    if values.numel():  # else it stands beside the picture
+        values[:4] = kornia.filters.gaussian_blur2d(values[None, :4], (5, 5), (_LENS_PX, _LENS_PX), "replicate")[0]
     return _Alone(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
 
 

@@ -34,14 +34,20 @@ def goal(name: str, found: Candidates, targets: Targets, t_star: float, known: S
     """How near () the detector is to a failure, to be raised; differentiable to `found`.
 
     targets: labels index the columns of found.log_scores; ignored ones are no objects, and excuse what lies on
-    them. t_star in (0, 1): score from which a detection counts. known: columns of classes that are judged.
+    them. t_star in (0, 1]: score from which a detection counts. known: columns of classes that are judged.
     KeyError for a name not in GOALS.
     """
     wanted = {HIDE: (_hidden,), PHANTOM: (_phantoms,), LOCALISATION: (_apart,), FAILURE: (_hidden, _phantoms)}[
         name
     ]
-    parts = [part(found, targets, math.log(t_star) - math.log1p(-t_star), known) for part in wanted]
+    parts = [part(found, targets, logit_of(t_star), known) for part in wanted]
     return torch.stack(parts).sum()
+
+
+def logit_of(t_star: float) -> float:
+    """The logit of a threshold in (0, 1], which is finite, as those of scores are."""
+    below = min(t_star, math.exp(_LARGEST_LOG))
+    return math.log(below) - math.log1p(-below)
 
 
 def of_detections(found: Detections, classes: int) -> Candidates:

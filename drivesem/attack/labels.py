@@ -105,6 +105,8 @@ class Labeller:
         objects, camera = base.objects, base.camera
         self._limit = np.array([camera.width - 1.0, camera.height - 1.0] * 2)
         self._boxes = self._project(base)
+        self._absent = ~_any_area(self._boxes)
+        """(N,): what comes with a change, and was not in the picture before."""
         self._inside = self._clipped(self._boxes)
         self._outside = _outside(self._boxes, self._inside)
         self._hidden = None if base_render is None else _hidden_shares(base_render)
@@ -143,14 +145,16 @@ class Labeller:
         inside = self._clipped(whole)
         boxes = self._box2d + (inside - self._inside).astype(self._box2d.dtype)
         boxes = np.minimum(np.maximum(boxes, self._lowest), self._highest)
-        change = (_outside(whole, inside) - self._outside).astype(self._truncation.dtype)
+        change = (_outside(whole, inside) - np.where(self._absent, 0.0, self._outside)).astype(
+            self._truncation.dtype
+        )
         truncation = np.minimum(np.maximum(self._truncation + change, 0), 1)
         truncation = np.where(change == 0, self._truncation, truncation)
         occlusion, gone = self._occlusion, np.zeros_like(self._ignore)
         out_of_sight = gone
         if self._hidden is not None and render is not None:
             hidden = _hidden_shares(render)
-            occlusion = _new_occlusion(self._occlusion, self._hidden, hidden)
+            occlusion = _new_occlusion(self._occlusion, np.where(self._absent, 0.0, self._hidden), hidden)
             gone = (hidden >= 1) & (self._hidden < 1)
             out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS) & in_view
         hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render) | ~in_view

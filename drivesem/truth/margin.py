@@ -13,7 +13,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import Candidates
-from drivesem.attack.goals import logits_of
+from drivesem.attack.goals import logit_of, logits_of
 from drivesem.truth.kinds import MEETS, SAME_PLACE, TOUCHES
 
 FLOOR = -8.0
@@ -88,7 +88,7 @@ def of_background(
 
 def _best(logits: Tensor, overlap: Tensor, least: float, t_star: float, sharpness: float | None) -> Tensor:
     """The best logit () among candidates (A,) whose overlap (A,) is enough, less t*'s; `FLOOR` at least."""
-    beyond = logits - (math.log(t_star) - math.log1p(-t_star))
+    beyond = logits - logit_of(t_star)
     floor = beyond.new_tensor(FLOOR)
     if sharpness is None:
         return torch.cat([beyond[overlap >= least], floor[None]]).amax()

@@ -30,8 +30,8 @@ _DARKEST = 1e-6
 """Of a picture's values before gamma: it has a slope there."""
 _PART = 1 << 17
 """Numbers that a processor's second cache holds: one operation after the other on so many, not on all."""
-_TAPS = 2
-"""Pixels either way that a blur takes."""
+_TAPS, _REACH = 2, 2.5
+"""Pixels either way that a blur takes at least, and standard deviations of a wide one."""
 _NOTHING = 1e-9
 """Weight beside the largest that a picture does not show; products with subnormal ones take ten times as long."""
 
@@ -262,7 +262,8 @@ def _seen(size: int, shift_px: float, zoom: float, blur_px: float) -> Matrix:
     middle, pixels = (size - 1) / 2, np.arange(size)
     place = np.clip((pixels - middle - shift_px) / zoom + middle, 0, size - 1)
     first = np.minimum(np.floor(place).astype(np.int64), size - 2)
-    taps = np.arange(-_TAPS, _TAPS + 1)
+    reach = max(_TAPS, math.ceil(_REACH * blur_px))
+    taps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (taps / blur_px) ** 2) if blur_px > 0 else (taps == 0).astype(np.float64)
     weights[weights < _NOTHING] = 0
     matrix = np.zeros((size, size))

@@ -35,7 +35,7 @@ class Scouted(Attack):
         seen = self._run(Sampling(self.count, self.steps, self.early_stop, "halton"), problem, theta0, generator)
         starts = [problem.project(theta0).theta, *seen.thetas]
         scores = [problem.score(start) for start in starts]
-        ranks = [self._rank(problem, start, score) for start, score in zip(starts, scores, strict=True)]
+        ranks = [self._order(problem, start, score) for start, score in zip(starts, scores, strict=True)]
         best = max(range(len(starts)), key=lambda i: (*ranks[i], -i))
         if self.early_stop and scores[best].success:
             return seen

@@ -17,6 +17,8 @@ _FIRST_C = 10.0
 """At 1, a step that raises the loss is not worth its size; the search begins where it surely is."""
 _FACTOR = 10.0
 """c goes up or down by it until it is bracketed, as in Carlini and Wagner's search."""
+_MOST_C = 1e12
+"""Far from where Adam's moments overflow."""
 _INSIDE = 0.9
 """A start at a bound is moved inwards, to so many half widths from the centre: at a bound tanh has no slope.
 Weather starts there."""
@@ -86,6 +88,8 @@ class SCW(Attack):
                 c = low * _FACTOR
             else:
                 c = math.sqrt(low * high)
+            if not 1 / _MOST_C < c < _MOST_C:
+                break  # nothing fails at any price, or all does for none
         return search.proposals()
 
 

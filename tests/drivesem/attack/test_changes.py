@@ -7,16 +7,27 @@ import torch
 
 import drivesem as ds
 from drivesem.attack.budgets import PRESETS
-from drivesem.attack.changes import Change, Changes, affordable, parse_changes, passes_of, proposals, vehicle_mesh
+from drivesem.attack.changes import (
+    Change,
+    Changes,
+    _labelled,
+    affordable,
+    parse_changes,
+    passes_of,
+    proposals,
+    vehicle_mesh,
+)
 from drivesem.attack.feasibility_check import check_exchange, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.synth.demo import demo_scene
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
 from scene_ir.meshes.load import save_mesh
 from scene_ir.meshes.loads import load
 from scene_ir.meshes.templates import template
+from scene_ir.removal import without_objects
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR
 
@@ -142,6 +153,32 @@ def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
     assert x1 - x0 > 40
     assert y1 - y0 > 20
     assert len(to_kitti_labels(labeller.paper(), more.origin, more).kind) == len(scene.objects)
+
+
+@pytest.mark.parametrize(("column", "level"), [(0.0, 0), (1230.0, 0), (600.0, 2)])
+def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> None:
+    """Half of it beyond the border, or behind the only other car, which stands at 11 m in the middle."""
+    scene = demo_scene(0, 0)
+    scene = without_objects(scene, range(1, len(scene.objects)))
+    (across, _, middle, _), *_ = scene.camera.matrix.tolist()
+    ground = scene.environment.ground.tolist()
+    x, z = (column - middle) / across * 12, 12.0
+    y = -(ground[3] + ground[0] * x + ground[2] * z) / ground[1]
+    vehicle = Vehicle(template("sedan"), Category.CAR, torch.tensor([x, y, z]), torch.tensor(1.57), SIZE)
+    made = _labelled(with_vehicle(scene, vehicle), None)
+    expected = 0.0 if column == 600 else 0.57
+    assert float(made.objects.truncation[-1]) == pytest.approx(expected, abs=0.03)
+    assert int(made.objects.occlusion[-1]) == level
+
+
+@pytest.mark.parametrize(("frame", "seed"), [(8, 0), (1, 1)])
+def test_a_place_beside_the_picture_is_passed_over(frame: int, seed: int) -> None:
+    made = proposals(demo_scene(0, frame), Changes((Change.PARK,)), 6, seed)
+    assert made
+    for one in made:
+        x0, y0, x1, y1 = one.objects.box2d[-1].tolist()
+        assert x1 > x0
+        assert y1 > y0
 
 
 def test_a_car_that_another_hides_is_not_counted(scene: SceneIR) -> None:

@@ -52,6 +52,12 @@ def test_hide_counts_the_best_score_that_meets_each_object():
     assert of("hide", SEEN, truth((True, True, True))) == 0
 
 
+def test_the_highest_threshold_has_a_logit():
+    assert goals.logit_of(0.3) == math.log(0.3) - math.log1p(-0.3)
+    assert 16 < goals.logit_of(1.0) < 17
+    assert math.isfinite(float(goals.goal("failure", SEEN, truth(), 1.0, ALL)))
+
+
 def test_hiding_what_is_hidden_gains_nothing():
     lone = truth((False, True, True))
     faint = [of("hide", candidates(([0, 0, 20, 20], CAR, score)), lone) for score in (0.4, 0.01, 0.001)]

@@ -4,13 +4,14 @@ import dataclasses
 import math
 
 import kornia
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from drivesem.settings.errors import UsageError
 from drivesem.synth.demo import demo_scene
-from drivesem.truth.nuisances import Draw, Nuisances
+from drivesem.truth.nuisances import Draw, Nuisances, _seen
 from scene_ir.types import SceneIR
 
 OFF = Nuisances.of("off")
@@ -54,6 +55,13 @@ def test_ranges_hold(scene: SceneIR) -> None:
     # Spread over the range, not only within it.
     assert max(v for d in draws for v in d.shift_px) > 10
     assert min(v for d in draws for v in d.shift_px) < -10
+
+
+@pytest.mark.parametrize("blur_px", [0.7, 2.0, 6.0])
+def test_a_blur_is_as_wide_as_it_says(blur_px: float) -> None:
+    row = _seen(101, 0.0, 1.0, blur_px)[50]
+    away = np.arange(101) - 50
+    assert math.sqrt((row * away**2).sum()) == pytest.approx(blur_px, rel=0.08)
 
 
 def dot(scene: SceneIR, x: int, y: int) -> Tensor:

@@ -58,6 +58,14 @@ def test_where_nothing_is_better_it_begins_at_the_photograph() -> None:
     assert proposals.queries == 8 + 5
 
 
+def test_it_does_not_begin_where_its_own_render_says_no(slope) -> None:
+    world = slope(need=6.0, sight=8.0)  # far out the detector fails, and the car is out of sight
+    attack = Scouted(SiFGSM(steps=3), 16)
+    proposals = attack._propose(world.problem, torch.zeros(6), torch.Generator().manual_seed(0))
+    assert any(world.problem.score(theta).violations for theta in proposals.thetas[:16])
+    assert not world.problem.score(proposals.thetas[16]).violations
+
+
 def test_it_stops_at_a_sample_that_fails() -> None:
     hills = Hills()
     hills.top = START + 0.05

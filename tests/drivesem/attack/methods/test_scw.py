@@ -58,6 +58,13 @@ def test_without_a_failure_the_highest_loss_is_kept(slope):
     assert result.score.loss == max(float(world.loss(theta)) for theta in world.scored)
 
 
+def test_the_search_ends_where_nothing_fails_at_any_price(slope):
+    world = slope(need=math.inf)
+    proposals = SCW(queries=400, steps=2)._propose(world.problem, START, torch.Generator())
+    assert all(bool(theta.isfinite().all()) for theta in proposals.thetas)
+    assert proposals.queries < 40
+
+
 def test_a_gradient_is_taken_only_where_nothing_fails_yet(slope):
     world = slope(need=4.0)
     result = SCW(queries=30)(world.problem, START)
