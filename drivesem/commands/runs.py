@@ -15,7 +15,7 @@ from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import frames_in
 from drivesem.run.lock import held_elsewhere, hold
 from drivesem.run.parts import merge
 from drivesem.settings.commands import DEFAULT_COMBO, Attack, Runs
@@ -82,7 +82,7 @@ def _row(folder: Path) -> dict[str, Any]:
         "dataset": attack.dataset,
         "params": ",".join(figures.get("params", ())) or attack.params or f"combo {attack.combo or DEFAULT_COMBO}",
         "method": attack.method,
-        "frames": len(list(folder.glob(f"{FRAMES}/*/{RESULT}"))),
+        "frames": len(frames_in(folder)),
         "grades": figures.get("grades"),
         "mb": round(size / 1e6, 1),
     }

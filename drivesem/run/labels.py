@@ -18,9 +18,18 @@ the re-rendered photograph, and in the photograph."""
 RESULT = "result.json"
 
 
+def frames_in(run: Path) -> list[str]:
+    """Identifiers of the frames in a run's folder, sorted, without what a killed command left there. Virtual KITTI's
+    are folders in folders.
+    """
+    frames = run / "frames"
+    found = (path.parent.relative_to(frames) for path in sorted(frames.rglob(RESULT)))
+    return [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
+
+
 def layout_of(path: Path) -> str:
     """ "run", or one of `layouts.LAYOUTS`, by what lies there. FormatError where it is none."""
-    if any((path / "frames").glob(f"*/{RESULT}")):
+    if frames_in(path):
         return "run"
     layout = layouts.layout_of(path)
     if layout is None:
@@ -37,12 +46,12 @@ def read(
 
 
 def _of_run(path: Path, scored: bool, stage: str) -> LabelTable:
-    paths = sorted((path / "frames").glob(f"*/{RESULT}"))
-    if not paths:
+    names = frames_in(path)
+    if not names:
         raise FormatError(str(path / "frames"), f"frames with {RESULT}", "none")
     if stage not in STAGES:
         raise RangeError("stage", f"one of {', '.join(STAGES)}", stage)
-    results = [load_frame(file) for file in paths]
+    results = [load_frame(path / "frames" / name / RESULT) for name in names]
     records: list[tuple[int, BoxRecord]] = []
     for i, result in enumerate(results):
         if scored:

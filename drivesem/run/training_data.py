@@ -13,7 +13,7 @@ import torch
 from drivesem.data.frames import size_of_image
 from drivesem.data.kitti_labels import table_of
 from drivesem.data.label_table import REGION, LabelTable, camera_entry, shortest
-from drivesem.run.labels import RESULT
+from drivesem.run.labels import RESULT, frames_in
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.truth.grades import Grade
 from scene_ir.errors import FormatError
@@ -37,7 +37,7 @@ def labels_of_run(run: Path, frames: Sequence[str] | None = None) -> LabelTable:
     object that the detector lost, in an extra column. frames: some of them, by default all. FormatError naming a
     file that is not as it should be.
     """
-    names = sorted(p.parent.name for p in (run / "frames").glob(f"*/{RESULT}")) if frames is None else list(frames)
+    names = frames_in(run) if frames is None else list(frames)
     if not names:
         raise FormatError(str(run / "frames"), f"frames with {RESULT}", "none")
     folders = [run / "frames" / name for name in names]

@@ -18,6 +18,7 @@ from drivesem.attack.labels import LabelMode, with_others
 from drivesem.data import kitti
 from drivesem.evaluation.coco import ClassScores, evaluate
 from drivesem.run.frame import RESULT, as_targets
+from drivesem.run.labels import frames_in
 from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.training.targets import TRAINED, training_targets
@@ -33,13 +34,14 @@ Stage = Literal["benign", "rerender", "counterexample"]
 
 @dataclass(frozen=True)
 class AttackedFrame:
-    """One frame's folder in a run."""
+    """A frame of a run. name: its identifier."""
 
-    folder: Path
+    run: Path
+    name: str
 
     @property
-    def name(self) -> str:
-        return self.folder.name
+    def folder(self) -> Path:
+        return self.run / "frames" / self.name
 
     @cached_property
     def result(self) -> FrameResult:
@@ -106,7 +108,7 @@ class RedrawnSamples(Sequence[Sample]):
 
 def frames_of(run: Path) -> list[AttackedFrame]:
     """The finished frames of a run of `drivesem attack`, by name. Raises FormatError where there are none."""
-    found = [AttackedFrame(path.parent) for path in sorted((run / "frames").glob(f"*/{RESULT}"))]
+    found = [AttackedFrame(run, name) for name in frames_in(run)]
     if not found:
         raise FormatError(str(run), "a run of drivesem attack with finished frames", "none")
     return found

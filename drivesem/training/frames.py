@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +23,14 @@ from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 PIXELS, INDEX = "pixels.u8", "index.json"
+_LOOKED_AT = 5
+"""So many frames, or up to twice as many, tell whether a cache is of the same pictures."""
 
 
 class FrameStore(Sequence[Sample]):
     """Frames with their labels; the pixels lie decoded in one file that is mapped into memory.
 
-    A data set that grows is read on where the file ends.
+    A data set that grows is read on where the file ends; one with other pictures is decoded anew.
     """
 
     def __init__(
@@ -40,11 +44,9 @@ class FrameStore(Sequence[Sample]):
         """names: the frames to take; done: called after each. Raises FormatError for a frame that cannot be read,
         and for one without labels; WriteError for a cache that cannot be written.
         """
-        index: dict[str, tuple[int, int, int]] = {}
-        if (cache / INDEX).is_file():
-            index = {name: (start, height, width) for name, start, height, width in files.read_json(cache / INDEX)}
-        end = sum(height * width * 3 for _, height, width in index.values())
         chosen = list(names)
+        index = _known(cache, dataset, chosen)
+        end = sum(height * width * 3 for _, height, width in index.values())
         with files.writing(cache / PIXELS):
             cache.mkdir(parents=True, exist_ok=True)
             with (cache / PIXELS).open("r+b" if (cache / PIXELS).is_file() else "w+b") as file:
@@ -79,6 +81,14 @@ class FrameStore(Sequence[Sample]):
     def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.image(index), self._targets[index]
 
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all pixels, hexadecimal."""
+        known = hashlib.sha256()
+        for index in range(len(self)):
+            known.update(self.image(index).tobytes())
+        return known.hexdigest()
+
     def objects(self) -> int:
         """How many objects there are to learn."""
         return sum(int((~targets.ignore).sum()) for targets in self._targets)
@@ -95,6 +105,26 @@ class FrameStore(Sequence[Sample]):
         """What a detector is judged by, frame by frame."""
         limits = suited(difficulty, self.labels)
         return [judged_targets(labels, limits, self.classes) for labels in self.labels]
+
+
+def _known(cache: Path, dataset: Dataset, names: Sequence[str]) -> dict[str, tuple[int, int, int]]:
+    """Where the pixels of each frame in a cache begin, and their height and width. Nothing where they are of other
+    pictures than the data set's: another folder's frames may have the same names.
+    """
+    if not (cache / INDEX).is_file() or not (cache / PIXELS).is_file():
+        return {}
+    index = {name: (start, height, width) for name, start, height, width in files.read_json(cache / INDEX)}
+    shared = [name for name in names if name in index]
+    # From the last on: where a numbered frame was taken out or put in, later names mean others.
+    for name in shared[:: -max(len(shared) // _LOOKED_AT, 1)]:
+        start, height, width = index[name]
+        image = to_uint8(dataset.frame(name).photograph)
+        kept = np.fromfile(cache / PIXELS, np.uint8, image.size, offset=start)
+        if image.shape[:2] != (height, width) or not np.array_equal(kept, image.reshape(-1)):
+            with files.writing(cache / INDEX):
+                (cache / INDEX).unlink()  # before its pixels go: a process may be killed in between
+            return {}
+    return index
 
 
 def _labels(dataset: Dataset, name: str) -> Labels:

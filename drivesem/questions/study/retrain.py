@@ -122,8 +122,7 @@ def run(study: Study, ready: Ready, out: Path, console: Console) -> RetrainCount
 
 
 def _frames(run: ArmRun, out: Path) -> list[AttackedFrame]:
-    folder = out / ARMS / run.arm.folder / "frames"
-    return [AttackedFrame(folder / result.identifier) for result in run.results]
+    return [AttackedFrame(out / ARMS / run.arm.folder, result.identifier) for result in run.results]
 
 
 def _on_benign_frames(
@@ -151,11 +150,11 @@ def _on_benign_frames(
 
 
 def look_at(detector: Detector, store: FrameStore, path: Path, device: str) -> list[Detections]:
-    """What is found in the frames of a store, remembered with the weights that found it."""
-    key = {"weights": weights_digest(detector), "frames": list(store.names)}
+    """What is found in the frames of a store, remembered with their pictures and the weights that found it."""
+    key = {"weights": weights_digest(detector), "frames": list(store.names), "pictures": store.digest}
     if path.is_file():
         kept = files.read_json(path)
-        if all(kept[name] == value for name, value in key.items()):
+        if all(kept.get(name) == value for name, value in key.items()):
             records = [tuple(BoxRecord(**record) for record in rows) for rows in kept["detections"]]
             return [as_detections(rows, detector.classes) for rows in records]
     found = detect(detector, store, range(len(store)), device)

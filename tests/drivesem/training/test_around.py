@@ -65,7 +65,7 @@ def frames(small_run: Path) -> list[AttackedFrame]:
     """A run whose first object counts as lost for certain."""
     (frame,) = frames_of(small_run)
     lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, error="missed", grade="certain")
-    known = AttackedFrame(frame.folder)
+    known = AttackedFrame(frame.run, frame.name)
     known.__dict__["result"] = replace(frame.result, failures=(lost, replace(lost, index=1, grade="threshold")))
     return [known]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import pytest
 from detectors.types import CLASSES
 from drivesem.attack.labels import Difficulty
 from drivesem.data.kitti import KittiDataset
-from drivesem.training.frames import FrameStore
+from drivesem.training.frames import PIXELS, FrameStore
 from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
 from scene_ir.errors import FormatError
+from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 
@@ -65,6 +67,52 @@ def test_frame_store_reads_on_where_it_stopped(tmp_path: Path, kitti_folder: Cal
         photograph = frames.dataset.frame(name).photograph
         assert np.array_equal(frames[i][0], (photograph * 255).round().permute(1, 2, 0).byte().numpy())
         assert frames[i][1].ignore.tolist() == [False, True]
+
+
+def test_frames_of_another_folder_are_decoded_anew(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
+    """Though they have the same names, as many pixels, and some of them are the same pictures."""
+
+    def store(folder: str) -> FrameStore:
+        dataset = KittiDataset(tmp_path / folder)
+        return FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES)
+
+    for seed, folder in enumerate(("one", "other")):
+        kitti_folder(tmp_path / folder, 3, seed=seed)
+    shutil.copytree(tmp_path / "one", tmp_path / "mixed")
+    last = Path("training", "image_2", "000002.png")
+    shutil.copy(tmp_path / "other" / last, tmp_path / "mixed" / last)
+    digests = {}
+    for folder in ("one", "other", "mixed", "one"):
+        frames = store(folder)
+        assert (tmp_path / "cache" / PIXELS).stat().st_size == 3 * 80 * 120 * 3
+        for i, name in enumerate(frames.names):
+            assert np.array_equal(frames.image(i), to_uint8(frames.dataset.frame(name).photograph))
+        assert digests.setdefault(folder, frames.digest) == frames.digest
+    assert len(set(digests.values())) == 3
+
+
+def test_a_cache_of_the_same_pictures_stays(
+    tmp_path: Path, kitti_folder: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few of many frames are looked at, the last among them, wherever the folder lies now."""
+    kitti_folder(tmp_path / "data", 30)
+    dataset = KittiDataset(tmp_path / "data")
+    FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES)
+    (tmp_path / "data").rename(tmp_path / "moved")
+    read: list[str] = []
+    dataset = KittiDataset(tmp_path / "moved")
+    frame = dataset.frame
+    monkeypatch.setattr(dataset, "frame", lambda name: (read.append(name), frame(name))[1])
+    FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES)
+    assert read == [f"{i:06d}" for i in (29, 23, 17, 11, 5)]
+
+
+def test_a_cache_that_was_cut_short_is_decoded_anew(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
+    dataset = KittiDataset(kitti_folder(tmp_path / "data", 2))
+    first = FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES).digest
+    with (tmp_path / "cache" / PIXELS).open("r+b") as file:
+        file.truncate(100)
+    assert FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES).digest == first
 
 
 def test_anchors_of_few_boxes_are_refused(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:

@@ -71,14 +71,15 @@ def attacked(frame: Callable[..., object], tmp_path: Path) -> list[AttackedFrame
     """Three frames: the first is not broken. Cars are at 10 by the benign labels, at 20 by moved ones."""
     found = []
     for i in range(3):
-        folder = tmp_path / "run" / f"{i}"
+        one = AttackedFrame(tmp_path / "run", f"{i}")
+        folder = one.folder
         for name, value in COLOURS.items():
             files.write_png(folder / f"{name}.png", np.full((60, 90, 3), value + i, np.uint8))
         kitti.write_labels(folder / "labels_paper.txt", labelled(10.0))
         kitti.write_labels(folder / "labels_moved.txt", labelled(20.0))
         files.write_json(folder / "scene" / "scene.json", {"schema": SCHEMA, "version": VERSION, "others": None})
         files.write_text(folder / "result.json", dump_frame(frame(f"{i}", success=i > 0)))
-        found.append(AttackedFrame(folder))
+        found.append(one)
     return found
 
 

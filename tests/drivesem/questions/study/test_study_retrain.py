@@ -203,6 +203,7 @@ def test_the_picture_is_of_failures_where_states_were_shown(
 def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Store:
         names = ("a", "b")
+        digest = "of their pictures"
 
         def __len__(self) -> int:
             return len(self.names)
@@ -226,7 +227,9 @@ def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.Mo
     retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     store.names = ("a",)  # pyright: ignore[reportAttributeAccessIssue]
     retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
-    assert looks == [2, 2, 1], "other weights, other frames"
+    store.digest = "of others"  # pyright: ignore[reportAttributeAccessIssue]
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    assert looks == [2, 2, 1, 1], "other weights, other frames, other pictures"
 
 
 def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
