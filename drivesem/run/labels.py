@@ -19,8 +19,8 @@ RESULT = "result.json"
 
 
 def frames_in(run: Path) -> list[str]:
-    """Identifiers of the frames in a run's folder, sorted, without what a killed command left there. Virtual KITTI's
-    are folders in folders.
+    """Identifiers of the frames in a run's folder, sorted, without what a killed command left there. Virtual
+    KITTI's are folders in folders.
     """
     frames = run / "frames"
     found = (path.parent.relative_to(frames) for path in sorted(frames.rglob(RESULT)))
