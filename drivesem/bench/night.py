@@ -151,7 +151,7 @@ def night_rows(spent: Sequence[Spent], frames: int, processes: int, seed: int) -
     others.append(row("frames taken apart before, in --cache", "reckoned", without, processes))
     if any(one.certify for one in spent):
         ungraded = [one.total - one.certify for one in spent]
-        others.append(row("no grades, --nuisances off --no-confirm", "reckoned", ungraded, processes))
+        others.append(row("no grades, --no-grade", "reckoned", ungraded, processes))
     cores = os.cpu_count() or 1
     if cores > processes:
         others.append(row("--workers", "reckoned", [one.total for one in spent], cores))

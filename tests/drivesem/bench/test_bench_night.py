@@ -32,7 +32,7 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
     assert hours == pytest.approx(
         {
             "--no-fit": 10.0,
-            "no grades, --nuisances off --no-confirm": 10.0,
+            "no grades, --no-grade": 10.0,
             "half the --steps": 9.0,
             "frames taken apart before, in --cache": 9.0,
             "--workers": 6.0,
@@ -43,7 +43,7 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
 
 def test_frames_that_were_not_fitted_have_no_faster_way() -> None:
     rows = night.night_rows([Spent(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
-    ways = ["half the --steps", "frames taken apart before, in --cache", "no grades, --nuisances off --no-confirm"]
+    ways = ["half the --steps", "frames taken apart before, in --cache", "no grades, --no-grade"]
     assert [row["how"] for row in rows] == ["as asked", *ways]
 
 
