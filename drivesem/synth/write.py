@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -37,6 +37,13 @@ from scene_ir.errors import FormatError, RangeError
 MANIFEST_VERSION = 2
 _STATE = ".drivesem"
 """Hidden folder for what a run needs to go on: readers of the layouts never look into it."""
+_DIGEST = "_digest"
+"""Ends the names of a recipe's digests of folders."""
+_READ = (
+    *(".glb", ".gltf", ".obj", ".ply", ".yaml", ".npz"),
+    *(".bin", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif"),
+)
+"""Files of vehicles and skies, and those that meshes name: a licence that is added changes no frame."""
 _FIRST_WORLDS = (1, 2, 6, 18, 20)
 """Virtual KITTI's; further scenes take the numbers between and after."""
 _STREETS_A_SCENE = 10
@@ -100,9 +107,22 @@ class Order:
         if self.edits is not None:
             told["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
         for name in ("meshes", "assets"):
-            folder = getattr(self, name)
+            folder: Path | None = getattr(self, name)
             told[name] = None if folder is None else folder.name
+            if folder is not None:
+                told[name + _DIGEST] = self._digest(folder)
         return {"generator": GENERATOR_VERSION, "version": MANIFEST_VERSION, **told}
+
+    def _digest(self, folder: Path) -> str:
+        """Of the files below a folder that vehicles and skies are read from, and their names; not of what this
+        order makes there.
+        """
+        known, made = hashlib.sha256(), self.out.resolve()
+        inside = made.is_relative_to(folder.resolve())
+        for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in _READ and path.is_file()):
+            if not (inside and path.resolve().is_relative_to(made)):
+                known.update(f"{path.relative_to(folder).as_posix()}\0{files.digest(path)}\0".encode())
+        return known.hexdigest()
 
     def places(self) -> list[Place]:
         """The frames of the data set, in order: frame by frame, each in all its variations."""
@@ -243,20 +263,24 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
     """
     stamp = order.out / _STATE / "recipe.json"
     recipe = order.recipe()
-    if order.resume and stamp.exists() and (found := files.read_json(stamp)) != recipe:
-        differing = sorted(k for k in {*found, *recipe} if found.get(k) != recipe.get(k))
-        key = differing[0]
-        raise FormatError(f"{stamp}: {key}", repr(recipe.get(key)), repr(found.get(key)))
+    if order.resume and stamp.exists():
+        found = files.read_json(stamp)
+        # Recipes of earlier versions have no digests.
+        differing = {k for k in {*found, *recipe} if found.get(k) != recipe.get(k)}
+        differing -= {k for k in recipe if k.endswith(_DIGEST) and k not in found}
+        if differing:
+            key = min(differing)
+            raise FormatError(f"{stamp}: {key}", repr(recipe.get(key)), repr(found.get(key)))
     if not order.resume or not stamp.exists():
         files.write_json(stamp, recipe)
     jobs = jobs_of(order)
     yield from (engine or map)(make_frame, jobs)
-    _finish(order, jobs)
+    _finish(order, recipe, jobs)
 
 
-def _finish(order: Order, jobs: Sequence[Job]) -> None:
+def _finish(order: Order, recipe: Mapping[str, object], jobs: Sequence[Job]) -> None:
     entries = [files.read_json(_entry_path(order.out, job.place.number)) for job in jobs]
     written = [rows for entry in entries for rows in entry["written"]]
     _writer(order).finish(written)
     frames = [entry["manifest"] for entry in entries]
-    files.write_json(order.out / "manifest.json", {**order.recipe(), "frames": frames})
+    files.write_json(order.out / "manifest.json", {**recipe, "frames": frames})

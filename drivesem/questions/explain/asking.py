@@ -9,7 +9,7 @@ from pathlib import Path
 from drivesem.attack.space import Parameter, parse_params
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.explain.frame import Effort, explain_frame
-from drivesem.questions.explain.report import answer_of, means
+from drivesem.questions.explain.report import answer_of, exchange_note, means
 from drivesem.questions.explain.results import EXPLANATION, read_explanation
 from drivesem.report.answer import Answer
 from drivesem.report.tables import number_of
@@ -35,9 +35,12 @@ def explain_run(config: Explain) -> Answer:
     work = build()
     claim(out, config, _WRITTEN, _FREE)
     frames = KeptFrames(run.folder, out, EXPLANATION, read_explanation)
-    explanations, failed = frames.ask(names, work, build, config, Bar("explaining frames"))
+    kept, failed = frames.ask(names, work, build, config, Bar("explaining frames"))
+    explanations = [one for one in kept if not one.by_exchange]
+    by_exchange = [one.identifier for one in kept if one.by_exchange]
     if not explanations:
-        raise UsageError("--run", "a run with frames that can be explained", "; ".join(failed.values()))
+        found = "; ".join([*failed.values(), *([exchange_note(by_exchange)] if by_exchange else [])])
+        raise UsageError("--run", "a run with frames that can be explained", found)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     facts = {
         "out": str(out),
@@ -47,6 +50,7 @@ def explain_run(config: Explain) -> Answer:
         "frames": len(explanations),
         "frames_of_run": len(run.frames),
         "frames_failed": failed,
+        "frames_by_exchange": by_exchange,
         "bootstrap": draws,
     }
     answer = answer_of(out, explanations, means(explanations, draws, config.seed), draws, facts)

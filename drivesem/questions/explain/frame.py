@@ -107,6 +107,7 @@ def explain_frame(
     out: Path,
 ) -> Explanation:
     """Explain the counterexample in a run's folder of one frame, and write the folder `out`, whole or not at all.
+    Of a scene that fails by the exchange of its vehicles alone there is nothing to weigh or to take back.
 
     attack, params: the run's. Raises FormatError where the scene is not there or is damaged, or the detector does
     not fail on it on this machine; RangeError for a gradient that is not finite.
@@ -124,11 +125,14 @@ def explain_frame(
     teams = {"parameter": players.parameters(space, theta), "object": players.objects(space, theta)}
     slope = objective.loss_and_grad(space.theta0)[1] * theta if isinstance(detector, Detector) else None
     generator = np.random.default_rng([effort.seed, zlib.crc32(result.identifier.encode())])
-    contributions = [
-        one for team in teams.values() for one in weigh(team, theta, judge, slope, effort.permutations, generator)
-    ]
-    blocks = _blocks(space, theta, teams, contributions, judge)
-    shortened = minimal(theta, blocks, judge.search(effort.points, effort.lost and found.lost > 0))
+    search = judge.search(effort.points, effort.lost and found.lost > 0)
+    contributions: list[Contribution] = []
+    if search.fails(space.theta0):
+        shortened = Minimal(space.theta0, 0.0, (True, True), space.theta0, 0.0, ())
+    else:
+        for team in teams.values():
+            contributions += weigh(team, theta, judge, slope, effort.permutations, generator)
+        shortened = minimal(theta, _blocks(space, theta, teams, contributions, judge), search)
     least = objective.evaluate(shortened.theta)
     views = _views(objective, theta)
     explanation = Explanation(
@@ -289,7 +293,8 @@ def _write(
             (name, to_uint8(one.render.image), _boxes(one), gradient) for name, (one, gradient) in views.items()
         ]
         files.write_png(part / "sensitivity.png", sensitivity.sheet(rows))
-    write_waterfalls(part / "shapley.png", explanation)
+    if explanation.contributions:
+        write_waterfalls(part / "shapley.png", explanation)
     write_explanation(part / EXPLANATION, explanation)
 
 

@@ -137,6 +137,11 @@ def notes(draws: int) -> list[str]:
     ]
 
 
+def exchange_note(names: Sequence[str]) -> str:
+    """What is said of frames that are left out. names: theirs."""
+    return f"left out, as the exchange of vehicles alone makes them fail: {', '.join(names)}"
+
+
 def answer_of(
     out: Path, explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, facts: Mapping[str, Any]
 ) -> Answer:
@@ -148,6 +153,7 @@ def answer_of(
         pictures = ("shapley", *(("sensitivity",) if e.sensitivity else ()), "minimal_overlay")
         appendix += [f"![](frames/{e.identifier}/{name}.png)\n" for name in pictures]
     tables = sheets(explanations, rows)
+    left_out: Sequence[str] = facts["frames_by_exchange"]
     return Answer(
         out=out,
         name="explain",
@@ -155,7 +161,7 @@ def answer_of(
         data={**facts, "rows": [row.to_json() for row in rows], "explained": [_brief(e) for e in explanations]},
         tables={"explain": [line for e in explanations for line in _flat(e)]},
         sheets=tables,
-        notes=notes(draws),
+        notes=[*notes(draws), *([f"Frames {exchange_note(left_out)}."] if left_out else [])],
         words=[name for sheet in tables for name in sheet.columns],
         printed_words=_WORDS,
         appendix=appendix,

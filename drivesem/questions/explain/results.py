@@ -116,6 +116,13 @@ class Explanation:
     renders: int
     seconds: float
 
+    @property
+    def by_exchange(self) -> bool:
+        """Whether the scene fails at theta0 already, by its exchange of vehicles alone: no part of theta is
+        weighed then, and the least change is none.
+        """
+        return self.least.scan[0]
+
     def of_kind(self, kind: str) -> tuple[Contribution, ...]:
         """Contributions of `parameter` or `object`."""
         return tuple(c for c in self.contributions if c.kind == kind)

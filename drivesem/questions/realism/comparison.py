@@ -21,12 +21,15 @@ PAIRS = tuple(combinations(PICTURES, 2))
 """Photograph and re-render, photograph and counterexample, re-render and counterexample."""
 REGIONS = ("frame", "boxes")
 Window = tuple[slice, slice]
+Box = tuple[float, float, float, float]
+"""x0, y0, x1, y1 px."""
 Measures = Mapping[str, PairDistance | SetFeatures]
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A whole frame, or the rectangle around one vehicle before and after.
+    """A whole frame, or the rectangle around one vehicle before and after, as far as it is there: one that left or
+    parked is so in one picture only.
 
     index: of the vehicle, None for the frame; kind: its class; distances: by metric and pair, PSNR's as the mean
     squared error; features: by metric and picture (D,).
@@ -69,15 +72,26 @@ class RealismRow:
     pictures: int
 
 
-def window(boxes_xyxy: Sequence[tuple[float, float, float, float]], height: int, width: int) -> Window:
+def area_of(box_xyxy: Box) -> float:
+    """px²; 0 of what is not seen, as of a vehicle that left."""
+    x0, y0, x1, y1 = box_xyxy
+    return max(x1 - x0, 0) * max(y1 - y0, 0)
+
+
+def rectangle_around(boxes_xyxy: Sequence[Box]) -> Box:
+    """The rectangle around boxes; those without an area are nowhere. ValueError where none has one."""
+    lefts, tops, rights, bottoms = zip(*(box for box in boxes_xyxy if area_of(box) > 0), strict=True)
+    return min(lefts), min(tops), max(rights), max(bottoms)
+
+
+def window(boxes_xyxy: Sequence[Box], height: int, width: int) -> Window:
     """Rows and columns of the rectangle around boxes, px, inside the picture, at least LEAST_PX a side.
 
-    Raises ShapeError for a picture that is smaller.
+    Raises ShapeError for a picture that is smaller, ValueError where no box has an area.
     """
     if min(height, width) < LEAST_PX:
         raise ShapeError("picture", f"at least {LEAST_PX} px a side", f"{width}x{height}")
-    x0, y0 = (min(box[i] for box in boxes_xyxy) for i in (0, 1))
-    x1, y1 = (max(box[i] for box in boxes_xyxy) for i in (2, 3))
+    x0, y0, x1, y1 = rectangle_around(boxes_xyxy)
     return _span(y0, y1, height), _span(x0, x1, width)
 
 
@@ -90,9 +104,12 @@ def _span(low: float, high: float, length: int) -> slice:
 
 
 def vehicles(result: FrameResult) -> list[tuple[BoxRecord, BoxRecord]]:
-    """The scene's objects before and after, in order."""
+    """The scene's objects before and after, in order, without those seen in neither picture. The box of one that
+    left or parked has no area in one of them.
+    """
     after = {box.index: box for box in result.targets_moved if box.index is not None}
-    return [(box, after[box.index]) for box in result.targets_benign if box.index in after]
+    pairs = [(box, after[box.index]) for box in result.targets_benign if box.index in after]
+    return [(one, other) for one, other in pairs if area_of(one.xyxy) > 0 or area_of(other.xyxy) > 0]
 
 
 def frame_parts(frame: Frame, measures: Measures) -> FrameParts:

@@ -19,7 +19,7 @@ import numpy as np
 from detectors.types import CLASSES
 from drivesem.evaluation.resampling import Figure, Interval, intervals
 from drivesem.questions.realism.closeness import Picture
-from drivesem.questions.realism.comparison import vehicles
+from drivesem.questions.realism.comparison import area_of, rectangle_around, vehicles
 from drivesem.questions.realism.frechet import Floats
 from drivesem.questions.survey.agreement import alpha, interval, nominal
 from drivesem.report import web
@@ -89,11 +89,11 @@ class Response:
 def items_of(runs: Sequence[Run], count: int, controls: int, seed: int) -> list[tuple[Item, View]]:
     """Counterexamples drawn from the runs, successes before others, and re-renders without any change.
 
-    Of each frame the vehicle that was lost, else the one with the largest box. Raises ShapeError where no frame
-    has a vehicle.
+    Of each frame the vehicle that was lost, else the one with the largest box, among those that the changed
+    picture shows: one that left is no question. Raises ShapeError where no frame has a vehicle.
     """
     generator = np.random.default_rng(seed)
-    frames = [(run, frame) for run in runs for frame in run.frames if vehicles(frame.result)]
+    frames = [(run, frame) for run in runs for frame in run.frames if all(_seen(frame, kind) for kind in KINDS)]
     if not frames:
         raise ShapeError("survey", "a run with vehicles", "none")
     order = [frames[i] for i in generator.permutation(len(frames))]
@@ -103,24 +103,26 @@ def items_of(runs: Sequence[Run], count: int, controls: int, seed: int) -> list[
     found = []
     for number in generator.permutation(len(wanted)).tolist():
         kind, run, frame = wanted[number]
-        before, after = _shown_vehicle(frame)
+        before, after = _shown_vehicle(frame, kind)
+        truth = after.label if kind == CHANGED else before.label
         name = hashlib.sha256(f"{seed} {number} {run.name} {frame.result.identifier}".encode()).hexdigest()[:8]
         assert before.index is not None
-        item = Item(name, kind, run.name, run.params, frame.result.identifier, before.index, before.label)
+        item = Item(name, kind, run.name, run.params, frame.result.identifier, before.index, truth)
         found.append((item, _view(frame, kind, before, after)))
     return found
 
 
-def _shown_vehicle(frame: Frame) -> tuple[BoxRecord, BoxRecord]:
+def _shown_vehicle(frame: Frame, kind: str) -> tuple[BoxRecord, BoxRecord]:
     lost = [failure.index for failure in frame.result.failures if failure.kind == "lost"]
-    pairs = vehicles(frame.result)
+    pairs = _seen(frame, kind)
     candidates = [pair for pair in pairs if pair[0].index in lost] or pairs
-    return max(candidates, key=lambda pair: _area(pair[1]))
+    return max(candidates, key=lambda pair: area_of(pair[1].xyxy))
 
 
-def _area(box: BoxRecord) -> float:
-    x0, y0, x1, y1 = box.xyxy
-    return max(x1 - x0, 0) * max(y1 - y0, 0)
+def _seen(frame: Frame, kind: str) -> list[tuple[BoxRecord, BoxRecord]]:
+    """The vehicles, before and after, that the changed picture of an item of this kind shows."""
+    place = 1 if kind == CHANGED else 0
+    return [pair for pair in vehicles(frame.result) if area_of(pair[place].xyxy) > 0]
 
 
 def _view(frame: Frame, kind: str, before: BoxRecord, after: BoxRecord) -> View:
@@ -128,8 +130,7 @@ def _view(frame: Frame, kind: str, before: BoxRecord, after: BoxRecord) -> View:
     changed = files.read_image(frame.pictures["attacked" if kind == CHANGED else "rerendered"])
     height, width = original.shape[:2]
     box = after.xyxy if kind == CHANGED else before.xyxy
-    x0, y0 = (min(before.xyxy[i], box[i]) for i in (0, 1))
-    x1, y1 = (max(before.xyxy[i], box[i]) for i in (2, 3))
+    x0, y0, x1, y1 = rectangle_around((before.xyxy, box))
     rows, columns = _around(y0, y1, height, _LEAST_HW[0]), _around(x0, x1, width, _LEAST_HW[1])
     top, left, h, w = rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
     outline = ((box[0] - left) / w, (box[1] - top) / h, (box[2] - left) / w, (box[3] - top) / h)

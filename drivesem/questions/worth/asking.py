@@ -126,6 +126,8 @@ def _runs(runs: Sequence[Run], config: Worth, distance: str | None, out: Path) -
         for one in runs
     ]
     rho = realism_of(far)
+    if second is not None:
+        second.look(runs)
     entries: list[Entry] = []
     for one, own in zip(runs, rho, strict=True):
         for picture, name in SHOWN.items():

@@ -106,6 +106,9 @@ def by_arm(config: Worth, base: float, draws: int, distance: str | None, out: Pa
     weights = (False,) if distance is None else (False, True)
     settings = [Setting(kind, w, base) for kind in MEMBERSHIPS for w in weights]
     seconds = _seconds(config, study, out)
+    asked = [run for run in runs if run.name == HELD_OUT or config.second is not None]
+    for second in seconds.values():
+        second.look(asked, ["attacked"])
     arms: list[ArmFigures] = []
     gains: list[Gain] = []
     for run, own, frames in zip(runs, rho, parts, strict=True):
@@ -119,7 +122,7 @@ def by_arm(config: Worth, base: float, draws: int, distance: str | None, out: Pa
             if picture == "attacked" or not setting.weighted
         }
         arms.append(ArmFigures(run, told, worth, sum(len(frame.region("boxes")) for frame in frames)))
-        for name, second in seconds.items() if run.name == HELD_OUT or config.second is not None else ():
+        for name, second in seconds.items() if run in asked else ():
             after = second.points(run, "attacked", own)
             gains += [
                 Gain(run.name, name, one, worth_of(after, one), gain_of(points["attacked"], after, one))

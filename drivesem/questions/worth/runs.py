@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +58,7 @@ def distances_of(frame: Frame, parts: FrameParts | None, name: str) -> Floats:
     if parts is None:
         return np.zeros(len(kept))
     by_index = {part.index: part.distances[name]["benign", "attacked"] for part in parts.region("boxes")}
-    return np.array([by_index[a.index] for a, _ in kept], np.float64)
+    return np.array([by_index.get(a.index, 0.0) for a, _ in kept], np.float64)
 
 
 def realism_of(distances: Sequence[Sequence[Floats]]) -> list[list[Floats]]:
@@ -109,14 +109,20 @@ class SecondDetector:
         self._memory = Memory(self._order, self._predictor)
         self.name, self.t_star = name, t_star_of(self._predictor)
 
+    def look(self, runs: Sequence[Run], shown: Collection[str] = tuple(SHOWN)) -> None:
+        """Look at all pictures of runs at once, before `points` are asked for: each look reads all the weights.
+        shown: which pictures, of SHOWN.
+        """
+        pictures = [frame.pictures[name] for run in runs for frame in run.frames for name in shown]
+        look(self._order, self._predictor, pictures, self._settings, self.name)
+
     def points(self, run: Run, picture: str, rho: Sequence[Floats] | None) -> Points:
-        """As `own_points`, before this detector."""
-        found = [self._find(frame.pictures[picture]) for frame in run.frames]
+        """As `own_points`, before this detector, which has looked at the run."""
+        found = [self._found(frame.pictures[picture]) for frame in run.frames]
         return _joined(run, picture, found, self.t_star, rho)
 
-    def _find(self, picture: Path) -> Detections:
+    def _found(self, picture: Path) -> Detections:
         """Detections whose labels are places in CLASSES."""
-        look(self._order, self._predictor, [picture], self._settings, self.name)
         found = self._memory.recall(picture)
         places = torch.tensor([CLASSES.index(name) for name in self._names])
         return Detections(found.boxes_xyxy, places[found.labels], found.scores)

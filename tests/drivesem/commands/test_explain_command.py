@@ -18,16 +18,21 @@ import torch
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.methods.given import Given
+from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.questions.explain import asking as explain_asking
 from drivesem.questions.explain import frame as explaining
 from drivesem.questions.explain.results import read_explanation
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
+from drivesem.run.frame import FrameSettings, attack_scene, write_frame
 from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import load_frame
+from scene_ir.exchange import without
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
 
@@ -244,6 +249,48 @@ def test_without_gradient(
     assert (folder / "minimal.png").is_file()
     # nothing is lost in the counterexample, so that its least change need not lose anything either
     assert found.least.outcome.lost == 0
+
+
+def exchanged(run: Path, name: str, share: float, scene: SceneIR) -> None:
+    """A further frame of the run, whose first car is gone, which makes it fail. share: of the step that its second
+    car goes as well.
+    """
+    scene, params = without(scene, 0), parse_params("translate,rotate")
+    space = ParameterSpace(scene, params)
+    theta = share * space.step * (torch.arange(space.dim) >= space.dim - 1)
+    settings = FrameSettings(
+        attack=Given(theta), params=params, label_mode="moved", term="objectness", render=RenderSettings(), seed=0
+    )
+    result = write_frame(attack_scene(name, scene, Jumpy(), settings), run / "frames" / name)
+    assert result.success_moved
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["frames"][name] = {}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_frames_that_fail_by_the_exchange_alone_are_left_out(
+    run: Path, explain: Callable[..., dict[str, Any]], scene: SceneIR, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = explain("--run", run, "--out", run / "alone")
+    exchanged(run, "demo-001", 0.0, scene)
+    exchanged(run, "demo-002", 0.1, scene)
+    data = explain("--run", run)
+    assert data["frames_by_exchange"] == ["demo-001", "demo-002"]
+    assert (data["frames"], data["frames_failed"]) == (1, {})
+    assert data["rows"] == alone["rows"]
+    page = (run / "explain" / "explain.md").read_text()
+    assert "the exchange of vehicles alone makes them fail: demo-001, demo-002." in page
+    for name, theta in (("demo-001", 0), ("demo-002", 1)):
+        found = read_explanation(run / "explain" / "frames" / name / "explain.json")
+        assert found.benign.success
+        assert len(found.sizes) == theta
+        assert (found.contributions, found.least.theta, found.least.norm) == ((), (), 0)
+        assert found.least.outcome == found.benign
+        assert found.least.failures
+    capsys.readouterr()
+    assert main(["explain", "--run", str(run), "--workers", "1", "--frame", "demo-001", "--points", "4"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.endswith("found left out, as the exchange of vehicles alone makes them fail: demo-001")
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

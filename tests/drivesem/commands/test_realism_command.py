@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import pytest
 from drivesem.cli import main
 from drivesem.evaluation.resampling import Interval
 from drivesem.questions.realism import comparison
-from drivesem.questions.realism.comparison import window
+from drivesem.questions.realism.comparison import rectangle_around, vehicles, window
 from drivesem.questions.realism.measures import LEAST_PX
+from drivesem.run.results import dump_frame, load_frame
 from scene_ir import files
 from scene_ir.errors import ShapeError
 
@@ -111,6 +113,25 @@ def test_windows() -> None:
     assert outside == (slice(200 - LEAST_PX, 200), slice(300 - LEAST_PX, 300))
     with pytest.raises(ShapeError, match="at least 64 px"):
         window([(0, 0, 1, 1)], 63, 300)
+
+
+def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
+    write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
+) -> None:
+    nowhere, box = (0.0, 0.0, 0.0, 0.0), (210.0, 120.0, 290.0, 190.0)
+    assert window([box, nowhere], 200, 300) == window([nowhere, box], 200, 300) == window([box], 200, 300)
+    assert rectangle_around([nowhere, box]) == box
+    run = write_run(tmp_path / "run")
+    path = run / "frames" / "a" / "result.json"
+    result = load_frame(path)
+    benign, moved = result.targets_benign, result.targets_moved
+    left = (replace(moved[0], xyxy=nowhere, ignore=True), moved[1])
+    files.write_text(path, dump_frame(replace(result, targets_moved=left)))
+    assert vehicles(load_frame(path)) == list(zip(benign, left, strict=True))
+    assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 6
+    never = (replace(benign[0], xyxy=nowhere, ignore=True), benign[1])
+    files.write_text(path, dump_frame(replace(result, targets_benign=never, targets_moved=left)))
+    assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 5
 
 
 def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:

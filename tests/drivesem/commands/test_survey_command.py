@@ -8,13 +8,19 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from drivesem.cli import main
-from drivesem.questions.survey.page import COLUMNS
+from drivesem.questions.survey.page import COLUMNS, items_of
+from drivesem.run.finished import load_run
+from drivesem.run.results import BoxRecord, dump_frame, load_frame
+from scene_ir.errors import ShapeError
 
 
 @pytest.fixture
@@ -74,6 +80,32 @@ def test_the_same_command_makes_the_same_survey(survey: Path, tmp_path: Path) ->
     assert (tmp_path / "again" / "survey.html").read_bytes() == (survey / "survey.html").read_bytes()
     assert main([*words, str(tmp_path / "other"), "--seed", "1"]) == 0
     assert key_of(tmp_path / "other")["survey"] != key_of(survey)["survey"]
+
+
+def test_of_vehicles_that_left_or_parked_those_are_shown_that_the_picture_has(
+    write_run: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The first car left and a lorry parked; people are asked about the lorry, where it stands, and of the picture
+    without any change about the car."""
+    folder, nowhere = write_run(tmp_path / "run"), (0.0, 0.0, 0.0, 0.0)
+    for path in (folder / "frames" / "a").glob("*.png"):
+        cv2.imwrite(str(path), np.zeros((400, 800, 3), np.uint8))
+    path = folder / "frames" / "a" / "result.json"
+    result, car, lorry = load_frame(path), (20.0, 200.0, 80.0, 240.0), (600.0, 300.0, 700.0, 360.0)
+    before = (BoxRecord(car, "Car", index=0), BoxRecord(nowhere, "Truck", ignore=True, index=1))
+    after = (BoxRecord(nowhere, "Car", ignore=True, index=0), BoxRecord(lorry, "Truck", ignore=True, index=1))
+    path.write_text(dump_frame(replace(result, targets_benign=before, targets_moved=after)))
+    found = {item.kind: (item, view) for item, view in items_of([load_run(folder, limit=1)], 1, 1, 0)}
+    (changed, view), (unchanged, _) = found["counterexample"], found["unchanged"]
+    assert (changed.object, changed.truth) == (1, "Truck")
+    assert (unchanged.object, unchanged.truth) == (0, "Car")
+    # a view of 320 x 180 px around the lorry
+    x0, y0, x1, y1 = view.outline_xyxy
+    assert (x1 - x0, y1 - y0) == (pytest.approx(100 / 320), pytest.approx(60 / 180))
+    gone = replace(result, targets_benign=before[:1], targets_moved=after[:1])
+    path.write_text(dump_frame(gone))
+    with pytest.raises(ShapeError, match="expected a run with vehicles"):
+        items_of([load_run(folder, limit=1)], 1, 1, 0)
 
 
 def test_fewer_frames_than_asked_for(

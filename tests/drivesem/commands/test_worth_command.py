@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from detectors.base import Predictor
 from detectors.types import Detections
 from drivesem.cli import main
 from drivesem.run import looking
@@ -119,6 +120,37 @@ def test_gain_of_a_second_detector(
         # blind: all is left to know
         gain = 8 / 12 * entropy(2 / 8, 6 / 8) - math.log(2)
     assert row["value"] == pytest.approx(gain)
+
+
+@pytest.fixture
+def fingerprints(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The detectors whose weights were read for a fingerprint, each time anew."""
+    real, found = looking.fingerprint, []
+
+    def read(order: looking.Order, predictor: Predictor) -> str:
+        found.append(order.detector)
+        return real(order, predictor)
+
+    monkeypatch.setattr(looking, "fingerprint", read)
+    return found
+
+
+def test_weights_are_not_read_for_each_picture(
+    write_run: Callable[..., Path],
+    tmp_path: Path,
+    worth: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    fingerprints: list[str],
+) -> None:
+    monkeypatch.setattr(looking, "load_predictor", lambda *_: Sees(2))
+    runs = [write_run(tmp_path / name) for name in ("one", "two")]
+    worth(*runs, "--distance", "none", "--second", "sees")
+    # what is remembered, and one look at all pictures
+    assert fingerprints == ["sees"] * 2
+    fingerprints.clear()
+    study = study_of(write_run, tmp_path / "study", "multi", "combo-1", "combo-2")
+    worth("--study", study, "--metrics", "ssim", "--distance", "none", "--second", "sees")
+    assert fingerprints == ["sees"] * 2
 
 
 def test_a_folder_of_retrain_is_a_second_detector(

@@ -19,6 +19,8 @@ from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.write import Order, synthesise
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.meshes.load import save_mesh
+from scene_ir.meshes.templates import template
 
 FRAMES = 2
 
@@ -151,6 +153,51 @@ def test_a_lost_image_is_made_again(made, monkeypatch):
 def test_another_recipe_in_the_same_folder_is_an_error(made):
     with pytest.raises(FormatError, match=rf"recipe\.json: seed: expected {SEED + 1}, found {SEED}"):
         list(synthesise(replace(made, seed=SEED + 1)))
+
+
+@pytest.mark.parametrize("option", ["meshes", "assets"])
+def test_another_folder_of_the_same_name_is_another_recipe(tmp_path, option):
+    folders = [tmp_path / place / "pack" for place in ("x", "y")]
+    for shape, folder in enumerate(folders):
+        place = folder if option == "meshes" else folder / "vehicles"
+        place.mkdir(parents=True)
+        save_mesh(template("sedan", shape), place / "sedan.glb")
+    first, second = (Order(tmp_path / "out", 1, **{option: folder}) for folder in folders)
+    stamp = tmp_path / "out" / ".drivesem" / "recipe.json"
+    files.write_json(stamp, first.recipe())
+    assert first.recipe()[option] == second.recipe()[option] == "pack"
+
+    def goes_on(order):
+        return next(synthesise(order, lambda *_: iter([0]))) == 0
+
+    assert goes_on(first)
+    with pytest.raises(FormatError, match=rf"recipe\.json: {option}_digest: expected '[0-9a-f]+', found '"):
+        goes_on(second)
+    # a data set of an earlier version, which wrote no digest
+    files.write_json(stamp, {k: v for k, v in first.recipe().items() if not k.endswith("_digest")})
+    assert goes_on(second)
+    with pytest.raises(FormatError, match=rf"recipe\.json: {option}: expected 'other', found 'pack'"):
+        goes_on(Order(tmp_path / "out", 1, **{option: folders[1].rename(tmp_path / "other")}))
+
+
+def test_the_digest_of_a_folder_is_of_what_vehicles_are_read_from(tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    save_mesh(template("sedan", 0), meshes / "sedan.glb")
+
+    def digest(out):
+        return Order(out, 1, meshes=meshes).recipe()["meshes_digest"]
+
+    inside, before = meshes / "out", digest(meshes / "out")
+    files.write_text(inside / "image_2" / "000000.png", "")  # by the order
+    files.write_text(meshes / "LICENCE.md", "")
+    assert digest(inside) == before
+    files.write_text(meshes / "Textures" / "paint.png", "")  # meshes may name what lies below
+    assert digest(inside) != before
+    (inside / "image_2" / "000000.png").unlink()
+    # a folder inside of the data set's is none that the order made
+    assert digest(tmp_path) == digest(inside)
+    assert not [name for name in Order(tmp_path, 1).recipe() if name.endswith("_digest")]
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_tables() -> None:
 
 def test_files(tmp_path: Path) -> None:
     frames = [explanation("a"), explanation("b", 1.5)]
-    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}}).write()
+    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}, "frames_by_exchange": []}).write()
     rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
     assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")
