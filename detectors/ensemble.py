@@ -41,7 +41,9 @@ class Said:
 
 
 class Ensemble(Detector):
-    """Detectors with the same classes. DetectorError for fewer than two, or other classes."""
+    """Detectors with the same classes. DetectorError for fewer than two, other classes, or a t* of 0 or 1, which
+    no shift takes to another.
+    """
 
     def __init__(self, members: Sequence[Detector]) -> None:
         super().__init__()
@@ -52,6 +54,11 @@ class Ensemble(Detector):
             if one.classes != first.classes:
                 theirs, own = (", ".join(names) for names in (first.classes, one.classes))
                 raise DetectorError(f"{PREFIX} {one.name}: expected {first.name}'s classes, {theirs}, found {own}")
+        for one in members:
+            if not 0 < one.t_star < 1:
+                raise DetectorError(
+                    f"{PREFIX} {one.name}: expected a t* above 0 and below 1, found {one.t_star:g}"
+                )
         self.members = nn.ModuleList(members)
         self.name = PREFIX + "+".join(one.name for one in members)
         self.classes, self.t_star = first.classes, T_STAR

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from detectors import boxes
 from detectors.base import Detector, DetectorError, Lowerable, Predictor, lowered_probability
@@ -291,7 +292,9 @@ class PlantedDetector(Wrapping):
                 f"detector {self.inner.name}: expected raw predictions that can be lowered, found "
                 f"{type(raw).__name__}"
             )
-        return raw.lowered(self._label, torch.stack([self._by(image, raw, i) for i, image in enumerate(images)]))
+        # Images may have other numbers of candidates; what fills them up is not lowered.
+        by = pad_sequence([self._by(image, raw, i) for i, image in enumerate(images)], batch_first=True)
+        return raw.lowered(self._label, by)
 
     def _by(self, image: Tensor, raw: Any, index: int) -> Tensor:
         told = self.inner.candidates(raw.one(index))

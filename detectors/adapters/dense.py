@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from detectors import boxes
@@ -38,36 +39,44 @@ class DensePredictions:
 
     boxes_xyxy (B, A, K, 4) px of the image, not clipped: K is 1, or C where each class has a box of its own.
     probabilities (B, A, C) in [0, 1]. image_hw: size of the image, px. held: what the gradient takes as constant,
-    one a image (Faster R-CNN: its proposals).
+    one a image (Faster R-CNN: its proposals). counts: of each image its own predictions, which come first; what
+    follows only fills up to the largest count, A. None: all are an image's own.
     """
 
     boxes_xyxy: Tensor
     probabilities: Tensor
     image_hw: tuple[int, int]
     held: tuple[Tensor, ...] = ()
+    counts: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         b, a, c = self.probabilities.shape
         found = tuple(self.boxes_xyxy.shape)
         if found not in ((b, a, 1, 4), (b, a, c, 4)):
             raise ValueError(f"boxes_xyxy: expected shape {(b, a, 1, 4)} or {(b, a, c, 4)}, found {found}")
+        if self.counts is not None and (len(self.counts) != b or max(self.counts, default=a) != a):
+            raise ValueError(f"counts: expected {b}, the largest of them {a}, found {self.counts}")
 
     def __len__(self) -> int:
         return int(self.probabilities.shape[0])
 
     def one(self, index: int) -> DensePredictions:
-        """What is said about one image of the batch, as a batch of one."""
+        """What is said about one image of the batch, as a batch of one; without what only fills up."""
         rows = slice(index, index + 1)
-        return DensePredictions(
-            self.boxes_xyxy[rows], self.probabilities[rows], self.image_hw, self.held[rows] if self.held else ()
-        )
+        own = slice(None if self.counts is None else self.counts[index])
+        held = self.held[rows] if self.held else ()
+        return DensePredictions(self.boxes_xyxy[rows, own], self.probabilities[rows, own], self.image_hw, held)
 
     def planted(self, box_xyxy: Tensor, label: int) -> DensePredictions:
         """The same, but for a certain prediction in the first place of each image, and silence of all others."""
-        placed, probabilities = self.boxes_xyxy.clone(), torch.zeros_like(self.probabilities)
+        # A network that suppresses may have said nothing: then there is no first place yet.
+        missing = max(1 - self.probabilities.shape[1], 0)
+        placed = F.pad(self.boxes_xyxy, (0, 0, 0, 0, 0, missing)).clone()
+        probabilities = torch.zeros_like(F.pad(self.probabilities, (0, 0, 0, missing)))
         placed[:, 0] = box_xyxy.to(placed)
         probabilities[:, 0, label] = 1
-        return replace(self, boxes_xyxy=placed, probabilities=probabilities)
+        counts = None if self.counts is None else tuple(max(count, 1) for count in self.counts)
+        return replace(self, boxes_xyxy=placed, probabilities=probabilities, counts=counts)
 
     def lowered(self, label: int, by: Tensor) -> DensePredictions:
         """The same, but for the class's probabilities; see `detectors.base.Lowerable`."""
@@ -134,9 +143,10 @@ def dense_loss(raw: DensePredictions, targets: Sequence[Targets], classes: Seque
         labels = target.labels.to(raw.probabilities.device)
         if bool(((labels < 0) | (labels >= len(classes))).any()):
             raise ValueError(f"targets.labels: expected 0..{len(classes) - 1}, found {target.labels.tolist()}")
-        unseen, silent = _of_image(raw, image, target)
+        own = raw.one(image)
+        unseen, silent = _of_image(own, target)
         missed.append(unseen)
-        probabilities = raw.probabilities[image][:, known]
+        probabilities = own.probabilities[0][:, known]
         heard = torch.where(silent[:, known], probabilities.square(), 0.0)
         alarms.append(heard.sum() / max(len(probabilities), 1))
     terms = {
@@ -147,15 +157,15 @@ def dense_loss(raw: DensePredictions, targets: Sequence[Targets], classes: Seque
     return terms | {"total": total, "objectness": total}
 
 
-def _of_image(raw: DensePredictions, image: int, target: Targets) -> tuple[Tensor, Tensor]:
-    """How much of the image's objects is not seen, (), and which predictions should be silent, (A, C) bool."""
-    probabilities = raw.probabilities[image]
+def _of_image(raw: DensePredictions, target: Targets) -> tuple[Tensor, Tensor]:
+    """How much of one image's objects is not seen, (), and which predictions should be silent, (A, C) bool."""
+    probabilities = raw.probabilities[0]
     silent = torch.ones_like(probabilities, dtype=torch.bool)
     unseen = probabilities.new_zeros(())
     wanted_xyxy, ignore = target.boxes_xyxy.to(probabilities), target.ignore.to(probabilities.device)
     for label in sorted(set(target.labels.tolist())):
         of_class = target.labels.to(ignore.device) == label
-        placed = raw.boxes_of(image, label).detach()
+        placed = raw.boxes_of(0, label).detach()
         objects, regions = wanted_xyxy[of_class & ~ignore], wanted_xyxy[of_class & ignore]
         meets = boxes.iou_matrix(objects, placed) >= MEETING_IOU
         if len(objects) and len(placed):

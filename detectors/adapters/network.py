@@ -61,11 +61,13 @@ class NetworkDetector(DenseDetector):
         form = self._reading
         assert form is not None
         found = [self._of_one(image[None], form) for image in images]
-        most = max(scores.shape[1] for _, scores in found)
+        counts = tuple(int(scores.shape[1]) for _, scores in found)
+        most = max(counts)
         # Filled up with boxes of no size and no probability, so that images share one tensor.
         boxes = torch.cat([F.pad(b, (0, 0, 0, most - b.shape[1])) for b, _ in found])
         scores = torch.cat([F.pad(s, (0, 0, 0, most - s.shape[1])) for _, s in found])
-        return DensePredictions(boxes[:, :, None], scores, (int(images.shape[2]), int(images.shape[3])))
+        image_hw = int(images.shape[2]), int(images.shape[3])
+        return DensePredictions(boxes[:, :, None], scores, image_hw, counts=counts)
 
     def _of_one(self, image: Tensor, form: Reading) -> tuple[Tensor, Tensor]:
         fed, fitted = fit(image, form.spec)

@@ -111,12 +111,17 @@ class OnnxPredictor:
             cells, labels = (all_scores > self._least_score).nonzero(as_tuple=True)
             scores = all_scores[cells, labels]
             placed = _placed(edges[cells], one)
+            # What lies in the padding around the picture has no area left in it.
+            there = boxes.area(boxes.clip(placed, *image_hw)) > 0
+            placed, scores, labels = placed[there], scores[there], labels[there]
             kept = boxes.nms(placed, scores, self._nms_iou, labels)
             placed = placed[kept]
             found.append((placed, scores[kept], labels[kept], cut(placed, one.window, image_hw)))
         placed, scores, labels, is_cut = (torch.cat(parts) for parts in zip(*found, strict=True))
-        kept = merge(placed, scores, labels, is_cut)
-        return Detections(boxes.clip(placed[kept], *image_hw), labels[kept], scores[kept])
+        if len(seen) > 1:
+            kept = merge(placed, scores, labels, is_cut)
+            placed, scores, labels = placed[kept], scores[kept], labels[kept]
+        return Detections(boxes.clip(placed, *image_hw), labels, scores)
 
 
 def session_of(path: Path) -> Any:

@@ -72,8 +72,8 @@ class Spec:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """Where a picture lies in a network's input. scale_xy: px of the input a px of the picture; offset_xy: px of
-    the input left of it and above.
+    """Where a picture lies in a network's input. scale_xy: px of the input a px of the picture, after its sides
+    were rounded to whole px; offset_xy: px of the input left of it and above.
     """
 
     scale_xy: tuple[float, float]
@@ -90,21 +90,22 @@ class Fitted:
 def fit(images: Tensor, spec: Spec) -> tuple[Tensor, Fitted]:
     """images (B, 3, H, W) RGB in [0, 1] as (B, 3, h, w), still RGB in [0, 1]; differentiable."""
     high, wide = images.shape[2:]
-    size, scale_xy = (high, wide), (1.0, 1.0)
+    size = high, wide
     filled = tuple(math.ceil(side / spec.multiple) * spec.multiple for side in size)
     if spec.size is not None:
         filled = size = spec.size
-        scale_xy = filled[1] / wide, filled[0] / high
         if spec.resize == "letterbox":
-            scale_xy = min(scale_xy), min(scale_xy)
-            size = (min(round(scale_xy[1] * high), filled[0]), min(round(scale_xy[0] * wide), filled[1]))
+            scale = min(filled[0] / high, filled[1] / wide)
+            size = tuple(
+                min(max(round(scale * side), 1), most) for side, most in zip((high, wide), filled, strict=True)
+            )
     if size != (high, wide):
         images = F.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
     below, right = filled[0] - size[0], filled[1] - size[1]
     left, top = (right // 2, below // 2) if spec.centred else (0, 0)
     if below or right:
         images = F.pad(images, (left, right - left, top, below - top), value=spec.pad)
-    return images, Fitted(scale_xy, (left, top))
+    return images, Fitted((size[1] / wide, size[0] / high), (left, top))
 
 
 def prepare(images: Tensor, spec: Spec) -> Tensor:

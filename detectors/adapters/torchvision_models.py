@@ -52,7 +52,8 @@ class TorchvisionDetector(DenseDetector):
         columns = torch.tensor(self._columns, device=boxes.device)
         boxes = boxes[:, :, columns] if boxes.shape[2] > 1 else boxes
         # From edges, counted from the corner, to pixel centres at integers.
-        return DensePredictions(boxes * scale - 0.5, probabilities[..., columns], image_hw, held)
+        counts = tuple(len(proposals) for proposals in held) if held else None
+        return DensePredictions(boxes * scale - 0.5, probabilities[..., columns], image_hw, held, counts)
 
     @contextmanager
     def holding(self, raw: DensePredictions) -> Iterator[None]:

@@ -387,6 +387,8 @@ def _pad(around: Parts, pad: Sequence[int], mode: str = "constant", value: float
 
 
 def _rectify(value: Parts, slope: float) -> Parts:
+    if slope < 0:  # what comes out no longer tells what went in, which gradients need
+        raise UntraceableError(f"a rectifier of slope {slope} below 0")
     layers = value.whole("a rectifier")
     return Parts(tuple(Rectified([layer], layer.channels, slope) for layer in layers))
 
@@ -551,9 +553,8 @@ def _simplified(outputs: list[Layer]) -> list[Layer]:
 
 
 def _rises(layer: Layer) -> bool:
-    """Whether it ends in a rectifier that keeps the order of numbers."""
-    slope = layer.slope if isinstance(layer, (Rectified, Sliding)) else None
-    return slope is not None and slope >= 0
+    """Whether it ends in a rectifier: that keeps the order of numbers."""
+    return isinstance(layer, (Rectified, Sliding)) and layer.slope is not None
 
 
 def _in_order(picture: Layer | None, outputs: Sequence[Layer]) -> tuple[Layer, ...]:

@@ -19,6 +19,51 @@ _MOST_WHOLE = 1 << 20
 _NUMBERS_A_BOX = 5
 """x, y, width, height, objectness; the classes follow."""
 
+_READ = {
+    "convolutional": (
+        *("batch_normalize", "filters", "size", "stride", "stride_x", "stride_y", "pad", "padding"),
+        *("activation", "groups"),
+    ),
+    "maxpool": ("stride", "stride_x", "stride_y", "size", "padding"),
+    "route": ("layers",),
+    "shortcut": ("from", "activation"),
+    "upsample": ("stride",),
+    "yolo": ("mask", "anchors", "classes", "num", "ignore_thresh", "iou_thresh"),
+}
+"""Keys of a section that are read."""
+_OF_ANY = (
+    *("learning_rate", "stopbackward", "onlyforward", "dont_update", "burnin_update", "train_only_bn", "clip"),
+    *("stream", "wait_stream"),
+)
+_WITHOUT_EFFECT = {
+    "convolutional": (
+        *("assisted_excitation", "sway", "rotate", "stretch", "stretch_sway", "angle", "dot", "grad_centr"),
+    ),
+    "yolo": (
+        *("jitter", "resize", "random", "max", "map", "truth_thresh", "iou_thresh_kind", "iou_loss"),
+        *("iou_normalizer", "obj_normalizer", "cls_normalizer", "delta_normalizer", "uc_normalizer"),
+        *("max_delta", "label_smooth_eps", "objectness_smooth", "focal_loss", "counters_per_class"),
+        *("nms_kind", "beta_nms", "show_details", "embedding_layer", "track_history_size", "sim_thresh"),
+        *("dets_for_track", "dets_for_show", "track_ciou_norm"),
+    ),
+}
+"""Further keys that change no box, of any section and of one: of Darknet's training, its suppression, tracking and
+display, and of a GPU's streams (src/parser.c of https://github.com/AlexeyAB/darknet)."""
+_NEUTRAL_OF_ANY = {"dontload": "0", "dontloadscales": "0"}
+_NEUTRAL = {
+    "convolutional": {
+        **dict.fromkeys(("antialiasing", "binary", "xnor", "bin_output", "cbn", "flipped", "reverse"), "0"),
+        "coordconv": "0",
+        "dilation": "1",
+    },
+    "maxpool": {"antialiasing": "0", "maxpool_depth": "0", "out_channels": "1", "maxpool_zero_nonmax": "0"},
+    "route": {"groups": "1", "group_id": "0"},
+    "shortcut": {"weights_type": "none", "weights_normalization": "none"},
+    "upsample": {"scale": "1"},
+    "yolo": {"scale_x_y": "1", "new_coords": "0"},
+}
+"""Further keys that change what a layer gives, or which weights it has, and the value with which they do not; of
+any section and of one."""
 
 _MOST_LAYERS = 1000
 """YOLOv3 has 107."""
@@ -150,6 +195,7 @@ def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
         if section.kind not in _LAYERS:
             known = ", ".join(f"[{name}]" for name in _LAYERS)
             raise DetectorError(f"{source}:{section.line}: expected one of {known}, found [{section.kind}]")
+        _check_keys(reader)
         layer = _LAYERS[section.kind](reader, len(layers))
         channel, stride = _output(layer, before, (channels, strides), reader)
         layers.append(layer)
@@ -258,6 +304,38 @@ class _Reader:
         return absolute
 
 
+def _check_keys(reader: _Reader) -> None:
+    """DetectorError for a key that would make another network than the one that is built."""
+    kind = reader.section.kind
+    passed = {*_READ[kind], *_OF_ANY, *_WITHOUT_EFFECT.get(kind, ())}
+    neutral = _NEUTRAL_OF_ANY | _NEUTRAL[kind]
+    for key, value in reader.section.options.items():
+        if key in passed:
+            continue
+        if key not in neutral:
+            raise reader.fail(key, "a key of YOLOv3's networks", "an unknown one")
+        if value != neutral[key] and not _is_number(value, neutral[key]):
+            raise reader.fail(key, neutral[key], value)
+
+
+def _is_number(text: str, wanted: str) -> bool:
+    """Whether a text is a number written otherwise."""
+    try:
+        return float(text) == float(wanted)
+    except ValueError:
+        return False
+
+
+def _stride(reader: _Reader, most: int = _MOST_WHOLE) -> int:
+    """px, of both directions."""
+    stride = reader.integer("stride", 1, most=most)
+    for key in ("stride_x", "stride_y"):
+        found = reader.integer(key, stride)
+        if found != stride:
+            raise reader.fail(key, f"{stride}, the stride", found)
+    return stride
+
+
 def _convolution(reader: _Reader, _here: int) -> Convolution:
     activation = reader.section.options.get("activation", "logistic")
     if activation not in ACTIVATIONS:
@@ -271,7 +349,7 @@ def _convolution(reader: _Reader, _here: int) -> Convolution:
     return Convolution(
         filters=reader.integer("filters"),
         size=size,
-        stride=reader.integer("stride", 1),
+        stride=_stride(reader),
         padding=padding,
         normalised=bool(reader.integer("batch_normalize", 0, 0)),
         leaky=activation == "leaky",
@@ -279,7 +357,7 @@ def _convolution(reader: _Reader, _here: int) -> Convolution:
 
 
 def _max_pool(reader: _Reader, _here: int) -> MaxPool:
-    stride = reader.integer("stride", 1, most=_MOST_SIDE)
+    stride = _stride(reader, _MOST_SIDE)
     size = reader.integer("size", stride, most=_MOST_SIDE)
     if reader.integer("padding", size - 1, 0) != size - 1:
         raise reader.fail("padding", str(size - 1), reader.section.options["padding"])
@@ -287,8 +365,6 @@ def _max_pool(reader: _Reader, _here: int) -> MaxPool:
 
 
 def _route(reader: _Reader, here: int) -> Route:
-    if "groups" in reader.section.options:
-        raise reader.fail("groups", "none", reader.section.options["groups"])
     return Route(tuple(reader.layer("layers", index, here) for index in reader.integers("layers")))
 
 

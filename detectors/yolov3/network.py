@@ -132,9 +132,10 @@ def _last_uses(cfg: Cfg) -> dict[int, int]:
 
 
 def _max_pool(x: Tensor, layer: MaxPool) -> Tensor:
-    # Darknet pads by size - 1 in all, the odd one right and below, with what no maximum takes.
+    # Darknet pads by size - 1 in all, the odd one right and below, with what no maximum takes. Sides are multiples
+    # of the stride: windows that begin inside and are no larger than it never meet that.
     before = (layer.size - 1) // 2
     after = layer.size - 1 - before
-    if layer.size > layer.stride:
+    if before or layer.size > layer.stride:
         x = F.pad(x, (before, after, before, after), value=-torch.inf)
     return F.max_pool2d(x, layer.size, layer.stride)

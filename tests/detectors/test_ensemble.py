@@ -86,6 +86,12 @@ def test_what_is_no_ensemble_is_told() -> None:
         Ensemble(members)
 
 
+@pytest.mark.parametrize("t_star", [0.0, 1.0])
+def test_a_threshold_that_no_shift_moves_is_refused(t_star: float) -> None:
+    with pytest.raises(DetectorError, match=rf"squeezedet: expected a t\* above 0 and below 1, found {t_star:g}"):
+        Ensemble([SqueezeDet(), SqueezeDet(t_star=t_star)])
+
+
 def test_code_of_a_member_is_told() -> None:
     assert code_of(SPEC) is None
     assert code_of("ensemble:squeezedet+module:own.py") == code_of("module:own.py") == "own.py"

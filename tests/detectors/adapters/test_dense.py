@@ -61,6 +61,38 @@ def test_no_objects_and_no_predictions() -> None:
     assert float(dense_loss(none, aim(([0.0, 0, 40, 20], CAR, False)), CLASSES)["objectness"]) == 75
 
 
+def test_a_loss_does_not_depend_on_the_pictures_beside() -> None:
+    """Two predictions of a picture, four of the one beside it: two rows only fill up."""
+    few, many = torch.tensor(ROWS[:2]), torch.tensor(ROWS)
+    filled = torch.stack([torch.cat((few, torch.zeros(2, 3))), many])
+    places = torch.stack([PLACES * torch.tensor([1.0, 1, 0, 0])[:, None], PLACES])[:, :, None]
+    raw = DensePredictions(places, filled, (64, 96), counts=(2, 4))
+    alone = [DensePredictions(PLACES[None, :2, None], few[None], (64, 96)), said(ROWS)]
+    targets = aim(([60.0, 0, 90, 20], CAR, False))
+    losses = [dense_loss(one, targets, CLASSES)["objectness"] for one in alone]
+    for image, (one, loss) in enumerate(zip(alone, losses, strict=True)):
+        own = raw.one(image)
+        assert torch.equal(own.probabilities, one.probabilities)
+        assert torch.equal(own.boxes_xyxy, one.boxes_xyxy)
+        assert torch.equal(dense_loss(own, targets, CLASSES)["objectness"], loss)
+    both = dense_loss(raw, targets * 2, CLASSES)["objectness"]
+    assert float(both) == pytest.approx(float(torch.stack(losses).mean()))
+    for counts in ((2,), (2, 3), (2, 5)):
+        with pytest.raises(ValueError, match="counts: expected 2, the largest of them 4, found"):
+            DensePredictions(places, filled, (64, 96), counts=counts)
+
+
+def test_a_prediction_is_planted_where_nothing_was_said() -> None:
+    box = torch.tensor([10.0, 10, 50, 30])
+    silent = DensePredictions(torch.zeros(1, 0, 1, 4), torch.zeros(1, 0, 3), (64, 96)).planted(box, CAR)
+    beside = DensePredictions(
+        PLACES[None, :, None].repeat(2, 1, 1, 1), torch.tensor([ROWS, ROWS]), (64, 96), counts=(0, 4)
+    ).planted(box, CAR)
+    for raw in (silent, beside.one(0), beside.one(1)):
+        assert torch.equal(raw.boxes_xyxy[0, 0, 0], box)
+        assert raw.probabilities.nonzero().tolist() == [[0, 0, CAR]]
+
+
 def test_each_class_may_have_its_own_box() -> None:
     own = PLACES[None, :, None].repeat(1, 1, 3, 1)
     own[:, :, CAR] += 200

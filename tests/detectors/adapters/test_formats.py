@@ -138,6 +138,21 @@ def test_letterbox_and_stretch_bring_boxes_back() -> None:
     assert fitted.back(torch.tensor([0.0, 0, 4, 4])).tolist() == [-0.5, -0.5, 3.5, 3.5]
 
 
+def test_boxes_come_back_by_the_rounded_size() -> None:
+    """375 x 1242 px at 416: 125.6 rows, of which 126 are shown; the picture's border comes back to its border."""
+    fed, fitted = fit(torch.ones(1, 3, 375, 1242), Spec(size=(416, 416), pad=0.0))
+    rows, columns = (fed[0, 0] > 0).nonzero().unbind(1)
+    edges = torch.tensor([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
+    torch.testing.assert_close(fitted.back(edges), torch.tensor([-0.5, -0.5, 1241.5, 374.5]), atol=1e-3, rtol=0)
+
+
+def test_a_picture_too_flat_for_a_row_has_one() -> None:
+    fed, fitted = fit(torch.ones(1, 3, 1, 1242), Spec(size=(416, 416), pad=0.0))
+    assert float(fed.sum()) == pytest.approx(3 * 416)
+    edges = torch.tensor([0.0, 207, 416, 208])
+    torch.testing.assert_close(fitted.back(edges), torch.tensor([-0.5, -0.5, 1241.5, 0.5]), atol=1e-3, rtol=0)
+
+
 def test_what_a_network_is_fed() -> None:
     image = torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1)
     spec = Spec(channels="bgr", scale=255.0, mean=(1.0, 2.0, 3.0), std=(2.0, 2.0, 4.0))

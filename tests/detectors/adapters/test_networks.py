@@ -10,9 +10,12 @@ import pytest
 import torch
 from torch import nn
 
+from detectors.adapters.network import NetworkDetector
 from detectors.base import DetectorError, predict
 from detectors.check import check_detector
+from detectors.planted import PlantedDetector, PlantedFault
 from detectors.registry import load_detector, load_predictor
+from detectors.types import Targets
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "detectors.md"
 SIDE = 64
@@ -34,6 +37,22 @@ class Tiny(nn.Module):
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return torch.cat((self.boxes, self.head(images).flatten(2).sigmoid()), 1)
+
+
+class Choosing(nn.Module):
+    """Suppresses by itself: a box of 32 px around each dark cell of 16 px, in torchvision's way."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.contrast = nn.Parameter(torch.tensor(12.0))
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        light = nn.functional.avg_pool2d(images.mean(1, keepdim=True), 16)
+        y, x = torch.meshgrid(*(torch.arange(side) for side in light.shape[2:]), indexing="ij")
+        corner = torch.stack((x, y), -1).reshape(-1, 2).to(light) * 16
+        scores = (self.contrast * (0.5 - light.flatten())).sigmoid()
+        dark = scores > 0.5
+        return torch.cat((corner - 8, corner + 24), -1)[dark], torch.zeros(int(dark.sum())).long(), scores[dark]
 
 
 @pytest.fixture
@@ -125,6 +144,28 @@ def test_the_documented_class_keeps_the_contract(documented: Path) -> None:
     centre = (found.boxes_xyxy[0, :2] + found.boxes_xyxy[0, 2:]) / 2
     assert 32 <= float(centre[0]) <= 64
     assert 16 <= float(centre[1]) <= 32
+
+
+def test_pictures_do_not_share_what_a_network_that_suppresses_says() -> None:
+    settings = {"classes": ("Car", "person"), "multiple": 16, "format": "torchvision"}
+    detector = NetworkDetector("choosing", Choosing(), settings).requires_grad_(False)
+    light, dark = (
+        torch.linspace(0.3, 0.9, 64).expand(1, 3, 64, 64),
+        torch.linspace(0, 0.4, 64).expand(1, 3, 64, 64),
+    )
+    pictures = torch.cat((light, dark, torch.ones_like(light)))
+    raw = detector(pictures)
+    assert raw.counts == (4, 16, 0)
+    box = Targets(torch.tensor([[8.0, 8, 40, 40]]), torch.tensor([0]), torch.tensor([False]))
+    faulty = PlantedDetector(detector, PlantedFault.of("height_px=20:40")).requires_grad_(False)
+    lowered = faulty(pictures)
+    for image, picture in enumerate(pictures):
+        alone = detector(picture[None])
+        assert torch.equal(raw.one(image).probabilities, alone.probabilities)
+        assert torch.equal(detector.loss(raw.one(image), [box])["total"], detector.loss(alone, [box])["total"])
+        assert torch.equal(lowered.one(image).probabilities, faulty(picture[None]).probabilities)
+    assert float(lowered.probabilities.max()) < float(raw.probabilities.max())
+    check_detector(detector, (64, 96)).require()
 
 
 def test_a_class_of_an_installed_module() -> None:

@@ -101,6 +101,27 @@ def test_a_box_is_cut_at_the_pictures_border(graph: Make) -> None:
     torch.testing.assert_close(found.boxes_xyxy, torch.tensor([[0.0, 0, 23.5, 23.5]]), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize(
+    ("tiling", "width", "both"), [("off", 64, True), ("auto", 64, True), ("auto", 128, False)]
+)
+def test_suppression_of_a_yaml_file(tiling: str, width: int, both: bool, graph: Make, tmp_path: Path) -> None:
+    """Two boxes at IoU 0.6: one window suppresses as the file says, several ones' boxes at 0.5 as ever."""
+    (tmp_path / "tiny.yaml").write_text("classes: coco\nnms_iou: 0.7\n")
+    rows = np.zeros((1, 300, 6))
+    rows[0, :2] = [10, 10, 50, 30, 0.9, CAR], [20, 10, 60, 30, 0.8, CAR]
+    predictor = OnnxPredictor(graph({"out": rows}), tiling)
+    (found,) = predict(predictor, torch.zeros(1, 3, SIDE, width))
+    assert {round(float(score), 6) for score in found.scores} == ({0.9, 0.8} if both else {0.9})
+
+
+def test_what_lies_in_the_padding_is_nothing(graph: Make) -> None:
+    # a picture of 64 x 128 fills rows 16 to 47 of the input
+    rows = np.zeros((1, 300, 6))
+    rows[0, :2] = [10, 2, 50, 14, 0.9, CAR], [10, 10, 50, 30, 0.8, CAR]
+    (found,) = predict(OnnxPredictor(graph({"out": rows}), "off"), torch.zeros(1, 3, 64, 128))
+    torch.testing.assert_close(found.scores, torch.tensor([0.8]))
+
+
 def test_nothing_is_found_in_an_empty_picture(graph: Make) -> None:
     first, second = predict(OnnxPredictor(graph(outputs({}))), torch.zeros(2, 3, 64, 128))
     assert len(first) == len(second) == 0

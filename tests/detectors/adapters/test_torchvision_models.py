@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,18 @@ def test_the_contract_is_kept(name: str, settled: Callable[[str], Any]) -> None:
     assert len(detector.classes) == 80
 
 
+def test_each_picture_keeps_to_its_own_proposals(settled: Callable[[str], Any]) -> None:
+    detector = settled("fasterrcnn_mobilenet_v3_large_320_fpn")
+    detector.model.transform.min_size = (96,)
+    images = torch.rand(2, 3, 64, 96)
+    raw = detector(images)
+    few = tuple(proposals[:count] for proposals, count in zip(raw.held, (3, 7), strict=True))
+    with detector.holding(replace(raw, held=few)):
+        cut = detector(images)
+    assert cut.counts == (3, 7)
+    assert [cut.one(i).probabilities.shape[1] for i in (0, 1)] == [3, 7]
+
+
 def test_what_is_decoded_is_what_torchvision_finds(settled: Callable[[str], Any]) -> None:
     detector = settled("ssdlite320_mobilenet_v3_large")
     image = torch.rand(3, 64, 96)
@@ -76,5 +89,5 @@ def test_weights_from_a_file(tmp_path: Path, settled: Callable[[str], Any]) -> N
 def test_names_that_are_none() -> None:
     with pytest.raises(DetectorError, match=r"torchvision: expected one of .*fcos_resnet50_fpn.*, found 'yolo9'"):
         load_detector("torchvision:yolo9,none")
-    with pytest.raises(DetectorError, match=r"gone\.pth: expected a weights file, found none"):
+    with pytest.raises(DetectorError, match=r"gone\.pth: expected weights of SSD, found"):
         load_detector("torchvision:ssdlite320_mobilenet_v3_large,gone.pth")

@@ -443,6 +443,7 @@ class Branching(nn.Module):
         Shuffled(), MeanOfAll(), InPlace(), Branching(), nn.Conv2d(3, 4, 3, padding_mode="reflect", padding=1),
         nn.Sequential(nn.Conv2d(3, 4, 1), nn.InstanceNorm2d(4)), nn.ConstantPad2d(1, 2.0),
         nn.Sequential(nn.ZeroPad2d(1), nn.ReLU()), nn.Upsample(scale_factor=1.5),
+        nn.Sequential(nn.Conv2d(3, 4, 1), nn.LeakyReLU(-0.1)),
     ],
     ids=lambda network: type(network).__name__,
 )  # fmt: skip

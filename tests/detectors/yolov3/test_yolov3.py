@@ -17,8 +17,8 @@ from detectors.base import RawPredictions
 from detectors.registry import load_detector, save_detector
 from detectors.training import TrainingSettings, train
 from detectors.types import Targets
-from detectors.yolov3.cfg import Cfg, parse, write
-from detectors.yolov3.network import Folded, Network
+from detectors.yolov3.cfg import Cfg, MaxPool, parse, write
+from detectors.yolov3.network import Folded, Network, _max_pool
 from detectors.yolov3.yolov3 import Assignment, YoloV3, YoloV3Slim
 
 HW = (32, 48)
@@ -380,6 +380,24 @@ def test_poolings_and_routes_by_hand() -> None:
         (found,) = network(x)
     # A window reaches one px right and below; beyond the edge there is nothing.
     assert found[0, 0].tolist() == [[5.0, 5.0, -2.0], [0.0, -3.0, -4.0]]
+
+
+@pytest.mark.parametrize(
+    ("size", "stride"), [(1, 2), (2, 1), (2, 2), (2, 4), (3, 1), (3, 2), (3, 3), (3, 4), (4, 2), (4, 4), (5, 5)]
+)
+def test_poolings_begin_where_darknet_s_do(size: int, stride: int) -> None:
+    """forward_maxpool_layer of its src/maxpool_layer.c, place by place."""
+    side = 3 * stride
+    picture = torch.rand(side, side, generator=torch.Generator().manual_seed(0))
+    padding = size - 1
+    places = (side + padding - size) // stride + 1
+    expected = torch.full((places, places), -torch.inf)
+    for row in range(places):
+        for column in range(places):
+            top, left = row * stride - padding // 2, column * stride - padding // 2
+            window = picture[max(top, 0) : top + size, max(left, 0) : left + size]
+            expected[row, column] = window.max()
+    assert torch.equal(_max_pool(picture[None, None], MaxPool(size, stride))[0, 0], expected)
 
 
 def test_weights_file_holds_the_cfg(mini: YoloV3, tmp_path: Path) -> None:

@@ -119,6 +119,52 @@ def test_errors_name_the_line(mini_text: str, before: str, after: str, at: str, 
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("section", "line", "message"),
+    [
+        ("yolo", "scale_x_y=1.2", "scale_x_y: expected 1, found 1.2"),
+        ("yolo", "new_coords=1", "new_coords: expected 0, found 1"),
+        ("yolo", "scale_xy=1", "scale_xy: expected a key of YOLOv3's networks, found an unknown one"),
+        ("convolutional", "dilation=2", "dilation: expected 1, found 2"),
+        ("convolutional", "xnor=1", "xnor: expected 0, found 1"),
+        ("convolutional", "flipped=1", "flipped: expected 0, found 1"),
+        ("convolutional", "antialiasing=1", "antialiasing: expected 0, found 1"),
+        ("convolutional", "dontload=1", "dontload: expected 0, found 1"),
+        ("convolutional", "stride_x=1", "stride_x: expected 2, the stride, found 1"),
+        ("convolutional", "jitter=.3", "jitter: expected a key of YOLOv3's networks, found an unknown one"),
+        ("maxpool", "stride_y=1", "stride_y: expected 2, the stride, found 1"),
+        ("maxpool", "maxpool_depth=1", "maxpool_depth: expected 0, found 1"),
+        ("maxpool", "maxpool_depth=", "maxpool_depth: expected 0, found "),
+        ("route", "groups=2", "groups: expected 1, found 2"),
+        ("shortcut", "weights_type=per_feature", "weights_type: expected none, found per_feature"),
+        ("upsample", "reverse=1", "reverse: expected a key of YOLOv3's networks, found an unknown one"),
+        ("upsample", "scale=2", "scale: expected 1, found 2"),
+    ],
+)
+def test_keys_that_make_another_network_are_refused(section: str, line: str, message: str, mini_text: str) -> None:
+    at = line_of(mini_text, f"[{section}]")
+    with pytest.raises(DetectorError) as caught:
+        parse(mini_text.replace(f"[{section}]", f"[{section}]\n{line}", 1), "own.cfg")
+    assert str(caught.value) == f"own.cfg:{at}: [{section}] {message}"
+
+
+def test_keys_that_change_nothing_pass(mini_text: str) -> None:
+    """Darknet's own values for them, and keys of its training; [net] may have anything."""
+    more = {
+        "net": "mosaic=1\nwhatever=3",
+        "convolutional": "dilation=1\nxnor=0\nstopbackward=1\ngroups=1",
+        "maxpool": "maxpool_depth=0\nlearning_rate=0.1",
+        "route": "groups=1\ngroup_id=0",
+        "shortcut": "weights_type=none",
+        "upsample": "scale=1.0",
+        "yolo": "scale_x_y = 1.0\nnew_coords=0\niou_loss=ciou\nnms_kind=greedynms\nbeta_nms=0.6\nmax=200",
+    }
+    text = mini_text
+    for section, lines in more.items():
+        text = text.replace(f"[{section}]", f"[{section}]\n{lines}")
+    assert parse(text).layers == parse(mini_text).layers
+
+
 def test_heads_agree_on_classes_and_there_is_one() -> None:
     with pytest.raises(DetectorError, match=r"own\.cfg: expected \[yolo\] sections .* found no \[yolo\]"):
         parse("[net]\n[convolutional]\nfilters=4\nactivation=linear", "own.cfg")
