@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os.path import isfile  # of a name that is too long it says no
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from pycocotools import mask as run_length
 
 from drivesem.data.coco_labels import AnnotationFile, Rows, files_of, firsts, identifier_of, numbers_of
-from drivesem.data.frames import PNG_COMPRESSION, Frames, as_photograph, check_focal, images_by_place, pinhole
+from drivesem.data.frames import PNG_COMPRESSION, Frames, as_photograph, check_focal, images_in, pinhole
 from drivesem.data.label_table import (
     REGION,
     LabelTable,
@@ -32,7 +33,7 @@ from drivesem.data.label_table import (
     shortest,
     to_coco,
 )
-from drivesem.data.photographs import focal_of, read_pixels
+from drivesem.data.photographs import focal_of, upright_pixels
 from drivesem.data.truth import Exposure, Place, TrackedObject
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -257,8 +258,19 @@ def _row_entry(table: LabelTable, row: int) -> dict[str, Any]:
 
 
 def images_beside(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """The images of a file, where they are in COCO's own places."""
-    return images_by_place((path.parent / "images", path.parent.parent / "images", path / "images"), frames)
+    """The images that a data set's file names, in the folder in which `CocoDataset` looks for them, or else those
+    that are called as their frames there. Folders of other parts may have others of the same names. FormatError.
+    """
+    (path,) = files_of(path)
+    folder, told = _images_of(path), AnnotationFile(path, files.read_json(path))
+    names = told.frames()
+    named = {names[i]: folder / name for i, name in told.file_names().items() if _stays_inside(Path(name))}
+    return images_in([folder], frames) | {name: image for name, image in named.items() if isfile(image)}
+
+
+def _stays_inside(file_name: Path) -> bool:
+    """Whether a file's name does not lead out of the folder that it is looked for in."""
+    return not (file_name.is_absolute() or ".." in file_name.parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,8 +294,9 @@ class CocoDataset(Frames[_Image]):
 
     A frame's identifier is its file name without suffix, folders joined by "_". `kind` is the category's name as
     written; `COCO_ROAD_USERS` reads COCO's own. Unknown truncation and 3D boxes are NaN, unknown occlusion 3, as
-    in KITTI; crowds are regions to ignore. Raises FormatError naming file and field; a frame's own faults are
-    raised by `labels` and `frame`, so that the other frames can be used.
+    in KITTI; crowds are regions to ignore. Images are upright, as EXIF says, but where the file tells the stored
+    one's size. Raises FormatError naming file and field; a frame's own faults are raised by `labels` and `frame`,
+    so that the other frames can be used.
     """
 
     def __init__(
@@ -316,7 +329,7 @@ class CocoDataset(Frames[_Image]):
                 if "file_name" not in record:
                     raise FormatError(told.images.at(i, "file_name"), "a value", "none")
                 name = Path(str(record["file_name"]))
-                if name.is_absolute() or ".." in name.parts:
+                if not _stays_inside(name):
                     raise FormatError(told.images.at(i, "file_name"), f"a file in {folder}", repr(str(name)))
                 identifier = identifier_of(record)
                 if identifier in entries:
@@ -352,7 +365,7 @@ class CocoDataset(Frames[_Image]):
         entry = self._entry(identifier)
         path, record = entry.told.path, entry.record
         size_hw = (record["height"], record["width"])
-        image = read_pixels(entry.path, size_hw)
+        image = upright_pixels(entry.path, size_hw)
         camera, told = self._camera(entry)
         labels = self.labels(identifier)
         rows, _, objects = self._things(identifier)

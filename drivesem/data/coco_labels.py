@@ -258,9 +258,21 @@ class AnnotationFile:
         self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
         self.annotations = tables["annotations"]
         self.images.texts("file_name")
+        for i, name in enumerate(self.images.values("file_name")):
+            if name and name[-1] in "./" and not Path(name).name:
+                raise FormatError(self.images.at(i, "file_name"), "the name of a file", json.dumps(name))
         self.categories.texts("name")
         self.frame = self.annotations.places("image_id", self.image_ids, "images")
         self.kind = self.annotations.places("category_id", self.category_ids, "categories")
+
+    def frames(self) -> list[str]:
+        """What a table calls the images: as their files, or as their ids where two files are called alike."""
+        names = [identifier_of(row) for row in self.images.rows]
+        return names if len(set(names)) == len(names) else [str(i) for i in self.image_ids.tolist()]
+
+    def file_names(self) -> dict[int, str]:
+        """The images' files by the image's place; an image may have none."""
+        return {i: name for i, name in enumerate(self.images.values("file_name")) if name}
 
 
 def _by_id(rows: Rows, ids: Ids) -> tuple[Rows, Any]:
@@ -286,9 +298,7 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
     if isinstance(content, list) and scored:
         return _results(path, content, truth)
     told = AnnotationFile(path, content)
-    frames = [identifier_of(row) for row in told.images.rows]
-    if len(set(frames)) != len(frames):
-        frames = [str(i) for i in told.image_ids.tolist()]
+    frames = told.frames()
     sizes_wh = np.stack([told.images.flags(key, 0) for key in ("width", "height")], axis=1)
     table = told.annotations.table(frames, told.kinds, told.category_ids, told.frame, told.kind, scored)
     return replace(
@@ -296,6 +306,7 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
         sizes_wh=sizes_wh,
         image_ids=told.image_ids,
         cameras={i: row["camera"] for i, row in enumerate(told.images.rows) if "camera" in row},
+        image_files=told.file_names(),
     )
 
 

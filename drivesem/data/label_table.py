@@ -197,8 +197,9 @@ class LabelTable:
 
     @property
     def scored(self) -> bool:
-        """Whether these are detections: all that is no region has a score."""
-        return len(self) > 0 and bool(np.isfinite(self.score[self.kind != REGION]).all())
+        """Whether these are detections: there is something besides regions, and all of it has a score."""
+        scores = self.score[self.kind != REGION]
+        return len(scores) > 0 and bool(np.isfinite(scores).all())
 
     def by_frame(self) -> list[range]:
         """The rows of each frame."""

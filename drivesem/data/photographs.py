@@ -24,8 +24,10 @@ _EXIF, _FOCAL, _FOCAL_35 = 0x8769, 0x920A, 0xA405
 _PLANE_X, _PLANE_Y, _PLANE_UNIT, _ORIENTATION = 0xA20E, 0xA20F, 0xA210, 0x0112
 """Tags of EXIF 2.32: its own directory, focal length in mm and in 35 mm film, pixels a unit on the sensor."""
 _UNIT_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0}
-_TURNED: dict[float, int] = {1: 0, 3: 2, 6: 3, 8: 1}
-"""EXIF's orientations without mirroring, and quarter turns to the left that put them upright."""
+_TURNED: dict[float, int] = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
+"""EXIF's orientations, and quarter turns to the left that put them upright."""
+_MIRRORED = (2, 4, 5, 7)
+"""Of these orientations those that left and right are to be swapped in, after the turns."""
 _OTHER_CHANNELS = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
 """Pillow's modes of 8 bits that are not red, green and blue, but can be."""
 
@@ -55,6 +57,22 @@ class Focal:
 
     def __str__(self) -> str:
         return f"{self.length_px:.1f} px, {self.source}"
+
+
+def upright_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
+    """As `read_pixels`, turned as EXIF says: as viewers show it, and OpenCV reads it. Where only the stored image
+    is of `size_hw`, that is meant, and stays as it is.
+    """
+    told, _, _ = _header(path)
+    pixels = np.rot90(read_pixels(path), _turns(told))
+    if size_hw not in (None, pixels.shape[:2]):
+        return read_pixels(path, size_hw)
+    return np.ascontiguousarray(pixels[:, ::-1] if _positive(told.get(_ORIENTATION)) in _MIRRORED else pixels)
+
+
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image as seen upright, from its header. FormatError."""
+    return _header(path)[1:]
 
 
 def camera_of(image_path: Path, focal_px: float | None = None) -> Camera:
@@ -105,8 +123,10 @@ def _positive(value: Any) -> float:
 
 def _header(path: Path) -> tuple[dict[int, Any], int, int]:
     """EXIF's values by tag, and width and height as seen upright. FormatError."""
+    from PIL import Image
+
     with files.opened_image(path) as image:  # Pillow reads EXIF when it is asked for, and then says what is wrong
-        exif = image.getexif()
+        exif = Image.Image.getexif(image)  # a PNG's own way decodes the pixels, behind which EXIF hardly ever is
         told = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
         width, height = image.size
     return (told, height, width) if _turns(told) % 2 else (told, width, height)
@@ -119,7 +139,6 @@ def _turns(told: Mapping[int, Any]) -> int:
 def photograph(path: Path, focal_px: float | None = None) -> Frame:
     """A photograph, upright, with its camera, without labels. FormatError naming the file; RangeError."""
     focal = focal_of(path, focal_px)
-    pixels = np.rot90(read_pixels(path), _turns(_header(path)[0]))
-    image = to_tensor(pixels)
+    image = to_tensor(upright_pixels(path))
     provenance = {"dataset": "photograph", "image": path.name, "focal": str(focal)}
     return Frame(path.stem, image, pinhole(image.shape[1], image.shape[2], focal.length_px), provenance=provenance)

@@ -81,7 +81,7 @@ def _named(path: Path, names: Sequence[str]) -> set[str]:
     for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         name = line.strip()
         if name and name not in known:
-            name = str(Path(name).with_suffix(""))
+            name = str(Path(name).with_suffix("")) if Path(name).name else name  # "." and "/" have none
             if name not in known:
                 raise FormatError(
                     f"{path}:{number}", f"a frame such as {names[0]}" if names else "nothing", repr(line)

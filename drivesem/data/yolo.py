@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import yaml
+from numpy.typing import NDArray
 
 from drivesem.data.coco import CATEGORIES, CATEGORY_IDS
 from drivesem.data.frames import (
@@ -27,11 +28,10 @@ from drivesem.data.frames import (
     check_focal,
     images_of,
     pinhole,
-    size_of_image,
 )
 from drivesem.data.kitti import finite_number, format_calib, read_calib
 from drivesem.data.label_table import REGION, LabelTable, Written, copy_images, matrix_of, positional, to_coco
-from drivesem.data.photographs import focal_of, read_pixels
+from drivesem.data.photographs import focal_of, upright_pixels, upright_size
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
@@ -101,17 +101,20 @@ def _line(label: int, box_xywh: Sequence[float], size_wh: Sequence[int], decimal
 
 
 def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
-    """Write a table's objects that have an area as part "train" and "val" of a data set."""
+    """Write a table's objects that have an area as part "train" and "val" of a data set. Boxes that reach beyond
+    the image are cut at its edge, as readers take no share above 1; what lies beyond is left out.
+    """
     table.need_sizes("yolo")
     table = table.in_edges("xywh")
     names, renamed = table.file_names()
     scored = table.scored
     judged, area = ~table.ignore & (table.kind != REGION), table.boxes[:, 2:].prod(axis=1)
-    written = judged & (table.boxes[:, 2:] > 0).all(axis=1)
+    boxes, cut = _inside_images(table)
+    written = judged & (boxes[:, 2:] > 0).all(axis=1)
     for name, rows, size_wh in zip(names, table.by_frame(), table.sizes_wh.tolist(), strict=True):
         lines: list[str] = []
         for row in (row for row in rows if written[row]):
-            line = _line(int(table.kind[row]), table.boxes[row].tolist(), size_wh, TABLE_DECIMALS)
+            line = _line(int(table.kind[row]), boxes[row].tolist(), size_wh, TABLE_DECIMALS)
             lines.append(f"{line} {positional(float(table.score[row]))}\n" if scored else f"{line}\n")
         files.write_text(out / "labels" / "train" / f"{name}.txt", "".join(lines))
     for i, camera in table.cameras.items():
@@ -122,9 +125,25 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     places = {identifier: folder / name for identifier, name in zip(table.frames, names, strict=True)}
     drawn = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
     without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
-    more = {"box without area": int(without.sum()), "area of the mask": int(drawn.sum())}
+    more = {
+        "box without area": int(without.sum()),
+        "box beyond the image": int((cut & judged & ~without).sum()),
+        "area of the mask": int(drawn.sum()),
+    }
     count = len(names) + 1 + copy_images(places, images)
     return Written.of(count, table.lost(("score", "camera"), renamed | more))
+
+
+def _inside_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """A table's boxes (N, 4) in COCO's pixels, cut where they reach beyond their image by more than rounding, and
+    which (N,) these are. What lies beyond it has no width or height.
+    """
+    low, sizes_wh = table.boxes[:, :2], table.sizes_wh[table.frame]
+    high = low + table.boxes[:, 2:]
+    beyond = np.maximum(-low, high - sizes_wh)
+    cut = np.any(beyond > EDGE / 2 * sizes_wh, axis=1)  # at both sides, and a reader still takes the width
+    corner, end = np.clip(low, 0, sizes_wh), np.clip(high, 0, sizes_wh)
+    return np.where(cut[:, None], np.concatenate([corner, end - corner], axis=1), table.boxes), cut
 
 
 class _Text(NamedTuple):
@@ -217,7 +236,7 @@ class YoloDataset(Frames[Path]):
     root: the folder that holds `data.yaml`, or another YAML file like it. focal_px: the focal length of images
     without a file in `calib`, by default EXIF's, or a usual one. The labels of `.../images/NAME.png` are
     `.../labels/NAME.txt`; an image without such a file has no objects, as YOLO has it. A frame's identifier is its
-    file name without suffix.
+    file name without suffix. Images are upright, as EXIF says and trainers read them.
 
     Truncation and 3D boxes are NaN, occlusion is 3, as what is unknown in KITTI. Raises FormatError naming file
     and field; a frame's own faults are raised by `labels` and `frame`, so that the other frames can be used.
@@ -250,12 +269,13 @@ class YoloDataset(Frames[Path]):
     def table(self, identifiers: Sequence[str]) -> LabelTable:
         """The labels of some frames in columns; of their images, the headers are read. FormatError as `labels`."""
         images = [self._entry(identifier) for identifier in identifiers]
-        sizes = [size_of_image(image) for image in images]
+        sizes = [upright_size(image) for image in images]
         texts = [
             _read_text(path, self.class_names, size, False) if path.exists() else _Text([], [], [])
             for path, size in zip((_beside(image, "labels") for image in images), sizes, strict=True)
         ]
-        return _table(identifiers, self.class_names, texts, False, np.array(sizes, np.int64).reshape(-1, 2))
+        table = _table(identifiers, self.class_names, texts, False, np.array(sizes, np.int64).reshape(-1, 2))
+        return replace(table, image_files={i: image.name for i, image in enumerate(images)})
 
     def image_path(self, identifier: str) -> Path:
         """The file of a frame's image. RangeError for a frame that is not there."""
@@ -267,7 +287,7 @@ class YoloDataset(Frames[Path]):
         Raises FormatError naming the file: an image that does not decode, or a calibration that is none.
         """
         image_path = self._entry(identifier)
-        image = read_pixels(image_path)
+        image = upright_pixels(image_path)
         height, width = image.shape[:2]
         told = {"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name}
         calib_path = _beside(image_path, "calib")

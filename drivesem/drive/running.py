@@ -67,7 +67,7 @@ def drive_run(config: Drive) -> Answer:
     check_device(config.device)
     worker = attacks.Worker.of(asked)
     out = Path(config.out) if config.out else Path("runs") / _name(config, [str(p) for p in params])
-    taking = Taking(config.clip, config.sequence, config.limit, config.seed, config.fit)
+    taking = Taking(config.clip, config.sequence, config.limit, config.seed, config.fit, config.keep_going)
     taker = Taker(taking, out / SCENES)
     claim(out, config, _WRITTEN, _FREE)
     if config.resume and (out / RESULT).is_file():

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
+from operator import itemgetter
 from pathlib import Path
 
 from drivesem.data.clips import Clip, clip_of, clips_in
@@ -18,7 +19,7 @@ from drivesem.settings.devices import memory_gb
 from drivesem.settings.errors import UsageError
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender, placements
 from scene_ir.derender.silhouette import Placement, candidates, placed
-from scene_ir.errors import FormatError
+from scene_ir.errors import FormatError, SceneError
 from scene_ir.io import load_scene, save_scene
 from scene_ir.types import Camera, Labels, SceneIR
 
@@ -33,7 +34,7 @@ _BYTES_A_PIXEL = 180
 @dataclass(frozen=True, slots=True)
 class Taking:
     """What is taken apart. folder: of clips, None for the embedded drive; name: of the clip, None for the first;
-    limit: frames, from the first on; fit: whether shapes are fitted.
+    limit: frames, from the first on; fit: whether shapes are fitted; keep_going: past frames that cannot be used.
     """
 
     folder: str | None
@@ -41,6 +42,7 @@ class Taking:
     limit: int | None
     seed: int
     fit: bool
+    keep_going: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,7 @@ class _Labelled:
         self.name = self._clip.name
         self.names = self._clip.frames[: taking.limit]
         self._fit = taking.fit
+        self._passed_over = (SceneError,) if taking.keep_going else ()
         self._shapes: dict[int, Placement] | None = None
 
     def scene(self, name: str) -> SceneIR:
@@ -92,9 +95,12 @@ class _Labelled:
         scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
 
-    def camera(self) -> Camera:
-        """Of the first frame."""
-        return self._clip.dataset.frame(self.names[0]).camera
+    def camera(self) -> Camera | None:
+        """Of the first frame that can be read; None where none can."""
+        for name in self.names:
+            with suppress(*self._passed_over):
+                return self._clip.dataset.frame(name).camera
+        return None
 
     def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
         """A label's vehicle where the label says; None where it is none."""
@@ -108,18 +114,42 @@ class _Labelled:
         return replace(shape, translation=at[0], yaw=at[1])
 
     def _known(self) -> dict[int, Placement]:
-        """The shape of each track, looked at once by each process."""
+        """The shape of each track, looked at once by each process: in the best of its frames that can be used."""
         if self._shapes is None:
-            best = _best_views(self._clip, self.names)
-            settings = derender_settings(self._fit)
-            self._shapes = {}
-            for name in sorted(set(best.values())):
-                rows = self._clip.tracks(name)
-                found = placements(self._clip.dataset.frame(name), settings)
-                for row, placement in found.items():
-                    if best.get(rows[row]) == name:
-                        self._shapes[rows[row]] = placement
+            look = cache(self._shapes_in)
+            best = {
+                track: next((shapes for name in names if (shapes := look(name)) is not None), {})
+                for track, names in self._views().items()
+            }
+            # not before all are known: with some, other frames' cars would be of no shape
+            self._shapes = {track: shapes[track] for track, shapes in best.items() if track in shapes}
         return self._shapes
+
+    def _shapes_in(self, name: str) -> dict[int, Placement] | None:
+        """The shapes that a frame shows, by track; None where it is passed over."""
+        with suppress(*self._passed_over):
+            found = placements(self._clip.dataset.frame(name), derender_settings(self._fit))
+            tracks = self._clip.tracks(name)
+            return {tracks[row]: placement for row, placement in found.items()}
+        return None
+
+    def _views(self) -> dict[int, list[str]]:
+        """For each vehicle's track its frames, the best first: those that show it largest, of those in which it is
+        hidden and cut least.
+        """
+        views: dict[int, list[tuple[tuple[bool, bool, float], str]]] = {}
+        for name in self.names:
+            with suppress(*self._passed_over):
+                labels = _labels_of(self._clip, name)
+                heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+                for row, track in enumerate(self._clip.tracks(name)):
+                    if labels.kind[row] in VEHICLES:
+                        plain = int(labels.occlusion[row]) <= 1, float(labels.truncation[row]) < 0.1
+                        views.setdefault(track, []).append(((*plain, float(heights[row])), name))
+        return {
+            track: [name for _, name in sorted(ranked, key=itemgetter(0), reverse=True)]
+            for track, ranked in views.items()
+        }
 
 
 def _labels_of(clip: Clip, name: str) -> Labels:
@@ -130,22 +160,6 @@ def _labels_of(clip: Clip, name: str) -> Labels:
             f"frame {name}: labels", f"one for each of {number_of(len(clip.tracks(name)), 'track')}", found
         )
     return labels
-
-
-def _best_views(clip: Clip, names: Sequence[str]) -> dict[int, str]:
-    """For each vehicle's track the frame that shows it largest, of those in which it is hidden and cut least."""
-    found: dict[int, tuple[tuple[bool, bool, float], str]] = {}
-    for name in names:
-        labels = _labels_of(clip, name)
-        heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
-        for row, track in enumerate(clip.tracks(name)):
-            if labels.kind[row] not in VEHICLES:
-                continue
-            plain = int(labels.occlusion[row]) <= 1, float(labels.truncation[row]) < 0.1
-            rank = (*plain, float(heights[row]))
-            if track not in found or rank > found[track][0]:
-                found[track] = rank, name
-    return {track: name for track, (_, name) in found.items()}
 
 
 class Taker:
@@ -184,6 +198,8 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
 def _check_memory(source: _Demo | _Labelled) -> None:
     """UsageError where the clip's frames would not fit into memory together."""
     camera = source.camera()
+    if camera is None:
+        return
     there, needed = memory_gb(), _BYTES_A_PIXEL * camera.width * camera.height / 2**30
     if there is not None and len(source.names) * needed > there:
         expected = f"at most {number_of(int(there / needed), 'frame')}, as memory of {there:g} GB holds"

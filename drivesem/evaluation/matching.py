@@ -2,12 +2,13 @@
 
 COCO (pycocotools, `evaluateImg`): detections by descending score take the free object with the greatest IoU; one
 that finds none is excused where it meets an ignored object, by the share of itself that lies there. VOC
-(`VOCevaldet.m`): each detection looks only at the object it overlaps most, and is wrong where that is taken.
+(`VOCevaldet.m`): each detection looks only at the object it overlaps most, and is wrong where that is taken, and
+excused where that is ignored.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +17,7 @@ from drivesem.evaluation.curves import Tally
 from drivesem.evaluation.instances import (
     EVERY_CLASS,
     Booleans,
+    Floats,
     Found,
     Integers,
     Pairs,
@@ -130,23 +132,36 @@ class Candidates:
             truth[pairs.found[chosen]] = pairs.truth[chosen]
 
     def voc(self, least: float) -> Match:
-        """VOC's matching at one IoU threshold; it excuses detections on difficult objects."""
+        """VOC's matching at one IoU threshold. A detection that overlaps an ignored ("difficult") object most is
+        excused, and one on a region of every class, by the share of itself there, if no object takes it.
+        """
         near = self.pairs.rows(self.pairs.overlap >= least)
         excused = np.zeros(len(self.found), np.bool_)
-        ignored = self._ignored[near.truth]
-        excused[near.found[ignored]] = True
-        pairs = near.rows(~ignored)
+        region = self.truths.label[near.truth] == EVERY_CLASS
+        excused[near.found[region]] = True
+        pairs = near.rows(~region)
+        pairs = replace(pairs, overlap=np.where(self.truths.ignore[pairs.truth], self._iou(pairs), pairs.overlap))
+        pairs = pairs.rows(pairs.overlap >= least)
         truth = np.full(len(self.found), NOTHING)
         wrong = np.zeros(len(self.found), np.bool_)
         if len(pairs.truth):
             pairs = pairs.rows(np.lexsort((pairs.truth, pairs.found)))
             best, _ = first_greatest(pairs.overlap, pairs.found)
             pairs = pairs.rows(best)
+            difficult = self.truths.ignore[pairs.truth]
+            excused[pairs.found[difficult]] = True
+            pairs = pairs.rows(~difficult)
             order = np.lexsort((pairs.found, -self.found.score[pairs.found], pairs.truth))
             first = np.diff(pairs.truth[order], prepend=-1) != 0
             wrong[pairs.found] = True
             truth[pairs.found[order[first]]] = pairs.truth[order[first]]
         return Match(truth, excused & ~wrong)
+
+    def _iou(self, pairs: Pairs) -> Floats:
+        """IoU (P,) of pairs, of which those with ignored objects hold the detection's share."""
+        one, other = self.truths.boxes[pairs.truth], self.found.boxes[pairs.found]
+        shared = (np.minimum(one[:, 2:4], other[:, 2:4]) - np.maximum(one[:, :2], other[:, :2])).prod(axis=1)
+        return shared / (one[:, 4:].prod(axis=1) + other[:, 4:].prod(axis=1) - shared)
 
     def tally(self, match: Match, label: int, counted: Booleans | None = None) -> Tally:
         """One class. counted (M,): objects to find; those that are found and not counted make no difference."""

@@ -82,19 +82,20 @@ class Outcome:
     def marks(self, frame: int, threshold: float) -> Marks:
         """One frame at detections of that score and above."""
         truths, found = self.candidates.truths, self.candidates.found
-        mine, seen = truths.frame == frame, (found.frame == frame) & (found.score >= threshold)
-        hit = np.zeros(len(truths), np.bool_)
+        mine = np.arange(*np.searchsorted(truths.frame, (frame, frame + 1)))
+        seen = np.arange(*np.searchsorted(found.frame, (frame, frame + 1)))
+        seen = seen[found.score[seen] >= threshold]
         matched = self.match.truth[seen]
-        hit[matched[matched != NOTHING]] = True
-        alarm = seen & (self.match.truth == NOTHING) & ~self.match.excused
+        hit, ignored = np.isin(mine, matched), truths.ignore[mine]
+        alarms = seen[(matched == NOTHING) & ~self.match.excused[seen]]
         boxes = truths.boxes[:, :4]
         return Marks(
-            found=found.boxes[seen & (self.match.truth != NOTHING), :4],
-            hit=boxes[mine & hit],
-            missed=boxes[mine & ~hit & ~truths.ignore],
-            ignored=boxes[mine & truths.ignore],
-            alarms=found.boxes[alarm, :4],
-            alarm_scores=found.score[alarm],
+            found=found.boxes[seen[matched != NOTHING], :4],
+            hit=boxes[mine[hit]],
+            missed=boxes[mine[~hit & ~ignored]],
+            ignored=boxes[mine[ignored]],
+            alarms=found.boxes[alarms, :4],
+            alarm_scores=found.score[alarms],
         )
 
 

@@ -69,6 +69,9 @@ def convert(source: Path, out: Path, how: Conversion) -> Written:
             if not sizes[i].all() and name in found:
                 sizes[i] = size_of_image(found[name])
         table = replace(table, sizes_wh=sizes)
+    names = {i: "_".join(name.split("/")) for i, name in enumerate(table.frames) if name in found}
+    looked_at = {i: f"{name}{found[table.frames[i]].suffix}" for i, name in names.items()}
+    table = replace(table, image_files=looked_at | dict(table.image_files))
     if layout == "kitti":
         table = replace(table, cameras=_calibrations(source, table))
     if how.copy_images and len(found) < len(table.frames):

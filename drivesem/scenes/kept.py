@@ -8,6 +8,7 @@ import contextlib
 import hashlib
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -23,6 +24,8 @@ from scene_ir.io import load_scene, save_scene
 from scene_ir.types import SceneIR
 
 _GB = 1e9
+_WRITING_S = 3600.0
+"""A scene is written within it: what is older and not whole was left by a process that was killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +53,17 @@ class KeptScenes:
         return scene
 
     def make_room(self, newest: Path | None = None) -> None:
-        """Remove what is beyond the limit, but for the `newest` scene. Several processes may do so at once: what
-        is gone already is no error.
+        """Remove what is beyond the limit, but for the `newest` scene and what another process is writing. Several
+        processes may do so at once: what is gone already is no error.
         """
         sizes: list[tuple[float, float, Path]] = []
         for path in self.folder.iterdir() if self.folder.is_dir() else ():
             with contextlib.suppress(OSError):
+                changed = path.stat().st_mtime
+                if path.match(".*.tmp") and time.time() - changed < _WRITING_S:
+                    continue
                 size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-                sizes.append((path.stat().st_mtime, size, path))
+                sizes.append((changed, size, path))
         total = sum(size for _, size, _ in sizes)
         for _, size, path in sorted(sizes):
             if total <= self.limit_gb * _GB or path == newest:

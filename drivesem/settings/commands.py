@@ -169,7 +169,7 @@ class Drive(Tiles, Searching, FrameCommand):
     """A folder, or its URL: Virtual KITTI 1.3.1 or 2, KITTI's tracking benchmark, or what drivesem synth
     --sequence wrote (kitti, vkitti2); by default an embedded drive, made by code."""
     sequence: str | None = None
-    """Which clip of the folder, such as 0003 or 01/clone; by default the first."""
+    """Which clip of the folder, such as 0003, 0001/clone or Scene01/clone; by default the first."""
     combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations, as of drivesem attack, instead of --params."""
     params: str | None = None

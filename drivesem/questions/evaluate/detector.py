@@ -20,6 +20,7 @@ from drivesem.data.registry import Dataset, open_dataset
 from drivesem.evaluation import coco
 from drivesem.evaluation.outcome import Outcome
 from drivesem.evaluation.resampling import DRAWS, Interval
+from drivesem.questions.evaluate.figures import MANY_FRAMES
 from drivesem.questions.evaluate.mistakes import marked
 from drivesem.report.tables import number_of, percent
 from drivesem.report.terminal import Console
@@ -62,7 +63,9 @@ def evaluate_detector(config: Eval) -> DetectorFigures:
     targets = [judged_targets(one, limits, judged) for one in labels]
     scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
     outcome = Outcome.of(targets, found, judged.index(HEADLINE))
-    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    draws = config.bootstrap
+    if draws is None:
+        draws = 0 if len(names) > MANY_FRAMES else DRAWS
     spread = outcome.intervals(draws, config.seed) if draws else []
     data: dict[str, Any] = {
         "detector": config.detector,
@@ -81,7 +84,8 @@ def evaluate_detector(config: Eval) -> DetectorFigures:
     }
     if config.out is not None:
         _write(Path(config.out), data, names, found, judged)
-        _draw(config, dataset, names, outcome, t_star)
+        if config.pictures:
+            _draw(config, dataset, names, outcome, t_star)
     return DetectorFigures(data, scores.per_class, spread)
 
 

@@ -221,3 +221,86 @@ def test_one_line_and_exit_code_2(
     text = capsys.readouterr().err
     assert len(text.splitlines()) == 1
     assert message in text
+
+
+@pytest.fixture
+def two_parts(tmp_path: Path) -> Path:
+    """A COCO folder whose parts have images of the same name, the first dark, the second light."""
+    root = tmp_path / "parts"
+    (root / "annotations").mkdir(parents=True)
+    for part, shade in (("train", 50), ("val", 200)):
+        (root / "images" / part).mkdir(parents=True)
+        Image.new("RGB", (100, 60), (shade, shade, shade)).save(root / f"images/{part}/000001.jpg")
+        content = {
+            "images": [{"id": 1, "file_name": "000001.jpg", "width": 100, "height": 60}],
+            "categories": [{"id": 3, "name": "car"}],
+            "annotations": [{"id": 7, "image_id": 1, "category_id": 3, "bbox": [10, 10, 30, 20], "iscrowd": 0}],
+        }
+        (root / f"annotations/instances_{part}.json").write_text(json.dumps(content))
+    return root
+
+
+def test_images_of_coco_are_those_of_its_part(
+    convert: Convert, two_parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    source = two_parts / "annotations/instances_val.json"
+    words = (source, "--to", "yolo", "--copy-images", "--out")
+    convert(*words, tmp_path / "yolo")
+    picture = two_parts / "images/val/000001.jpg"
+    copied = tmp_path / "yolo/images/train/000001.jpg"
+    assert copied.read_bytes() == picture.read_bytes()
+    # one that is called as its frame there, with another suffix
+    picture.rename(picture.with_suffix(".jpeg"))
+    convert(*words, tmp_path / "again")
+    assert (tmp_path / "again/images/train/000001.jpeg").read_bytes() == copied.read_bytes()
+    # another part's is none
+    picture.with_suffix(".jpeg").unlink()
+    assert main(["convert", *map(str, words), str(tmp_path / "none")]) == 2
+    assert "--copy-images: expected an image of each of 1 frames, found 0" in capsys.readouterr().err
+
+
+def test_images_below_folders_are_found_by_name_and_none_outside(
+    convert: Convert, two_parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    source = two_parts / "annotations/instances_train.json"
+    content = json.loads(source.read_text())
+    (two_parts / "images/train/day").mkdir()
+    (two_parts / "images/train/000001.jpg").rename(two_parts / "images/train/day/1.jpg")
+    content["images"][0]["file_name"] = "day/1.jpg"
+    source.write_text(json.dumps(content))
+    convert(source, "--to", "yolo", "--copy-images", "--out", tmp_path / "yolo")
+    assert (tmp_path / "yolo/images/train/day_1.jpg").is_file()
+    for name in ("../val/000001.jpg", str(two_parts / "images/val/000001.jpg"), f"{'x' * 300}.jpg"):
+        content["images"][0]["file_name"] = name
+        source.write_text(json.dumps(content))
+        words = [str(source), "--to", "yolo", "--copy-images", "--out", str(tmp_path / "none")]
+        assert main(["convert", *words]) == 2
+        assert "--copy-images: expected an image of each of 1 frames, found 0" in capsys.readouterr().err
+
+
+def test_names_of_images_that_stay_where_they_are(convert: Convert, two_parts: Path, tmp_path: Path):
+    source = two_parts / "annotations/instances_val.json"
+    for words in ((), ("--map", "car=Car")):
+        out = tmp_path / f"{len(words)}.json"
+        convert(source, "--to", "coco", *words, "--out", out)
+        assert json.loads(out.read_text())["images"][0]["file_name"] == "000001.jpg"
+    convert(source, "--to", "yolo", "--copy-images", "--out", tmp_path / "yolo")
+    convert(tmp_path / "yolo", "--to", "coco", "--out", tmp_path / "of-yolo.json")
+    assert json.loads((tmp_path / "of-yolo.json").read_text())["images"][0]["file_name"] == "000001.jpg"
+
+
+def test_regions_alone_are_no_detections(convert: Convert, tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    region = LABELS.splitlines(keepends=True)[-1]
+    (tmp_path / "in/000000.txt").write_text(region)
+    convert(tmp_path / "in", "--to", "kitti", "--out", tmp_path / "out")
+    assert (tmp_path / "out/000000.txt").read_text().startswith("DontCare -1 -1 -10 240.79 112.01 260.53 118.90")
+
+
+def test_pictures_beside_kittis_labels_keep_their_suffix(convert: Convert, kitti: Path, tmp_path: Path):
+    for path in (kitti / "training/image_2").glob("*.png"):
+        Image.open(path).save(path.with_suffix(".jpg"))
+        path.unlink()
+    convert(kitti, "--to", "coco", "--out", tmp_path / "a.json")
+    content = json.loads((tmp_path / "a.json").read_text())
+    assert [row["file_name"] for row in content["images"]] == ["000003.jpg", "000011.jpg"]

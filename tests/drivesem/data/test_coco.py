@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from pycocotools import mask as run_length
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -24,6 +25,7 @@ from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.io import to_uint8
 from scene_ir.types import Category
 
 LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw", "ignore_xyxy")
@@ -398,3 +400,30 @@ def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
             coco_labels.identifier_of({"file_name": name})
         return
     assert coco_labels.identifier_of({"file_name": name}) == told
+
+
+@pytest.mark.parametrize(
+    ("orientation", "size_wh", "turned"), [(3, (80, 40), 2), (6, (40, 80), 3), (6, (80, 40), 0)]
+)
+def test_a_turned_picture_is_upright_where_the_file_says_no_other_size(
+    orientation: int, size_wh: tuple[int, int], turned: int, tmp_path: Path
+) -> None:
+    told = IMAGE | {"width": size_wh[0], "height": size_wh[1]}
+    path = foreign(tmp_path, images=[told], annotations=[])
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 80, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "val2017" / IMAGE["file_name"], exif=exif)
+    frame = coco.CocoDataset(path).frame("000000000139")
+    assert np.array_equal(to_uint8(frame.photograph), np.rot90(pixels, turned))
+
+
+@pytest.mark.parametrize("name", [".", "/", "./"])
+def test_an_image_whose_file_has_no_name_is_refused(name: str, tmp_path: Path) -> None:
+    path = foreign(tmp_path, images=[IMAGE | {"file_name": name}])
+    for read in (coco.CocoDataset, lambda path: coco_labels.read_table(path, False, None)):
+        with pytest.raises(
+            FormatError, match=r"images\[0\]\.file_name: expected the name of a file, found"
+        ) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)

@@ -100,6 +100,10 @@ def test_what_is_no_split_is_told(tmp_path: Path) -> None:
     listed.write_text("000000\n000009\n")
     with pytest.raises(FormatError, match=r"names\.txt:2: expected a frame such as 000000, found '000009'"):
         chosen(Named(["000000"]), str(listed))
+    for name in (".", "/"):
+        listed.write_text(f"{name}\n")
+        with pytest.raises(FormatError, match=r"names\.txt:1: expected a frame such as 000000, found '[./]'"):
+            chosen(Named(["000000"]), str(listed))
     listed.write_text("\n")
     with pytest.raises(FormatError, match=r"--split .*: expected at least one frame of the data set"):
         chosen(Named(["000000"]), str(listed))

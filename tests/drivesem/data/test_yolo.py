@@ -4,20 +4,23 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from drivesem.data import yolo
 from drivesem.data.coco import CATEGORIES
-from drivesem.data.label_table import to_coco
+from drivesem.data.label_table import LabelTable, to_coco
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.io import to_uint8
 
 
 def place(number: int, part: str = "train") -> Place:
@@ -188,3 +191,46 @@ def test_a_part_without_frames_is_the_other_one(tmp_path: Path, make_exposure: C
     writer.finish([writer.write(place(0), make_exposure())])
     assert yaml.safe_load((tmp_path / "data.yaml").read_text())["val"] == "images/train"
     assert yolo.YoloDataset(tmp_path).identifiers == ("000000",)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_upright_as_opencv_reads_them(orientation: int, suffix: str, tmp_path: Path) -> None:
+    """Trainers read them so, and labels are of what they read."""
+    path = tmp_path / f"images/train/a{suffix}"
+    path.parent.mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 50, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(path, exif=exif)
+    files.write_text(tmp_path / "labels/train/a.txt", "0 0.25 0.5 0.5 1\n")
+    files.write_text(tmp_path / "data.yaml", "train: images/train\nval: images/train\nnames: [Car]\n")
+    seen = cv2.imread(str(path))
+    assert seen is not None
+    frame = yolo.YoloDataset(tmp_path).frame("a")
+    assert np.array_equal(to_uint8(frame.photograph), seen[..., ::-1])
+    assert frame.labels is not None
+    height, width = seen.shape[:2]
+    assert frame.labels.boxes_xyxy.tolist() == [[-0.5, -0.5, width / 2 - 0.5, height - 0.5]]
+    assert (frame.camera.width, frame.camera.height) == (width, height)
+
+
+def test_boxes_beyond_the_image_are_cut_and_told(tmp_path: Path) -> None:
+    """A reader takes no share above 1; what is only rounded beyond stays as it is."""
+    boxes = [
+        [-30, 5, 50, 20],
+        [70, 5, 50, 20],
+        [-9, 0, 118, 50],
+        [120, 5, 9, 9],
+        [0, 0, 100.004, 50],
+        [1, 2, 3, 4],
+    ]
+    table = LabelTable.of(
+        ["a"], ["Car"], [0] * 6, [0] * 6, np.array(boxes, float), "xywh", sizes_wh=np.array([[100, 50]])
+    )
+    written = yolo.write_table(table, tmp_path, {})
+    assert written.lost == {"box beyond the image": 4}
+    files.write_png(tmp_path / "images/train/a.png", np.zeros((50, 100, 3), np.uint8))
+    again = yolo.YoloDataset(tmp_path).table(("a",))
+    cut = [[0, 5, 20, 20], [70, 5, 30, 20], [0, 0, 100, 50], *boxes[4:]]
+    assert np.allclose(again.boxes, cut, rtol=0, atol=1e-9)

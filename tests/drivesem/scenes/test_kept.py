@@ -144,3 +144,13 @@ def test_photographs_are_taken_apart_once(scene: SceneIR, tmp_path: Path, monkey
 def test_bad_input(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     assert message in capsys.readouterr().err
+
+
+def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
+    """What was left by one that was killed, long ago, goes as a scene does."""
+    writing, left, scene = tmp_path / ".b.01234567.tmp", tmp_path / ".a.89abcdef.tmp", tmp_path / "c"
+    for path in (writing, left, scene):
+        files.write_text(path / "scene.json", "{}")
+    os.utime(left, (0, 0))
+    KeptScenes(tmp_path, 1e-9).make_room()
+    assert list(tmp_path.iterdir()) == [writing]
