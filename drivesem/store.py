@@ -212,7 +212,9 @@ class Store:
         written: dict[str, _Version | None] = dict.fromkeys(removed)
         beside: dict[str, str] = {}
         for name in sorted(changed, key=lambda name: here[name][1]):
-            data = files.read_bytes(self.folder / name)
+            data = _read(self.folder / name)
+            if data is None:
+                continue
             digest = hashlib.sha256(data).hexdigest()
             if known.get(name) is not None:
                 beside[name] = f"{_COMMITS}/{digest}"
@@ -220,8 +222,8 @@ class Store:
             written[name] = _Version(len(data), here[name][1], digest)
         self._commit(written)
         for name, place in beside.items():
-            data = files.read_bytes(self.folder / name)
-            if place.endswith(hashlib.sha256(data).hexdigest()):  # else it has changed again
+            data = _read(self.folder / name)
+            if data is not None and place.endswith(hashlib.sha256(data).hexdigest()):  # else it has changed again
                 self._put(name, data)
                 self._remove(place)
         for name in removed:
@@ -281,15 +283,26 @@ def _versions(path: Path) -> dict[str, _Version | None]:
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, tuple[int, int]]]:
-    """Files that are whole, with their states. Hidden ones at the top, such as a lock, are this machine's own."""
-    left = set(files.leftovers(folder))
+    """Files that are whole, with their states, whatever other processes write meanwhile. Hidden ones at the top,
+    such as a lock, are this machine's own.
+    """
     for root, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if Path(root, name) not in left]
+        folders[:] = [name for name in folders if not files.is_leftover(name)]
         for path in (Path(root, name) for name in names):
-            own = path in left or (path.parent == folder and path.name.startswith("."))
+            own = files.is_leftover(path.name) or (path.parent == folder and path.name.startswith("."))
             state = None if own else _state(path)
             if state is not None:
                 yield path, state
+
+
+def _read(path: Path) -> bytes | None:
+    """None for a file that is gone since it was listed: the next copy tells so."""
+    try:
+        return files.read_bytes(path)
+    except FormatError:
+        if path.exists():
+            raise
+        return None
 
 
 def _state(path: Path) -> tuple[int, int] | None:

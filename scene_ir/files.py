@@ -63,10 +63,20 @@ def _sibling(path: Path) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
 
 
+def is_leftover(name: str) -> bool:
+    """Whether a file or folder of this name is being written, or was when its process was killed."""
+    return _LEFT.fullmatch(name) is not None
+
+
 def leftovers(folder: Path) -> list[Path]:
-    """Files and folders below `folder` that a process was writing when it was killed, the outermost of them."""
-    found = sorted(path for path in folder.rglob(".*.tmp") if _LEFT.fullmatch(path.name))
-    return [path for path in found if not any(parent in found for parent in path.parents)]
+    """Files and folders below `folder` that a process was writing when it was killed, the outermost of them; of
+    processes that write now, too, which may end meanwhile.
+    """
+    found: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        found += [Path(place, name) for name in (*folders, *names) if is_leftover(name)]
+        folders[:] = [name for name in folders if not is_leftover(name)]
+    return sorted(found)
 
 
 @contextmanager

@@ -79,8 +79,11 @@ def written(budget: Budget) -> str:
     for name, preset in PRESETS.items():
         if budget == preset:
             return name
-    # The bounds that no other preset has, and that no budget can be given, tell it apart.
-    preset = STREET if budget.across_m == PRESETS[STREET].across_m else PAPER
+    preset = PAPER
+    if budget.across_m == PRESETS[STREET].across_m:
+        preset = STREET  # which alone has a bound that no budget can be given
+    elif budget.translate != PRESETS[PAPER].translate and budget.translate_m == PRESETS[PARKING].translate_m:
+        preset = PARKING  # whose metres stay beside own lengths; a text has but one of the two
     widest = PRESETS[preset]
     changed = [p.value for p in Parameter if getattr(budget, p.value) != getattr(widest, p.value)]
     parts = {name: repr(getattr(budget, name)) for name in changed}

@@ -126,13 +126,16 @@ def _prune(config: Runs, console: Console) -> dict[str, Any]:
         attack_of(folder)
         hold(folder)  # what another command is writing now is none of this
         for path in files.leftovers(folder):
+            # A question to the run writes below it, and holds the folder of its own answers alone.
+            if any(held_elsewhere(parent) for parent in path.parents if parent.is_relative_to(folder)):
+                continue
             removed.append(str(path))
             if config.dry:
                 continue
             if path.is_dir():
                 shutil.rmtree(path)
             else:
-                path.unlink()
+                path.unlink(missing_ok=True)
     verb = "would be removed" if config.dry else "removed"
     console.print("\n".join([*removed, f"{len(removed)} leftovers {verb}"]), soft_wrap=True, markup=False)
     return {"removed": removed}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -38,14 +38,14 @@ from drivesem.attack.space import SIX, Parameter, combo, parse_params
 from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS
-from drivesem.run.folder import FRAMES, claim
+from drivesem.run.folder import FRAMES, claim, settings_of
 from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
 from drivesem.run.manifest import manifest_of
 from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
 from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
-from drivesem.settings.blocks import FrameCommand
+from drivesem.settings.blocks import FrameCommand, option
 from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
 from drivesem.settings.devices import check_device
 from drivesem.settings.errors import UsageError
@@ -64,6 +64,8 @@ PEERS = ("yolov3-slim", "squeezedet")
 WITHOUT_GRADIENT = "climb"
 """The method for detectors that have no gradient, where nobody asked for one: of those that need none, it finds
 most failures that hold."""
+_NEED_NO_GRADIENT = (*GRADIENT_FREE, "corners", WITHOUT_GRADIENT)
+"""All methods for such detectors."""
 _AROUND = 3
 """Passes of a frame in which no method has a say."""
 WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
@@ -74,11 +76,12 @@ def attack_run(config: Attack) -> RunSummary:
     SceneError for bad input.
     """
     start = time.perf_counter()
+    _check_texts(config)
     config = _settled(config)
     aim_of(config)
     check_device(config.device)
-    detector = _load(config)
-    suited = _suited(config, detector)
+    detector = named_detector(config)
+    suited = suited_to(config, detector)
     worker = Worker.of(suited, detector)
     if suited.method != config.method:
         told = f"--method {suited.method} takes the place of {config.method}"
@@ -132,7 +135,14 @@ def _attacked(
         frames_failed=dict(sorted(failed.items())),
         seconds=round(time.perf_counter() - start, 3),
     )
-    return conclude(out, config, summary, results)
+    return conclude(out, config, summary, results, empty)
+
+
+def _check_texts(config: Attack) -> None:
+    """FormatError for a setting that no file of the run could hold: the first is written after all frames."""
+    for name, value in settings_of(config, presentation=()).items():
+        if isinstance(value, str):
+            files.check_text(option(name), value)
 
 
 def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mapping[str, str]) -> None:
@@ -148,13 +158,18 @@ def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mappi
     )
 
 
-def conclude(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
-    """Write into the folder of a run what is said of all of its frames."""
+def conclude(
+    out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult], empty: Collection[str]
+) -> RunSummary:
+    """Write into the folder of a run what is said of all of its frames. empty: those that have vehicles, of which
+    none could be taken apart.
+    """
     summary = replace(summary, out=str(out))
     metrics = summary.to_json()
     files.write_json(out / METRICS, metrics)
     names = [result.identifier for result in results]
-    files.write_json(out / MANIFEST, manifest_of(config, out, names, metrics))
+    manifest = manifest_of(config, out, names, metrics) | {"empty": sorted(empty)}
+    files.write_json(out / MANIFEST, manifest)
     write_run(out, config, summary, results)
     return summary
 
@@ -210,7 +225,7 @@ class Worker:
         """
         config = _settled(config)
         params, source, method = params_of(config), open_source(config), attack_method(config)
-        detector = _load(config) if detector is None else detector
+        detector = named_detector(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
         grader, changes = grader_of(config, detector), changes_of(config)
         return cls(config, params, method, source, detector, grader, changes)
@@ -380,7 +395,7 @@ def _reach(config: Attack) -> int | None:
     return config.steps if config.range == "steps" else None
 
 
-def _load(config: Attack) -> Predictor:
+def named_detector(config: Attack) -> Predictor:
     """The detector under attack. Raises UsageError where it is none."""
     try:
         if config.precision == "float32":
@@ -390,7 +405,7 @@ def _load(config: Attack) -> Predictor:
         raise UsageError("--detector", "a detector", error) from error
 
 
-def _suited(config: Attack, detector: Predictor) -> Attack:
+def suited_to(config: Attack, detector: Predictor) -> Attack:
     """The settings with a method that needs no gradient, where the detector has none and nobody asked for one."""
     if isinstance(detector, Detector) or config.method != Attack().method:
         return config
@@ -408,7 +423,7 @@ def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -
     if isinstance(detector, Detector):
         return
     if needs_gradient:
-        expected = f"one of {', '.join(GRADIENT_FREE)} for {config.detector}, which has no gradient"
+        expected = f"one of {', '.join(_NEED_NO_GRADIENT)} for {config.detector}, which has no gradient"
         raise UsageError("--method", expected, config.method)
     if config.objective not in OF_DETECTIONS:
         expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"

@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack, get_args, get_type_hints
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detectors.base import Predictor
+from detectors.base import Predictor, device_of
 from drivesem.report.tables import number_of
-from drivesem.run.attack import Worker
+from drivesem.run.attack import Worker, named_detector, suited_to
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.report import grading, pictures
 from drivesem.run.results import Failure, FrameResult
@@ -183,7 +184,9 @@ def attack(
         found = ds.attack(scene, "squeezedet", params="translate,rotate,mesh")
         found.picture, found.theta, found.failures
 
-    detector: a name or file as of `drivesem attack --detector`, or a detector that is loaded (`ds.load_detector`).
+    detector: a name or file as of `drivesem attack --detector`, or a detector that is loaded (`ds.load_detector`),
+    beside which there is no precision, no tiles, and no device but its own. One without gradient is attacked by
+    climb, where no other method is asked for.
     options: those of `drivesem attack`, with underscores. The same scene, settings and number of torch threads
     give the command's theta and picture. Raises UsageError naming the argument, SceneError or DetectorError.
     """
@@ -194,7 +197,10 @@ def attack(
         config = Attack(detector=named, **options)
         config.check()
         check_device(config.device)
-        worker = Worker.of(config, None if isinstance(detector, str) else detector)
+        if not isinstance(detector, str):
+            _check_beside(detector, options)
+        loaded = named_detector(config) if isinstance(detector, str) else detector
+        worker = Worker.of(suited_to(config, loaded), loaded)
     except UsageError as error:
         raise UsageError(_argument(error.field), _argument(error.expected), error.actual) from error
     attacked = worker.search(held.name, held.ir)
@@ -213,6 +219,17 @@ def _check(options: Mapping[str, Any]) -> None:
             raise UsageError(name, f"one of {', '.join(map(str, choices))}", repr(value))
         if not choices and not (isinstance(value, kinds[name]) or (kinds[name] is float and type(value) is int)):
             raise UsageError(name, f"a value of type {kinds[name].__name__}", repr(value))
+
+
+def _check_beside(detector: Predictor, options: Mapping[str, Any]) -> None:
+    """Raise UsageError for an option that says how to load the detector, which is loaded otherwise."""
+    for name in ("precision", "tiles"):
+        if name in options:
+            raise UsageError(name, "none beside a detector that is loaded", repr(options[name]))
+    own = device_of(detector)
+    asked = torch.device(options.get("device", own))
+    if asked.type != own.type or asked.index not in (None, own.index):
+        raise UsageError("device", f"that of the detector, which is loaded: {own}", repr(options["device"]))
 
 
 def _argument(text: str) -> str:

@@ -104,15 +104,20 @@ def load_run(folder: str | Path, limit: int | None = None) -> Run:
         run = ds.load_run("runs/a")
         pandas.DataFrame(run.rows())
 
-    Raises UsageError for a folder that holds no finished run, FormatError naming a file that is damaged.
+    Raises UsageError for a folder that holds no finished run and a limit below 1, FormatError naming a file that
+    is damaged.
     """
+    if limit is not None and limit < 1:
+        raise UsageError("limit", "at least 1", limit)
     return load_runs([str(folder)], limit, "folder")[0]
 
 
-def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "--run") -> list[Run]:
-    """Runs by folder; limit: the first frames of each; setting: what names them on the command line. Raises
-    UsageError for a folder that holds no finished run, FormatError naming a file that is not as `drivesem attack`
-    writes it.
+def load_runs(
+    folders: Sequence[str], limit: int | None = None, setting: str = "--run", may_be_empty: bool = False
+) -> list[Run]:
+    """Runs by folder; limit: the first frames of each; setting: what names them on the command line. may_be_empty:
+    also runs without frames, as a part may be. Raises UsageError for a folder that holds no finished run,
+    FormatError naming a file that is not as `drivesem attack` writes it.
     """
     paths = [Path(folder) for folder in folders]
     doubled = sorted({str(path) for path in paths if sum(p.resolve() == path.resolve() for p in paths) > 1})
@@ -121,7 +126,11 @@ def load_runs(folders: Sequence[str], limit: int | None = None, setting: str = "
     # Runs of the same name in different folders are told apart by their whole paths.
     plain = [path.resolve().name for path in paths]
     names = [name if plain.count(name) == 1 else str(path) for name, path in zip(plain, paths, strict=True)]
-    return [_load(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
+    runs = [_load(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
+    for run in runs:
+        if not run.frames and not may_be_empty:
+            raise UsageError(setting, "a run with frames", f"{run.folder}, which has none")
+    return runs
 
 
 def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
@@ -144,8 +153,6 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
     except (AttributeError, KeyError, TypeError) as error:
         raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
     from_json(float | None, metrics.get("t_star"), f"{folder / METRICS}: t_star")
-    if not identifiers:
-        raise UsageError(setting, "a run with frames", f"{folder}, which has none")
     return Run(
         name=name,
         folder=folder,

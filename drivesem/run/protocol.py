@@ -17,7 +17,10 @@ PROTOCOL = {
     "parametrisation": "roi",
 }
 """Settings of configs/paper.yaml, but for the budget and for what moves."""
-_AS_EVER = ("rate", "momentum", "restarts", "scouts", "target_objects", "target_classes", "precision", "t_star")
+_AS_EVER = (
+    *("passes", "rate", "momentum", "restarts", "scouts"),
+    *("target_objects", "target_classes", "precision", "t_star"),
+)
 """Settings that the protocol leaves as they are."""
 
 

@@ -83,6 +83,12 @@ def _aliases(command: str) -> set[str]:
     return {name for marker in markers for name in getattr(marker, "aliases", None) or ()}
 
 
+def _positional(command: str) -> set[str]:
+    """Settings of a command that are words without an option."""
+    kinds = get_type_hints(COMMANDS[command], include_extras=True)
+    return {name for name, kind in kinds.items() if "Positional" in repr(getattr(kind, "__metadata__", ()))}
+
+
 def _refused(command: str, text: str) -> UsageError:
     """The parser's own sentence, as field, expected and found where it is one of the usual ones."""
     choice = re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?),?\)", text)
@@ -119,10 +125,11 @@ def _with_presets(command: str, words: list[str]) -> list[str]:
     left = list(words)
     while left:
         word, equals, path = left.pop(0).partition("=")
-        if word == "--config" and (equals or left):
-            named += preset_words(path or left.pop(0), command)
-        elif word == "--config":
-            raise UsageError("--config", _presets_for(command), "nothing")
+        if word == "--config":
+            path = path if equals or not left else left.pop(0)
+            if not path:
+                raise UsageError("--config", _presets_for(command), "nothing")
+            named += preset_words(path, command)
         else:
             rest.append(f"{word}{equals}{path}")
     return named + rest
@@ -158,8 +165,10 @@ def preset_words(path: str, command: str) -> list[str]:
         name = str(key).replace("-", "_")
         if name not in known:
             raise UsageError(f"{path}: {key}", f"one of {', '.join(known)}", "an unknown key")
-        if name in own:
+        if name in own and name not in _positional(command):
             words += _words(path, own[name], value)
+        elif name in own and value not in (None, []):
+            raise UsageError(f"{path}: {key}", "nothing: it stands on the command line, without an option", value)
     return words
 
 

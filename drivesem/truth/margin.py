@@ -6,8 +6,6 @@ two frames (`nuisances`) it says how sure a failure is.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 

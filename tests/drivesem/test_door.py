@@ -21,6 +21,8 @@ import torch
 
 import drivesem as ds
 from drivesem.cli import main
+from drivesem.run import attack as run_attack
+from drivesem.run.attack import Worker
 from drivesem.run.counterexample import AttackOptions
 from drivesem.run.results import Failure, load_frame
 from drivesem.scenes.scene import image_of
@@ -30,6 +32,7 @@ from drivesem.truth.grades import Agreement, Count
 from scene_ir.errors import FormatError, RangeError, SceneError
 from scene_ir.files import read_image
 from scene_ir.types import Frame
+from tests.drivesem.commands.test_attack_command import Blinking
 
 OPTIONS = {"params": "translate,rotate", "steps": 2}
 
@@ -270,6 +273,36 @@ def test_bad_options_name_the_argument(scene: ds.Scene, options: dict[str, objec
     assert "--" not in str(caught.value).partition("expected")[0]
 
 
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"precision": "bfloat16"}, "precision: expected none beside a detector that is loaded, found 'bfloat16'"),
+        ({"tiles": "off"}, "tiles: expected none beside a detector that is loaded, found 'off'"),
+        ({"device": "meta"}, "device: expected that of the detector, which is loaded: cpu, found 'meta'"),
+    ],
+)
+def test_how_a_detector_is_loaded_is_no_option_beside_one(
+    scene: ds.Scene, options: dict[str, str], line: str
+) -> None:
+    with pytest.raises(UsageError, match=line):
+        ds.attack(scene, ds.load_detector("squeezedet"), **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_detector_without_gradient_gets_the_commands_method(
+    scene: ds.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    methods: list[str] = []
+    monkeypatch.setattr(Worker, "search", lambda worker, *_: methods.append(worker.config.method) or 1 / 0)
+    monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blinking())
+    for detector in (Blinking(), "any"):
+        with pytest.raises(ZeroDivisionError):
+            ds.attack(scene, detector, params="color", confirm=False)
+        every = "method: expected one of random, halton, sobol, cma-es, corners, climb for"
+        with pytest.raises(UsageError, match=every):
+            ds.attack(scene, detector, params="color", confirm=False, method="apgd")
+    assert methods == ["climb", "climb"]
+
+
 def test_runs_are_rows(small_run: Path) -> None:
     run = ds.load_run(small_run)
     (row,) = run.rows()
@@ -278,6 +311,9 @@ def test_runs_are_rows(small_run: Path) -> None:
     assert "squeezedet" in tags_of(run._repr_html_()).text
     with pytest.raises(UsageError, match="folder: expected a folder of drivesem attack"):
         ds.load_run(small_run / "frames")
+    for limit in (0, -1):
+        with pytest.raises(UsageError, match=f"limit: expected at least 1, found {limit}"):
+            ds.load_run(small_run, limit=limit)
 
 
 def test_frames_of_a_data_set(small_kitti: Path) -> None:

@@ -128,6 +128,38 @@ def test_nothing_is_copied_twice_and_what_is_gone_here_comes_back(tmp_path: Path
     one.keep(now=True)
 
 
+def test_a_copy_bears_what_is_written_meanwhile(
+    tmp_path: Path, machine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders that begin while files are listed stay here; files that are gone when they are read are missing."""
+    one = Store(f"plain://{tmp_path}/run", "--out")
+    one.fetch()
+    write(one.folder, {"a": "1", "b": "1"})
+    one.keep(now=True)
+    write(one.folder, {"a": "two", "b": "two", "c": "two"})
+    walk, put = os.walk, one._put
+
+    def begun(top: Path) -> Iterator[Any]:
+        write(one.folder, {"frames/.0.0123abcd.tmp/half": "-"})
+        return walk(top)
+
+    def without(name: str, data: bytes) -> None:
+        put(name, data)
+        for gone in ("a", "c"):  # changed and copied; new and not yet copied
+            (one.folder / gone).unlink(missing_ok=True)
+
+    with monkeypatch.context() as meanwhile:
+        meanwhile.setattr(os, "walk", begun)
+        meanwhile.setattr(one, "_put", without)
+        one.keep(now=True)
+    one.keep(now=True)
+    shutil.rmtree(one.folder / "frames")
+    assert texts(one.folder) == {"b": "two"}
+    machine()
+    assert texts(place(one.url)) == {"b": "two"}
+    assert not [name for name in one._listed() if ".tmp" in name]
+
+
 def test_between_commits_there_is_what_was_there_at_one(tmp_path: Path, machine: Any) -> None:
     """Cut off at each of its writes, in the middle of a file: whoever reads sees the folder before or after."""
     states = [

@@ -167,3 +167,20 @@ def test_a_gzip_file_gives_no_more_than_it_may(tmp_path: Path) -> None:
     assert files.read_gzip(tmp_path / "a.gz") == files.read_gzip(tmp_path / "a.gz", 1000) == bytes(1000)
     with pytest.raises(FormatError, match=r"a\.gz: expected at most 999 bytes, unpacked, found more"):
         files.read_gzip(tmp_path / "a.gz", 999)
+
+
+def test_leftovers_bear_folders_that_end_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (".left.0123abcd.tmp/.half.89abcdef.tmp", "frame/.part.4567abcd.tmp", "gone", ".other.tmp"):
+        (tmp_path / name).mkdir(parents=True)
+    scan = os.scandir
+
+    def scandir(path: str | Path) -> object:
+        if Path(path).name in ("gone", ".left.0123abcd.tmp"):
+            os.rename(path, tmp_path / "elsewhere")
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert files.leftovers(tmp_path) == [
+        tmp_path / ".left.0123abcd.tmp",
+        tmp_path / "frame" / ".part.4567abcd.tmp",
+    ]

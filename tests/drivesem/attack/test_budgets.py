@@ -97,19 +97,29 @@ def test_sizes_and_the_sun_change_in_street_alone():
         budget_of("street,size=20%")
 
 
-_LIMITS = st.floats(1e-6, 0.25)
-
-
 @given(
-    preset=st.sampled_from(["paper", "street"]),
-    narrowed=st.dictionaries(st.sampled_from([p.value for p in SIX]), _LIMITS),
-    metres=st.none() | st.floats(1e-3, 1),
+    preset=st.sampled_from(list(PRESETS)),
+    shares=st.dictionaries(st.sampled_from(list(Parameter)), st.floats(1e-6, 1)),
+    metres=st.none() | st.floats(1e-6, 0.5),
 )
-def test_what_is_written_reads_back(preset, narrowed, metres):
-    budget = replace(PRESETS[preset], **narrowed)
+def test_what_is_written_reads_back(preset: str, shares: dict[Parameter, float], metres: float | None) -> None:
+    """Of every preset, narrowed in all ways that a text can say. shares: of what the preset allows."""
+    widest = PRESETS[preset]
+    limits = {p.value: repr(share * getattr(widest, p.value)) for p, share in shares.items()}
     if metres is not None:
-        budget = replace(budget, translate=PRESETS[preset].translate, translate_m=metres)
+        limits["translate"] = f"{metres!r}m"
+    narrowed = [f"{name}={limit}" for name, limit in limits.items() if float(limit.rstrip("m"))]
+    budget = budget_of(",".join([preset, *narrowed]) if narrowed else preset)
     assert budget_of(written(budget)) == budget
+
+
+def test_own_lengths_beside_the_metres_of_parking_are_written() -> None:
+    budget = budget_of("parking,translate=0.01")
+    assert (budget.translate, budget.translate_m) == (0.01, 0.5)
+    assert written(budget) == "parking,translate=0.01"
+    assert budget_of(written(budget)) == budget
+    # As runs from before have it, which a second run must be able to go on with.
+    assert written(budget_of("parking,rotate=2deg")).startswith("rotate=0.0349")
 
 
 def test_metres_are_the_same_for_long_and_short_cars(street):

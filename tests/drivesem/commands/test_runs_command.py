@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivesem.cli import main
-from scene_ir.files import leftovers
+from scene_ir import files
 from tests.drivesem.commands.test_attack_command import without_times
 
 WORDS = [
@@ -79,6 +81,58 @@ def test_frames_that_differ_and_other_settings_are_refused(
     assert f"found {other}: another seed" in capsys.readouterr().err
 
 
+def test_a_part_that_takes_the_others_keeps_its_frames(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also one that was made with --no-resume, which removes frames that are there."""
+    own = tmp_path / "own"
+    shutil.copytree(parts / "part1", own)
+    config = own / "config.yaml"
+    config.write_text(config.read_text().replace("resume: true", "resume: false"))
+    merged = told(["merge", str(own), str(parts / "part2"), "--out", str(own)], capsys)
+    assert without_times(merged) == without_times(json.loads((parts / "whole" / "metrics.json").read_text()))
+    assert "resume: true" in config.read_text()
+
+
+def test_frames_that_are_there_are_compared_with_the_parts(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part, out = tmp_path / "part", tmp_path / "merged"
+    shutil.copytree(parts / "part2", part)
+    merge = ["runs", "merge", str(part), "--out", str(out)]
+    assert main(merge) == 0
+    figures = (out / "metrics.json").read_text()
+    result = part / "frames" / "demo-001" / "result.json"
+    files.write_json(result, json.loads(result.read_text()) | {"objects": 99})
+    assert main(merge) == 2
+    assert f"--out: expected a new folder, or one of the same frames, found another demo-001 in {out}" in (
+        capsys.readouterr().err
+    )
+    assert (out / "metrics.json").read_text() == figures
+
+
+@pytest.mark.slow
+def test_parts_with_nothing_to_attack_merge_into_the_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames whose vehicles cannot be attacked count once, whichever part had them; a part may have no frame."""
+    words = [*WORDS, "--no-grade", "--target-objects", "6"]
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+    names = [str(tmp_path / f"part{number}") for number in (1, 2, 3, 4)]
+    for number, name in enumerate(names, 1):
+        assert main([*words, "--part", f"{number}/4", "--out", name]) == 0
+    manifests = [json.loads((Path(name) / "manifest.json").read_text()) for name in names]
+    assert [one["empty"] for one in manifests] == [["demo-000"], [], ["demo-002"], []]
+    assert [len(one["frames"]) for one in manifests] == [0, 1, 0, 0]
+    whole = json.loads((tmp_path / "whole" / "metrics.json").read_text())
+    assert whole["frames_without_vehicles"] == 2
+    for runs in (names, [*names, str(tmp_path / "whole")]):
+        merged = told(["merge", *runs, "--out", str(tmp_path / "merged")], capsys)
+        assert without_times(merged) == without_times(whole)
+    assert main(["runs", "merge", names[3], "--out", str(tmp_path / "nothing")]) == 2
+    assert f"FOLDER: expected runs with frames, found none in {names[3]}" in capsys.readouterr().err
+
+
 def test_list_and_show(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = {Path(row["run"]).name: row for row in told(["list", str(parts)], capsys)["runs"]}
     assert {name: row["frames"] for name, row in rows.items()} == {"part1": 2, "part2": 1, "whole": 3}
@@ -124,17 +178,50 @@ def test_prune_removes_what_a_killed_command_left(
     half.mkdir()
     (half / ".benign.png.89abcdef.tmp").write_bytes(b"half")
     before = {p for p in run.rglob("*") if half not in (p, *p.parents) and p.name != ".lock"}
-    assert leftovers(run) == [half]
+    assert files.leftovers(run) == [half]
     assert told(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
     assert half.is_dir()
     assert told(["prune", str(run)], capsys) == {"removed": [str(half)]}
     assert {p for p in run.rglob("*") if p.name != ".lock"} == before
 
 
+_HOLDER = """
+import sys
+from pathlib import Path
+from drivesem.run.lock import hold
+hold(Path(sys.argv[1]))
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_prune_passes_over_what_a_question_is_writing(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(parts / "part2", run)
+    halves = [run / question / "frames" / ".demo-001.0123abcd.tmp" for question in ("explain", "holes")]
+    for half in halves:
+        half.mkdir(parents=True)
+        (half.parent.parent / ".lock").touch()
+    command = [sys.executable, "-c", _HOLDER, str(run / "explain")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as asking:
+        assert asking.stdout is not None
+        assert asking.stdout.readline() == "held\n"
+        assert told(["prune", str(run)], capsys) == {"removed": [str(halves[1])]}
+        asking.communicate()
+    assert halves[0].is_dir()
+    assert told(["prune", str(run)], capsys) == {"removed": [str(halves[0])]}
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["runs", "merge", "a"], "--out: expected a folder, of runs merge alone, found None"),
+        (
+            ["runs", "merge", "a", "--out", "b\udcff"],
+            r"--out: expected text that UTF-8 holds, found 'b\udcff'",
+        ),
         (["runs", "show"], "FOLDER: expected runs to show, found none"),
         (["runs", "list", "nowhere"], "FOLDER: expected a folder with runs of drivesem attack, found nowhere"),
         (["runs", "list", "--dry"], "--dry: expected runs prune, found runs list"),

@@ -43,6 +43,7 @@ def test_the_preset_is_the_protocol() -> None:
         {"budget": "parking"},
         {"rate": 0.5},
         {"scouts": 4},
+        {"passes": 300},
     ],
 )
 def test_any_other_setting_is_another_protocol(changed: dict[str, object]) -> None:

@@ -19,7 +19,7 @@ import drivesem
 from drivesem.cli import main
 from drivesem.run.folder import attack_of
 from drivesem.settings.blocks import Command, Regions, constraints, option
-from drivesem.settings.commands import COMMANDS, Attack, Explain, Study, Synth
+from drivesem.settings.commands import COMMANDS, Attack, Drive, Explain, Study, Synth
 from drivesem.settings.constraints import Anywhere, Constraint, Folder, Of, OneOf, Required, Within
 from drivesem.settings.errors import UsageError
 from drivesem.settings.parsing import commands_of, parse, preset_words
@@ -46,6 +46,17 @@ def test_resolved_configuration_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("".join(f"{line}\n" for line in to_yaml(config).splitlines() if "null" not in line))
     assert parse(["attack", f"--config={path}"]) == config
+
+
+def test_words_without_an_option_are_no_settings_of_a_file(tmp_path: Path) -> None:
+    """Commands write them into config.yaml with all others: null where there were none."""
+    path = tmp_path / "config.yaml"
+    path.write_text(to_yaml(Drive(steps=3)))
+    assert parse(["drive", "--config", str(path)]) == Drive(steps=3)
+    assert parse(["drive", "clips", "--config", str(path)]) == Drive(steps=3, clip="clips")
+    path.write_text(to_yaml(Drive(clip="clips")))
+    with pytest.raises(UsageError, match=r"config\.yaml: clip: expected nothing: .*, found clips"):
+        parse(["drive", "--config", str(path)])
 
 
 _NEEDED: dict[str, tuple[str, ...]] = {
@@ -135,6 +146,10 @@ def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
         (["attack", "--frobnicate"], "frobnicate"),
         (["attack", "--config", "nowhere.yaml"], "nowhere.yaml"),
         (["attack", "--config"], "--config"),
+        (["attack", "--config="], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
+        (["attack", "--config=", "--json"], "preset: paper, quick, found nothing"),
+        (["attack", "--config", ""], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
+        (["attack", "--out", "b\udcffd"], r"--out: expected text that UTF-8 holds, found 'b\udcffd'"),
         (["attack", "--config", "qick"], "or a preset: paper, quick, found qick; did you mean quick?"),
         (["view"], "SCENE|RUN: expected a value (drivesem view --help says which), found none"),
         (["export", "runs/a"], "--to: expected a value (drivesem export --help says which), found none"),
