@@ -308,7 +308,7 @@ def test_what_cannot_grade_is_refused(
     [
         (
             ["--method", "apgd"],
-            "--method: expected one of random, halton, sobol, cma-es for any, which has no gradient",
+            "--method: expected one of random, halton, sobol, cma-es, corners, climb for any, which has no",
         ),
         (["--restarts", "2"], "--restarts: expected --method si-fgsm"),
         (["--method", "sobol", "--objective", "confidence"], "--objective: expected one of objectness, hide"),
