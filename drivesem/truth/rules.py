@@ -22,8 +22,8 @@ _CUTS, _FEWEST = 48, 5
 """Ends of intervals that are tried, at most, half of them quantiles of the samples that fail; samples inside of an
 interval and outside of it, at least."""
 _FOLDS, _OBJECTS = 5, 3
-"""Of a pooled rule: parts of the objects, each of which is told by the rule of the others; objects, at least,
-whose failures lie inside."""
+"""Of a pooled rule: parts of the objects, at most, each of which is told by the rule of the others; objects, at
+least, whose failures lie inside."""
 _BEYOND_CHANCE = 1.0
 """Standard errors, over objects, by which such a rule tells failures of objects that it was not made of."""
 _RULES = 8
@@ -148,12 +148,11 @@ def cover(features: Mapping[str, Floats], fails: Flags, objects: NDArray[np.int6
 def _tells_others(features: Mapping[str, Floats], fails: Flags, objects: NDArray[np.int64]) -> bool:
     """Whether rules of some objects tell failures of the others, beyond chance."""
     known, numbers = np.unique(objects, return_inverse=True)
-    parts = np.random.default_rng(len(known)).permutation(len(known)) % _FOLDS
+    folds = min(_FOLDS, len(known))
+    parts = np.random.default_rng(len(known)).permutation(len(known)) % folds
     gains = np.zeros(len(known))
-    for part in range(_FOLDS):
+    for part in range(folds):
         held = parts[numbers] == part
-        if held.all() or not held.any():
-            return False
         made = {name: values[~held] for name, values in features.items()}
         rule = fit(made, fails[~held], support=0.0)
         inside = contains(rule.where, features, len(fails))[held]

@@ -1,4 +1,4 @@
-"""Two detectors beside each other: by hole, by kind of failure, and in all, with paired intervals."""
+"""Two detectors beside each other: by hole, by kind of failure, and in all, with paired intervals and tests."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.evaluation.resampling import Difference, differences, rate
+from drivesem.evaluation.resampling import LEVEL, Difference, differences, holm, rate
 from drivesem.questions.gate.results import Pair
 
 HOLE, KIND, ALL, PHANTOMS = "hole", "kind", "all", "phantoms"
@@ -18,8 +18,9 @@ HOLE, KIND, ALL, PHANTOMS = "hole", "kind", "all", "phantoms"
 class GateRow:
     """level: HOLE, KIND, ALL or PHANTOMS; hole: its name. before, after: share of samples in which either detector
     does not find the object, of PHANTOMS in which it reports what is not there; difference: after less before;
-    low, high: its 95 % interval by paired bootstrap, over samples of one hole and over holes else;
-    samples, holes: how many. grew: by more than is tolerated, beyond chance.
+    low, high: its 95 % interval by paired bootstrap, over samples of one hole and over holes else; p: of the sign
+    test, one-sided, Holm's over all rows; samples, holes: how many. grew: by more than is tolerated, and by more
+    than chance.
     """
 
     level: str
@@ -29,6 +30,7 @@ class GateRow:
     difference: float
     low: float | None
     high: float | None
+    p: float
     samples: int
     holes: int
     grew: bool
@@ -65,10 +67,20 @@ def rows_of(found: Mapping[str, Sequence[Pair]], tolerance: float, draws: int, s
     ]
     whole = [_row(ALL, ALL, pairs, tolerance, draws, seed)] if named else []
     phantoms = [_row(PHANTOMS, PHANTOMS, seen, tolerance, draws, seed)] if seen else []
-    return [*holes, *others, *whole, *phantoms]
+    rows = [*holes, *others, *whole, *phantoms]
+    # A kind of one hole, and all of one kind, are no further test: their p is that of the row that they repeat.
+    tested = [
+        row.p
+        for row in rows
+        if not (row.level == KIND and row.holes == 1) and not (row.level == ALL and len(kinds) == 1)
+    ]
+    adjusted = {p: least for p, least in zip(tested, holm(tested), strict=True) if least is not None}
+    ps = [adjusted[row.p] for row in rows]
+    return [replace(row, p=p, grew=row.grew and p < 1 - LEVEL) for row, p in zip(rows, ps, strict=True)]
 
 
 def _row(level: str, name: str, pairs: Sequence[Pair], tolerance: float, draws: int, seed: int) -> GateRow:
+    """p as if it were the only row, and grew before p is asked."""
     if len(pairs) == 1:  # of one hole the samples are what chance chose
         before, after = (np.array(side, np.float64) for side in (pairs[0].before, pairs[0].after))
         count = np.ones(len(before))
@@ -89,6 +101,7 @@ def _row(level: str, name: str, pairs: Sequence[Pair], tolerance: float, draws: 
         difference=one.difference,
         low=one.low,
         high=one.high,
+        p=_sign_test(pairs),
         samples=sum(len(pair.before) for pair in pairs),
         holes=len(pairs),
         grew=one.difference > tolerance and (one.low is None or one.low > 0),
@@ -97,5 +110,15 @@ def _row(level: str, name: str, pairs: Sequence[Pair], tolerance: float, draws: 
 
 def _difference(before: np.ndarray, after: np.ndarray, count: np.ndarray, draws: int, seed: int) -> Difference:
     first, second = rate("lost", before, count), rate("lost", after, count)
-    (one,) = differences([first], [second], len(count), draws, np.random.default_rng(seed))
+    (one,) = differences([first], [second], len(count), draws, np.random.default_rng(seed), test=False)
     return one
+
+
+def _sign_test(pairs: Sequence[Pair]) -> float:
+    """Exact, one-sided, of the samples in which one detector alone fails (McNemar 1947): were both alike in these
+    holes, either would fail there with even odds.
+    """
+    from scipy.stats import binomtest  # on use: it takes a third of a second to load
+
+    alone = [after for p in pairs for before, after in zip(p.before, p.after, strict=True) if before != after]
+    return float(binomtest(sum(alone), len(alone), alternative="greater").pvalue) if alone else 1.0

@@ -193,6 +193,17 @@ def test_gate(run, tmp_path, capsys, after, code, grew):
     assert (suite.get("failures") != "0") == grew
 
 
+def test_a_gate_of_poses_that_cannot_be_drawn_is_not_passed(run, tmp_path, capsys):
+    for path in run.glob("frames/*/theta.npz"):
+        path.unlink()
+    words = ("gate", run, "--network", "keen", "--samples", "24", "--keep-going", "--out", tmp_path / "gate")
+    code, data, _ = answer(capsys, *words)
+    assert (code, data["passed"], data["rows"]) == (1, False, [])
+    assert data["frames_failed"]
+    suite = ET.parse(tmp_path / "gate" / "gate.xml").getroot()
+    assert suite.get("errors") == str(len(data["frames_failed"]))
+
+
 def test_bad_input_is_one_line_and_exit_code_2(run, tmp_path, capsys):
     cases = {
         ("explain",): "RUN: expected a folder of drivesem classify attack, to explain, found nothing",

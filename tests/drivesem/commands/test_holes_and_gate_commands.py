@@ -333,6 +333,31 @@ def test_one_that_sees_what_is_not_there_does_not_pass(
     assert "phantoms" in (tmp_path / "seeing things" / "gate.md").read_text()
 
 
+def test_frames_that_cannot_be_compared_do_not_pass(
+    gate: Callable[[str], tuple[int, dict[str, Any]]],
+    attacked: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The run is kept without its scenes."""
+    run, out = tmp_path / "run", tmp_path / "out"
+    shutil.copytree(attacked, run, ignore=shutil.ignore_patterns("scene"))
+    words = ["gate", str(run), "--before", "any", "--after", "any", "--workers", "1", "--out", str(out)]
+    assert main([*words, "--keep-going", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["passed"], told["rows"]) == (False, [])
+    (reason,) = told["frames_failed"].values()
+    assert "scene" in reason
+    suite = ET.parse(out / "gate.xml").getroot()
+    assert (suite.attrib["tests"], suite.attrib["errors"], suite.attrib["failures"]) == ("1", "1", "0")
+    error = suite.find("testcase[@name='demo-000']/error")
+    assert error is not None
+    assert error.attrib["message"] == reason
+    page = (out / "gate.md").read_text()
+    assert "1 frame could not be compared, so the gate is not passed." in page
+    assert "No certain failure" not in page
+
+
 def test_other_classes_are_no_comparison(
     gate: Callable[[str], tuple[int, dict[str, Any]]], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -121,6 +121,27 @@ def test_covering_tells_nothing_of_chance(by_car: bool) -> None:
     assert told <= 1
 
 
+@pytest.mark.parametrize("cars", [3, 4, 5])
+def test_three_cars_are_enough(cars: int) -> None:
+    """Where there are fewer cars than parts, each car is a part."""
+    truth = {"lightness": (0.2, 0.5)}
+    features, objects = of_cars(cars, 48, 0)
+    (rule,) = cover(features, failing(contains(truth, features, len(objects)), 0, else_=0.01), objects)
+    assert rule.where["lightness"] == pytest.approx(truth["lightness"], abs=0.1)
+
+
+@pytest.mark.parametrize("cars", [3, 4])
+def test_a_few_cars_tell_nothing_of_chance(cars: int) -> None:
+    """Nor where each fails as often as it will."""
+    told = 0
+    for seed in range(30):
+        features, objects = of_cars(cars, 48, seed)
+        rng = np.random.default_rng(seed)
+        for often in (0.05, 0.4, rng.random(cars)[objects]):
+            told += bool(cover(features, rng.random(len(objects)) < often, objects))
+    assert told <= 4
+
+
 def test_what_fails_in_two_cars_alone_is_no_rule() -> None:
     features, objects = of_cars(40, 12, 1)
     assert cover(features, objects < 2, objects) == []
