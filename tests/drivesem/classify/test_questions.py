@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import xml.etree.ElementTree as ET
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rich.console import Console
 from drivesem.classify import attack as attacking
 from drivesem.classify import confirm as confirming
 from drivesem.classify import least, pictures
+from drivesem.classify.finished import ClassifyRun
 from drivesem.classify.holes import PoseHole
 from drivesem.classify.least import LeastChange
 from drivesem.classify.networks import loading
@@ -96,8 +98,11 @@ def answer(capsys, *words):
 
 def test_confirm_writes_the_grade_and_the_page(run, capsys, monkeypatch):
     monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("twin"))
+    read = mock.Mock(side_effect=ClassifyRun.of)
+    monkeypatch.setattr(confirming.ClassifyRun, "of", read)
     code, data, _ = answer(capsys, "confirm", run)
     assert code == 0
+    assert read.call_count == 2  # before and after, however many failures there are
     assert data["grades"] == {"threshold": 1, "certain": 1, "confirmed": 1}
     assert data["second"]["agree"] == 1
     assert data["second"]["iou"]["least"] >= 0.995
