@@ -96,13 +96,19 @@ def answer(capsys, *words):
     return code, json.loads(said.out) if said.out else {}, said.err
 
 
+def test_confirm_reads_a_run_twice_however_many_failures_there_are(run, capsys, monkeypatch):
+    monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("twin"))
+    monkeypatch.setattr(ClassifyRun, "failures", lambda self, limit: [NAME] * 5)
+    read = mock.Mock(side_effect=ClassifyRun.of)
+    monkeypatch.setattr(ClassifyRun, "of", read)
+    assert answer(capsys, "confirm", run)[0] == 0
+    assert read.call_count == 2
+
+
 def test_confirm_writes_the_grade_and_the_page(run, capsys, monkeypatch):
     monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("twin"))
-    read = mock.Mock(side_effect=ClassifyRun.of)
-    monkeypatch.setattr(confirming.ClassifyRun, "of", read)
     code, data, _ = answer(capsys, "confirm", run)
     assert code == 0
-    assert read.call_count == 2  # before and after, however many failures there are
     assert data["grades"] == {"threshold": 1, "certain": 1, "confirmed": 1}
     assert data["second"]["agree"] == 1
     assert data["second"]["iou"]["least"] >= 0.995
