@@ -6,7 +6,7 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,6 +21,7 @@ from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Mesh, Part
 
+_Number = TypeVar("_Number", np.float32, np.float64)
 _VERSION = 1
 _KEY = "drivesem_mesh"
 """Key of the GLB mesh's `extras` that marks files of `save_mesh`."""
@@ -156,7 +157,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     )
     if mesh.colours is not None:
         colours = mesh.colours.detach().cpu().numpy().astype(np.float32)
-        shown = np.round(_linear(colours.clip(0, 1)) * 255).astype(np.uint8)
+        shown = np.round(linear(colours.clip(0, 1)) * 255).astype(np.uint8)
         shape.visual = ColorVisuals(shape, vertex_colors=shown)
         shape.vertex_attributes["_rgb"] = colours
     if mesh.uv is not None:
@@ -429,7 +430,7 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
 
 
-def _linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
+def linear(srgb: NDArray[_Number]) -> NDArray[_Number]:
     """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 

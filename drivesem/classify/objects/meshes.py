@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from drivesem.classify.objects.types import ObjectModel, used
 from scene_ir.errors import FormatError
-from scene_ir.meshes.load import painted, read_scene, texels
+from scene_ir.meshes.load import linear, painted, read_scene, texels
 from scene_ir.meshes.lod import simplify
 from scene_ir.types import Mesh, Part
 
@@ -96,7 +96,7 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         if factor is not None:
             rgb[:] = 1.0
         elif visual.defined:
-            rgb = _linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
+            rgb = linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
     elif isinstance(material, PBRMaterial):
         image = material.baseColorTexture
         rough = _number(material.roughnessFactor, 1.0, 1.0)
@@ -115,7 +115,7 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
     if image is not None and uv is not None and len(uv) == len(part.vertices):
         corners = np.nan_to_num(np.asarray(uv, float)[part.faces][..., :2], posinf=0.0, neginf=0.0)
         seen = texels(image, np.einsum("pc,fcd->fpd", _PLACES, corners), path, _TEXTURE_PX)
-        rgb = rgb * _linear(seen).mean(axis=1)
+        rgb = rgb * linear(seen).mean(axis=1)
     if factor is not None:
         rgb = rgb * factor[part.faces].mean(axis=1)
     return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])
@@ -131,8 +131,3 @@ def _share(value: Any, other: float) -> Array:
     if not isinstance(value, list) or len(value) != 3 or not np.isfinite(value).all():
         return np.full(3, other)
     return np.array(value, float).clip(0, 1)
-
-
-def _linear(srgb: Array) -> Array:
-    """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clip(0) + 0.055) / 1.055) ** 2.4)
