@@ -7,8 +7,10 @@ by either of its backends; what is done here with its pixels is plain torch for 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
+from itertools import islice
 from typing import Any
 
 import torch
@@ -114,8 +116,8 @@ class LitMesh:
         seen = Looks.of(fragments, looks)
         blend = _Blend.of(self, seen, clip, coverage, backend)
         colour = self._colours(blend.face, blend.at, clip, vertices, lights, backend)
-        amounts = [(seen.pixel, colour[: len(seen.face)] * seen.share[:, None].to(colour))]
-        amounts += [strip.change(seen, colour) for strip in blend.strips]
+        own = seen.pixel, colour[: len(seen.face)] * seen.share[:, None].to(colour)
+        amounts = [own, *blend.changes(seen, colour)]
         total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
         # All in one go: a sum out of place copies the whole picture.
         total.index_add_(0, *(torch.cat(parts) for parts in zip(*amounts, strict=True)))
@@ -265,21 +267,12 @@ def _edge_on(clip: Tensor, faces: Tensor) -> Tensor:
 @dataclass(frozen=True, slots=True)
 class _Strip:
     """Parts of looks (P,) that are of another colour than a look: amount (P,), of a look, differentiable, of the
-    sights `more` (P,), and less of the sights `less` (P,), of which there are none where it is None.
+    first sights (P,), and less of the second ones, where there are any.
     """
 
     look: Tensor
     amount: Tensor
-    more: Tensor
-    less: Tensor | None
-
-    def change(self, seen: Looks, colour: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (P,), and what each gets more of (P, 3); colour (S, 3): of sights."""
-        change = colour.index_select(0, self.more)
-        if self.less is not None:
-            change = change - colour.index_select(0, self.less)
-        amount = self.amount.to(colour) / seen.count**2
-        return seen.pixel_of(self.look), amount[:, None] * change
+    sights: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,31 +311,43 @@ class _Blend:
         cut = [torch.zeros_like(coverage, dtype=torch.bool) for _ in range(2)]
         for axis, along in enumerate((~outer.down, outer.down)):
             cut[axis][outer.here[rim.across & along]] = True
-        strips = []
         way, share = between.way, torch.where(between.across, between.share, 0.5)
         before, after = (numbers(sight, inner, way) for sight in (between.before, between.after))
-        # Of a border along the way, the looks to its sides are the ones that share it.
-        for look, amount, more, less in (
-            (inner.here[way], 0.5 - share, after, before),
-            (inner.there[way], share - 0.5, before, after),
-        ):
-            aside = torch.where(inner.down[way], cut[0][look], cut[1][look])
-            part = torch.where(aside, coverage.index_select(0, look), 1.0)
-            strips.append(_Strip(look, amount.clamp_min(0) * part, more, less))
         part = ((seen.fragments.face >= 0) & (coverage.detach() < 1)).nonzero()[:, 0]
-        strips.append(_Strip(part, coverage.index_select(0, part) - 1, seen.sight[part], None))
         # What meets nothing goes on with the colour from which its outline is reached, rather across it.
         order = torch.arange(len(outer.there)) + len(outer.there) * ~rim.across
         ends, which = torch.unique(outer.there, return_inverse=True)
         first = order.new_full((len(ends),), 2 * len(order)).scatter_reduce(0, which, order, "amin")
         source = (first[which] == order) & (coverage.detach()[outer.there] > 0)
-        look = outer.there[source]
-        strips.append(_Strip(look, coverage.index_select(0, look), seen.sight[outer.here[source]], None))
+        here, there, beyond = inner.here[way], inner.there[way], outer.there[source]
+        here_covers, there_covers, part_covers, beyond_covers = _picked(coverage, (here, there, part, beyond))
+        strips = []
+        # Of a border along the way, the looks to its sides are the ones that share it.
+        for look, covers, amount, more, less in (
+            (here, here_covers, 0.5 - share, after, before),
+            (there, there_covers, share - 0.5, before, after),
+        ):
+            aside = torch.where(inner.down[way], cut[0][look], cut[1][look])
+            strips.append(_Strip(look, amount.clamp_min(0) * torch.where(aside, covers, 1.0), (more, less)))
+        strips.append(_Strip(part, part_covers - 1, (seen.sight[part],)))
+        strips.append(_Strip(beyond, beyond_covers, (seen.sight[outer.here[source]],)))
         way, share, end = rim.inner.way, rim.inner.share, rim.end
         before, after = (numbers(sight, outer, way) for sight in (rim.inner.before, rim.inner.after))
         for look, amount, shown in (
             (outer.here[way], end.clamp_max(0.5) - share, rim.inner.across),
             (outer.there[way], end - share.clamp_min(0.5), rim.inner.across & source[way]),
         ):
-            strips.append(_Strip(look, torch.where(shown, amount.clamp_min(0), 0.0), after, before))
+            strips.append(_Strip(look, torch.where(shown, amount.clamp_min(0), 0.0), (after, before)))
         return cls(torch.cat(faces), torch.cat(places), strips)
+
+    def changes(self, seen: Looks, colour: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pixels (P,), and what each gets more of (P, 3), by strip; colour (S, 3): of sights."""
+        picked = iter(_picked(colour, [sight for strip in self.strips for sight in strip.sights]))
+        for strip in self.strips:
+            change = reduce(torch.sub, islice(picked, len(strip.sights)))
+            yield seen.pixel_of(strip.look), (strip.amount.to(colour) / seen.count**2)[:, None] * change
+
+
+def _picked(values: Tensor, places: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Of values (N, ...) those at places (P,), for each. In one go: each gradient fills an array (N, ...)."""
+    return values.index_select(0, torch.cat(list(places))).split([len(one) for one in places])
