@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.run.folder import CONFIG
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import MANIFEST, RESULT, names_in
 from drivesem.run.lock import held_elsewhere
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, load_frame
@@ -20,7 +20,7 @@ from drivesem.truth.grades import Grade
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-MANIFEST, METRICS = "manifest.json", "metrics.json"
+METRICS = "metrics.json"
 PICTURES = {"benign": "benign.png", "rerendered": "rerender.png", "attacked": "counterexample.png"}
 """A frame's photograph, the same rendered again without any change, and the picture that was found: all lossless,
 as the source was judged on them."""
@@ -147,11 +147,11 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
         raise UsageError(
             setting, "a finished run (the same command finishes it)", f"{folder}, which stopped early"
         )
-    manifest, metrics = files.read_json(folder / MANIFEST), files.read_json(folder / METRICS)
+    identifiers, metrics = names_in(folder), files.read_json(folder / METRICS)
     try:
-        identifiers, params = list(manifest["frames"].keys()), ",".join(metrics["params"])
-    except (AttributeError, KeyError, TypeError) as error:
-        raise FormatError(f"{folder / MANIFEST}, {METRICS}", "frames and params of a run", error) from error
+        params = ",".join(metrics["params"])
+    except (KeyError, TypeError) as error:
+        raise FormatError(str(folder / METRICS), "params of a run", error) from error
     from_json(float | None, metrics.get("t_star"), f"{folder / METRICS}: t_star")
     return Run(
         name=name,
@@ -160,7 +160,7 @@ def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
         # Runs from before there was a choice followed the default.
         method=str(settings.get("method", Attack().method)),
         params=params,
-        frames=tuple(_frame(files.below(folder / "frames", identifier)) for identifier in identifiers[:limit]),
+        frames=tuple(_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
     )
 
 

@@ -10,21 +10,34 @@ import numpy as np
 from drivesem.data import layouts
 from drivesem.data.label_table import LabelTable
 from drivesem.run.results import BoxRecord, load_frame
+from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
 STAGES = ("attacked", "attacked-paper", "rerendered", "benign")
 """What of a run is looked at: detections after the attack with labels that moved or the benign ones, detections in
 the re-rendered photograph, and in the photograph."""
-RESULT = "result.json"
+RESULT, MANIFEST = "result.json", "manifest.json"
 
 
 def frames_in(run: Path) -> list[str]:
-    """Identifiers of the frames in a run's folder, sorted, without what a killed command left there. Virtual
-    KITTI's are folders in folders.
+    """Identifiers of a run's frames, sorted: of a finished one those of its manifest, else those in its folder,
+    without what a killed command left there. Virtual KITTI's are folders in folders. Raises FormatError for a
+    damaged manifest.
     """
     frames = run / "frames"
     found = (path.parent.relative_to(frames) for path in sorted(frames.rglob(RESULT)))
-    return [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
+    names = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
+    return sorted(names_in(run)) if names and (run / MANIFEST).is_file() else names
+
+
+def names_in(run: Path) -> list[str]:
+    """Identifiers of a finished run's frames. Raises FormatError for a damaged manifest."""
+    manifest = files.read_json(run / MANIFEST)
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("frames"), dict):
+        raise FormatError(f"{run / MANIFEST}: frames", "hashes by frame and file", "something else")
+    for name in manifest["frames"]:
+        files.below(run / "frames", name)
+    return list(manifest["frames"])
 
 
 def layout_of(path: Path) -> str:

@@ -176,7 +176,7 @@ def edit(path: Path, *keys: Any, value: Any) -> None:
         ("result", ("objects",), 1.5, "objects: expected an integer"),
         ("result", ("unknown",), 1, "unknown: expected a field of FrameResult"),
         ("metrics", ("t_star",), "half", "metrics.json: t_star: expected a finite number"),
-        ("manifest", ("frames",), ["a"], "frames and params of a run"),
+        ("manifest", ("frames",), ["a"], "manifest.json: frames: expected hashes by frame and file"),
         ("manifest", ("frames",), {"/dev/zero": {}}, "frames: expected names of what is in there"),
         ("manifest", ("frames",), {"../..": {}}, "frames: expected names of what is in there"),
     ],
