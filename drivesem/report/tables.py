@@ -118,8 +118,8 @@ def _longest(texts: Iterable[str]) -> int:
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:
-    """Rows of the same columns as CSV, with a heading."""
-    columns = list(rows[0])
+    """Rows as CSV, with a heading of all columns that any of them has."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
     return csv_table(columns, ([row.get(name) for name in columns] for row in rows), line_end)
 
 

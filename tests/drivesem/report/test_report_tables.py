@@ -5,7 +5,7 @@ import io
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.tables import Sheet, number_of
+from drivesem.report.tables import Sheet, csv_text, number_of
 from drivesem.report.terminal import Console
 
 COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
@@ -27,6 +27,12 @@ def shown(sheet: Sheet, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str
 def test_one_is_one_and_no_more() -> None:
     assert [number_of(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
     assert [number_of(count, "query", "queries") for count in (1, 40)] == ["1 query", "40 queries"]
+
+
+def test_a_column_that_the_first_row_lacks_is_in_the_csv() -> None:
+    """Of searches, the first is not compared with itself."""
+    rows = [{"name": "climb", "seconds": 1.5}, {"name": "halton", "seconds": 2, "ahead": 0.25}]
+    assert csv_text(rows) == "name,seconds,ahead\nclimb,1.5,\nhalton,2,0.25\n"
 
 
 def test_a_table_that_fits_is_one() -> None:
