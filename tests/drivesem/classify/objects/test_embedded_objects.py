@@ -74,13 +74,14 @@ def measured(model: ObjectModel) -> list[float]:
 
 def test_objects_are_those_that_were_published() -> None:
     """An object of each kind, as the table beside this file has it: networks were trained on these, and figures
-    are told of them. `measured` of each name gives its row.
+    are told of them. `measured` of each name gives its row. Sines differ in the last bit between kinds of
+    processors, by which two vertices in order of rounded places may change theirs.
     """
     rows = (Path(__file__).parent / "embedded.csv").read_text().splitlines()
     assert len(rows) == sum(len(kinds) for kinds in KINDS.values())
     for row in rows:
         name, *figures = row.split(",")
-        expected = pytest.approx([float(figure) for figure in figures], rel=1e-6)
+        expected = pytest.approx([float(figure) for figure in figures], rel=1e-5)
         assert measured(OBJECTS.load(name)) == expected, name
 
 
