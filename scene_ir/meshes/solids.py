@@ -12,6 +12,7 @@ from enum import IntEnum
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from scene_ir.types import Mesh, Part
 
@@ -84,6 +85,11 @@ def quad_faces(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return cut.reshape(-1, 3)
 
 
+def grid_quads(grid: np.ndarray) -> np.ndarray:
+    """The quads (Q, 4) between neighbours of a grid (A, B) of vertices, row by row."""
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], -1).reshape(-1, 4)
+
+
 def cleaned(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Solid:
     """Merge coincident vertices (to 1 um), drop collapsed faces, turn the winding outwards (y up: see module)."""
     # a stable sort by rows: np.unique over rows takes five times as long
@@ -114,9 +120,19 @@ def mirrored(solid: Solid) -> Solid:
     return Solid(solid.vertices * np.array([1.0, 1.0, -1.0]), solid.faces[:, ::-1], solid.material)
 
 
-def shifted(solid: Solid, x: float) -> Solid:
-    """The solid moved forward by `x` m."""
-    return replace(solid, vertices=solid.vertices + np.array([x, 0.0, 0.0]))
+def moved(solid: Solid, offset: ArrayLike) -> Solid:
+    """The solid elsewhere, by an offset (3,) in m."""
+    return replace(solid, vertices=solid.vertices + np.asarray(offset, float))
+
+
+def joined(solids: Sequence[Solid]) -> Solid:
+    """Solids, overlapping as they may, as one."""
+    starts = np.cumsum([0] + [len(s.vertices) for s in solids])
+    return Solid(
+        np.concatenate([s.vertices for s in solids]),
+        np.concatenate([s.faces + start for s, start in zip(solids, starts[:-1], strict=True)]),
+        np.concatenate([s.material for s in solids]),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +162,9 @@ class Skin:
         floor = np.arange(starts[2], starts[3]).reshape(self.floor.shape[:2])
         quads = np.concatenate(
             [
-                np.stack([wall[:-1, :-1], wall[:-1, 1:], wall[1:, 1:], wall[1:, :-1]], -1).reshape(-1, 4),
+                grid_quads(wall),
                 np.stack([lid[1:, :-1], lid[1:, 1:], lid[:-1, 1:], lid[:-1, :-1]], -1).reshape(-1, 4),
-                np.stack([floor[:-1, :-1], floor[:-1, 1:], floor[1:, 1:], floor[1:, :-1]], -1).reshape(-1, 4),
+                grid_quads(floor),
             ]
         )
         material = np.concatenate(
@@ -193,9 +209,7 @@ def revolve(profile: np.ndarray, material: np.ndarray, centre: Sequence[float]) 
     r, z = profile[:, 0, None], profile[:, 1, None]
     x, y = r * np.cos(angle), r * np.sin(angle)
     vertices = np.stack([x, y, np.broadcast_to(z, x.shape)], -1) + np.asarray(centre)
-    index = np.arange(vertices[..., 0].size).reshape(x.shape)
-    right = np.roll(index, -1, axis=1)
-    quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], -1).reshape(-1, 4)
+    quads = grid_quads(np.pad(np.arange(x.size).reshape(x.shape), ((0, 0), (0, 1)), mode="wrap"))
     flat = vertices.reshape(-1, 3)
     return cleaned(flat, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), material.reshape(-1).repeat(2))
 
@@ -229,19 +243,15 @@ def box(
     layers = [(lo[0], np.tile(middle, (8, 1))), (lo[0], inner), (lo[0] + b, ring)]
     layers += [(hi[0] - b, ring), (hi[0], inner), (hi[0], np.tile(middle, (8, 1)))]
     vertices = np.concatenate([np.column_stack([np.full(8, x), yz]) for x, yz in layers])
-    index = np.arange(len(vertices)).reshape(-1, 8)
-    right = np.roll(index, -1, axis=1)
-    quads = np.stack([index[:-1], right[:-1], right[1:], index[1:]], -1).reshape(-1, 4)
+    quads = grid_quads(np.pad(np.arange(len(vertices)).reshape(-1, 8), ((0, 0), (0, 1)), mode="wrap"))
     strip = np.array([rear or material, material, material, material, front or material])
     return cleaned(vertices, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), strip.repeat(8).repeat(2))
 
 
 def assemble(solids: Sequence[Solid], name: str) -> Mesh:
     """Solids, overlapping as they may, as one mesh in the unit box (float32), vertices split between materials."""
-    counts = np.cumsum([0] + [len(s.vertices) for s in solids])
-    vertices = np.concatenate([s.vertices for s in solids])
-    faces = np.concatenate([s.faces + start for s, start in zip(solids, counts[:-1], strict=True)])
-    material = np.concatenate([s.material for s in solids])
+    whole = joined(solids)
+    vertices, faces, material = whole.vertices, whole.faces, whole.material
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = high - low
     half = max(-low[2], high[2])

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from scene_ir.errors import RangeError
 from scene_ir.meshes.bodies import Body, body_grid, wheels
 from scene_ir.meshes.outlines import KINDS, BusOutline, CarOutline, TruckOutline, outline
-from scene_ir.meshes.solids import Material, Skin, Solid, assemble, box, coons, mirrored, shifted
+from scene_ir.meshes.solids import Material, Skin, Solid, assemble, box, coons, mirrored, moved
 from scene_ir.types import Mesh
 
 _M = 6
@@ -386,7 +386,7 @@ def _truck_cab(truck: TruckOutline) -> Solid:
     material[1, :1] = Material.PLATE
     lid_material = np.full((m, n), int(Material.PAINT))
     floor_material = np.full((m, n), int(Material.UNDERBODY))
-    return shifted(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), middle)
+    return moved(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), (middle, 0, 0))
 
 
 def _truck(truck: TruckOutline, name: str) -> Mesh:

@@ -34,7 +34,8 @@ KINDS: Mapping[str, tuple[Callable[[Kit], None], ...]] = {
 }
 """What makes each class's objects; object n is of kind n modulo their number."""
 
-_RANGES: Mapping[Split, range] = {"train": range(70), "val": range(70, 80), "test": range(80, 100)}
+_NUMBERS = tuple(f"{number:04d}" for number in range(100))
+_SPLITS: Mapping[Split, tuple[str, ...]] = {"train": _NUMBERS[:70], "val": _NUMBERS[70:80], "test": _NUMBERS[80:]}
 """Numbers of each split's objects, in every class: 70, 10 and 20 %, as in the paper."""
 
 
@@ -49,19 +50,13 @@ class EmbeddedObjects:
 
     def names(self, split: Split) -> tuple[str, ...]:
         """Names of a split's objects, in the order of classes."""
-        return tuple(f"{name}/{number:04d}" for name in self.classes for number in _RANGES[split])
+        return tuple(f"{name}/{number}" for name in self.classes for number in _SPLITS[split])
 
     def load(self, name: str) -> ObjectModel:
         """The object "class/0000" to "class/0099". Raises RangeError for any other name."""
         kind, _, number = name.partition("/")
-        most = _RANGES["test"].stop
-        if (
-            kind not in KINDS
-            or not (number.isascii() and number.isdecimal())
-            or len(number) != 4
-            or int(number) >= most
-        ):
-            raise RangeError("object", f"a class of {', '.join(self.classes)}, and 0000 to {most - 1:04d}", name)
+        if kind not in KINDS or number not in _NUMBERS:
+            raise RangeError("object", f"a class of {', '.join(self.classes)}, and 0000 to {_NUMBERS[-1]}", name)
         make = KINDS[kind][int(number) % len(KINDS[kind])]
         kit = Kit(np.random.default_rng([crc32(kind.encode()), int(number)]))
         make(kit)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,15 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from trimesh.util import append_faces
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from drivesem.classify.objects.types import ObjectModel, used
+from drivesem.classify.objects.types import ObjectModel, object_model, used
 from scene_ir.errors import FormatError
 from scene_ir.meshes.load import linear, painted, read_scene, texels
 from scene_ir.meshes.lod import simplify
-from scene_ir.types import Mesh, Part
+from scene_ir.types import Mesh
 
 Array = NDArray[np.float64]
 
@@ -47,9 +47,9 @@ def read_object(path: Path, name: str, label: int, folder: Path, most_triangles:
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise FormatError(str(path), "a mesh with faces", "none")
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
-    faces = np.concatenate([np.asarray(p.faces, np.int64) + s for p, s in zip(parts, starts[:-1], strict=True)])
+    vertices, faces = append_faces(
+        [np.asarray(part.vertices, float) for part in parts], [np.asarray(part.faces, np.int64) for part in parts]
+    )
     looks = np.concatenate([_looks(part, path) for part in parts])
     shown = np.unique(faces)
     if not np.isfinite(vertices[shown]).all():
@@ -67,21 +67,13 @@ def read_object(path: Path, name: str, label: int, folder: Path, most_triangles:
     faces, looks = faces[doubled > _SMALL], looks[doubled > _SMALL]
     if len(faces) == 0:
         raise FormatError(f"{path}: faces", "at least one face with an area", "none")
-    part = torch.full((len(faces),), int(Part.OTHER))
-    mesh = used(Mesh(torch.from_numpy(unit), torch.from_numpy(faces), part, name))
     if most_triangles is not None and len(faces) > most_triangles:
-        mesh, looks = _simplified(mesh, looks, most_triangles)
-    table = torch.from_numpy(looks.astype(np.float32))
-    return ObjectModel(name, label, used(mesh), table[:, :3].contiguous(), table[:, 3], table[:, 4])
-
-
-def _simplified(mesh: Mesh, looks: Array, triangles: int) -> tuple[Mesh, Array]:
-    """About `triangles` faces of the same surface; borders between materials stay."""
-    rounded = np.rint(looks * [_STEPS, _STEPS, _STEPS, _STEPS, 1])
-    _, first, material = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    coarse = simplify(replace(mesh, part=torch.from_numpy(material.reshape(-1))), triangles)
-    part = coarse.part.numpy()
-    return replace(coarse, part=torch.full_like(coarse.part, int(Part.OTHER))), looks[first[part]]
+        rounded = np.rint(looks * [_STEPS, _STEPS, _STEPS, _STEPS, 1])
+        _, first, material = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+        fine = Mesh(torch.from_numpy(unit), torch.from_numpy(faces), torch.from_numpy(material.reshape(-1)))
+        coarse = simplify(used(fine), most_triangles)  # borders between materials stay
+        unit, faces, looks = coarse.vertices.numpy(), coarse.faces.numpy(), looks[first[coarse.part.numpy()]]
+    return object_model(name, label, unit, faces, looks)
 
 
 def _looks(part: trimesh.Trimesh, path: Path) -> Array:

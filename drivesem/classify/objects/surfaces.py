@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
-from drivesem.classify.objects.types import ObjectModel
-from scene_ir.meshes.solids import Solid, mirrored
-from scene_ir.types import Mesh, Part
+from drivesem.classify.objects.types import ObjectModel, object_model
+from scene_ir.meshes.solids import Solid, joined, mirrored
 
 Rgb = tuple[float, float, float]
 
@@ -72,17 +70,18 @@ class Kit:
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._solids: list[Solid] = []
-        self._surfaces: dict[Surface, int] = {}
+        self._looks: list[np.ndarray] = []
 
     def add(self, surface: Surface, *solids: Solid) -> None:
         """Solids of one surface."""
         for solid in solids:
-            self.painted([surface], Solid(solid.vertices, solid.faces, np.zeros(len(solid.faces), np.int64)))
+            self.painted([surface], solid)
 
     def painted(self, surfaces: Sequence[Surface], solid: Solid) -> None:
         """A solid whose materials are numbers of surfaces."""
-        numbers = np.array([self._surfaces.setdefault(s, len(self._surfaces)) for s in surfaces])
-        self._solids.append(Solid(solid.vertices, solid.faces, numbers[solid.material]))
+        table = np.array([(*s.diffuse, s.specular, s.shininess) for s in surfaces])
+        self._solids.append(solid)
+        self._looks.append(table[solid.material])
 
     def both(self, surface: Surface, *solids: Solid) -> None:
         """Solids of one surface, and their twins on the other side of z = 0."""
@@ -113,24 +112,8 @@ class Kit:
 
     def model(self, name: str, label: int) -> ObjectModel:
         """All solids as one object: centred, longest side 1, the front turned to -z."""
-        counts = np.cumsum([0] + [len(s.vertices) for s in self._solids])
-        vertices = np.concatenate([s.vertices for s in self._solids])
-        faces = np.concatenate([s.faces + start for s, start in zip(self._solids, counts[:-1], strict=True)])
-        material = torch.from_numpy(np.concatenate([s.material for s in self._solids]))
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        unit = (vertices - (low + high) / 2) / (high - low).max()
-        table = list(self._surfaces)
-        mesh = Mesh(
-            vertices=torch.from_numpy((unit[:, [2, 1, 0]] * [1.0, 1.0, -1.0]).astype(np.float32)),
-            faces=torch.from_numpy(faces.astype(np.int64)),
-            part=torch.full((len(faces),), int(Part.OTHER), dtype=torch.int64),
-            name=name,
-        )
-        return ObjectModel(
-            name,
-            label,
-            mesh,
-            torch.tensor([s.diffuse for s in table], dtype=torch.float32)[material],
-            torch.tensor([s.specular for s in table], dtype=torch.float32)[material],
-            torch.tensor([s.shininess for s in table], dtype=torch.float32)[material],
-        )
+        whole = joined(self._solids)
+        low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
+        unit = (whole.vertices - (low + high) / 2) / (high - low).max()
+        turned = unit[:, [2, 1, 0]] * [1.0, 1.0, -1.0]
+        return object_model(name, label, turned, whole.faces, np.concatenate(self._looks))

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.types import Mesh, check_finite, check_shape
+from scene_ir.types import Mesh, Part, check_finite, check_shape
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
@@ -45,14 +47,12 @@ class ObjectModel:
         count = self.mesh.faces.shape[0]
         if count == 0:
             raise ShapeError(f"{self.name}: mesh.faces", "at least one face", "none")
-        check_shape(f"{self.name}: diffuse", self.diffuse, count, 3)
-        check_shape(f"{self.name}: specular", self.specular, count)
-        check_shape(f"{self.name}: shininess", self.shininess, count)
-        for field, values, most in (
-            ("diffuse", self.diffuse, 1.0),
-            ("specular", self.specular, 1.0),
-            ("shininess", self.shininess, float("inf")),
+        for field, values, shape, most in (
+            ("diffuse", self.diffuse, (count, 3), 1.0),
+            ("specular", self.specular, (count,), 1.0),
+            ("shininess", self.shininess, (count,), float("inf")),
         ):
+            check_shape(f"{self.name}: {field}", values, *shape)
             check_finite(f"{self.name}: {field}", values)
             low, high = float(values.min()), float(values.max())
             if low < 0 or high > most:
@@ -63,9 +63,17 @@ class ObjectModel:
 def used(mesh: Mesh) -> Mesh:
     """The mesh without vertices that no face has, which nothing draws and an attack would move all the same."""
     places, faces = torch.unique(mesh.faces, return_inverse=True)
-    return (
-        mesh if len(places) == len(mesh.vertices) else replace(mesh, vertices=mesh.vertices[places], faces=faces)
-    )
+    return replace(mesh, vertices=mesh.vertices[places], faces=faces)
+
+
+def object_model(
+    name: str, label: int, vertices: NDArray[np.floating], faces: NDArray[np.integer], looks: NDArray[np.float64]
+) -> ObjectModel:
+    """The object of vertices (V, 3), faces (F, 3), and their linear RGB, specular share and exponent (F, 5)."""
+    corners, sides = torch.from_numpy(vertices.astype(np.float32)), torch.from_numpy(faces.astype(np.int64))
+    table = torch.from_numpy(looks.astype(np.float32))
+    mesh = used(Mesh(corners, sides, torch.full((len(faces),), int(Part.OTHER)), name))
+    return ObjectModel(name, label, mesh, table[:, :3].contiguous(), table[:, 3], table[:, 4])
 
 
 class ObjectSet(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivesem.classify.objects.shapes import beams, body, box, boxes, lathe, patch, torus, tube, wing
+from drivesem.classify.objects.shapes import beams, body, box, boxes, lathe, patch, points, torus, tube, wing
 from drivesem.classify.objects.surfaces import BLACK, GLASS, RUBBER, STEEL, WHITE, Kit, Surface, metal, paint
 
 
@@ -14,14 +14,6 @@ def _engine(kit: Kit, cowl: Surface, x: float, y: float, z: float, radius: float
     kit.both(cowl, lathe(radius * np.array(profile), (x, y, z), "x", 14))
     kit.both(BLACK, lathe(radius * np.array([(0.79, 0.0), (0.79, 1.2)]), (x, y, z), "x", 14))
     kit.both(STEEL, lathe(radius * np.array([(0.55, -1.3), (0.2, -2.2)]), (x, y, z), "x", 12))
-
-
-def _propeller(kit: Kit, x: float, y: float, radius: float, blades: int, spinner: Surface) -> None:
-    kit.add(spinner, lathe(radius * np.array([(0.16, 0.0), (0.13, 0.15), (0.01, 0.3)]), (x, y, 0), "x"))
-    hub, turn = np.array([x + 0.06 * radius, y, 0]), kit.between(0, np.pi)
-    for angle in turn + 2 * np.pi * np.arange(blades) / blades:
-        tip = hub + radius * np.array([0.0, np.sin(angle), np.cos(angle)])
-        kit.add(BLACK, beams(hub, tip, 0.14 * radius, 0.035 * radius))
 
 
 def _gear(kit: Kit, x: float, z: float, top: float, ground: float, radius: float) -> None:
@@ -49,7 +41,7 @@ def _jet(kit: Kit, radius: float, length: float, rear: bool) -> None:
         kit.both(livery, patch(stations, (-0.42 * length, 0.42 * length), (-0.45, -0.05), 0.012 * r))
     x = np.arange(-0.16 if rear else -0.33, 0.22 if rear else 0.36, (1.5 if rear else 0.55) * r / length) * length
     pane = (0.5 * r, 0.45 * r, 0.1 * r) if rear else (0.24 * r, 0.34 * r, 0.06 * r)
-    kit.both(GLASS, boxes(np.stack([x, 0 * x + 0.30 * r, 0 * x + 0.94 * r], 1), pane))
+    kit.both(GLASS, boxes(points(x, 0.30 * r, 0.94 * r), pane))
     span, sweep = length * kit.between(0.42, 0.52), kit.between(0.40, 0.62)
     root, chord = kit.between(0.03, 0.10) * length, 0.235 * length
     tip = (root - span * sweep, 0.35 * r, span, 0.20 * chord)
@@ -103,7 +95,12 @@ def light_plane(kit: Kit) -> None:
     kit.add(skin, body(stations, 16, 2.8))
     kit.add(GLASS, body(cabin, 14, 3.2))
     kit.both(livery, boxes([(0.0, -0.02, 0.86 * r)], (0.8 * half, 0.16, 0.14 * r)))
-    _propeller(kit, 0.97 * half, -0.12, kit.between(0.85, 1.0), kit.count(2, 3), livery)
+    x, reach, blades = 0.97 * half, kit.between(0.85, 1.0), kit.count(2, 3)
+    kit.add(livery, lathe(reach * np.array([(0.16, 0.0), (0.13, 0.15), (0.01, 0.3)]), (x, -0.12, 0), "x"))
+    hub = np.array([x + 0.06 * reach, -0.12, 0])
+    angle = kit.between(0, np.pi) + 2 * np.pi * np.arange(blades) / blades
+    tips = hub + reach * points(0.0, np.sin(angle), np.cos(angle))
+    kit.add(BLACK, beams(hub, tips, 0.14 * reach, 0.035 * reach))
     span, chord, lead = half * kit.between(1.20, 1.36), kit.between(1.35, 1.6), 0.5 * half
     height, rise = (0.42 + 0.8 * r, 0.02 * span) if high else (-0.45 * r, 0.09 * span)
     tip = (lead - 0.2 * chord, height + 1.6 * rise, span, 0.7 * chord)

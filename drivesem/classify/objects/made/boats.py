@@ -15,7 +15,7 @@ from drivesem.classify.objects.shapes import (
     lathe,
     loft,
     moved,
-    prism,
+    points,
     rectangle,
     slab,
     torus,
@@ -38,6 +38,7 @@ from drivesem.classify.objects.surfaces import (
     metal,
     paint,
 )
+from scene_ir.meshes.solids import Solid
 
 
 def _sections(length: float, beam: float, depth: float, sheer: float, stern: float, full: float = 2.0) -> Array:
@@ -47,14 +48,14 @@ def _sections(length: float, beam: float, depth: float, sheer: float, stern: flo
     """
     t = np.linspace(0, 1, 17)[:, None]
     s = np.linspace(-1, 1, 13)
-    half = beam / 2 * np.where(t < 0.4, stern + (1 - stern) * np.sin(np.pi / 2 * t / 0.4),
-        1 - ((t - 0.4) / 0.6).clip(0, 1) ** 2.2).clip(0.015)  # fmt: skip
+    aft, fore = stern + (1 - stern) * np.sin(np.pi / 2 * t / 0.4), 1 - ((t - 0.4) / 0.6).clip(0, 1) ** 2.2
+    half = beam / 2 * np.where(t < 0.4, aft, fore).clip(0.015)
     deck = depth + sheer * t**2.2
     keel = 0.75 * deck * ((t - 0.72) / 0.28).clip(0) ** 2.0
     x = length * (t - 0.5) + 0.1 * length * t**6 * np.abs(s) ** 1.5
     y = keel + (deck - keel) * np.abs(s) ** (2.2 * full)
     z = half * np.sign(s) * np.abs(s) ** (1 / full)
-    return np.stack(np.broadcast_arrays(x, y, z), -1)
+    return points(x, y, z)
 
 
 def _hull(kit: Kit, sections: Array, top: Surface, bottom: Surface, deck: Surface) -> None:
@@ -70,14 +71,14 @@ def _hull(kit: Kit, sections: Array, top: Surface, bottom: Surface, deck: Surfac
     kit.both(bottom, tube(sections[:, -1], 3 * unit, 6))
 
 
-def _sail(corners: list[tuple[float, float, float]], belly: float) -> tuple[Array, Array]:
-    """Both faces of a sail: tack, clew, head; how far the wind fills it to the right."""
+def _sail(*corners: tuple[float, float, float], belly: float) -> Solid:
+    """A sail: tack, clew, head; how far the wind fills it to the right."""
     tack, clew, head = np.array(corners)
     u, v = np.linspace(0, 1, 8)[:, None, None], np.linspace(0, 1, 9)[None, :, None]
     foot = tack + (clew - tack) * u
     grid = foot + (head - foot) * v * 0.985
     grid = grid + np.array([0, 0, belly]) * 4 * u * (1 - u) * (1 - v) ** 0.5 * np.minimum(1, 3 * v + 0.4)
-    return grid, grid - [0, 0, 0.02]
+    return slab(grid, grid - [0, 0, 0.02])
 
 
 def sailboat(kit: Kit) -> None:
@@ -87,28 +88,27 @@ def sailboat(kit: Kit) -> None:
     hull, below = WHITE if kit.chance(0.6) else kit.lacquer(), kit.lacquer()
     sections = _sections(long, beam, depth, 0.05 * long, kit.between(0.5, 0.75), 1.5)
     _hull(kit, sections, hull, below, dull(kit.tint(WOODS)))
-    cabin = [(0.16, 0, 0.26), (0.14, 0.05, 0.24), (0.1, 0.075, 0.18)]
     x0, x1 = -0.12 * long, 0.17 * long
     kit.add(hull, loft([rectangle((x0, x1 - 0.6 * rise * long), depth + rise * long,
-        0.3 * beam - 0.4 * rise * long) for _, rise, _ in cabin]))  # fmt: skip
-    kit.both(GLASS, boxes([(x, depth + 0.035 * long, 0.275 * beam) for x in np.linspace(x0 + 0.6, x1 - 0.7, 3)],
-        (0.09 * long, 0.03 * long, 0.05 * beam)))  # fmt: skip
+        0.3 * beam - 0.4 * rise * long) for rise in (0, 0.05, 0.075)]))  # fmt: skip
+    panes = points(np.linspace(x0 + 0.6, x1 - 0.7, 3), depth + 0.035 * long, 0.275 * beam)
+    kit.both(GLASS, boxes(panes, (0.09 * long, 0.03 * long, 0.05 * beam)))
     mast, top = 0.08 * long, depth + long * kit.between(1.05, 1.25)
     kit.add(STEEL, tube([(mast, depth, 0), (mast, top, 0)], [0.012 * long, 0.007 * long], 8))
     boom, low = -0.36 * long, depth + 0.15 * long
     kit.add(STEEL, tube([(mast, low, 0), (boom, low - 0.01 * long, 0.02 * long)], 0.008 * long, 6))
     belly = kit.between(0.05, 0.09) * long * (1 if kit.chance(0.5) else -1)
     cloth = dull((0.74, 0.73, 0.69)) if kit.chance(0.7) else dull(kit.tint(PAINTS))
-    kit.add(cloth, slab(*_sail([(mast - 0.1, low + 0.1, 0), (boom + 0.2, low + 0.1, 0.02 * long),
-        (mast - 0.1, top - 0.1, 0)], belly)))  # fmt: skip
+    tack, clew, peak = (mast - 0.1, low + 0.1, 0), (boom + 0.2, low + 0.1, 0.02 * long), (mast - 0.1, top - 0.1, 0)
+    kit.add(cloth, _sail(tack, clew, peak, belly=belly))
     bow = (0.5 * long, depth + 0.06 * long, 0.0)
     second = cloth if kit.chance(0.6) else dull(kit.tint(PAINTS))
-    kit.add(second, slab(*_sail([bow, (mast - 0.06 * long, low - 0.04 * long, 0.05 * long),
-        (mast + 0.02 * long, top - 0.12 * long, 0)], belly)))  # fmt: skip
-    kit.add(STEEL, beams([bow, (-0.48 * long, depth, 0)], [(mast, top, 0), (mast, top, 0)], 0.003 * long))
+    clew, peak = (mast - 0.06 * long, low - 0.04 * long, 0.05 * long), (mast + 0.02 * long, top - 0.12 * long, 0)
+    kit.add(second, _sail(bow, clew, peak, belly=belly))
+    kit.add(STEEL, beams([bow, (-0.48 * long, depth, 0)], (mast, top, 0), 0.003 * long))
     kit.both(STEEL, beams((mast, depth, 0.45 * beam), (mast, 0.94 * top, 0.0), 0.003 * long))
-    kit.add(dull((0.03, 0.03, 0.035)), prism(rectangle((-0.08 * long, 0.06 * long), -0.13 * long, 0.012 * long),
-        rectangle((-0.1 * long, 0.1 * long), 0.03 * long, 0.02 * long)))  # fmt: skip
+    kit.add(dull((0.03, 0.03, 0.035)), loft([rectangle((-0.08 * long, 0.06 * long), -0.13 * long, 0.012 * long),
+        rectangle((-0.1 * long, 0.1 * long), 0.03 * long, 0.02 * long)]))  # fmt: skip
     kit.add(BLACK, block((-0.47 * long, -0.41 * long), (-0.06 * long, 0.06 * long), 0.01 * long))
 
 
@@ -120,24 +120,21 @@ def motor_yacht(kit: Kit) -> None:
     _hull(kit, _sections(long, beam, depth, 0.07 * long, 0.85, 1.3), hull, kit.lacquer(), dull(kit.tint(WOODS)))
     decks, w = kit.count(1, 2), 0.36 * beam
     x0, x1, y = -0.34 * long, kit.between(0.16, 0.24) * long, depth + 0.02 * long
-    for deck in range(decks + 1):
-        h = (0.095 if deck < decks else 0.03) * long
-        lean = 0.1 * long
-        if deck < decks:
-            low = rectangle((x0, x1), y - 0.03 * long, w)
-            high = rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w)
-            kit.add(WHITE, prism(low, high))
-            a, b = 0.35, 0.88
-            strip = [low * (1 - v) + high * v for v in (a, b)]
-            kit.add(GLASS, prism(*(part * [1, 1, 1.03] + 0.02 * long * AHEAD for part in strip)))
-            kit.add(WHITE, block((x0 - 0.04 * long, x1 - lean + 0.02 * long),
-                (y + h - 0.006 * long, y + h + 0.012 * long), 0.98 * w, 0.01 * long))  # fmt: skip
-        else:
-            kit.add(GLASS, prism(rectangle((x1 - 0.02 * long, x1 + 0.005 * long), y, 0.75 * w),
-                rectangle((x1 - 0.06 * long, x1 - 0.05 * long), y + 0.04 * long, 0.7 * w)))  # fmt: skip
-            kit.add(dull((0.55, 0.5, 0.42)), block((x0 + 0.1 * long, x0 + 0.2 * long), (y, y + 0.035 * long),
-                0.6 * w, 0.01 * long))  # fmt: skip
+    h, lean = 0.095 * long, 0.1 * long
+    for _ in range(decks):
+        low = rectangle((x0, x1), y - 0.03 * long, w)
+        high = rectangle((x0 + 0.02 * long, x1 - lean), y + h, 0.86 * w)
+        kit.add(WHITE, loft([low, high]))
+        strip = [low * (1 - v) + high * v for v in (0.35, 0.88)]
+        kit.add(GLASS, loft([part * [1, 1, 1.03] + 0.02 * long * AHEAD for part in strip]))
+        kit.add(WHITE, block((x0 - 0.04 * long, x1 - lean + 0.02 * long),
+            (y + h - 0.006 * long, y + h + 0.012 * long), 0.98 * w, 0.01 * long))  # fmt: skip
         x0, x1, y, w = x0 + 0.04 * long, x1 - lean - 0.03 * long, y + h, 0.86 * w
+    screen = rectangle((x1 - 0.06 * long, x1 - 0.05 * long), y + 0.04 * long, 0.7 * w)
+    kit.add(GLASS, loft([rectangle((x1 - 0.02 * long, x1 + 0.005 * long), y, 0.75 * w), screen]))
+    bench = (x0 + 0.1 * long, x0 + 0.2 * long)
+    kit.add(dull((0.55, 0.5, 0.42)), block(bench, (y, y + 0.035 * long), 0.6 * w, 0.01 * long))
+    x0, y, w = x0 + 0.04 * long, y + 0.03 * long, 0.86 * w
     kit.both(WHITE, beams((x0 + 0.02 * long, y - 0.04 * long, 0.8 * w),
         (x0 + 0.06 * long, y + 0.06 * long, 0.7 * w), 0.03 * long, 0.015 * long))  # fmt: skip
     kit.add(WHITE, block((x0 + 0.03 * long, x0 + 0.09 * long), (y + 0.05 * long, y + 0.065 * long), 0.75 * w,
@@ -145,15 +142,11 @@ def motor_yacht(kit: Kit) -> None:
     kit.add(WHITE, ball((x0 + 0.06 * long, y + 0.085 * long, 0), 0.022 * long, 12))
     kit.add(STEEL, tube([(x0 + 0.05 * long, y + 0.06 * long, 0.1 * w),
         (x0 + 0.02 * long, y + 0.2 * long, 0.1 * w)], 0.003 * long, 6))  # fmt: skip
-    _rail(kit, long, beam, depth, 0.07 * long, 0.05 * long)
-    kit.both(BLACK, *(moved(ball((0, 0, 0), (0.012 * long, 0.012 * long, 0.004 * long), 10),
-        (x, 0.72 * depth, 0.485 * beam)) for x in (-0.15 * long, -0.05 * long, 0.05 * long)))  # fmt: skip
-
-
-def _rail(kit: Kit, long: float, beam: float, depth: float, sheer: float, high: float) -> None:
-    """A rail around the fore deck."""
-    line = _sections(long, 0.94 * beam, depth, sheer, 0.85)[8:16, -1]
-    kit.both(CHROME, tube(line + high * UP, 0.003 * long, 6), beams(line, line + high * UP, 0.004 * long))
+    foot = _sections(long, 0.94 * beam, depth, 0.07 * long, 0.85)[8:16, -1]
+    rail = foot + 0.05 * long * UP
+    kit.both(CHROME, tube(rail, 0.003 * long, 6), beams(foot, rail, 0.004 * long))
+    kit.both(BLACK, *(ball((x * long, 0.72 * depth, 0.485 * beam), (0.012 * long, 0.012 * long, 0.004 * long), 10)
+        for x in (-0.15, -0.05, 0.05)))  # fmt: skip
 
 
 def rowing_boat(kit: Kit) -> None:
@@ -168,20 +161,20 @@ def rowing_boat(kit: Kit) -> None:
     kit.add(wood, slab(outer, outer * [0.99, 0.95, 0.96] + 0.03 * UP))
     kit.add(inside, slab(outer * [0.985, 0.95, 0.955] + 0.032 * UP, inner))
     transom = outer[0]
-    kit.add(wood, prism(transom + 0.06 * AHEAD, transom - 0.01 * AHEAD))
+    kit.add(wood, loft([transom + 0.06 * AHEAD, transom - 0.01 * AHEAD]))
     kit.both(inside, tube(outer[:, -1], 0.028, 6))
     for x in (-0.28 * long, -0.02 * long, 0.22 * long):
-        here = float(np.interp(x, outer[:, -1, 0], outer[:, -1, 2]))
+        here = np.interp(x, outer[:, -1, 0], outer[:, -1, 2])
         kit.add(inside, block((x - 0.11, x + 0.11), (0.78 * depth, 0.78 * depth + 0.035), 0.93 * here, 0.01))
     oar, out = dull(kit.tint(WOODS)), kit.between(0.9, 1.3)
     end = np.array([kit.between(-0.35, 0.1) * long, 0.35 * depth, beam / 2 + out])
     grip, lock = np.array([0.02 * long, 1.45 * depth, 0.12]), np.array([-0.06 * long, 1.08 * depth, beam / 2])
     way = (end - lock) / np.linalg.norm(end - lock)
     kit.both(oar, tube([grip, lock, end], 0.022, 6), beams(end - 0.1 * way, end + 0.4 * way, 0.035, 0.14))
-    kit.both(STEEL, torus(lock.tolist(), 0.04, 0.01, "x", 12))
+    kit.both(STEEL, torus(lock, 0.04, 0.01, "x", 12))
     for x in np.linspace(-0.36, 0.3, 7) * long:
         y, z = (np.array([np.interp(x, outer[:, j, 0], outer[:, j, k]) for j in range(1, 12)]) for k in (1, 2))
-        kit.add(inside, tube(np.stack([0 * y + x, y + 0.06, 0.86 * z], 1), 0.014, 4))
+        kit.add(inside, tube(points(x, y + 0.06, 0.86 * z), 0.014, 4))
 
 
 def fishing_boat(kit: Kit) -> None:
@@ -198,25 +191,22 @@ def fishing_boat(kit: Kit) -> None:
     kit.add(below, block((x - 1.15 * d, x + 1.2 * d), (depth + h, depth + h + 0.02 * long), 1.15 * w,
         0.006 * long))  # fmt: skip
     level = depth + 0.68 * h
-    kit.add(GLASS, boxes([(x + d, level, z) for z in (-0.6 * w, 0, 0.6 * w)],
-        (0.01 * long, 0.06 * long, 0.45 * w)))  # fmt: skip
-    kit.both(GLASS, boxes([(x - 0.4 * d, level, w), (x + 0.45 * d, level, w)],
-        (0.6 * d, 0.06 * long, 0.012 * long)))  # fmt: skip
+    ahead, beside = points(x + d, level, [-0.6 * w, 0, 0.6 * w]), points([x - 0.4 * d, x + 0.45 * d], level, w)
+    kit.add(GLASS, boxes(ahead, (0.01 * long, 0.06 * long, 0.45 * w)))
+    kit.both(GLASS, boxes(beside, (0.6 * d, 0.06 * long, 0.012 * long)))
     top = depth + kit.between(0.55, 0.75) * long
     for mast, height in ((0.3 * long, 0.85 * top), (x - 1.6 * d, top)):
-        kit.add(dull(kit.tint(WOODS)), tube([(mast, depth, 0), (mast, height, 0)], [0.012 * long, 0.006 * long],
-            8))  # fmt: skip
-        kit.add(STEEL, beams([(mast, height, 0), (mast, height, 0)],
-            [(mast, depth, 0.4 * beam), (mast, depth, -0.4 * beam)], 0.003 * long))  # fmt: skip
+        pole = tube([(mast, depth, 0), (mast, height, 0)], [0.012 * long, 0.006 * long], 8)
+        kit.add(dull(kit.tint(WOODS)), pole)
+        stays = points(mast, depth, [0.4 * beam, -0.4 * beam])
+        kit.add(STEEL, beams((mast, height, 0), stays, 0.003 * long))
         kit.add(STEEL, beams((mast, 0.6 * height, 0), (mast - 0.2 * long, 0.9 * height, 0), 0.01 * long))
     kit.add(STEEL, beams((0.3 * long, 0.85 * top, 0), (0.5 * long, depth + 0.12 * long, 0), 0.003 * long))
-    drum = -0.38 * long
-    kit.add(dull((0.03, 0.16, 0.12)), lathe([(0.05 * long, -0.24 * beam), (0.05 * long, 0.24 * beam)],
-        (drum, depth + 0.07 * long, 0), "z", 14))  # fmt: skip
-    kit.both(STEEL, lathe([(0.07 * long, 0.24 * beam), (0.07 * long, 0.26 * beam)], (drum, depth + 0.07 * long, 0),
-        "z", 16))  # fmt: skip
+    drum, end = (-0.38 * long, depth + 0.07 * long, 0), 0.24 * beam
+    kit.add(dull((0.03, 0.16, 0.12)), lathe([(0.05 * long, -end), (0.05 * long, end)], drum, "z", 14))
+    kit.both(STEEL, lathe([(0.07 * long, end), (0.07 * long, 0.26 * beam)], drum, "z", 16))
     for place in (-0.3, -0.1, 0.1):
-        z = float(np.interp(place * long, sections[:, -2, 0], sections[:, -2, 2]))
+        z = np.interp(place * long, sections[:, -2, 0], sections[:, -2, 2])
         kit.both(RUBBER, torus((place * long, 0.72 * depth, 1.02 * z), 0.035 * long, 0.015 * long, "z", 16))
     kit.add(LAMP, ball((x + d, depth + h + 0.04 * long, 0), 0.02 * long, 10))
     kit.both(paint((0.65, 0.15, 0.01)), torus((x, depth + 0.4 * h, w), 0.035 * long, 0.01 * long, "z", 16))
@@ -227,11 +217,12 @@ def ship(kit: Kit) -> None:
     long = kit.between(60, 80)
     cargo = kit.chance(0.5)
     beam, depth = long * kit.between(0.16, 0.19), long * kit.between(0.09, 0.115)
-    hull = paint(kit.tint(((0.02, 0.03, 0.06), (0.45, 0.03, 0.02), (0.03, 0.15, 0.08),
-        (0.02, 0.06, 0.3)))) if cargo else WHITE  # fmt: skip
+    colours = ((0.02, 0.03, 0.06), (0.45, 0.03, 0.02), (0.03, 0.15, 0.08), (0.02, 0.06, 0.3))
+    hull = paint(kit.tint(colours)) if cargo else WHITE
     sections = _sections(long, beam, depth, 0.05 * long, 0.85, 2.2)
     _hull(kit, sections, hull, paint((0.35, 0.03, 0.02)) if cargo else kit.lacquer(), dull((0.25, 0.08, 0.05)))
     stripe, w = kit.lacquer(), 0.44 * beam
+    x0, x1, rows = -0.4 * long, -0.29 * long, 5
     if cargo:
         size = np.array([0.115 * long, 0.033 * long, 0.2 * beam])
         for x in np.arange(-0.2, 0.34, 0.125) * long:
@@ -239,31 +230,29 @@ def ship(kit: Kit) -> None:
                 for level in range(kit.count(2, 4) if abs(z) < 1 or x < 0.25 * long else 0):
                     place = [(x, depth + (level + 0.5) * size[1] + 0.02 * long, 1.04 * z * size[2])]
                     kit.add(metal(kit.tint(PAINTS)), boxes(place, size))
-        x0, x1, rows = -0.4 * long, -0.29 * long, 5
     else:
-        x0, x1, rows = -0.4 * long, 0.26 * long, kit.count(3, 5)
+        x1, rows = 0.26 * long, kit.count(3, 5)
     y, step, b = depth, 0.033 * long, x1
     for i in range(rows):
         shrink = 0.0 if cargo else 0.035 * long * i
         a, b = x0 + 0.5 * shrink, x1 - shrink
         kit.add(WHITE, block((a, b), (y, y + step), w * (1 - 0.03 * i), 0.004 * long))
-        panes = np.arange(a + 0.015 * long, b - 0.01 * long, 0.018 * long if cargo else 0.02 * long)
-        kit.both(GLASS, boxes([(x, y + 0.55 * step, w * (1 - 0.03 * i)) for x in panes],
-            (0.011 * long, 0.4 * step, 0.02 * beam)))  # fmt: skip
+        x = np.arange(a + 0.015 * long, b - 0.01 * long, 0.018 * long if cargo else 0.02 * long)
+        panes = points(x, y + 0.55 * step, w * (1 - 0.03 * i))
+        kit.both(GLASS, boxes(panes, (0.011 * long, 0.4 * step, 0.02 * beam)))
         y += step
     kit.add(GLASS, block((b - 0.002 * long, b + 0.003 * long), (y - 0.7 * step, y - 0.25 * step), 0.8 * w))
     kit.add(WHITE, block((b - 0.05 * long, b + 0.005 * long), (y, y + 0.6 * step), 1.1 * w, 0.003 * long))
     kit.add(BLACK, block((b + 0.003 * long, b + 0.007 * long), (y + 0.15 * step, y + 0.45 * step), 1.0 * w))
     funnel = -0.37 * long if cargo else kit.between(-0.22, -0.05) * long
     for x in (funnel,) if cargo or kit.chance(0.5) else (funnel, funnel + 0.12 * long):
-        pipe = [(0.03, 0.0), (0.026, 0.075), (0.026, 0.08)]
-        chimney = lathe([(a * long, h * long) for a, h in pipe], (0, 0, 0), sides=18)
-        kit.add(stripe, moved(turned(chimney, "z", 0.15), (x, y, 0)))
-        kit.add(BLACK, moved(turned(lathe([(0.027 * long, 0.06 * long), (0.025 * long, 0.09 * long)], sides=18),
-            "z", 0.15), (x, y, 0)))  # fmt: skip
-    kit.add(STEEL, tube([(b - 0.03 * long, y, 0), (b - 0.03 * long, y + 0.1 * long, 0)], 0.004 * long, 6))
-    kit.add(STEEL, tube([(0.42 * long, depth, 0), (0.42 * long, depth + 0.14 * long, 0)], 0.004 * long, 6))
-    boats = np.linspace(x0 + 0.1 * long, 0.2 * long, 6) if not cargo else [x0 + 0.05 * long]
+        outer, rim = [(0.03, 0.0), (0.026, 0.075), (0.026, 0.08)], [(0.027, 0.06), (0.025, 0.09)]
+        for colour, profile in ((stripe, outer), (BLACK, rim)):
+            pipe = lathe(np.array(profile) * long, sides=18)
+            kit.add(colour, moved(turned(pipe, "z", 0.15), (x, y, 0)))
+    for x, foot, high in ((b - 0.03 * long, y, 0.1 * long), (0.42 * long, depth, 0.14 * long)):
+        kit.add(STEEL, tube([(x, foot, 0), (x, foot + high, 0)], 0.004 * long, 6))
+    boats = [x0 + 0.05 * long] if cargo else np.linspace(x0 + 0.1 * long, 0.2 * long, 6)
     kit.both(paint((0.65, 0.2, 0.01)), *(ball((x, depth + 1.4 * step, 1.03 * w),
         (0.022 * long, 0.01 * long, 0.01 * long), 10) for x in boats))  # fmt: skip
 

@@ -8,6 +8,7 @@ from drivesem.classify.objects.shapes import (
     AHEAD,
     UP,
     Array,
+    Pair,
     ball,
     beams,
     block,
@@ -16,6 +17,7 @@ from drivesem.classify.objects.shapes import (
     boxes,
     lathe,
     moved,
+    points,
     slab,
     torus,
     tube,
@@ -47,31 +49,31 @@ _LEATHER = dull((0.015, 0.014, 0.014))
 def _wheel(kit: Kit, x: float, radius: float, thick: float, spoked: bool) -> None:
     hub = np.array([x, radius, 0.0])
     inner = radius - 2 * thick
-    kit.add(RUBBER, torus(hub.tolist(), radius - thick, thick, "z", 32))
+    kit.add(RUBBER, torus(hub, radius - thick, thick, "z", 32))
     rim = CHROME if spoked else metal((0.05, 0.05, 0.055))
-    kit.add(rim, torus(hub.tolist(), inner, 0.32 * thick, "z", 28))
-    kit.add(STEEL, lathe([(0.05, -0.07), (0.05, 0.07)], hub.tolist(), "z", 14))
-    kit.both(CHROME, lathe([(0.42 * inner, 0.045), (0.42 * inner, 0.052)], hub.tolist(), "z", 20))
-    count = 18 if spoked else 5
+    kit.add(rim, torus(hub, inner, 0.32 * thick, "z", 28))
+    kit.add(STEEL, lathe([(0.05, -0.07), (0.05, 0.07)], hub, "z", 14))
+    kit.both(CHROME, lathe([(0.42 * inner, 0.045), (0.42 * inner, 0.052)], hub, "z", 20))
+    count, wide, deep = (18, 0.007, 0.007) if spoked else (5, 0.05, 0.035)
     angle = 2 * np.pi * np.arange(count) / count
-    ends = hub + inner * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    starts = hub + np.stack([0 * angle, 0 * angle, 0.035 * (-1.0) ** np.arange(count) * spoked], 1)
-    kit.add(rim, beams(starts, ends, 0.007 if spoked else 0.05, 0.007 if spoked else 0.035))
+    ends = hub + inner * points(np.cos(angle), np.sin(angle), 0)
+    starts = hub + points(0, 0, 0.035 * (-1.0) ** np.arange(count) * spoked)
+    kit.add(rim, beams(starts, ends, wide, deep))
 
 
-def _fender(x: float, y: float, radius: float, angles: tuple[float, float], half: float) -> Solid:
+def _fender(x: float, y: float, radius: float, angles: Pair, half: float) -> Solid:
     """A mudguard around a wheel's axle, between two angles from forward, upwards."""
     a, z = np.linspace(*angles, 11)[:, None], np.linspace(-half, half, 5)
     rise = radius - 0.35 * half * (z / half) ** 2
 
     def skin(r: Array) -> Array:
-        return np.stack([x + r * np.cos(a), y + r * np.sin(a), np.broadcast_to(z, (11, 5))], -1)
+        return points(x + r * np.cos(a), y + r * np.sin(a), z)
 
     return slab(skin(rise), skin(rise - 0.008))
 
 
-def _fork(kit: Kit, axle: tuple[float, float], head: tuple[float, float], half: float) -> None:
-    (x, y), (hx, hy) = (axle, head)
+def _fork(kit: Kit, axle: Pair, head: Pair, half: float) -> None:
+    (x, y), (hx, hy) = axle, head
     kit.both(CHROME, tube([(x, y, half), (hx, hy, half)], 0.022, 8))
     kit.both(STEEL, tube([(x, y, half), (x + 0.5 * (hx - x), y + 0.5 * (hy - y), half)], 0.03, 8))
     kit.add(BLACK, box((hx - 0.04, hy - 0.02, -half - 0.03), (hx + 0.04, hy + 0.02, half + 0.03), 0.01))
@@ -87,7 +89,7 @@ def _bars(kit: Kit, path: list[tuple[float, float, float]], mirrors: bool) -> No
     kit.both(BLACK, tube([end - 0.1 * way + 0.02 * AHEAD, end + 0.07 * AHEAD], 0.006, 4))
     if mirrors:
         top = end - 0.12 * way + np.array([-0.02, 0.15, 0.05])
-        kit.both(BLACK, tube([end - 0.13 * way, top], 0.006, 4), ball(top.tolist(), (0.015, 0.035, 0.055), 10))
+        kit.both(BLACK, tube([end - 0.13 * way, top], 0.006, 4), ball(top, (0.015, 0.035, 0.055), 10))
 
 
 def _engine(kit: Kit, twin: bool, y: float) -> None:
@@ -103,11 +105,11 @@ def _engine(kit: Kit, twin: bool, y: float) -> None:
 def _exhaust(kit: Kit, y: float, rear: float, lift: float, sides: int) -> None:
     path = [(0.12, y + 0.18, 0.09), (0.24, y + 0.08, 0.12), (0.2, y - 0.1, 0.14), (-0.05, y - 0.14, 0.16),
         (-0.25, y - 0.12, 0.17)]  # fmt: skip
-    parts = (tube(path, 0.025, 8), tube([(-0.22, y - 0.12, 0.17), (-0.32, y - 0.1, 0.18),
-        (rear, y - 0.06 + lift, 0.19)], [0.026, 0.045, 0.05], 10))  # fmt: skip
-    (kit.both if sides == 2 else kit.add)(CHROME, *parts)
-    (kit.both if sides == 2 else kit.add)(BLACK, tube([(rear + 0.01, y - 0.06 + lift, 0.19),
-        (rear - 0.006, y - 0.06 + lift, 0.19)], 0.035, 10))  # fmt: skip
+    end = y - 0.06 + lift
+    muffler = [(-0.22, y - 0.12, 0.17), (-0.32, y - 0.1, 0.18), (rear, end, 0.19)]
+    add = kit.both if sides == 2 else kit.add
+    add(CHROME, tube(path, 0.025, 8), tube(muffler, [0.026, 0.045, 0.05], 10))
+    add(BLACK, tube([(rear + 0.01, end, 0.19), (rear - 0.006, end, 0.19)], 0.035, 10))
 
 
 def _rear(kit: Kit, axle: float, radius: float, seat: float) -> None:
@@ -118,24 +120,24 @@ def _rear(kit: Kit, axle: float, radius: float, seat: float) -> None:
     kit.add(STEEL, torus((axle, radius, 0.075), 0.1, 0.008, "z", 20))
 
 
-def _lamps(kit: Kit, x: float, y: float, rear: tuple[float, float], size: float) -> None:
+def _lamps(kit: Kit, x: float, y: float, rear: Pair, size: float) -> None:
     """Headlamp, tail lamp, indicators."""
-    kit.add(CHROME, lathe([(0.4 * size, -0.11), (0.95 * size, -0.03), (size, 0.02), (0.9 * size, 0.03)], (x, y, 0),
-        "x", 18))  # fmt: skip
+    shell = [(0.4 * size, -0.11), (0.95 * size, -0.03), (size, 0.02), (0.9 * size, 0.03)]
+    kit.add(CHROME, lathe(shell, (x, y, 0), "x", 18))
     kit.add(LAMP, lathe([(0.88 * size, 0.0), (0.8 * size, 0.045), (0.3 * size, 0.055)], (x, y, 0), "x", 18))
-    kit.both(AMBER, ball((x - 0.04, y - 0.02, size + 0.09), 0.03, 8),
-        ball((rear[0] + 0.05, rear[1] - 0.02, 0.15), 0.026, 8))  # fmt: skip
+    a, b = rear
+    kit.both(AMBER, ball((x - 0.04, y - 0.02, size + 0.09), 0.03, 8), ball((a + 0.05, b - 0.02, 0.15), 0.026, 8))
     kit.both(BLACK, tube([(x - 0.04, y - 0.02, 0.06), (x - 0.04, y - 0.02, size + 0.08)], 0.01, 4))
-    kit.add(TAIL_LAMP, block((rear[0] - 0.02, rear[0] + 0.02), (rear[1] - 0.035, rear[1] + 0.035), 0.06, 0.012))
-    kit.add(BLACK, block((rear[0] - 0.03, rear[0] - 0.02), (rear[1] - 0.2, rear[1] - 0.06), 0.08))
+    kit.add(TAIL_LAMP, block((a - 0.02, a + 0.02), (b - 0.035, b + 0.035), 0.06, 0.012))
+    kit.add(BLACK, block((a - 0.03, a - 0.02), (b - 0.2, b - 0.06), 0.08))
 
 
-def _frame(kit: Kit, surface: Surface, head: tuple[float, float], seat: float) -> None:
+def _frame(kit: Kit, surface: Surface, head: Pair, seat: float) -> None:
     hx, hy = head
     kit.both(surface, tube([(hx - 0.03, hy - 0.12, 0.04), (0.22, 0.42, 0.1), (0.1, 0.22, 0.11),
         (-0.28, 0.24, 0.12), (-0.34, 0.5, 0.11), (-0.3, seat - 0.06, 0.1)], 0.018, 6))  # fmt: skip
-    kit.both(surface, tube([(hx - 0.03, hy - 0.06, 0.03), (-0.1, seat, 0.07), (-0.62, seat + 0.02, 0.09)], 0.018,
-        6))  # fmt: skip
+    upper = [(hx - 0.03, hy - 0.06, 0.03), (-0.1, seat, 0.07), (-0.62, seat + 0.02, 0.09)]
+    kit.both(surface, tube(upper, 0.018, 6))
 
 
 def roadster(kit: Kit) -> None:
@@ -227,8 +229,8 @@ def cruiser(kit: Kit) -> None:
         (head[0] - 0.18, 0.96 + rise, wide - 0.12), (head[0] - 0.3, 0.94 + rise, wide)], True)  # fmt: skip
     _lamps(kit, head[0] + 0.17, 0.8, (-base - 0.36, 0.52), kit.between(0.09, 0.115))
     if kit.chance(0.4):
-        kit.add(GLASS, moved(turned(block((-0.008, 0.008), (0.0, 0.42), 0.24, 0.006), "z", 0.35),
-            (head[0] + 0.13, 0.92, 0)))  # fmt: skip
+        screen = turned(block((-0.008, 0.008), (0.0, 0.42), 0.24, 0.006), "z", 0.35)
+        kit.add(GLASS, moved(screen, (head[0] + 0.13, 0.92, 0)))
 
 
 def scooter(kit: Kit) -> None:
@@ -242,8 +244,8 @@ def scooter(kit: Kit) -> None:
     kit.both(STEEL, tube([(base, r, 0.08), (base - 0.1, 0.55, 0.05)], 0.022, 6))
     kit.add(coat, tube([(base - 0.08, 0.44, 0), (head[0], head[1], 0)], [0.08, 0.06], 10))
     z, t = np.linspace(-0.2, 0.2, 9), np.linspace(0, 1, 8)[:, None]
-    shield = np.stack([base - 0.16 - 0.12 * t - 1.6 * z ** 2 - 0.1 * (1 - t) ** 4, 0.2 + 0.58 * t + 0 * z,
-        z * (0.75 + 0.45 * np.sin(np.pi * (0.2 + 0.6 * t)))], -1)  # fmt: skip
+    shield = points(base - 0.16 - 0.12 * t - 1.6 * z**2 - 0.1 * (1 - t) ** 4, 0.2 + 0.58 * t,
+        z * (0.75 + 0.45 * np.sin(np.pi * (0.2 + 0.6 * t))))  # fmt: skip
     kit.add(coat, slab(shield, shield - 0.015 * AHEAD))
     kit.add(BLACK, block((-0.22, base - 0.22), (floor - 0.05, floor), 0.18, 0.02))
     kit.add(coat, block((-0.22, base - 0.24), (floor - 0.07, floor - 0.03), 0.19, 0.02))
@@ -269,14 +271,7 @@ def scooter(kit: Kit) -> None:
 MOTORCYCLES = (roadster, sport, cruiser, scooter)
 
 
-def _board(
-    kit: Kit,
-    deck: Surface,
-    length: float,
-    widths: list[tuple[float, float]],
-    kicks: tuple[float, float],
-    concave: float,
-) -> None:
+def _board(kit: Kit, deck: Surface, length: float, widths: list[Pair], kicks: Pair, concave: float) -> None:
     """A deck with grip, trucks and wheels. widths: (place from the middle in half lengths, half width), tail to
     nose; kicks: how far tail and nose rise.
     """
@@ -288,9 +283,8 @@ def _board(
     wide = wide * end + 0.004
     s = np.linspace(-1, 1, 7)
     rise = np.where(t < 0, kicks[0], kicks[1]) * ((np.abs(t) - 0.58).clip(0) / 0.42) ** 1.3
-    top = np.stack(np.broadcast_arrays(half * t[:, None], rise[:, None] + concave * s**2, wide[:, None] * s), -1)
     clear, r = kit.between(0.085, 0.1), kit.between(0.026, 0.036)
-    top = top + clear * UP
+    top = points(half * t[:, None], rise[:, None] + concave * s**2 + clear, wide[:, None] * s)
     kit.add(deck, slab(top, top - 0.013 * UP))
     inset = top * [0.985, 1, 0.96]
     kit.add(dull((0.012, 0.012, 0.013)), slab(inset + 0.003 * UP, inset - 0.004 * UP))
@@ -300,16 +294,13 @@ def _board(
     wheels = plastic(kit.tint(((0.75, 0.73, 0.66), (0.6, 0.3, 0.02), (0.55, 0.03, 0.03), (0.05, 0.35, 0.12),
         (0.02, 0.18, 0.45), (0.02, 0.02, 0.02))))  # fmt: skip
     alloy = STEEL if kit.chance(0.7) else BLACK
-    axle = float(kit.between(0.52, 0.58)) * half
+    axle, level, track = kit.between(0.52, 0.58) * half, clear - 0.012, wide.max() * 0.92
     for x, way in ((axle, 1), (-axle, -1)):
-        level = clear - 0.012
         kit.add(BLACK, block((x - 0.045, x + 0.045), (level - 0.012, level), 0.03, 0.004))
         kit.add(alloy, block((x - 0.038, x + 0.038), (level - 0.026, level - 0.01), 0.024, 0.006))
+        hanger = [(x, r, -0.62 * track), (x, r + 0.012, 0), (x, r, 0.62 * track)]
         kit.add(alloy, tube([(x + 0.015 * way, level - 0.015, 0), (x - 0.015 * way, r + 0.006, 0)], [0.016, 0.012],
-            10))  # fmt: skip
-        track = float(wide.max()) * 0.92
-        kit.add(alloy, tube([(x, r, -0.62 * track), (x, r + 0.012, 0), (x, r, 0.62 * track)],
-            [0.009, 0.014, 0.009], 8))  # fmt: skip
+            10), tube(hanger, [0.009, 0.014, 0.009], 8))  # fmt: skip
         kit.add(CHROME, tube([(x, r, -1.02 * track), (x, r, 1.02 * track)], 0.005, 6))
         tread = r * np.array([(0.45, -0.62), (0.88, -0.6), (1.0, -0.38), (1.0, 0.38), (0.88, 0.6), (0.45, 0.62)])
         kit.both(wheels, lathe(tread, (x, r, 0.8 * track), "z", 20))
@@ -338,9 +329,9 @@ def longboard(kit: Kit) -> None:
     """Long and flat, with pointed ends or cut-outs at the wheels."""
     w = kit.between(0.11, 0.13)
     pointed = kit.chance(0.5)
-    line = [(-1, 0.25 * w), (-0.6, 0.8 * w), (0.0, w), (0.6, 0.85 * w),
-        (1, 0.45 * w)] if pointed else [(-1, 0.5 * w), (-0.75, 0.55 * w), (-0.5, 0.95 * w), (0.5, 0.95 * w),
-        (0.75, 0.55 * w), (1, 0.5 * w)]  # fmt: skip
+    ends = [(-1, 0.25 * w), (-0.6, 0.8 * w), (0.0, w), (0.6, 0.85 * w), (1, 0.45 * w)]
+    cuts = [(-1, 0.5 * w), (-0.75, 0.55 * w), (-0.5, 0.95 * w), (0.5, 0.95 * w), (0.75, 0.55 * w), (1, 0.5 * w)]
+    line = ends if pointed else cuts
     _board(kit, paint(kit.tint(WOODS)), kit.between(0.92, 1.05), line,
         (kit.between(0.0, 0.015), kit.between(0.0, 0.015)), kit.between(-0.004, 0.006))  # fmt: skip
 

@@ -15,11 +15,13 @@ from drivesem.classify.objects.shapes import (
     lathe,
     loft,
     moved,
-    prism,
+    points,
     rectangle,
+    squares,
     torus,
     tube,
     turned,
+    turned_each,
 )
 from drivesem.classify.objects.surfaces import (
     BLACK,
@@ -46,21 +48,14 @@ def _slats(kit: Kit, wood: Surface, line: list[tuple[float, float]], length: flo
     places = np.array(line)
     for (x, y), way in zip(places, np.gradient(places, axis=0), strict=True):
         board = block((-wide / 2, wide / 2), (-0.016, 0.016), length / 2, 0.008)
-        kit.add(wood, moved(turned(board, "z", float(np.arctan2(way[1], way[0]))), (x, y, 0)))
-
-
-def _seat_line(kit: Kit, seats: int, backs: int) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Places of the boards of seat and back, front to rear."""
-    lean = kit.between(0.15, 0.32)
-    seat = [(0.22 - 0.44 * t, 0.45 - 0.02 * np.sin(np.pi * t)) for t in np.linspace(0, 1, seats)]
-    back = [(-0.27 - lean * h, 0.5 + h) for h in np.linspace(0.06, 0.4, backs)]
-    return seat, back
+        kit.add(wood, moved(turned(board, "z", np.arctan2(way[1], way[0])), (x, y, 0)))
 
 
 def park_bench(kit: Kit) -> None:
     """Slats on cast iron ends with scrolled arms."""
-    length, count = kit.between(1.3, 1.9), kit.count(5, 7)
-    seat, back = _seat_line(kit, count, kit.count(3, 5))
+    length, count, backs, lean = kit.between(1.3, 1.9), kit.count(5, 7), kit.count(3, 5), kit.between(0.15, 0.32)
+    seat = [(0.22 - 0.44 * t, 0.45 - 0.02 * np.sin(np.pi * t)) for t in np.linspace(0, 1, count)]
+    back = [(-0.27 - lean * h, 0.5 + h) for h in np.linspace(0.06, 0.4, backs)]
     wood, iron = dull(kit.tint(WOODS)), IRON if kit.chance(0.6) else metal((0.02, 0.1, 0.05))
     _slats(kit, wood, seat, length, 0.36 / count)
     _slats(kit, wood, back, length, 0.075)
@@ -85,12 +80,9 @@ def garden_bench(kit: Kit) -> None:
     kit.both(wood, box((-0.3, 0.64, half - 0.045), (0.31, 0.675, half + 0.045), 0.01))
     kit.add(wood, block((0.215, 0.245), (0.34, 0.42), half), block((-0.28, -0.24), (0.5, 0.57), half))
     rise = kit.between(0.0, 0.12)
-    rail = [(-0.26, top - 0.06 + rise * (1 - (z / half) ** 2), z) for z in np.linspace(-half, half, 9)]
-    kit.add(wood, tube(rail, 0.045, 4))
-    bars = kit.count(9, 15)
-    z = np.linspace(-0.92 * half, 0.92 * half, bars)
-    ends = np.stack([0 * z - 0.26, top - 0.06 + rise * (1 - (z / half) ** 2), z], 1)
-    kit.add(wood, beams(ends * [1, 0, 1] + 0.54 * UP, ends, 0.022, 0.04))
+    rail, bars = np.linspace(-half, half, 9), np.linspace(-0.92 * half, 0.92 * half, kit.count(9, 15))
+    line, ends = (points(-0.26, top - 0.06 + rise * (1 - (z / half) ** 2), z) for z in (rail, bars))
+    kit.add(wood, tube(line, 0.045, 4), beams(ends * [1, 0, 1] + 0.54 * UP, ends, 0.022, 0.04))
     kit.both(wood, box((-0.24, 0.16, half - 0.02), (0.22, 0.21, half + 0.02)))
 
 
@@ -108,8 +100,8 @@ def stone_bench(kit: Kit) -> None:
         kit.add(wood, block((x - 0.11 * deep, x + 0.11 * deep), (0.445, 0.475), 0.96 * half, 0.012))
     if kit.chance(0.5):
         kit.both(stone, box((-deep - 0.06, 0.4, foot - 0.08), (-deep + 0.04, 0.85, foot + 0.08), 0.015))
-        kit.add(wood, block((-deep, -deep + 0.05), (0.58, 0.68), 0.96 * half, 0.012))
-        kit.add(wood, block((-deep, -deep + 0.05), (0.73, 0.83), 0.96 * half, 0.012))
+        for y in ((0.58, 0.68), (0.73, 0.83)):
+            kit.add(wood, block((-deep, -deep + 0.05), y, 0.96 * half, 0.012))
 
 
 def steel_bench(kit: Kit) -> None:
@@ -118,10 +110,8 @@ def steel_bench(kit: Kit) -> None:
     high = kit.between(0.36, 0.46)
     curve = [(0.27, 0.4), (0.25, 0.44), (0.16, 0.45), (0.04, 0.43), (-0.1, 0.42), (-0.2, 0.44), (-0.26, 0.52),
         (-0.29, 0.62), (-0.32, 0.72), (-0.36, 0.42 + high), (-0.41, 0.43 + high)]  # fmt: skip
-    z = np.linspace(-half, half, kit.count(14, 22))
-    for place in z:
-        path = [(x, y, place) for x, y in curve]
-        kit.add(colour, tube(path, 0.012, 4))
+    for z in np.linspace(-half, half, kit.count(14, 22)):
+        kit.add(colour, tube([(x, y, z) for x, y in curve], 0.012, 4))
     for x, y in (curve[0], curve[3], curve[5], curve[-1]):
         kit.add(colour, tube([(x, y, -half - 0.02), (x, y, half + 0.02)], 0.018, 6))
     for side in (0.8 * half, -0.8 * half):
@@ -132,10 +122,6 @@ def steel_bench(kit: Kit) -> None:
 BENCHES = (park_bench, garden_bench, steel_bench, stone_bench)
 
 
-def _round(profile: list[tuple[float, float]], *, sides: int = 24) -> Solid:
-    return lathe(profile, sides=sides)
-
-
 def dustbin(kit: Kit) -> None:
     """A ribbed can of zinc with a lid and a handle on each side."""
     r, h = kit.between(0.24, 0.3), kit.between(0.58, 0.76)
@@ -143,14 +129,14 @@ def dustbin(kit: Kit) -> None:
     ribs, rows = kit.count(10, 16), [(1.0, 0.0), (0.86, 0.02)]
     for t in np.linspace(0.08, 0.95, ribs):
         rows += [(0.87 + 0.13 * t, t - 0.02), (0.91 + 0.13 * t, t)]
-    kit.add(zinc, _round([(0.9 * r * a, h * t) for a, t in [*rows, (1.0, 0.97)]], sides=28))
+    kit.add(zinc, lathe([(0.9 * r * a, h * t) for a, t in [*rows, (1.0, 0.97)]], sides=28))
     lid, grip = kit.between(0.06, 0.16), kit.between(0.05, 0.08)
     dome = [(1.06, -0.06), (1.08, 0.02), (0.98, 0.16), (0.75, 0.55), (0.4, 0.9), (0.0, 1.0)]
-    kit.add(zinc, moved(_round([(r * a, lid * t) for a, t in dome], sides=28), (0, h, 0)))
-    kit.add(zinc, tube([(0, h + 0.9 * lid, -grip), (0, h + lid + 0.06, -grip), (0, h + lid + 0.06, grip),
-        (0, h + 0.9 * lid, grip)], 0.012, 6))  # fmt: skip
-    side = [(-grip, 0.72 * h, r), (-grip, 0.72 * h, r + 0.05), (grip, 0.72 * h, r + 0.05), (grip, 0.72 * h, r)]
-    kit.both(zinc, tube([(x, y, z * 0.97) for x, y, z in side], 0.012, 6))
+    kit.add(zinc, lathe([(r * a, lid * t) for a, t in dome], (0, h, 0), sides=28))
+    low, high = h + 0.9 * lid, h + lid + 0.06
+    kit.add(zinc, tube(points(0, [low, high, high, low], [-grip, -grip, grip, grip]), 0.012, 6))
+    out = np.array([r, r + 0.05, r + 0.05, r]) * 0.97
+    kit.both(zinc, tube(points([-grip, -grip, grip, grip], 0.72 * h, out), 0.012, 6))
 
 
 def wheeled_bin(kit: Kit) -> None:
@@ -159,24 +145,23 @@ def wheeled_bin(kit: Kit) -> None:
         (0.16, 0.08, 0.03)))  # fmt: skip
     coat, lid = plastic(colour), plastic(colour if kit.chance(0.5) else kit.tint(PAINTS))
     w, h, d = kit.between(0.24, 0.32), kit.between(0.85, 1.0), kit.between(0.27, 0.33)
-    low = rectangle((-0.72 * d, 0.66 * d), 0.06, 0.76 * w)
-    kit.add(coat, prism(low, rectangle((-d, d), h, w)))
+    kit.add(coat, loft([rectangle((-0.72 * d, 0.66 * d), 0.06, 0.76 * w), rectangle((-d, d), h, w)]))
     kit.add(coat, block((-1.04 * d, 1.06 * d), (h - 0.1, h - 0.03), 1.06 * w, 0.02))
     for y in (0.35 * h, 0.62 * h):
         s = 0.74 + 0.26 * y / h
         kit.add(coat, box((0.0, y - 0.01, -w * s - 0.012), (d * s + 0.008, y + 0.01, w * s + 0.012)))
-    front = rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w)
-    rear = rectangle((-0.95 * d, 0.9 * d), h + 0.1, 0.92 * w)
-    front[[1, 2], 1] -= 0.02
-    rear[[1, 2], 1] -= 0.05
-    kit.add(lid, prism(front, rear))
+    rim = rectangle((-1.05 * d, 1.08 * d), h, 1.06 * w)
+    top = rectangle((-0.95 * d, 0.9 * d), h + 0.1, 0.92 * w)
+    rim[[1, 2], 1] -= 0.02
+    top[[1, 2], 1] -= 0.05
+    kit.add(lid, loft([rim, top]))
     kit.add(lid, block((1.0 * d, 1.16 * d), (h - 0.01, h + 0.02), 0.3 * w, 0.01))
     bar = [(-0.98 * d, h - 0.02, 0.8 * w), (-1.3 * d, h + 0.02, 0.8 * w), (-1.3 * d, h + 0.02, -0.8 * w)]
     kit.add(coat, tube([*bar, (-0.98 * d, h - 0.02, -0.8 * w)], 0.016, 6))
     r = kit.between(0.09, 0.12)
-    wheel = [(0.5 * r, -0.03), (r, -0.025), (r, 0.025), (0.5 * r, 0.03)]
-    kit.both(RUBBER, lathe(wheel, (-0.78 * d, r, w * 0.86), "z", 18))
-    kit.both(STEEL, lathe([(0.5 * r, -0.035), (0.5 * r, 0.036)], (-0.78 * d, r, w * 0.86), "z", 12))
+    wheel, hub = [(0.5 * r, -0.03), (r, -0.025), (r, 0.025), (0.5 * r, 0.03)], (-0.78 * d, r, w * 0.86)
+    kit.both(RUBBER, lathe(wheel, hub, "z", 18))
+    kit.both(STEEL, lathe([(0.5 * r, -0.035), (0.5 * r, 0.036)], hub, "z", 12))
     kit.add(STEEL, tube([(-0.78 * d, r, -0.85 * w), (-0.78 * d, r, 0.85 * w)], 0.012, 6))
     kit.add(WHITE, boxes([(0.9 * d, 0.72 * h, 0)], (0.04, 0.14, 0.2)))
 
@@ -185,13 +170,12 @@ def pedal_bin(kit: Kit) -> None:
     """A smooth cylinder with a domed lid and a pedal, or a flap that swings."""
     r, h = kit.between(0.15, 0.2), kit.between(0.42, 0.66)
     coat = CHROME if kit.chance(0.5) else kit.lacquer()
-    kit.add(BLACK, _round([(1.03 * r, 0.0), (1.03 * r, 0.05)], sides=28),
-        _round([(1.02 * r, h), (1.02 * r, h + 0.025)], sides=28))  # fmt: skip
-    kit.add(coat, _round([(r, 0.04), (r, h + 0.01)], sides=28))
-    top = kit.between(0.05, 0.14)
-    arc = [(np.cos(a), np.sin(a)) for a in np.linspace(0, np.pi / 2, 8)]
-    kit.add(coat if kit.chance(0.6) else BLACK, moved(_round([(r * c, top * s) for c, s in arc], sides=28),
-        (0, h + 0.025, 0)))  # fmt: skip
+    rows = (BLACK, 1.03, 0.0, 0.05), (BLACK, 1.02, h, h + 0.025), (coat, 1.0, 0.04, h + 0.01)
+    for surface, wide, low, high in rows:
+        kit.add(surface, lathe([(wide * r, low), (wide * r, high)], sides=28))
+    top, angle = kit.between(0.05, 0.14), np.linspace(0, np.pi / 2, 8)
+    lid = lathe(np.stack([r * np.cos(angle), top * np.sin(angle)], 1), (0, h + 0.025, 0), sides=28)
+    kit.add(coat if kit.chance(0.6) else BLACK, lid)
     kit.add(BLACK, block((r - 0.03, r + 0.085), (0.015, 0.035), 0.05, 0.006))
     kit.add(BLACK, block((-r - 0.05, -r + 0.02), (h - 0.03, h + 0.06), 0.04, 0.01))
 
@@ -200,19 +184,18 @@ def slatted_bin(kit: Kit) -> None:
     """A park's bin: slats around a bucket, with a hood on posts or an open ring."""
     r, h, n = kit.between(0.24, 0.32), kit.between(0.7, 0.9), kit.count(14, 22)
     wood = dull(kit.tint(WOODS)) if kit.chance(0.6) else metal(kit.tint(PAINTS))
-    kit.add(BLACK, _round([(0.86 * r, 0.06), (0.86 * r, h - 0.1), (0.8 * r, h - 0.1), (0.8 * r, 0.1)]))
-    for angle in 2 * np.pi * np.arange(n) / n:
-        slat = block((0.9 * r, r), (0.05, h), 0.36 * 2 * np.pi * r / n, 0.006)
-        kit.add(wood, turned(slat, "y", float(angle)))
-    hoops = (0.14 * h, 0.55 * h, 0.92 * h)
-    kit.add(IRON, *(torus((0, y, 0), 0.985 * r, 0.022, "y", 28) for y in hoops))
-    kit.add(IRON, _round([(0.5 * r, 0.0), (0.5 * r, 0.06)]))
+    bucket = [(0.86 * r, 0.06), (0.86 * r, h - 0.1), (0.8 * r, h - 0.1), (0.8 * r, 0.1)]
+    kit.add(BLACK, lathe(bucket, sides=24))
+    slat = block((0.9 * r, r), (0.05, h), 0.36 * 2 * np.pi * r / n, 0.006)
+    kit.add(wood, *turned_each(slat, 2 * np.pi * np.arange(n) / n))
+    kit.add(IRON, *(torus((0, y * h, 0), 0.985 * r, 0.022, "y", 28) for y in (0.14, 0.55, 0.92)))
+    kit.add(IRON, lathe([(0.5 * r, 0.0), (0.5 * r, 0.06)], sides=24))
     if kit.chance(0.6):
         for angle in (0.5, 2.6, 3.7, 5.8):
             x, z = 0.9 * r * np.cos(angle), 0.9 * r * np.sin(angle)
             kit.add(IRON, tube([(x, h - 0.05, z), (x, h + 0.22, z)], 0.014, 6))
-        kit.add(IRON, moved(_round([(1.08 * r, 0.0), (1.06 * r, 0.03), (0.6 * r, 0.1), (0.0, 0.13)]),
-            (0, h + 0.21, 0)))  # fmt: skip
+        hood = [(1.08 * r, 0.0), (1.06 * r, 0.03), (0.6 * r, 0.1), (0.0, 0.13)]
+        kit.add(IRON, lathe(hood, (0, h + 0.21, 0), sides=24))
     else:
         kit.add(IRON, torus((0, h, 0), 0.9 * r, 0.035, "y", 28))
 
@@ -220,12 +203,12 @@ def slatted_bin(kit: Kit) -> None:
 TRASHCANS = (wheeled_bin, dustbin, slatted_bin, pedal_bin)
 
 
-def _tunnel(x: tuple[float, float], y: float, half: float, straight: float, flat: float = 1.0) -> Solid:
-    """A box of rounded top along x: standing on y, straight sides, above them a half circle times `flat`."""
+def _tunnel(x: tuple[float, float], y: float, half: float, straight: float) -> Solid:
+    """A box of rounded top along x: standing on y, straight sides, above them a half circle."""
     angle = np.linspace(0, np.pi, 21)
-    top = np.stack([y + straight + flat * half * np.sin(angle), half * np.cos(angle)], 1)
+    top = np.stack([y + straight + half * np.sin(angle), half * np.cos(angle)], 1)
     ring = np.concatenate([top, [(y, -half), (y, half)]])
-    return loft([np.column_stack([np.full(len(ring), end), ring]) for end in x])
+    return loft([points(end, *ring.T) for end in x])
 
 
 def _flag(kit: Kit, x: float, y: float, z: float, size: float) -> None:
@@ -245,7 +228,7 @@ def rural_mailbox(kit: Kit) -> None:
     kit.add(coat, _tunnel((x[0] - 0.012, x[0] + 0.004), height - 0.006, 1.05 * half, straight + 0.006))
     kit.add(CHROME, block((x[1] + 0.01, x[1] + 0.05), (height + straight + 0.4 * half,
         height + straight + 0.75 * half), 0.02, 0.006))  # fmt: skip
-    number = [(x[1] + 0.02, height + 0.6 * straight, z) for z in (-0.05, 0.0, 0.05)]
+    number = points(x[1] + 0.02, height + 0.6 * straight, [-0.05, 0.0, 0.05])
     kit.add(BLACK if coat.diffuse[1] > 0.25 else WHITE, boxes(number, (0.012, 0.06, 0.028)))
     _flag(kit, 0.25 * long, height + 0.5 * straight, half, kit.between(0.16, 0.22))
     wood = dull(kit.tint((*WOODS, (0.6, 0.6, 0.58))))
@@ -259,17 +242,16 @@ def rural_mailbox(kit: Kit) -> None:
         kit.add(wood, block((-0.45, 0.55 * long), (height - 0.09, height), 0.04, 0.01))
         kit.add(wood, beams((-0.28, height - 0.35, 0), (0.05, height - 0.06, 0), 0.05, 0.05))
         cap = ((0.07, 0.42), (0.07, 0.45), (0.005, 0.53))
-        kit.add(wood, loft([rectangle((-0.3 - s, -0.3 + s), height + y, s) for s, y in cap]))
+        kit.add(wood, moved(squares([(s, height + y) for s, y in cap]), (-0.3, 0, 0)))
 
 
 def collection_box(kit: Kit) -> None:
     """A street's collection box: a rounded top over a slot, on four legs."""
     half, deep, straight = kit.between(0.28, 0.34), kit.between(0.26, 0.32), kit.between(0.62, 0.8)
     coat = paint(kit.tint(((0.015, 0.06, 0.28), (0.015, 0.06, 0.28), (0.62, 0.4, 0.01), (0.03, 0.18, 0.08))))
-    barrel = turned(_tunnel((-half, half), 0.18, deep, straight), "y", np.pi / 2)
-    kit.add(coat, barrel)
-    end = turned(_tunnel((half - 0.01, half + 0.015), 0.17, 1.04 * deep, straight + 0.01), "y", np.pi / 2)
-    kit.both(coat, end)
+    kit.add(coat, turned(_tunnel((-half, half), 0.18, deep, straight), "y", np.pi / 2))
+    end = _tunnel((half - 0.01, half + 0.015), 0.17, 1.04 * deep, straight + 0.01)
+    kit.both(coat, turned(end, "y", np.pi / 2))
     for x in (deep - 0.08, -deep):
         kit.both(coat, box((x, 0, half - 0.08), (x + 0.08, 0.2, half), 0.01))
     slot = 0.18 + straight + 0.25 * deep
@@ -286,10 +268,10 @@ def pillar_box(kit: Kit) -> None:
     """A cast iron pillar with a cap, a slot and a notice."""
     r, h = kit.between(0.22, 0.27), kit.between(1.15, 1.4)
     coat = paint(kit.tint(((0.5, 0.01, 0.01), (0.5, 0.01, 0.01), (0.02, 0.2, 0.07), (0.6, 0.38, 0.01)), 0.15))
-    kit.add(BLACK, _round([(1.12 * r, 0.0), (1.12 * r, 0.1), (1.05 * r, 0.14)], sides=28))
-    kit.add(coat, _round([(r, 0.12), (r, h), (1.08 * r, h + 0.02), (1.08 * r, h + 0.05)], sides=28))
+    kit.add(BLACK, lathe([(1.12 * r, 0.0), (1.12 * r, 0.1), (1.05 * r, 0.14)], sides=28))
+    kit.add(coat, lathe([(r, 0.12), (r, h), (1.08 * r, h + 0.02), (1.08 * r, h + 0.05)], sides=28))
     cap = [(1.22, 0.0), (1.24, 0.05), (1.05, 0.11), (0.7, 0.18), (0.3, 0.22), (0.0, 0.23)]
-    kit.add(coat, moved(_round([(r * a, 0.9 * b) for a, b in cap], sides=28), (0, h + 0.05, 0)))
+    kit.add(coat, lathe([(r * a, 0.9 * b) for a, b in cap], (0, h + 0.05, 0), sides=28))
     kit.add(coat, torus((0, 0.24 * h, 0), r, 0.012, "y", 28), torus((0, 0.93 * h, 0), r, 0.014, "y", 28))
     kit.add(coat, block((0.8 * r, 1.1 * r), (0.8 * h, 0.9 * h), 0.62 * r, 0.015))
     kit.add(BLACK, block((0.9 * r, 1.115 * r), (0.835 * h, 0.872 * h), 0.5 * r))
@@ -304,13 +286,14 @@ def house_mailbox(kit: Kit) -> None:
     foot, coat = kit.between(0.45, 0.8), kit.lacquer() if kit.chance(0.6) else dull(kit.tint(WOODS))
     roof, pitch = dull(kit.tint((*WOODS, (0.05, 0.05, 0.055), (0.3, 0.05, 0.03)))), kit.between(0.5, 0.9) * half
     kit.add(coat, block((-deep, deep), (foot, foot + tall), half, 0.008))
-    gable = np.array([[0, foot + tall, -half], [0, foot + tall, half], [0, foot + tall + pitch, 0.0]])
-    kit.add(coat, prism(gable - deep * AHEAD, gable + deep * AHEAD))
+    eaves = foot + tall
+    gable = [eaves, eaves, eaves + pitch], [-half, half, 0.0]
+    kit.add(coat, loft([points(x, *gable) for x in (-deep, deep)]))
     for side in (1, -1):
         eave = np.array([0, foot + tall - 0.25 * pitch, 1.25 * half * side])
         ridge = np.array([0, foot + tall + pitch, 0])
         ring = np.array([eave, ridge, ridge + 0.025 * UP, eave + 0.025 * UP])
-        kit.add(roof, prism(ring - 1.25 * deep * AHEAD, ring + 1.25 * deep * AHEAD))
+        kit.add(roof, loft([ring - 1.25 * deep * AHEAD, ring + 1.25 * deep * AHEAD]))
     trim = CHROME if kit.chance(0.5) else BLACK
     kit.add(BLACK, block((0.9 * deep, deep + 0.006), (foot + 0.66 * tall, foot + 0.8 * tall), 0.72 * half))
     flap = turned(block((0, 0.014), (-0.01, 0.15 * tall), 0.78 * half, 0.004), "z", -0.5)
@@ -323,8 +306,7 @@ def house_mailbox(kit: Kit) -> None:
         "x", 24))  # fmt: skip
     post = dull(kit.tint(WOODS)) if kit.chance(0.5) else IRON
     kit.add(post, block((-0.03, 0.03), (0, foot), 0.03, 0.006))
-    base = [rectangle((-s, s), y, s) for s, y in ((0.15, 0), (0.15, 0.05), (0.1, 0.07))]
-    kit.add(dull(kit.tint(STONES)), loft(base))
+    kit.add(dull(kit.tint(STONES)), squares([(0.15, 0), (0.15, 0.05), (0.1, 0.07)]))
 
 
 MAILBOXES = (rural_mailbox, collection_box, house_mailbox, pillar_box)

@@ -17,7 +17,7 @@ from drivesem.classify.objects.shapes import (
     lathe,
     loft,
     moved,
-    prism,
+    points,
     rectangle,
     section,
     torus,
@@ -73,10 +73,8 @@ def sedan(kit: Kit) -> None:
         kit.add(plastic((0.75, 0.72, 0.55)), block((-0.15, 0.1), (height - 0.03, height + 0.12), 0.3, 0.03))
     elif police:
         kit.add(BLACK, block((-0.2, 0.05), (height - 0.02, height + 0.04), 0.32 * width, 0.02))
-        kit.add(paint((0.02, 0.05, 0.6)), box((-0.17, height + 0.03, 0.03), (0.02, height + 0.12, 0.31 * width),
-            0.02))  # fmt: skip
-        kit.add(paint((0.6, 0.02, 0.02)), box((-0.17, height + 0.03, -0.31 * width), (0.02, height + 0.12, -0.03),
-            0.02))  # fmt: skip
+        for rgb, a, b in (((0.02, 0.05, 0.6), 0.03, 0.31 * width), ((0.6, 0.02, 0.02), -0.31 * width, -0.03)):
+            kit.add(paint(rgb), box((-0.17, height + 0.03, a), (0.02, height + 0.12, b), 0.02))
 
 
 def hatchback(kit: Kit) -> None:
@@ -92,8 +90,7 @@ def estate(kit: Kit) -> None:
     _, height, _ = _template(kit, "estate", kit.lacquer())
     if kit.chance(0.35):
         kit.add(BLACK, block((-0.9, 0.5), (height + 0.04, height + 0.32), 0.35, 0.1))
-        kit.both(STEEL, block((-0.6, -0.55), (height - 0.04, height + 0.05), 0.5),
-            block((0.2, 0.25), (height - 0.04, height + 0.05), 0.5))  # fmt: skip
+        kit.both(STEEL, *(block((x, x + 0.05), (height - 0.04, height + 0.05), 0.5) for x in (-0.6, 0.2)))
 
 
 def off_road(kit: Kit) -> None:
@@ -131,28 +128,13 @@ def _panes(kit: Kit, x: tuple[float, float], y: tuple[float, float], half: float
     """A row of windows on both sides."""
     edges = np.linspace(*x, count + 1)
     middle = (edges[1:] + edges[:-1]) / 2
-    places = np.stack([middle, 0 * middle + (y[0] + y[1]) / 2, 0 * middle + half], 1)
-    kit.both(GLASS, boxes(places, (edges[1] - edges[0] - gap, y[1] - y[0], 0.05)))
+    size = (edges[1] - edges[0] - gap, y[1] - y[0], 0.05)
+    kit.both(GLASS, boxes(points(middle, (y[0] + y[1]) / 2, half), size))
 
 
 def _band(kit: Kit, surface: Surface, x: tuple[float, float], y: tuple[float, float], half: float) -> None:
     """A stripe along both sides."""
     kit.both(surface, box((x[0], y[0], half - 0.05), (x[1], y[1], half + 0.012)))
-
-
-def _bus_ends(kit: Kit, half: float, wide: float, low: float, sill: float, top: float, sign: float) -> None:
-    """Screens, lamps, bumpers, the sign with the route, plates, mirrors."""
-    kit.add(GLASS, block((half - 0.05, half + 0.02), (sill, top), 0.92 * wide, 0.02))
-    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (sill + 0.2, top), 0.8 * wide, 0.02))
-    kit.add(BLACK, block((half - 0.05, half + 0.03), (sign, sign + 0.28), 0.8 * wide, 0.01))
-    kit.add(AMBER, boxes([(half + 0.03, sign + 0.14, z * wide) for z in (-0.45, -0.3, -0.1, 0.05, 0.2, 0.4)],
-        (0.012, 0.15, 0.1 * wide)))  # fmt: skip
-    for x, lamp, y in ((half, LAMP, low + 0.38), (-half, TAIL_LAMP, low + 0.55)):
-        kit.both(lamp, box((x - 0.05, y, 0.58 * wide), (x + 0.05, y + 0.2, 0.88 * wide), 0.03))
-        kit.add(BLACK, block((x - 0.09, x + 0.09), (low, low + 0.2), 0.98 * wide, 0.04))
-        kit.add(WHITE, block((x - 0.1, x + 0.1), (low + 0.05, low + 0.16), 0.25))
-    kit.both(BLACK, tube([(half - 0.05, top - 0.1, wide), (half + 0.25, top - 0.15, wide + 0.12)], 0.03, 6))
-    kit.both(BLACK, box((half + 0.18, top - 0.65, wide + 0.02), (half + 0.28, top - 0.15, wide + 0.24), 0.03))
 
 
 def _ends(half: float, roof: float, ease: float) -> list[list[float]]:
@@ -167,29 +149,37 @@ def city_bus(kit: Kit) -> None:
     coat, second = kit.lacquer(), kit.lacquer()
     length, height, width = _template(kit, "bus", coat)
     side = width / 2 - 0.04
-    kit.both(second, box((-0.4 * length, 0.62, side - 0.05),
-        (0.38 * length, kit.between(0.72, 0.95), side + 0.006)))  # fmt: skip
-    kit.add(BLACK, block((length / 2 - 0.32, length / 2 - 0.1), (0.83 * height, 0.92 * height), 0.36 * width,
-        0.02))  # fmt: skip
-    kit.add(AMBER, boxes([(length / 2 - 0.1, 0.875 * height, z) for z in (-0.5, -0.3, 0.0, 0.2, 0.45)],
-        (0.02, 0.13, 0.12)))  # fmt: skip
+    top = kit.between(0.72, 0.95)
+    kit.both(second, box((-0.4 * length, 0.62, side - 0.05), (0.38 * length, top, side + 0.006)))
+    front = length / 2 - 0.1
+    kit.add(BLACK, block((length / 2 - 0.32, front), (0.83 * height, 0.92 * height), 0.36 * width, 0.02))
+    kit.add(AMBER, boxes(points(front, 0.875 * height, [-0.5, -0.3, 0.0, 0.2, 0.45]), (0.02, 0.13, 0.12)))
 
 
 def double_decker(kit: Kit) -> None:
     """Two rows of windows, one above the other."""
     length, wide, high = kit.between(8.8, 10.6), 1.25, kit.between(4.1, 4.4)
     half, low = length / 2, 0.32
-    coat = paint(kit.tint(((0.5, 0.012, 0.012), (0.5, 0.012, 0.012), (0.02, 0.2, 0.09), (0.02, 0.06, 0.35),
-        (0.6, 0.4, 0.02)), 0.15))  # fmt: skip
+    red = (0.5, 0.012, 0.012)
+    coat = paint(kit.tint((red, red, (0.02, 0.2, 0.09), (0.02, 0.06, 0.35), (0.6, 0.4, 0.02)), 0.15))
     kit.add(coat, carriage(_ends(half, 0.12, 0.35), wide, low, high, 0.2))
-    lower, upper = (1.25, 2.0), (2.75, 3.55)
-    _panes(kit, (-half + 0.6, half - 0.9), lower, wide, kit.count(5, 7), 0.09)
+    upper, top, sign = (2.75, 3.55), 2.05, 2.2
+    _panes(kit, (-half + 0.6, half - 0.9), (1.25, 2.0), wide, kit.count(5, 7), 0.09)
     _panes(kit, (-half + 0.35, half - 0.35), upper, wide, kit.count(6, 8), 0.09)
-    kit.add(GLASS, block((half - 0.05, half + 0.02), (upper[0], upper[1]), 0.9 * wide, 0.02))
-    kit.add(GLASS, block((-half - 0.02, -half + 0.05), (upper[0], upper[1]), 0.8 * wide, 0.02))
-    _bus_ends(kit, half, wide, low, 1.05, 2.05, 2.2)
-    _band(kit, WHITE if kit.chance(0.7) else kit.lacquer(), (-half + 0.3, half - 0.3),
-        (2.25, 2.25 + kit.between(0.1, 0.35)), wide)  # fmt: skip
+    for front, rear, share in ((upper, upper, 0.9), ((1.05, top), (1.25, top), 0.92)):
+        kit.add(GLASS, block((half - 0.05, half + 0.02), front, share * wide, 0.02))
+        kit.add(GLASS, block((-half - 0.02, -half + 0.05), rear, 0.8 * wide, 0.02))
+    kit.add(BLACK, block((half - 0.05, half + 0.03), (sign, sign + 0.28), 0.8 * wide, 0.01))
+    letters = points(half + 0.03, sign + 0.14, wide * np.array([-0.45, -0.3, -0.1, 0.05, 0.2, 0.4]))
+    kit.add(AMBER, boxes(letters, (0.012, 0.15, 0.1 * wide)))
+    for x, lamp, y in ((half, LAMP, low + 0.38), (-half, TAIL_LAMP, low + 0.55)):
+        kit.both(lamp, box((x - 0.05, y, 0.58 * wide), (x + 0.05, y + 0.2, 0.88 * wide), 0.03))
+        kit.add(BLACK, block((x - 0.09, x + 0.09), (low, low + 0.2), 0.98 * wide, 0.04))
+        kit.add(WHITE, block((x - 0.1, x + 0.1), (low + 0.05, low + 0.16), 0.25))
+    kit.both(BLACK, tube([(half - 0.05, top - 0.1, wide), (half + 0.25, top - 0.15, wide + 0.12)], 0.03, 6))
+    kit.both(BLACK, box((half + 0.18, top - 0.65, wide + 0.02), (half + 0.28, top - 0.15, wide + 0.24), 0.03))
+    stripe, rise = WHITE if kit.chance(0.7) else kit.lacquer(), kit.between(0.1, 0.35)
+    _band(kit, stripe, (-half + 0.3, half - 0.3), (2.25, 2.25 + rise), wide)
     _road_wheels(kit, (half - 2.2, -half + 2.4), 0.5, wide)
 
 
@@ -202,9 +192,8 @@ def school_bus(kit: Kit) -> None:
     kit.add(coat, moved(carriage(_ends((half + front) / 2, 0.15, 0.4), wide, low, high, 0.3), -nose / 2 * AHEAD))
     bonnet = [(front - 0.1, 1.78, 0.98), (front + 0.5 * nose, 1.66, 0.95), (half - 0.05, 1.5, 0.86),
         (half, 1.35, 0.8)]  # fmt: skip
-    rings = [np.column_stack([np.full(12, x), section(w, low, top, 0.22)]) for x, top, w in bonnet]
-    kit.add(coat, loft(rings))
-    kit.add(BLACK, boxes([(half, y, 0) for y in np.linspace(0.85, 1.25, 5)], (0.05, 0.05, 1.0)))
+    kit.add(coat, loft([section(x, w, low, top, 0.22) for x, top, w in bonnet]))
+    kit.add(BLACK, boxes(points(half, np.linspace(0.85, 1.25, 5), 0), (0.05, 0.05, 1.0)))
     kit.both(LAMP, lathe([(0.13, -0.03), (0.13, 0.04)], (half, 1.05, 0.64), "x", 16))
     kit.add(BLACK, block((half - 0.05, half + 0.14), (0.45, 0.68), wide, 0.04))
     kit.add(GLASS, block((front - 0.05, front + 0.02), (1.85, 2.6), 0.92 * wide, 0.02))
@@ -233,10 +222,9 @@ def coach(kit: Kit) -> None:
     tail = _ends(half, 0.15, 0.4)[:3]
     front = [[half - rake, 0.0, 0, 0], [half - 0.35 * rake, 0.12, 0.0, 0.03], [half, 0.75, 0.04, 0.08]]
     kit.add(coat if kit.chance(0.6) else WHITE, carriage(tail + front, wide, low, high, 0.28))
-    side = np.array([[half - 0.3, 1.2], [half + 0.03, 1.2], [half + 0.03, high - 0.75],
-        [half - 0.3 * rake, high - 0.16], [half - rake, high - 0.3]])  # fmt: skip
-    screen = [np.column_stack([side, np.full(5, z)]) for z in (-0.9 * wide, 0.9 * wide)]
-    kit.add(GLASS, prism(*screen))
+    x = [half - 0.3, half + 0.03, half + 0.03, half - 0.3 * rake, half - rake]
+    y = [1.2, 1.2, high - 0.75, high - 0.16, high - 0.3]
+    kit.add(GLASS, loft([points(x, y, z) for z in (-0.9 * wide, 0.9 * wide)]))
     _panes(kit, (-half + 0.5, half - 0.5), (1.75, high - 0.55), wide, kit.count(6, 8), 0.05)
     _band(kit, second, (-half + 0.5, half - 0.6), (0.95, 0.95 + kit.between(0.15, 0.5)), wide)
     for x in np.linspace(-0.1 * length, 0.2 * length, 4):
@@ -246,13 +234,14 @@ def coach(kit: Kit) -> None:
         kit.both(lamp, box((x - 0.06, 0.75, 0.55 * wide), (x + 0.05, 0.95, 0.9 * wide), 0.03))
         kit.add(BLACK, block((x - 0.1, x + 0.08), (low, low + 0.2), 0.96 * wide, 0.04))
     kit.add(second, block((half - 0.05, half + 0.06), (0.62, 1.05), 0.5 * wide, 0.05))
-    for side in (1, -1):
-        arm = [(half - rake, high - 0.1, side * 0.9 * wide), (half + 0.35, high - 0.25, side * 1.05 * wide),
-            (half + 0.4, high - 0.5, side * 1.08 * wide)]  # fmt: skip
-        kit.add(BLACK, tube(arm, 0.05, 6), box((half + 0.34, high - 1.1, side * 1.08 * wide - 0.12),
-            (half + 0.44, high - 0.5, side * 1.08 * wide + 0.12), 0.04))  # fmt: skip
-    _road_wheels(kit, (half - 2.3, -half + 2.6, -half + 1.4) if kit.chance(0.4) else (half - 2.3, -half + 2.2),
-        0.5, wide)  # fmt: skip
+    for side in (wide, -wide):
+        z = 1.08 * side
+        arm = [(half - rake, high - 0.1, 0.9 * side), (half + 0.35, high - 0.25, 1.05 * side),
+            (half + 0.4, high - 0.5, z)]  # fmt: skip
+        mirror = box((half + 0.34, high - 1.1, z - 0.12), (half + 0.44, high - 0.5, z + 0.12), 0.04)
+        kit.add(BLACK, tube(arm, 0.05, 6), mirror)
+    rear = (-half + 2.6, -half + 1.4) if kit.chance(0.4) else (-half + 2.2,)
+    _road_wheels(kit, (half - 2.3, *rear), 0.5, wide)
     kit.add(WHITE, block((-0.15 * length, 0.1 * length), (high - 0.05, high + 0.14), 0.7, 0.06))
 
 
@@ -262,15 +251,15 @@ BUSES = (city_bus, double_decker, school_bus, coach)
 def _bogies(kit: Kit, places: Sequence[float], radius: float) -> None:
     for x in places:
         kit.add(BLACK, block((x - 1.5, x + 1.5), (0.35, 0.95), 1.0, 0.1))
+        wheel = [(radius, -0.12), (radius, 0.0), (0.8 * radius, 0.04), (0.3 * radius, 0.1)]
         for dx in (-0.95, 0.95):
-            kit.both(STEEL, lathe([(radius, -0.12), (radius, 0.0), (0.8 * radius, 0.04), (0.3 * radius, 0.1)],
-                (x + dx, radius, 0.95), "z", 14))  # fmt: skip
+            kit.both(STEEL, lathe(wheel, (x + dx, radius, 0.95), "z", 14))
 
 
 def _track(kit: Kit, rear: float, front: float) -> None:
     """Rails on sleepers beneath it all."""
     x = np.arange(rear, front, 0.75)
-    kit.add(paint((0.1, 0.065, 0.04)), boxes(np.stack([x, 0 * x - 0.22, 0 * x], 1), (0.28, 0.16, 2.5)))
+    kit.add(paint((0.1, 0.065, 0.04)), boxes(points(x, -0.22, 0), (0.28, 0.16, 2.5)))
     kit.both(STEEL, box((rear - 0.2, -0.14, 0.7), (front + 0.2, 0.0, 0.8)))
 
 
@@ -296,38 +285,36 @@ def steam_train(kit: Kit) -> None:
     kit.add(BLACK, lathe([(1.04 * r, 0.0), (1.04 * r, 0.9), (0.85 * r, 0.98)], (long - 0.9, y, 0), "x", 22))
     kit.add(STEEL, lathe([(0.72 * r, 0.0), (0.7 * r, 0.08), (0.2 * r, 0.16)], (long + 0.05, y, 0), "x", 18))
     kit.add(trim, *(lathe([(1.02 * r, 0), (1.02 * r, 0.07)], (x, y, 0), "x", 22) for x in (0.9, 2.2, 3.5)))
-    kit.add(BLACK, lathe([(0.3, y + 0.8 * r), (0.26, y + r + 0.2), (0.28, y + r + 0.7),
-        (0.42 if kit.chance(0.5) else 0.34, y + r + 1.0), (0.34, y + r + 1.02)], (long - 0.4, 0, 0),
-        sides=18))  # fmt: skip
+    wide = 0.42 if kit.chance(0.5) else 0.34
+    chimney = [(0.3, y + 0.8 * r), (0.26, y + r + 0.2), (0.28, y + r + 0.7), (wide, y + r + 1.0),
+        (0.34, y + r + 1.02)]  # fmt: skip
+    kit.add(BLACK, lathe(chimney, (long - 0.4, 0, 0), sides=18))
+    dome = [(0.36, 0.8 * r), (0.34, r + 0.25), (0.2, r + 0.42), (0.0, r + 0.46)]
     for x in (1.4, 2.9):
-        kit.add(trim if kit.chance(0.7) else coat, moved(lathe([(0.36, 0.8 * r), (0.34, r + 0.25), (0.2, r + 0.42),
-            (0.0, r + 0.46)], sides=16), (x, y, 0)))  # fmt: skip
+        kit.add(trim if kit.chance(0.7) else coat, lathe(dome, (x, y, 0), sides=16))
     kit.add(LAMP, lathe([(0.2, 0.0), (0.2, 0.22), (0.05, 0.26)], (long - 0.1, y + r + 0.22, 0), "x", 16))
     kit.add(BLACK, block((-0.4, long + 0.2), (1.05, 1.25), 1.2), block((-0.2, long - 0.2), (0.55, 1.1), 0.5))
     kit.add(coat, block((-1.9, -0.1), (1.1, 2.5), 1.3, 0.05))
     kit.both(coat, *(box((x - 0.1, 2.4, 1.1), (x + 0.1, 3.5, 1.3)) for x in (-1.8, -0.2)))
     kit.add(BLACK, block((-1.0, -0.2), (2.45, 2.9), 1.2))
     kit.both(trim, box((-1.6, 1.7, 1.25), (-0.4, 2.1, 1.32)))
-    roof = [np.column_stack([np.full(9, x), 3.5 + 0.35 * np.sin(np.linspace(0, np.pi, 9)),
-        1.45 * np.cos(np.linspace(0, np.pi, 9))]) for x in (-2.2, 0.1)]  # fmt: skip
-    kit.add(BLACK, loft(roof))
-    drive, count = kit.between(0.62, 0.75), kit.count(2, 3)
-    places = [0.2 + 1.5 * i for i in range(count)]
+    arc = np.linspace(0, np.pi, 9)
+    kit.add(BLACK, loft([points(x, 3.5 + 0.35 * np.sin(arc), 1.45 * np.cos(arc)) for x in (-2.2, 0.1)]))
+    drive, places = kit.between(0.62, 0.75), [0.2 + 1.5 * i for i in range(kit.count(2, 3))]
     for x in places:
         kit.both(red, torus((x, drive, 0.85), 0.88 * drive, 0.11, "z", 24),
             lathe([(0.25 * drive, -0.06), (0.2 * drive, 0.12)], (x, drive, 0.85), "z", 12))  # fmt: skip
         angle = 2 * np.pi * np.arange(8) / 8
-        spokes = np.stack([x + 0.85 * drive * np.cos(angle), drive + 0.85 * drive * np.sin(angle),
-            0 * angle + 0.85], 1)  # fmt: skip
-        kit.both(red, beams(np.broadcast_to([x, drive, 0.85], (8, 3)), spokes, 0.07))
+        rim = points(x + 0.85 * drive * np.cos(angle), drive + 0.85 * drive * np.sin(angle), 0.85)
+        kit.both(red, beams((x, drive, 0.85), rim, 0.07))
     kit.both(STEEL, box((places[0] - 0.15, drive - 0.28, 0.98), (places[-1] + 0.15, drive - 0.16, 1.06)),
         tube([(places[-1], drive - 0.2, 1.08), (long - 0.9, 0.75, 1.08)], 0.05, 6))  # fmt: skip
     kit.both(coat, lathe([(0.32, -0.45), (0.32, 0.45)], (long - 0.5, 0.78, 1.0), "x", 16))
     kit.both(STEEL, *(lathe([(0.36, -0.05), (0.36, 0.05)], (x, 0.36, 0.85), "z", 16)
         for x in (long - 1.3, long + 0.1)))  # fmt: skip
     if kit.chance(0.6):
-        kit.add(red, beams([(long + 0.3, 0.95, z) for z in np.linspace(-1.1, 1.1, 9)],
-            [(long + 1.2 - 0.6 * abs(z), 0.12, z) for z in np.linspace(-1.1, 1.1, 9)], 0.07))  # fmt: skip
+        z = np.linspace(-1.1, 1.1, 9)
+        kit.add(red, beams(points(long + 0.3, 0.95, z), points(long + 1.2 - 0.6 * abs(z), 0.12, z), 0.07))
     kit.add(red, block((long + 0.15, long + 0.32), (0.85, 1.25), 1.25))
     kit.both(STEEL, lathe([(0.12, 0), (0.1, 0.3), (0.22, 0.32), (0.2, 0.38)], (long + 0.3, 1.05, 0.85), "x", 12))
     kit.add(coat, block((-5.0, -2.4), (0.95, 2.4), 1.25, 0.05))
@@ -345,18 +332,16 @@ def express(kit: Kit) -> None:
     t = np.linspace(0, 1, 9)
     slope = t ** kit.between(1.6, 2.4)
     stations = [[0.0, 0.05, 0.0, 0.05], [0.2, 0, 0, 0], [long - nose, 0, 0, 0]]
-    rows = zip(t[1:], slope[1:], strict=True)
-    stations += [[long - nose + nose * a, 1.95 * b, 0.12 * b, 0.62 * b] for a, b in rows]
+    stations += [[long - nose + nose * a, 1.95 * b, 0.12 * b, 0.62 * b] for a, b in zip(t, slope, strict=True)][1:]
     kit.add(coat, carriage(stations, 1.45, 0.55, 3.75, 0.48))
-    glass, (a, b) = ([], (kit.between(0.26, 0.32), kit.between(0.62, 0.72)))
-    for v in np.linspace(a, b, 5):
-        s = float(np.interp(v, t, slope))
+    glass, angle = [], np.linspace(0, np.pi, 9)
+    for v in np.linspace(kit.between(0.26, 0.32), kit.between(0.62, 0.72), 5):
+        s = np.interp(v, t, slope)
         x, roof, side = long - nose + nose * v, 3.75 - 1.95 * s + 0.015, (1.45 - 0.62 * s) * 0.8
-        angle = np.linspace(0, np.pi, 9)
-        top = np.stack([np.full(9, x), roof - 0.45 + 0.47 * np.sin(angle) ** 0.5, 1.2 * side * np.cos(angle)], 1)
+        top = points(x, roof - 0.45 + 0.47 * np.sin(angle) ** 0.5, 1.2 * side * np.cos(angle))
         glass.append(np.concatenate([top, top[::-1] * [1, 1, 0.7] - [0, 0.5, 0]]))
     kit.add(GLASS, loft(glass))
-    s = float(np.interp(0.88, t, slope))
+    s = np.interp(0.88, t, slope)
     kit.both(LAMP, ball((long - 0.14 * nose, 1.45, 1.45 - 0.66 * s), (0.32, 0.09, 0.14), 10))
     kit.add(BLACK, block((long - 0.25, long + 0.06), (0.62, 0.95), 0.5, 0.08))
     _panes(kit, (0.9, long - nose - 0.6), (2.0, 2.75), 1.45, kit.count(5, 7), 0.3)
@@ -388,12 +373,11 @@ def diesel_train(kit: Kit) -> None:
     kit.add(second, block((front - 0.05, front + 0.02), (2.35, 2.55), 1.35))
     kit.both(LAMP, lathe([(0.16, 0), (0.14, 0.06)], (front, 3.6, 0.2), "x", 12),
         lathe([(0.13, 0), (0.12, 0.05)], (long - 0.26, 1.5, 0.75), "x", 12))  # fmt: skip
-    for i in range(6):
-        z = -1.25 + 0.5 * i
-        kit.add((AMBER, BLACK)[i % 2], box((long - 0.02, 0.5, z - 0.25), (long + 0.1, 1.15, z + 0.25)))
+    for z, surface in zip(np.arange(-1.25, 1.5, 0.5), (AMBER, BLACK) * 3, strict=True):
+        kit.add(surface, box((long - 0.02, 0.5, z - 0.25), (long + 0.1, 1.15, z + 0.25)))
+    x = np.arange(0.2, front - cab, 1.0)
     kit.both(WHITE, tube([(0.2, 2.1, 1.35), (front - cab, 2.1, 1.35)], 0.03, 6),
-        beams([(x, 1.15, 1.35) for x in np.arange(0.2, front - cab, 1.0)],
-        [(x, 2.1, 1.35) for x in np.arange(0.2, front - cab, 1.0)], 0.05))  # fmt: skip
+        beams(points(x, 1.15, 1.35), points(x, 2.1, 1.35), 0.05))  # fmt: skip
     kit.add(BLACK, lathe([(0.22, 3.3), (0.2, 3.8)], (2.2, 0, 0), sides=12),
         lathe([(0.5, 3.35), (0.5, 3.5)], (3.6, 0, 0), sides=16))  # fmt: skip
     _bogies(kit, (1.8, long - 2.0), 0.46)
@@ -403,15 +387,17 @@ def diesel_train(kit: Kit) -> None:
         a, b, load = rear - size, rear, kit.lacquer()
         kit.add(BLACK, block((a, b), (0.85, 1.1), 1.2, 0.04), block((b - 0.1, b + 0.5), (0.8, 1.0), 0.15))
         if what == 0:
-            kit.add(load, lathe([(0.2, 0.0), (0.95, 0.15), (1.15, 0.45), (1.15, size - 0.65), (0.95, size - 0.35),
-                (0.2, size - 0.2)], (a + 0.1, 2.2, 0), "x", 20))  # fmt: skip
+            tank = [(0.2, 0.0), (0.95, 0.15), (1.15, 0.45), (1.15, size - 0.65), (0.95, size - 0.35),
+                (0.2, size - 0.2)]  # fmt: skip
+            kit.add(load, lathe(tank, (a + 0.1, 2.2, 0), "x", 20))
             kit.add(STEEL, lathe([(0.3, 3.3), (0.3, 3.55)], ((a + b) / 2, 0, 0), sides=12))
         elif what == 1:
             kit.add(load, block((a + 0.1, b - 0.1), (1.05, 3.6), 1.3, 0.05))
             x = np.linspace(a + 0.3, b - 0.3, 9)
-            kit.both(load, boxes(np.stack([x, 0 * x + 2.3, 0 * x + 1.3], 1), (0.08, 2.4, 0.1)))
+            kit.both(load, boxes(points(x, 2.3, 1.3), (0.08, 2.4, 0.1)))
         else:
-            kit.add(load, prism(rectangle((a + 0.5, b - 0.5), 1.0, 0.9), rectangle((a + 0.1, b - 0.1), 2.7, 1.3)))
+            low, high = (a + 0.5, b - 0.5), (a + 0.1, b - 0.1)
+            kit.add(load, loft([rectangle(low, 1.0, 0.9), rectangle(high, 2.7, 1.3)]))
             kit.add(BLACK, ball(((a + b) / 2, 2.6, 0), (0.42 * size, 0.55, 1.1), 12))
         _bogies(kit, ((a + b) / 2,), 0.42)
         rear = a - 0.5
@@ -424,30 +410,28 @@ def tram(kit: Kit) -> None:
     long = kit.between(6.2, 7.4)
     for rear, front, ahead in ((0.25, long, True), (-long, -0.25, False)):
         middle, half = (rear + front) / 2, (front - rear) / 2
-        stations = np.array(_ends(half, 0.05, 0.2))
-        nose = np.array([[half - 1.3, 0, 0, 0], [half - 0.5, 0.1, 0.0, 0.1], [half - 0.1, 0.45, 0.02, 0.32],
-            [half, 0.7, 0.05, 0.45]])  # fmt: skip
-        stations = np.concatenate([stations[:3], nose]) if ahead else np.concatenate([nose[::-1] * [-1, 1, 1, 1],
-            stations[3:]])  # fmt: skip
+        nose = [[half - 1.3, 0, 0, 0], [half - 0.5, 0.1, 0.0, 0.1], [half - 0.1, 0.45, 0.02, 0.32],
+            [half, 0.7, 0.05, 0.45]]  # fmt: skip
+        stations = np.array(_ends(half, 0.05, 0.2)[:3] + nose)
+        stations = stations if ahead else stations[::-1] * [-1, 1, 1, 1]
         kit.add(coat, moved(carriage(stations, 1.3, 0.45, 3.4, 0.35), middle * AHEAD))
         inner = (rear + 0.3, front - 1.3) if ahead else (rear + 1.3, front - 0.3)
         _panes(kit, inner, (1.6, 2.75), 1.3, kit.count(4, 5), 0.12)
         _band(kit, second, inner, (0.6, kit.between(1.0, 1.4)), 1.3)
         end, way = (front, 1) if ahead else (rear, -1)
-        kit.add(GLASS, prism(*(np.array([[end + 0.03 * way, 1.45, z], [end + 0.03 * way, 2.62, z],
-            [end - 0.1 * way, 2.95, z], [end - 0.5 * way, 2.85, z], [end - 0.5 * way, 1.45, z]])
-            for z in (-0.8, 0.8))))  # fmt: skip
+        pane = np.array([[0.03, 1.45], [0.03, 2.62], [-0.1, 2.95], [-0.5, 2.85], [-0.5, 1.45]])
+        kit.add(GLASS, loft([points(end + way * pane[:, 0], pane[:, 1], z) for z in (-0.8, 0.8)]))
         kit.add(BLACK, block((end - 0.3 if ahead else end - 0.06, end + 0.06 if ahead else end + 0.3), (2.82, 3.1),
             0.6, 0.02))  # fmt: skip
-        kit.add(AMBER, boxes([(end + 0.065 * way, 2.96, z) for z in (-0.4, -0.2, 0.05, 0.3)], (0.02, 0.16, 0.13)))
+        kit.add(AMBER, boxes(points(end + 0.065 * way, 2.96, [-0.4, -0.2, 0.05, 0.3]), (0.02, 0.16, 0.13)))
         kit.both(LAMP if ahead else TAIL_LAMP, lathe([(0.14, -0.1), (0.12, 0.1)], (end - 0.08 * way, 1.0, 0.62),
             "x", 14))  # fmt: skip
         kit.add(second, block((end - 0.25 if ahead else end - 0.04, end + 0.04 if ahead else end + 0.25),
             (0.5, 0.8), 0.8, 0.06))  # fmt: skip
         _bogies(kit, (middle,), 0.32)
     kit.add(BLACK, block((-0.35, 0.35), (0.6, 3.2), 1.15))
-    kit.add(STEEL, beams([(2.0, 3.4, 0.3), (2.0, 3.4, -0.3), (1.2, 3.9, 0), (1.2, 3.9, 0)],
-        [(1.2, 3.9, 0), (1.2, 3.9, 0), (2.0, 4.35, 0.3), (2.0, 4.35, -0.3)], 0.05))  # fmt: skip
+    side, knee = [0.3, -0.3], (1.2, 3.9, 0)
+    kit.add(STEEL, beams(points(2.0, 3.4, side), knee, 0.05), beams(knee, points(2.0, 4.35, side), 0.05))
     kit.add(STEEL, block((1.9, 2.1), (4.32, 4.4), 0.8), block((2.8, 4.2), (3.35, 3.65), 0.7, 0.08))
     _track(kit, -long, long)
 
